@@ -1,0 +1,75 @@
+"""Cell time, which can run faster or slower than the clock on the wall.
+
+Motion, the simulated world, the camera rate and header stamps follow cell time; requests, watchdogs and planning
+budgets follow wall time. All processes of a cell compute the same cell time from an epoch and a speed that the
+supervisor hands down in the environment.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Mapping
+
+SPEED_VARIABLE = "ZENCELL_SPEED"
+EPOCH_VARIABLE = "ZENCELL_EPOCH"
+MIN_SPEED, MAX_SPEED = 0.1, 10.0
+
+
+class Clock:
+    """Cell time: equal to Unix time at the epoch and `speed` times as fast after it."""
+
+    def __init__(self, speed: float = 1.0, epoch_ns: int | None = None) -> None:
+        """Start a clock.
+
+        Args:
+            speed: seconds of cell time per second of wall time, 0.1 to 10.
+            epoch_ns: wall time [ns since the Unix epoch] at which cell time equals wall time; now when not given.
+
+        Raises:
+            ValueError: when the speed is out of bounds.
+        """
+        if not MIN_SPEED <= speed <= MAX_SPEED:
+            raise ValueError(f"speed: {speed:g} is not within {MIN_SPEED:g} to {MAX_SPEED:g}")
+        self.speed = speed
+        # Monotonic from here on: a step of the system clock must not move the robot.
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        self.epoch_ns = self._wall_ns() if epoch_ns is None else epoch_ns
+
+    @classmethod
+    def from_environment(cls, environ: Mapping[str, str] = os.environ) -> Clock:
+        """The clock that the supervisor handed down, or one at speed 1."""
+        epoch = environ.get(EPOCH_VARIABLE)
+        return cls(float(environ.get(SPEED_VARIABLE, "1")), int(epoch) if epoch else None)
+
+    def environment(self) -> dict[str, str]:
+        """Variables from which another process makes the same clock."""
+        return {SPEED_VARIABLE: repr(self.speed), EPOCH_VARIABLE: str(self.epoch_ns)}
+
+    def _wall_ns(self) -> int:
+        return time.monotonic_ns() + self._offset_ns
+
+    def now_ns(self) -> int:
+        """Cell time now, in ns since the Unix epoch: the stamp of a header."""
+        return self.epoch_ns + int((self._wall_ns() - self.epoch_ns) * self.speed)
+
+    def now(self) -> float:
+        """Cell time now [s]."""
+        return self.now_ns() * 1e-9
+
+    def wall_seconds(self, cell_seconds: float) -> float:
+        """Wall time [s] in which this much cell time passes."""
+        return cell_seconds / self.speed
+
+    def wall_rate(self, cell_rate: float, most: float) -> float:
+        """Rate on the wall clock [Hz] for a rate in cell time, at most `most`."""
+        return min(cell_rate * self.speed, most)
+
+    def age_ms(self, stamp_ns: int) -> float:
+        """Wall time [ms] since a stamp was taken."""
+        return (self.now_ns() - stamp_ns) / self.speed * 1e-6
+
+    async def sleep(self, cell_seconds: float) -> None:
+        """Wait until this much cell time has passed."""
+        await asyncio.sleep(max(0.0, cell_seconds) / self.speed)

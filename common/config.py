@@ -1,0 +1,436 @@
+"""Configuration: a cell file names a robot, a world, a pipeline and its services; every value has a unit and bounds.
+
+`load_cell` resolves the names, applies `--set PATH=VALUE` overrides and checks all of it. A service declares a
+`Config` (a `Parameters`); its fields are either parameters, set under `services.<name>` of the cell, or sections of
+the cell, which are recognised by their type and filled in. Only what a service declares reaches it: `World` (where
+things really lie) is declared by the simulated hardware alone, everything else takes `Surroundings`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from common.errors import ConfigError, UnknownName
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Length = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Rgb = tuple[
+    Annotated[float, Field(ge=0, le=1)], Annotated[float, Field(ge=0, le=1)], Annotated[float, Field(ge=0, le=1)]
+]
+
+
+class Section(BaseModel):
+    """A part of the cell that several services may need."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Parameters(BaseModel):
+    """Base of the `Config` of a service, and of the `Options` of a planner or hardware backend."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+# --- robot ------------------------------------------------------------------------------------------------------
+
+
+class GripperConfig(Section):
+    """A parallel gripper: `width` is the distance between the inner faces of the fingers [m]."""
+
+    joints: list[str] = Field(description="finger joints; each moves half the width")
+    links: list[str] = Field(description="links that may touch what is grasped")
+    max_width: Length = Field(0.08, description="fully open [m]")
+    speed: Length = Field(0.2, description="closing speed of the width [m/s]")
+    acceleration: Length = Field(2.0, description="of the width [m/s^2]")
+    jerk: float = Field(50.0, gt=0, le=1e4, description="of the width [m/s^3]")
+
+
+class HardwareConfig(Section):
+    """The backend that moves the joints: a module of common/hardware, or a dotted module of your own."""
+
+    backend: str = "mock"
+    options: dict[str, Any] = {}
+
+
+class RobotConfig(Section):
+    """A robot: its descriptions, the group that is planned for, and limits that the URDF does not give."""
+
+    name: str
+    urdf: str = Field(description="path, or package://<package>/... from an installed description package")
+    srdf: str = Field("", description="as urdf; its disabled collision pairs are used")
+    package_dirs: list[str] = Field([], description="where package:// is looked up, before the installed packages")
+    group: str = "arm"
+    group_aliases: list[str] = []
+    joints: list[str] = Field(min_length=1, description="joints of the group, in order")
+    base_link: str
+    tcp_link: str
+    locked_joints: dict[str, Number] = Field({}, description="joints outside the group and where planning holds them")
+    named_poses: dict[str, list[Number]] = Field(description="joint positions [rad]; must have home")
+    acceleration_limits: list[Annotated[float, Field(gt=0, le=1000)]] = Field(description="[rad/s^2]")
+    jerk_limits: list[Annotated[float, Field(gt=0, le=1e6)]] = Field(description="[rad/s^3]")
+    gripper: GripperConfig | None = None
+    hardware: HardwareConfig = HardwareConfig()
+
+    @model_validator(mode="after")
+    def _lengths_fit(self) -> RobotConfig:
+        for field in ("acceleration_limits", "jerk_limits"):
+            if len(getattr(self, field)) != len(self.joints):
+                raise ValueError(f"{field} has {len(getattr(self, field))} values for {len(self.joints)} joints")
+        if "home" not in self.named_poses:
+            raise ValueError("named_poses must have home")
+        for name, positions in self.named_poses.items():
+            if len(positions) != len(self.joints):
+                raise ValueError(f"named pose {name} has {len(positions)} values for {len(self.joints)} joints")
+        return self
+
+
+# --- world ------------------------------------------------------------------------------------------------------
+
+
+class Fixture(Section):
+    """A solid that never moves, pose in world."""
+
+    id: str
+    shape: Literal["box", "sphere", "cylinder"] = "box"
+    dimensions: list[Length] = Field(description="box x, y, z; sphere radius; cylinder radius, length [m]")
+    position: Point
+    rpy: tuple[Number, Number, Number] = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw [rad], R = Rz Ry Rx")
+    color: Rgb = (0.5, 0.5, 0.5)
+
+
+class Container(Section):
+    """An open box of five panels in which balls lie in a 2 x 2 grid of slots, in layers."""
+
+    id: str = "box"
+    x: Coordinate = Field(0.55, description="centre [m]")
+    y: Coordinate = Field(0.25, description="centre [m]")
+    half_side: Length = Field(0.08, description="outer half side [m]")
+    floor_thickness: Length = Field(0.005, description="[m]")
+    wall_height: Length = Field(0.07, description="from the table [m]")
+    wall_thickness: Length = Field(0.008, description="[m]")
+    slot_offset: Length = Field(0.033, description="slots lie at plus and minus this from the centre [m]")
+    layers: int = Field(2, ge=1, le=5, description="of four slots each")
+    color: Rgb = (1.0, 0.6, 0.0)
+
+
+class CameraConfig(Section):
+    """A pinhole camera. +Z looks forward, +X is to the right in the picture, +Y is down."""
+
+    frame: str = "camera_optical_frame"
+    width: int = Field(640, ge=16, le=4096, description="[px]")
+    height: int = Field(480, ge=16, le=4096, description="[px]")
+    fx: float = Field(520.0, gt=1, le=1e5, description="focal length [px]")
+    fy: float = Field(520.0, gt=1, le=1e5, description="focal length [px]")
+    cx: float = Field(320.0, ge=0, le=4096, description="principal point [px]")
+    cy: float = Field(240.0, ge=0, le=4096, description="principal point [px]")
+    position: Point = Field((0.40, 0.0, 0.80), description="optical centre in world [m]")
+    rpy: tuple[Number, Number, Number] = Field(
+        (math.pi, 0.0, -math.pi / 2), description="of the optical frame in world [rad], R = Rz Ry Rx"
+    )
+
+
+class Surroundings(Section):
+    """What everybody in the cell knows: what is fixed, where the camera is, how large the balls are."""
+
+    fixtures: list[Fixture] = []
+    container: Container = Container()
+    camera: CameraConfig = CameraConfig()
+    ball_radius: float = Field(0.03, ge=0.01, le=0.035, description="[m]")
+    ball_color: Rgb = (1.0, 0.15, 0.10)
+    table_height: Coordinate = Field(0.0, description="z of the surface on which balls rest [m]")
+
+
+class World(Surroundings):
+    """The surroundings and where things really lie: for simulated hardware only."""
+
+    layout: Literal["fixed", "random"] = "fixed"
+    count: int = Field(7, ge=1, le=8, description="balls in the world, when `balls` is empty")
+    spots: list[tuple[Coordinate, Coordinate]] = Field([], description="the fixed layout: the first `count` are used")
+    balls: list[tuple[Coordinate, Coordinate]] = Field([], description="centres [m]; replaces layout and count")
+    min_separation: Length = Field(0.07, description="random: least distance of centres [m]")
+    container_clearance: Length = Field(0.04, description="random: least distance of a ball from the container [m]")
+    objects: list[dict[str, Any]] = Field([], description="objects other than balls")
+
+    @model_validator(mode="after")
+    def _balls_do_not_overlap(self) -> World:
+        for i, a in enumerate(self.balls):
+            for j, b in enumerate(self.balls[:i]):
+                if math.dist(a, b) < 2 * self.ball_radius - 1e-9:
+                    raise ValueError(f"balls {j} {list(b)} and {i} {list(a)} overlap")
+        if self.layout == "fixed" and not self.balls and self.count > len(self.spots):
+            raise ValueError(f"count {self.count} is more than the {len(self.spots)} spots of the fixed layout")
+        return self
+
+
+# --- motion -----------------------------------------------------------------------------------------------------
+
+
+class Motion(Section):
+    """How fast the robot moves and how hard planning tries, unless a request says otherwise."""
+
+    velocity_scaling: float = Field(0.2, gt=0, le=1, description="fraction of the joints' velocity limits")
+    acceleration_scaling: float = Field(0.2, gt=0, le=1, description="fraction of the joints' acceleration limits")
+    cartesian_speed_scale: float = Field(
+        1.0, gt=0, le=1, description="stretch of straight-line trajectories after retiming: t/s, v*s, a*s^2"
+    )
+    planning_attempts: int = Field(5, ge=1, le=100, description="tries of a sampling planner, the best is kept")
+    planning_time: float = Field(10.0, gt=0, le=600, description="wall time for one plan [s]")
+    object_padding: float = Field(
+        0.003, ge=0, le=0.05, description="perceived objects are planned around with this much more radius [m]"
+    )
+
+
+class PlannerEntry(Section):
+    """A planner of the pipeline: a module of common/planning/planners, or a dotted module of your own."""
+
+    name: str
+    options: dict[str, Any] = {}
+
+
+class Pipeline(Section):
+    """Planners in the order in which they are tried, and the checks after them."""
+
+    planners: list[PlannerEntry] = Field(min_length=1)
+    validation_step: float = Field(0.01, gt=0, le=0.2, description="largest joint step between checked states [rad]")
+
+
+class Run(Section):
+    """What belongs to one run."""
+
+    cell: str
+    seed: int = Field(0, ge=0, le=2**31 - 1)
+    autostart: bool = True
+
+
+# --- cell -------------------------------------------------------------------------------------------------------
+
+
+class ServiceEntry(Section):
+    """A process of the cell: its module and its parameters, which are checked by the service itself."""
+
+    name: str
+    module: str
+    parameters: dict[str, Any] = {}
+
+
+class Cell(Section):
+    """A resolved cell: everything that its services are configured with."""
+
+    run: Run
+    robot: RobotConfig
+    world: World
+    motion: Motion
+    pipeline: Pipeline
+    services: dict[str, ServiceEntry]
+    task: str = Field(description="the service that runs the task and ends in DONE")
+
+    @property
+    def name(self) -> str:
+        """The first part of every key."""
+        return self.run.cell
+
+    def section(self, kind: type[Section]) -> Section:
+        """The section of that type; surroundings are cut out of the world, without what lies in it."""
+        if kind is Surroundings:
+            return Surroundings.model_validate({f: getattr(self.world, f) for f in Surroundings.model_fields})
+        for value in (self.run, self.robot, self.world, self.motion, self.pipeline):
+            if type(value) is kind:
+                return value
+        raise TypeError(f"{kind.__name__} is not a section of a cell")
+
+
+C = TypeVar("C", bound=BaseModel)
+P = TypeVar("P", bound=Parameters)
+
+
+def config_root() -> Path:
+    """The folder of the configuration: `ZENCELL_CONFIG`, or config/ beside the packages."""
+    given = os.environ.get("ZENCELL_CONFIG")
+    return Path(given) if given else Path(__file__).resolve().parent.parent / "config"
+
+
+def names_of(kind: str) -> list[str]:
+    """Names that can be given for a kind: cells, robots, worlds or pipelines."""
+    return sorted(path.stem for path in (config_root() / kind).glob("*.yaml"))
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A mapping from a YAML file.
+
+    Raises:
+        ConfigError: the file is not there, does not parse (with line and column), or holds no mapping.
+    """
+    try:
+        loaded = yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError("file", str(path), f"can not be read: {error}") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "not valid YAML"
+        raise ConfigError("file", str(path), f"does not parse{where}: {problem}") from None
+    if not isinstance(loaded, dict):
+        raise ConfigError("file", str(path), "must hold a mapping")
+    return loaded
+
+
+def find_file(kind: str, name: str, beside: Path | None = None) -> Path:
+    """The file that a name stands for: a path (absolute, or relative to `beside`), or a name of config/<kind>.
+
+    Raises:
+        UnknownName: with the choices.
+    """
+    if name.endswith((".yaml", ".yml")):
+        path = (beside or Path()) / Path(name).expanduser()
+        if not path.is_file():
+            raise ConfigError(kind.removesuffix("s"), str(path), "is not a file")
+        return path
+    path = config_root() / kind / f"{name}.yaml"
+    if not path.is_file():
+        raise UnknownName(kind.removesuffix("s"), name, names_of(kind))
+    return path
+
+
+def parse_override(text: str) -> tuple[list[str], Any]:
+    """The dotted path and the value (as YAML) of `PATH=VALUE`."""
+    path, found, value = text.partition("=")
+    if not found or not path.strip():
+        raise ConfigError("--set", text, "must be PATH=VALUE, for example world.count=5")
+    try:
+        return path.strip().split("."), yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise ConfigError(f"--set {path}", value, "is not a YAML value") from None
+
+
+def _override(tree: dict[str, Any], path: Sequence[str], value: Any) -> None:
+    node = tree
+    for depth, part in enumerate(path[:-1]):
+        child = node.setdefault(part, {})
+        if child is None:
+            child = node[part] = {}
+        if not isinstance(child, dict):
+            raise ConfigError("--set", ".".join(path), f"can not go below {'.'.join(path[: depth + 1])}, a value")
+        node = child
+    node[path[-1]] = value
+
+
+def check(model: type[C], values: Mapping[str, Any], prefix: str = "") -> C:
+    """The model made of the values.
+
+    Raises:
+        ConfigError: names the first field that does not fit, its value and what would.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise _first_error(error, model, prefix) from None
+
+
+def _first_error(error: ValidationError, model: type[BaseModel], prefix: str) -> ConfigError:
+    first = error.errors(include_url=False, include_context=False)[0]
+    field = ".".join(part for part in [prefix, *(str(p) for p in first["loc"])] if part)
+    message = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be").replace("Input ", "")
+    if first["type"] == "extra_forbidden":
+        names = _fields_at(model, first["loc"][:-1])
+        return ConfigError(field, first["input"], f"is not a parameter; choices: {', '.join(names)}")
+    if first["type"] == "value_error":
+        return ConfigError(field or prefix or "cell", "", message)
+    return ConfigError(field, first["input"], message)
+
+
+def _fields_at(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
+    """Names of the fields of the model that lies at a location within `model`."""
+    current = model
+    for part in location:
+        annotation = current.model_fields[str(part)].annotation if str(part) in current.model_fields else None
+        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
+            break
+        current = annotation
+    return sorted(name for name, f in current.model_fields.items() if not _is_section(f.annotation))
+
+
+def _is_section(annotation: object) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, Section)
+
+
+def load_cell(
+    cell: str, overrides: Sequence[str] = (), *, world: str | None = None, seed: int | None = None
+) -> Cell:
+    """Resolve a cell by its name in config/cells or the path of a YAML file.
+
+    Args:
+        cell: a name, or a path that ends in .yaml.
+        overrides: `PATH=VALUE` each, applied after all files were read.
+        world: name or path of a world that replaces the cell's.
+        seed: replaces the cell's seed.
+
+    Raises:
+        ConfigError, UnknownName: one line naming the field, the value and the choices.
+    """
+    path = find_file("cells", cell)
+    tree = read_yaml(path)
+    parsed = [parse_override(text) for text in overrides]
+    for parts, value in parsed:  # which file to read may itself be overridden
+        if len(parts) == 1 and parts[0] in ("robot", "world", "pipeline"):
+            tree[parts[0]] = value
+    if world is not None:
+        tree["world"] = world
+    for part in ("robot", "world", "pipeline"):
+        value = tree.get(part)
+        if isinstance(value, str):
+            tree[part] = read_yaml(find_file(f"{part}s", value, path.parent))
+        elif not isinstance(value, dict):
+            raise ConfigError(part, value, f"must be a name or a mapping; choices: {', '.join(names_of(part + 's'))}")
+    services = tree.get("services")
+    if not isinstance(services, dict):
+        raise ConfigError("services", services, "must be a mapping of services in start order")
+    for parts, value in parsed:
+        if parts[0] == "services" and len(parts) > 1 and parts[1] not in services:
+            raise UnknownName("service", parts[1], services)
+        if len(parts) > 1 or parts[0] not in ("robot", "world", "pipeline"):
+            _override(tree, parts, value)
+    run = {"cell": tree.pop("cell", path.stem), "autostart": tree.pop("autostart", True), "seed": tree.pop("seed", 0)}
+    if seed is not None:
+        run["seed"] = seed
+    tree["run"] = run
+    tree["services"] = {name: _service_entry(name, value) for name, value in services.items()}
+    return check(Cell, tree)
+
+
+def _service_entry(name: str, parameters: Any) -> dict[str, Any]:
+    if parameters is not None and not isinstance(parameters, dict):
+        raise ConfigError(f"services.{name}", parameters, "must be a mapping of parameters")
+    module = name if "." in name else f"services.{name}"
+    if "." not in name and importlib.util.find_spec(module) is None:
+        raise UnknownName("service", name, service_names())
+    return {"name": name.rpartition(".")[2], "module": module, "parameters": parameters or {}}
+
+
+def service_names() -> list[str]:
+    """Services that come with the project: the modules in services/."""
+    folder = Path(__file__).resolve().parent.parent / "services"
+    return sorted(path.stem for path in folder.glob("[a-z]*.py"))
+
+
+def service_config(cell: Cell, name: str, config: type[P]) -> P:
+    """The configuration of one service: its parameters from the cell, and the sections that it declares.
+
+    Raises:
+        ConfigError: names `services.<name>.<parameter>`, the value and the bounds or choices.
+    """
+    entry = cell.services.get(name)
+    given = dict(entry.parameters) if entry else {}
+    for field, info in config.model_fields.items():
+        if _is_section(info.annotation):
+            given[field] = cell.section(info.annotation)  # type: ignore[arg-type]
+    return check(config, given, f"services.{name}")

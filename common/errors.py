@@ -1,0 +1,84 @@
+"""Errors that carry their data, so that a message can name the thing, the value and the choices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class ZencellError(Exception):
+    """An error that is shown to the person as one line, without a traceback."""
+
+
+class ConfigError(ZencellError):
+    """A value of the configuration that can not be used: names the field, the value and what would do."""
+
+    def __init__(self, field: str, value: object, expected: str) -> None:
+        super().__init__(f"{field}: {value!r} {expected}")
+        self.field = field
+        self.value = value
+        self.expected = expected
+
+
+class UnknownName(ZencellError):
+    """A name that is not among the choices."""
+
+    def __init__(self, what: str, name: str, choices: Iterable[str]) -> None:
+        listed = sorted(choices)
+        near = get_close_matches(name, listed, n=1)
+        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        super().__init__(f"unknown {what} {name!r}{hint}; choices: {', '.join(listed) or 'none'}")
+        self.what = what
+        self.name = name
+        self.choices = listed
+
+
+class RequestFailed(ZencellError):
+    """Base of the four ways in which a request ends without an answer."""
+
+
+class RemoteError(RequestFailed):
+    """The responder refused the request or failed at it: `code` is for programs, the message for people."""
+
+    def __init__(self, key: str, code: str, message: str) -> None:
+        super().__init__(f"{key}: {message} [{code}]")
+        self.key = key
+        self.code = code
+        self.message = message
+
+
+class NoResponder(RequestFailed):
+    """Nobody serves the key, known before anything was sent: the request was certainly not carried out."""
+
+    def __init__(self, key: str) -> None:
+        super().__init__(f"{key}: no service answers this key")
+        self.key = key
+
+
+class RequestLost(RequestFailed):
+    """The responder or the router went away after the request was sent: it may have been carried out."""
+
+    def __init__(self, key: str) -> None:
+        super().__init__(f"{key}: the responder went away; the request may have been carried out")
+        self.key = key
+
+
+class RequestTimeout(RequestFailed):
+    """No answer within the time given: the request may still be carried out."""
+
+    def __init__(self, key: str, seconds: float) -> None:
+        super().__init__(f"{key}: no answer within {seconds:g} s")
+        self.key = key
+        self.seconds = seconds
+
+
+class Refused(ZencellError):
+    """Raised by the handler of a request to refuse it: becomes a `RemoteError` at the requester."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class DecodeError(ZencellError):
+    """A payload that is not a valid message: too large, not msgpack, or not of the expected shape."""

@@ -1,0 +1,503 @@
+"""Every message that travels between services: SI units, quaternions x, y, z, w, names as in ROS where ROS has one.
+
+All models refuse unknown fields and numbers that are not finite. A pose is that of the named thing in
+`header.frame_id`. Stamps are cell time in ns since the Unix epoch and are taken once, when the frame is exposed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+SCHEMA_VERSION = 1
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Name = Annotated[str, Field(min_length=1, max_length=120)]
+
+
+class Message(BaseModel):
+    """Base of everything that is sent."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Header(Message):
+    """When and in which frame."""
+
+    stamp: int = Field(0, ge=0, description="cell time [ns since the Unix epoch]")
+    frame_id: str = ""
+
+
+# --- geometry ---------------------------------------------------------------------------------------------------
+
+
+class Vector3(Message):
+    """A point, displacement [m] or box size [m]."""
+
+    x: Finite = 0.0
+    y: Finite = 0.0
+    z: Finite = 0.0
+
+
+class Quaternion(Message):
+    """A unit quaternion; refused when its norm is more than 1e-3 off one."""
+
+    x: Finite = 0.0
+    y: Finite = 0.0
+    z: Finite = 0.0
+    w: Finite = 1.0
+
+    @model_validator(mode="after")
+    def _is_unit(self) -> Quaternion:
+        norm = math.sqrt(self.x**2 + self.y**2 + self.z**2 + self.w**2)
+        if abs(norm - 1) > 1e-3:
+            raise ValueError(f"quaternion has norm {norm:.4f}, not 1")
+        return self
+
+
+class Pose(Message):
+    """Position [m] and orientation."""
+
+    position: Vector3 = Vector3()
+    orientation: Quaternion = Quaternion()
+
+
+class PoseArray(Message):
+    """Poses of several things; `ids[i]` and `labels[i]`, where given, belong to `poses[i]`."""
+
+    header: Header = Header()
+    poses: list[Pose] = []
+    ids: list[str] = []
+    labels: list[str] = Field([], description="scene_balls: table, held, falling or box")
+
+    @model_validator(mode="after")
+    def _same_length(self) -> PoseArray:
+        for field in ("ids", "labels"):
+            count = len(getattr(self, field))
+            if count not in (0, len(self.poses)):
+                raise ValueError(f"{field} has {count} entries for {len(self.poses)} poses")
+        return self
+
+
+class TransformStamped(Message):
+    """Pose of `child_frame_id` in `header.frame_id`."""
+
+    header: Header
+    child_frame_id: Name
+    transform: Pose
+
+
+class TFMessage(Message):
+    """Transforms of one instant."""
+
+    transforms: list[TransformStamped]
+
+
+# --- camera -----------------------------------------------------------------------------------------------------
+
+
+class Image(Message):
+    """Pixels, row by row. `step` is the row stride in bytes; 0 means unpadded. See common/perception/image.py."""
+
+    header: Header
+    height: int = Field(ge=1, le=16384)
+    width: int = Field(ge=1, le=16384)
+    encoding: str = Field(description="bgr8, rgb8, mono8, 16UC1 or 32FC1")
+    is_bigendian: bool = False
+    step: int = Field(0, ge=0)
+    data: bytes
+
+
+class CameraInfo(Message):
+    """Pinhole calibration, as sensor_msgs/CameraInfo: `k` is the 3x3 intrinsic matrix [px], row by row."""
+
+    header: Header
+    height: int = Field(ge=1, le=16384)
+    width: int = Field(ge=1, le=16384)
+    distortion_model: str = "plumb_bob"
+    d: list[Finite] = []
+    k: list[Finite] = Field(min_length=9, max_length=9)
+
+    @model_validator(mode="after")
+    def _has_focal_lengths(self) -> CameraInfo:
+        if self.k[0] <= 0 or self.k[4] <= 0:
+            raise ValueError(f"focal lengths must be positive, not {self.k[0]:g} and {self.k[4]:g}")
+        return self
+
+
+class Color(Message):
+    """Red, green, blue and opacity, each 0 to 1."""
+
+    r: Fraction = 1.0
+    g: Fraction = 1.0
+    b: Fraction = 1.0
+    a: Fraction = 1.0
+
+
+class Marker(Message):
+    """Something to look at: a detection or a shape for the operator. `scale` is the full size [m]."""
+
+    ns: str
+    id: int
+    type: Literal["sphere", "cylinder", "box", "text"]
+    pose: Pose
+    scale: Vector3
+    color: Color = Color()
+    text: str = ""
+    pixel: tuple[Finite, Finite] | None = Field(None, description="where the centre is seen, (u, v) [px]")
+    partial: bool = Field(False, description="touches the border of the picture: not wholly in view")
+
+
+class MarkerArray(Message):
+    """Markers of one instant; a later message with the same header frame replaces them all."""
+
+    header: Header
+    markers: list[Marker]
+
+
+class Rejection(Message):
+    """A detected object that is not offered to the task, and why."""
+
+    position: Vector3
+    reason: str
+
+
+class Rejections(Message):
+    """Rejections that are new: one is sent once for each place."""
+
+    header: Header
+    rejected: list[Rejection]
+
+
+# --- planning scene ---------------------------------------------------------------------------------------------
+
+
+class CollisionObject(Message):
+    """A solid in the planning scene.
+
+    `dimensions` [m]: box (x, y, z), sphere (radius,), cylinder (radius, length along z).
+    """
+
+    id: Name
+    role: Literal["fixture", "container", "target", "contained", "attached"]
+    shape: Literal["box", "sphere", "cylinder"]
+    dimensions: list[Positive] = Field(min_length=1, max_length=3)
+    pose: Pose
+    color: Color = Color()
+
+    @model_validator(mode="after")
+    def _dimensions_fit_shape(self) -> CollisionObject:
+        wanted = {"box": 3, "sphere": 1, "cylinder": 2}[self.shape]
+        if len(self.dimensions) != wanted:
+            raise ValueError(f"a {self.shape} has {wanted} dimensions, not {len(self.dimensions)}")
+        return self
+
+
+class AttachedObject(Message):
+    """A solid that moves with the robot: `object.pose` is its pose in the frame of `link`."""
+
+    link: Name
+    object: CollisionObject
+
+
+class PlanningScene(Message):
+    """What the planner avoids, all of it perceived or fixed; poses of `objects` are in `header.frame_id`."""
+
+    header: Header
+    objects: list[CollisionObject] = []
+    attached: list[AttachedObject] = []
+    allowed_collisions: list[tuple[str, str]] = Field([], description="pairs of link or object names that may touch")
+
+
+# --- robot ------------------------------------------------------------------------------------------------------
+
+
+class JointState(Message):
+    """Positions [rad or m], velocities [rad/s or m/s] and efforts of named joints."""
+
+    header: Header
+    name: list[Name]
+    position: list[Finite]
+    velocity: list[Finite] = []
+    effort: list[Finite] = []
+
+    @model_validator(mode="after")
+    def _same_length(self) -> JointState:
+        for field in ("position", "velocity", "effort"):
+            count = len(getattr(self, field))
+            if count != len(self.name) and (count or field == "position"):
+                raise ValueError(f"{field} has {count} entries for {len(self.name)} joints")
+        return self
+
+
+class JointTrajectoryPoint(Message):
+    """State of all joints at a time [s] after the start."""
+
+    time_from_start: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    positions: list[Finite]
+    velocities: list[Finite]
+    accelerations: list[Finite]
+
+    @model_validator(mode="after")
+    def _same_length(self) -> JointTrajectoryPoint:
+        if not len(self.positions) == len(self.velocities) == len(self.accelerations):
+            raise ValueError("positions, velocities and accelerations differ in length")
+        return self
+
+
+class JointTrajectory(Message):
+    """A timed path of the named joints; the first point is where the robot starts, at time 0."""
+
+    header: Header = Header()
+    joint_names: list[Name] = Field(min_length=1)
+    points: list[JointTrajectoryPoint]
+
+    @model_validator(mode="after")
+    def _dof_fits(self) -> JointTrajectory:
+        for index, point in enumerate(self.points):
+            if len(point.positions) != len(self.joint_names):
+                raise ValueError(f"point {index} has {len(point.positions)} values for {len(self.joint_names)} joints")
+        return self
+
+
+# --- planning requests ------------------------------------------------------------------------------------------
+
+
+class JointGoal(Message):
+    """Joint positions to end at [rad], in the order of the robot's group; or the name of a named pose."""
+
+    kind: Literal["joints"] = "joints"
+    positions: list[Finite] = []
+    named: str = Field("", description="a named pose of the robot file, such as home; used when positions is empty")
+
+
+class PoseGoal(Message):
+    """A pose for the tool centre point, with a region about it for planners that can use one.
+
+    The straight-line planner ends at the pose itself. Sampling planners may end anywhere in the region: a box with
+    the sides `position_tolerance` [m] centred on the pose, tilted by at most `tilt_tolerance` [rad] from the pose's
+    tool axis and turned about it by at most `yaw_tolerance` [rad].
+    """
+
+    kind: Literal["pose"] = "pose"
+    pose: Pose
+    position_tolerance: Vector3 = Vector3()
+    tilt_tolerance: Annotated[float, Field(ge=0, le=math.pi, allow_inf_nan=False)] = 0.0
+    yaw_tolerance: Annotated[float, Field(ge=0, le=math.pi, allow_inf_nan=False)] = 0.0
+
+
+class PlanRequest(Message):
+    """Ask for a trajectory. Poses are in the robot's base frame, `world`.
+
+    `attach` names an object of the planning scene that is to be planned with as if it were already held (or as held
+    now); `release` plans as if nothing were held. Contact that an attached object has at the start is allowed until
+    the tool has moved `contact_distance`.
+    """
+
+    header: Header = Header()
+    id: Name
+    stage: str = Field("", description="what the motion is for: appears in every error")
+    start: list[Finite] = Field([], description="joint positions [rad]; empty: where the robot is now")
+    goal: Annotated[JointGoal | PoseGoal, Field(discriminator="kind")]
+    straight: bool = Field(False, description="only a straight line of the tool will do")
+    allowed_collisions: list[tuple[str, str]] = Field([], description="in addition to the planning scene's")
+    attach: str = ""
+    release: bool = False
+    contact_distance: Annotated[float, Field(ge=0, le=0.2, allow_inf_nan=False)] = 0.02
+    velocity_scaling: Annotated[float, Field(gt=0, le=1)] | None = None
+    acceleration_scaling: Annotated[float, Field(gt=0, le=1)] | None = None
+    planning_time: Annotated[float, Field(gt=0, le=600)] | None = Field(None, description="wall time [s]")
+    planning_attempts: Annotated[int, Field(ge=1, le=100)] | None = None
+    planner: str = Field("", description="use this planner of the pipeline only")
+    seed: int | None = None
+
+
+class PlanAttempt(Message):
+    """One try of one planner. `error` is empty for a success."""
+
+    planner: str
+    seconds: Finite
+    error: str = ""
+    message: str = ""
+    fraction: Finite = 0.0
+    waypoint: int | None = None
+    colliding: tuple[str, str] | None = None
+
+
+class PlanResponse(Message):
+    """A trajectory, or the error of the planner that got furthest. All attempts are listed."""
+
+    header: Header = Header()
+    id: Name
+    ok: bool
+    trajectory: JointTrajectory | None = None
+    planner: str = ""
+    seconds: Finite = Field(0.0, description="wall time [s] of the whole request")
+    fraction: Finite = 0.0
+    error: str = Field("", description="code: start_in_collision, no_ik, collision, incomplete, timeout, ...")
+    message: str = Field("", description="one line naming stage, planner, waypoint and colliding pair")
+    colliding: tuple[str, str] | None = None
+    attempts: list[PlanAttempt] = []
+
+
+# --- execution --------------------------------------------------------------------------------------------------
+
+GoalState = Literal["none", "rejected", "active", "succeeded", "aborted", "cancelled"]
+
+
+class ExecuteRequest(Message):
+    """Follow a trajectory. The requester mints `id`; the same id never moves the robot twice."""
+
+    id: Name
+    trajectory: JointTrajectory
+
+
+class StopRequest(Message):
+    """Bring the robot to rest. An empty id stops whatever runs."""
+
+    id: str = ""
+    reason: str = "asked to"
+
+
+class MotionStatus(Message):
+    """State of the newest goal, and the answer to execute and stop."""
+
+    header: Header = Header()
+    id: str = ""
+    state: GoalState = "none"
+    progress: Fraction = 0.0
+    error: str = Field("", description="code, such as start_mismatch, limit, path_tolerance, cancelled")
+    message: str = ""
+    source: str = Field("", description="who said so: controller or hardware")
+
+
+class GripperCommand(Message):
+    """Move the fingers to a width [m]. The requester mints `id`; the same id never moves them twice."""
+
+    id: Name
+    width: Annotated[float, Field(ge=0, le=0.2, allow_inf_nan=False)]
+
+
+class GripperState(Message):
+    """Width between the fingers [m], whether something is between them, and the newest command."""
+
+    header: Header = Header()
+    width: Finite = 0.0
+    holding: bool = False
+    moving: bool = False
+    id: str = ""
+    state: GoalState = "none"
+    message: str = ""
+
+
+# --- task -------------------------------------------------------------------------------------------------------
+
+TaskState = Literal["IDLE", "GRASPING", "PLACING", "HOMING", "DONE", "ERROR"]
+
+
+class TaskCommand(Message):
+    """What a person may tell the task."""
+
+    command: Literal["start", "pause", "resume", "stop"]
+
+
+class PlanFigure(Message):
+    """One successful plan, for the summary."""
+
+    planner: str
+    seconds: Finite
+    fraction: Finite
+    attempts: int
+
+
+class PickPlaceStatus(Message):
+    """State and counters of the pick-and-place task."""
+
+    header: Header = Header()
+    state: TaskState = "IDLE"
+    paused: bool = False
+    started: bool = False
+    stage: str = ""
+    target: str = Field("", description="track id of the object in work")
+    placed: int = 0
+    targets: int = Field(0, description="objects that the task has seen and may take or has taken")
+    failures: int = 0
+    retries: int = 0
+    skipped: list[Rejection] = Field([], description="validated targets that could not be taken, and why")
+    plans: list[PlanFigure] = []
+    moving_seconds: Finite = Field(0.0, description="cell time in motion [s]")
+    planning_seconds: Finite = Field(0.0, description="wall time spent in plan requests [s]")
+    task_seconds: Finite = Field(0.0, description="cell time since the start of the task [s]")
+    message: str = ""
+
+
+# --- world ------------------------------------------------------------------------------------------------------
+
+
+class SceneUpdate(Message):
+    """What happened to an object of the simulated world, as in the seed: "remove:ball_3", "add:ball_3"."""
+
+    header: Header = Header()
+    data: str
+    pose: Pose | None = None
+
+
+class WorldEdit(Message):
+    """Change the simulated world. `reset` brings the first layout back; `id` may be empty for `add`."""
+
+    op: Literal["add", "move", "remove", "reset"]
+    id: str = ""
+    position: Vector3 | None = Field(None, description="centre [m]; z is found from what lies there")
+
+
+class WorldEditReply(Message):
+    """The object that was changed and what is in the world now."""
+
+    id: str
+    ids: list[str]
+
+
+# --- processes --------------------------------------------------------------------------------------------------
+
+
+class ServiceStatus(Message):
+    """One process as the supervisor sees it."""
+
+    name: str
+    state: Literal["waiting", "starting", "ready", "restarting", "stopping", "stopped", "failed"]
+    pid: int | None = None
+    restarts: int = 0
+    ready_seconds: Finite | None = Field(None, description="wall time from its start to its readiness token [s]")
+    message: str = ""
+
+
+class SupervisorStatus(Message):
+    """All processes of the cell."""
+
+    header: Header = Header()
+    cell: str
+    services: list[ServiceStatus]
+
+
+class LogLine(Message):
+    """A line of a service's log."""
+
+    header: Header = Header()
+    service: str
+    level: Literal["debug", "info", "warning", "error", "critical"]
+    message: str
+
+
+class ServiceCounters(Message):
+    """What a service's transport counted: dropped, refused and handled messages by key."""
+
+    header: Header = Header()
+    service: str
+    received: dict[str, int] = {}
+    dropped: dict[str, int] = Field({}, description="newer message came before this one was read")
+    invalid: dict[str, int] = Field({}, description="payloads that did not parse or validate")
+    overflow: dict[str, int] = Field({}, description="events lost because the reader fell behind")

@@ -1,0 +1,94 @@
+"""Every key of a cell, said once: its message, its kind and who writes it.
+
+A key on the wire is `<cell>/<topic>`, for example `panda/camera/image_raw`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, Literal, TypeVar
+
+from common import messages as m
+
+Kind = Literal["stream", "event", "state", "request"]
+M = TypeVar("M", bound=m.Message)
+Q = TypeVar("Q", bound=m.Message)
+A = TypeVar("A", bound=m.Message)
+
+
+@dataclass(frozen=True)
+class Topic(Generic[M]):
+    """A key that is published.
+
+    stream: the newest counts, older ones are dropped and counted; event: every one counts, in order; state: the
+    last value can be asked for at any time and is repeated each second.
+    """
+
+    key: str
+    message: type[M]
+    kind: Literal["stream", "event", "state"]
+    writer: str
+    doc: str
+
+
+@dataclass(frozen=True)
+class Request(Generic[Q, A]):
+    """A key that answers: a request of type `message` gets an `answer`."""
+
+    key: str
+    message: type[Q]
+    answer: type[A]
+    writer: str
+    doc: str
+    kind: Literal["request"] = "request"
+
+
+SCENE_BALLS = Topic("scene_balls", m.PoseArray, "state", "trajectory_executor",
+                    "the truth: where every ball is; simulated hardware only")
+SCENE_OBJECT_UPDATES = Topic("scene_object_updates", m.SceneUpdate, "event", "trajectory_executor",
+                             "remove:ball_3 when grasped, add:ball_3 when it lies still again")
+CAMERA_IMAGE = Topic("camera/image_raw", m.Image, "stream", "camera_simulator", "what the camera sees, 10 Hz")
+CAMERA_INFO = Topic("camera/camera_info", m.CameraInfo, "state", "camera_simulator", "intrinsics of the camera")
+DETECTED_OBJECTS = Topic("detected_objects", m.MarkerArray, "stream", "vision_detector",
+                         "balls found in the picture, in world")
+DETECTION_IMAGE = Topic("detection_image", m.Image, "stream", "vision_detector", "the picture with what was found")
+VALIDATED_TARGETS = Topic("validated_targets", m.PoseArray, "stream", "workspace_validator",
+                          "detections that the arm can take, in world")
+REJECTED_TARGETS = Topic("rejected_targets", m.Rejections, "event", "workspace_validator",
+                         "detections that it can not take, with the reason, once for each place")
+WORKSPACE_MARKERS = Topic("workspace_markers", m.MarkerArray, "state", "workspace_validator",
+                          "reachable shell and excluded column as cylinders")
+PLANNING_SCENE = Topic("planning_scene", m.PlanningScene, "state", "scene_manager",
+                       "fixtures and perceived objects with track ids, attached object, allowed collisions")
+JOINT_STATES = Topic("joint_states", m.JointState, "stream", "trajectory_executor", "joint positions, 100 Hz")
+TF = Topic("tf", m.TFMessage, "stream", "robot_state_publisher", "poses of the robot's links")
+TF_STATIC = Topic("tf_static", m.TFMessage, "state", "robot_state_publisher", "poses that never change: base, camera")
+GRIPPER_STATE = Topic("gripper/state", m.GripperState, "state", "trajectory_executor",
+                      "width, whether it holds something, newest command")
+MOTION_STATUS = Topic("motion/status", m.MotionStatus, "state", "trajectory_executor",
+                      "newest goal: state, progress, error, source")
+DISPLAY_TRAJECTORY = Topic("display_trajectory", m.JointTrajectory, "state", "motion_planner", "newest plan")
+PICK_PLACE_STATUS = Topic("pick_place_status", m.PickPlaceStatus, "state", "smart_pick_place",
+                          "IDLE, GRASPING, PLACING, HOMING, DONE or ERROR, and counters")
+SUPERVISOR_STATUS = Topic("supervisor/status", m.SupervisorStatus, "state", "supervisor", "all processes")
+LOG = Topic("log", m.LogLine, "event", "everyone", "log lines")
+COUNTERS = Topic("counters", m.ServiceCounters, "event", "everyone",
+                 "received, dropped and refused messages of each service, each second")
+
+MOTION_PLAN = Request("motion/plan", m.PlanRequest, m.PlanResponse, "motion_planner", "plan a trajectory")
+MOTION_EXECUTE = Request("motion/execute", m.ExecuteRequest, m.MotionStatus, "trajectory_executor",
+                         "follow a trajectory; the result appears on motion/status")
+MOTION_STOP = Request("motion/stop", m.StopRequest, m.MotionStatus, "trajectory_executor", "bring the robot to rest")
+GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState, "trajectory_executor",
+                          "move the fingers; the result appears on gripper/state")
+WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "trajectory_executor",
+                     "add, move, remove, reset; simulated hardware only")
+TASK_COMMAND = Request("task/command", m.TaskCommand, m.PickPlaceStatus, "smart_pick_place",
+                       "start, pause, resume or stop the task")
+
+AnyTopic = Topic[m.Message] | Request[m.Message, m.Message]
+
+
+def all_topics() -> dict[str, AnyTopic]:
+    """Every topic by key, in the order of this file."""
+    return {value.key: value for value in globals().values() if isinstance(value, Topic | Request)}
