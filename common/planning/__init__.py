@@ -1,0 +1,1 @@
+"""Motion planning: collision world, planners, retiming, validation, pipeline."""

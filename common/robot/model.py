@@ -1,0 +1,185 @@
+"""The robot as everybody computes with it: the planning group's joints, limits, forward kinematics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from common.config import RobotConfig
+from common.errors import ConfigError, UnknownName
+from common.robot.description import find_description, package_folders
+
+Array = NDArray[np.float64]
+
+
+class RobotModel:
+    """Kinematics of the planning group; joints outside it are held where the robot file says.
+
+    Poses are in the base frame, which is `world`. Not thread-safe: pinocchio's working data belong to the model, so
+    each thread loads its own.
+
+    Attributes:
+        config: the robot file.
+        joint_names: joints of the group, in the order of every (dof,) array.
+        lower, upper: position limits (dof,) [rad], from the URDF.
+        velocity: limits (dof,) [rad/s], from the URDF.
+        acceleration, jerk: limits (dof,) [rad/s^2], [rad/s^3], from the robot file.
+        link_parents: link -> the link it hangs on, for every link but the root.
+        full_model, model: pinocchio models with all joints and with those of the group.
+        tcp_frame: index of the TCP's frame in `model`.
+    """
+
+    def __init__(self, config: RobotConfig, full_model: pin.Model, urdf: Path, srdf: Path | None) -> None:
+        """Reduce the full model to the group. Use `load`."""
+        self.config = config
+        self.urdf = urdf
+        self.srdf = srdf
+        self.full_model = full_model
+        self.locked_ids, self.full_reference = _locked(config, full_model)
+        self.model = pin.buildReducedModel(full_model, self.locked_ids, self.full_reference)
+        self.data = self.model.createData()
+        self._full_data = full_model.createData()
+        self.joint_names: list[str] = list(self.model.names)[1:]
+        if self.joint_names != config.joints:
+            raise ConfigError("robot.joints", config.joints, f"must be in the URDF's order: {self.joint_names}")
+        if self.model.nq != len(self.joint_names):
+            raise ConfigError("robot.joints", config.joints, "must have one position each; continuous joints have two")
+        self.dof: int = self.model.nq
+        self.lower: Array = np.array(self.model.lowerPositionLimit)
+        self.upper: Array = np.array(self.model.upperPositionLimit)
+        self.velocity: Array = np.array(self.model.velocityLimit)
+        self.acceleration: Array = np.array(config.acceleration_limits, dtype=float)
+        self.jerk: Array = np.array(config.jerk_limits, dtype=float)
+        for name, low, high, speed in zip(self.joint_names, self.lower, self.upper, self.velocity, strict=True):
+            if not (np.isfinite(low) and np.isfinite(high) and low < high and 0 < speed < np.inf):
+                raise ConfigError("robot.urdf", config.urdf, f"has no usable limits for joint {name}")
+        self._links = {f.name: i for i, f in enumerate(self.model.frames) if f.type == pin.FrameType.BODY}
+        self._full_links = {f.name: i for i, f in enumerate(full_model.frames) if f.type == pin.FrameType.BODY}
+        for field, link in (("tcp_link", config.tcp_link), ("base_link", config.base_link)):
+            if link not in self._links:
+                raise ConfigError(f"robot.{field}", link, f"is not a link; choices: {', '.join(self._links)}")
+        self.tcp_frame: int = self._links[config.tcp_link]
+        self.link_parents = _link_parents(full_model)
+        for name, positions in config.named_poses.items():
+            for joint, value, low, high in zip(self.joint_names, positions, self.lower, self.upper, strict=True):
+                if not low <= value <= high:
+                    field = f"robot.named_poses.{name}"
+                    raise ConfigError(field, value, f"must be within {low:g} to {high:g} for joint {joint}")
+
+    @classmethod
+    def load(cls, config: RobotConfig) -> RobotModel:
+        """The model of a robot file.
+
+        Raises:
+            ConfigError: a description is not there or does not fit the robot file: names the field and what would do.
+        """
+        urdf = find_description("robot.urdf", config.urdf, config.package_dirs)
+        srdf = find_description("robot.srdf", config.srdf, config.package_dirs) if config.srdf else None
+        try:
+            full_model = pin.buildModelFromUrdf(str(urdf))
+        except ValueError as error:
+            raise ConfigError("robot.urdf", str(urdf), f"does not parse: {error}") from None
+        return cls(config, full_model, urdf, srdf)
+
+    @property
+    def package_folders(self) -> list[Path]:
+        """Folders in which the URDF's package:// meshes are looked up."""
+        return package_folders(self.config.package_dirs)
+
+    @property
+    def groups(self) -> list[str]:
+        """Names under which the planning group is known."""
+        return [self.config.group, *self.config.group_aliases]
+
+    @property
+    def link_names(self) -> list[str]:
+        """All links of the robot."""
+        return list(self._links)
+
+    def fk(self, q: ArrayLike) -> Array:
+        """(4, 4) T_world_tcp at joint positions q (dof,) [rad]."""
+        pin.framesForwardKinematics(self.model, self.data, self._checked(q))
+        return np.array(self.data.oMf[self.tcp_frame].homogeneous)
+
+    def link_poses(self, q: ArrayLike, others: Mapping[str, float] | None = None) -> dict[str, Array]:
+        """(4, 4) T_world_link of every link at q (dof,) [rad].
+
+        Args:
+            q: positions of the group.
+            others: positions [rad or m] of joints outside the group, such as the fingers; else where they are locked.
+        """
+        checked = self._checked(q)
+        if not others:
+            pin.framesForwardKinematics(self.model, self.data, checked)
+            return {name: np.array(self.data.oMf[i].homogeneous) for name, i in self._links.items()}
+        full = self.full_reference.copy()
+        for name, value in [*zip(self.joint_names, checked, strict=True), *others.items()]:
+            if not self.full_model.existJointName(name):
+                raise UnknownName("joint", name, list(self.full_model.names)[1:])
+            full[self.full_model.joints[self.full_model.getJointId(name)].idx_q] = value
+        pin.framesForwardKinematics(self.full_model, self._full_data, full)
+        return {name: np.array(self._full_data.oMf[i].homogeneous) for name, i in self._full_links.items()}
+
+    def named(self, name: str) -> Array:
+        """Joint positions (dof,) [rad] of a named pose of the robot file.
+
+        Raises:
+            UnknownName: with the choices.
+        """
+        if name not in self.config.named_poses:
+            raise UnknownName("named pose", name, self.config.named_poses)
+        return np.array(self.config.named_poses[name], dtype=float)
+
+    def within_limits(self, q: ArrayLike, tolerance: float = 1e-6) -> bool:
+        """Whether all positions are within the joints' limits, give or take the tolerance [rad]."""
+        checked = self._checked(q)
+        return bool(np.all(checked >= self.lower - tolerance) and np.all(checked <= self.upper + tolerance))
+
+    def order(self, names: Sequence[str], values: Sequence[float]) -> Array | None:
+        """Values of the group's joints (dof,) picked from named ones; None when one is missing."""
+        found = dict(zip(names, values, strict=True))
+        if any(name not in found for name in self.joint_names):
+            return None
+        return np.array([found[name] for name in self.joint_names], dtype=float)
+
+    def _checked(self, q: ArrayLike) -> Array:
+        array = np.asarray(q, dtype=float)
+        if array.shape != (self.dof,):
+            raise ValueError(f"joint positions have shape {array.shape}, not ({self.dof},)")
+        return array
+
+
+def _locked(config: RobotConfig, model: pin.Model) -> tuple[list[int], Array]:
+    """Indices of the joints outside the group, and a full configuration that holds them where the file says."""
+    names = list(model.names)[1:]
+    for name in [*config.joints, *config.locked_joints]:
+        if name not in names:
+            raise ConfigError("robot.joints", name, f"is not a joint of the URDF; choices: {', '.join(names)}")
+    reference = np.array(pin.neutral(model))
+    locked = []
+    for name in names:
+        if name in config.joints:
+            continue
+        if name not in config.locked_joints:
+            raise ConfigError("robot.locked_joints", name, "must be given: it is in the URDF but not in the group")
+        index = model.getJointId(name)
+        reference[model.joints[index].idx_q] = config.locked_joints[name]
+        locked.append(index)
+    return locked, reference
+
+
+def _link_parents(model: pin.Model) -> dict[str, str]:
+    parents: dict[str, str] = {}
+    for frame in model.frames:
+        if frame.type != pin.FrameType.BODY:
+            continue
+        index = frame.parentFrame
+        while index and model.frames[index].type != pin.FrameType.BODY:
+            index = model.frames[index].parentFrame
+        if model.frames[index].type == pin.FrameType.BODY:
+            parents[frame.name] = model.frames[index].name
+    return parents
