@@ -190,6 +190,16 @@ class Motion(Section):
     )
 
 
+class Grasp(Section):
+    """How an object is taken and put down, for the tool centre point with the tool pointing down."""
+
+    approach_clearance: float = Field(0.10, ge=0.02, le=0.5, description="pre-grasp above the grasp [m]")
+    grasp_clearance: float = Field(0.0, ge=-0.02, le=0.05, description="grasp above the centre of the object [m]")
+    min_grasp_z: float = Field(0.012, ge=0.0, le=0.5, description="the tool centre point never goes below this [m]")
+    lift_height: float = Field(0.15, ge=0.05, le=0.5, description="lift above the grasp [m]")
+    drop_z: float = Field(0.25, ge=0.18, le=0.6, description="height of release above the container [m]")
+
+
 class PlannerEntry(Section):
     """A planner of the pipeline: a module of common/planning/planners, or a dotted module of your own."""
 
@@ -230,6 +240,7 @@ class Cell(Section):
     robot: RobotConfig
     world: World
     motion: Motion
+    grasp: Grasp = Grasp()
     pipeline: Pipeline
     services: dict[str, ServiceEntry]
     task: str = Field(description="the service that runs the task and ends in DONE")
@@ -243,7 +254,7 @@ class Cell(Section):
         """The section of that type; surroundings are cut out of the world, without what lies in it."""
         if kind is Surroundings:
             return Surroundings.model_validate({f: getattr(self.world, f) for f in Surroundings.model_fields})
-        for value in (self.run, self.robot, self.world, self.motion, self.pipeline):
+        for value in (self.run, self.robot, self.world, self.motion, self.grasp, self.pipeline):
             if type(value) is kind:
                 return value
         raise TypeError(f"{kind.__name__} is not a section of a cell")
