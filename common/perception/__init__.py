@@ -1,0 +1,1 @@
+"""Pictures in, positions out: pure functions of arrays and a camera."""

@@ -1,0 +1,114 @@
+"""One rigid camera pose and its pinhole model: the only way from pixels to the world and back.
+
+The optical frame is OpenCV's: +X to the right in the picture, +Y down, +Z forward. Pixel (0, 0) is the centre of the
+pixel in the upper left corner. There is no other mapping anywhere: a mirrored one would not be a rotation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from common.config import CameraConfig
+from common.errors import ZencellError
+from common.messages import CameraInfo, Header
+from common.robot.transforms import rpy_to_matrix, transform
+
+Array = npt.NDArray[np.float64]
+
+
+class CameraError(ZencellError):
+    """A camera that can not be: a pose that is not rigid, a distortion that is not handled here."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pinhole:
+    """Intrinsics [px], picture size [px] and the (4, 4) pose of the optical frame in world."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    T_world_optical: Array
+    _rotation: Array = field(init=False, repr=False)
+    _position: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        T = np.asarray(self.T_world_optical, dtype=float)
+        R = T[:3, :3]
+        if T.shape != (4, 4) or not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+            raise CameraError("the camera pose is not rigid: its rotation must be orthonormal with determinant +1")
+        object.__setattr__(self, "T_world_optical", T)
+        object.__setattr__(self, "_rotation", R)
+        object.__setattr__(self, "_position", T[:3, 3])
+
+    @classmethod
+    def from_config(cls, camera: CameraConfig) -> Pinhole:
+        """The camera of the surroundings."""
+        T = transform(rpy_to_matrix(*camera.rpy), camera.position)
+        return cls(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, T)
+
+    @classmethod
+    def from_info(cls, info: CameraInfo, T_world_optical: Array) -> Pinhole:
+        """The camera that a camera_info message and a (4, 4) pose of its optical frame describe.
+
+        Raises:
+            CameraError: the picture is distorted (rectify it first) or skewed.
+        """
+        if any(abs(value) > 1e-12 for value in info.d):
+            raise CameraError(f"distortion {list(info.d)} is not handled: rectify the picture first")
+        fx, skew, cx, s10, fy, cy, s20, s21, s22 = info.k
+        if skew or s10 or s20 or s21 or s22 != 1:
+            raise CameraError(f"intrinsic matrix {list(info.k)} is not of the form [fx 0 cx; 0 fy cy; 0 0 1]")
+        return cls(fx, fy, cx, cy, info.width, info.height, T_world_optical)
+
+    @property
+    def position(self) -> Array:
+        """Optical centre in world, (3,) [m]."""
+        return self._position
+
+    def info(self, header: Header) -> CameraInfo:
+        """The camera_info message of this camera."""
+        k = [self.fx, 0.0, self.cx, 0.0, self.fy, self.cy, 0.0, 0.0, 1.0]
+        return CameraInfo(header=header, height=self.height, width=self.width, d=[0.0] * 5, k=k)
+
+    def to_camera(self, points: npt.ArrayLike) -> Array:
+        """Points of world in the optical frame: (..., 3) [m]."""
+        return (np.asarray(points, dtype=float) - self._position) @ self._rotation
+
+    def project(self, points: npt.ArrayLike) -> Array:
+        """Pixels (u, v) of points in world: (..., 2) [px]; nan where a point is not in front of the camera."""
+        p = self.to_camera(points)
+        z = np.where(p[..., 2] > 1e-9, p[..., 2], np.nan)
+        return np.stack([self.fx * p[..., 0] / z + self.cx, self.fy * p[..., 1] / z + self.cy], axis=-1)
+
+    def directions(self, pixels: npt.ArrayLike) -> Array:
+        """Unit vectors in world along the rays through pixels: (..., 3)."""
+        p = np.asarray(pixels, dtype=float)
+        d = np.stack([(p[..., 0] - self.cx) / self.fx, (p[..., 1] - self.cy) / self.fy, np.ones(p.shape[:-1])], axis=-1)
+        d /= np.linalg.norm(d, axis=-1, keepdims=True)
+        return d @ self._rotation.T
+
+    def ray(self, pixel: npt.ArrayLike) -> tuple[Array, Array]:
+        """Origin (3,) [m] and unit direction (3,) in world of the ray through a pixel (u, v)."""
+        return self._position, self.directions(pixel)
+
+    def on_plane(self, pixels: npt.ArrayLike, z: float) -> Array:
+        """Where the rays through pixels meet the horizontal plane at z [m]: (..., 2) [m]; nan where they do not."""
+        d = self.directions(pixels)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (z - self._position[2]) / d[..., 2]
+        t = np.where(np.isfinite(t) & (t > 0), t, np.nan)
+        return self._position[:2] + t[..., None] * d[..., :2]
+
+    def in_picture(self, pixels: npt.ArrayLike, margin: float = 0.0) -> npt.NDArray[np.bool_]:
+        """Which pixels lie in the picture, at least `margin` [px] inside its border: (...)."""
+        p = np.asarray(pixels, dtype=float)
+        u, v = p[..., 0], p[..., 1]
+        low, right, bottom = margin - 0.5, self.width - 0.5 - margin, self.height - 0.5 - margin
+        inside: npt.NDArray[np.bool_] = (u >= low) & (u <= right) & (v >= low) & (v <= bottom)
+        return inside
