@@ -1,0 +1,222 @@
+"""The figures of a run, gathered from what the cell publishes; the file that `run` writes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from common.messages import MotionStatus, PickPlaceStatus, PlanFigure, PoseArray, Rejection, Vector3
+
+SAME_PLACE = 0.03  # [m] rejections closer than this are of the same thing
+MAX_LATENCIES = 100_000  # of frames; the oldest are forgotten: three hours at 10 Hz
+
+
+@dataclass
+class Rejected:
+    """Places that were rejected, each once."""
+
+    places: list[Rejection] = field(default_factory=list)
+
+    def add(self, rejections: Iterable[Rejection]) -> None:
+        """Take note of rejections; of the same place only the newest reason is kept."""
+        for rejection in rejections:
+            for index, known in enumerate(self.places):
+                if _distance(known.position, rejection.position) < SAME_PLACE:
+                    self.places[index] = rejection
+                    break
+            else:
+                self.places.append(rejection)
+
+
+@dataclass
+class Counted:
+    """Figures of the task that start over when its process does."""
+
+    failures: int = 0
+    retries: int = 0
+    moving: float = 0.0  # cell time [s]
+    planning: float = 0.0  # wall time [s]
+    plans: list[PlanFigure] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, status: PickPlaceStatus) -> Counted:
+        """The figures in a status."""
+        return cls(
+            status.failures, status.retries, status.moving_seconds, status.planning_seconds, list(status.plans)
+        )
+
+    def __add__(self, other: Counted) -> Counted:
+        """Figures of one life of the process and of the next."""
+        return Counted(
+            self.failures + other.failures,
+            self.retries + other.retries,
+            self.moving + other.moving,
+            self.planning + other.planning,
+            self.plans + other.plans,
+        )
+
+    def restarted_since(self, earlier: Counted) -> bool:
+        """Whether these figures can not follow the earlier ones in one life of the process."""
+        return (
+            self.failures < earlier.failures
+            or self.retries < earlier.retries
+            or self.moving < earlier.moving - 1e-9
+            or self.planning < earlier.planning - 1e-9
+            or len(self.plans) < len(earlier.plans)
+        )
+
+
+class Summary:
+    """Gathers the figures of one run."""
+
+    def __init__(self, cell: str, seed: int, speed: float) -> None:
+        """Start with nothing seen.
+
+        Args:
+            cell: name of the cell.
+            seed: of the run.
+            speed: seconds of cell time per second of wall time.
+        """
+        self.cell = cell
+        self.seed = seed
+        self.speed = speed
+        self.status = PickPlaceStatus()
+        self.ready: float | None = None  # wall time [s] from the start of the process to the cell being ready
+        self.first_motion: float | None = None  # wall time [s] from the start of the process
+        self.truth: PoseArray | None = None
+        self.rejected = Rejected()
+        self.restarts: dict[str, int] = {}
+        self.failed = False  # the cell did not come up
+        self._latencies: list[float] = []  # [ms]
+        self._before = Counted()  # of earlier lives of the task's process
+        self._now = Counted()
+        self._task_since: float | None = None  # cell time [s]
+        self._task_until = 0.0  # cell time [s]
+
+    def on_status(self, status: PickPlaceStatus) -> None:
+        """Take note of the task's status."""
+        figures = Counted.of(status)
+        if figures.restarted_since(self._now):
+            self._before = self._before + self._now
+        self._now = figures
+        self.status = status
+        if status.started:
+            stamp = status.header.stamp * 1e-9
+            if self._task_since is None:
+                self._task_since = stamp - status.task_seconds
+            self._task_until = stamp
+
+    def on_motion(self, status: MotionStatus, seconds: float) -> None:
+        """Take note of a motion's status at a wall time [s] from the start of the process."""
+        if status.state == "active" and self.first_motion is None:
+            self.first_motion = seconds
+
+    def on_latency(self, milliseconds: float) -> None:
+        """Take note of the time [ms] from a frame's exposure to the arrival of the targets seen in it."""
+        if len(self._latencies) >= MAX_LATENCIES:
+            del self._latencies[: MAX_LATENCIES // 2]
+        self._latencies.append(milliseconds)
+
+    @property
+    def state(self) -> str:
+        """Where the task ended; ERROR too when the cell did not come up."""
+        return "ERROR" if self.failed else self.status.state
+
+    def as_dict(self) -> dict[str, Any]:
+        """The summary file."""
+        rejected = Rejected(list(self.rejected.places))
+        rejected.add(self.status.skipped)
+        figures = self._before + self._now
+        task = self._task_until - self._task_since if self._task_since is not None else 0.0
+        return {
+            "cell": self.cell,
+            "state": self.state,
+            "placed": self.status.placed,
+            "targets": self.status.targets,
+            "rejected": [{"position": _xyz(place.position), "reason": place.reason} for place in rejected.places],
+            "failures": figures.failures,
+            "retries": figures.retries,
+            "seconds": {
+                "ready": _rounded(self.ready),
+                "first_motion": _rounded(self.first_motion),
+                "task": _rounded(task),
+                "moving": _rounded(figures.moving),
+                "planning": _rounded(figures.planning),
+            },
+            "plans": [plan.model_dump() for plan in figures.plans],
+            "frame_to_target_ms": {
+                "p50": _rounded(percentile(self._latencies, 0.50)),
+                "p99": _rounded(percentile(self._latencies, 0.99)),
+            },
+            "restarts": dict(self.restarts),
+            "seed": self.seed,
+            "speed": self.speed,
+            "truth": count_truth(self.truth),
+        }
+
+
+def count_truth(balls: PoseArray | None) -> dict[str, int] | None:
+    """How many balls really lie in the box, on the table and anywhere else; None without simulated hardware."""
+    if balls is None:
+        return None
+    in_box = sum(label == "box" for label in balls.labels)
+    on_table = sum(label == "table" for label in balls.labels)
+    return {"in_box": in_box, "on_table": on_table, "elsewhere": len(balls.poses) - in_box - on_table}
+
+
+def is_settled(balls: PoseArray | None) -> bool:
+    """Whether nothing is on its way any more."""
+    return balls is None or not any(label in ("falling", "held") for label in balls.labels)
+
+
+def percentile(values: Sequence[float], fraction: float) -> float | None:
+    """The value below which this fraction of the values lies (nearest rank); None of nothing."""
+    if not values:
+        return None
+    return sorted(values)[max(0, math.ceil(fraction * len(values)) - 1)]
+
+
+def describe(summary: dict[str, Any]) -> list[str]:
+    """The summary in a few lines for people."""
+    seconds = summary["seconds"]
+    lines = [f"{summary['cell']}: {summary['state']}, {summary['placed']} of {summary['targets']} placed"]
+    if truth := summary["truth"]:
+        lines[0] += f" (truth: {truth['in_box']} in the box, {truth['on_table']} on the table"
+        lines[0] += f", {truth['elsewhere']} elsewhere)" if truth["elsewhere"] else ")"
+    for place in summary["rejected"]:
+        x, y, z = place["position"]
+        lines.append(f"  left at ({x:.3f}, {y:.3f}, {z:.3f}): {place['reason']}")
+    figures = [
+        f"ready {_seconds(seconds['ready'])}",
+        f"first motion {_seconds(seconds['first_motion'])}",
+        f"task {_seconds(seconds['task'])}",
+        f"moving {_seconds(seconds['moving'])}",
+        f"planning {_seconds(seconds['planning'])} in {len(summary['plans'])} plans",
+    ]
+    lines.append("  " + ", ".join(figures))
+    if summary["failures"] or summary["retries"]:
+        lines.append(f"  {summary['failures']} failures, {summary['retries']} retries")
+    if summary["frame_to_target_ms"]["p50"] is not None:
+        latency = summary["frame_to_target_ms"]
+        lines.append(f"  frame to target {latency['p50']:.1f} ms (median), {latency['p99']:.1f} ms (99 %)")
+    if restarted := {name: count for name, count in summary["restarts"].items() if count}:
+        lines.append("  started again: " + ", ".join(f"{name} {count} x" for name, count in restarted.items()))
+    return lines
+
+
+def _seconds(value: float | None) -> str:
+    return "never" if value is None else f"{value:.1f} s"
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
+
+
+def _xyz(position: Vector3) -> list[float]:
+    return [round(position.x, 4), round(position.y, 4), round(position.z, 4)]
+
+
+def _distance(a: Vector3, b: Vector3) -> float:
+    return math.dist((a.x, a.y, a.z), (b.x, b.y, b.z))

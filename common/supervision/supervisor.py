@@ -1,0 +1,242 @@
+"""Starts a cell's processes in order, restarts what dies, and leaves none behind."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Callable, Sequence
+
+from common.config import Cell
+from common.errors import ZencellError
+from common.messages import ServiceStatus
+from common.supervision.backoff import Backoff
+from common.supervision.child import Child, describe_exit
+from common.supervision.launch import ROUTER, Launch
+
+START_TIMEOUT = 15.0  # [s] from being let through the gate to the readiness token
+HEAD_START = 0.5  # [s] between SIGTERM to one service and to the one before it, when it does not end sooner
+TERM_TIMEOUT = 5.0  # [s] from SIGTERM to SIGKILL
+STOP_TIMEOUT = 6.5  # [s] after which whatever still runs is killed
+SHOWN_LINES = 5  # last log lines in the error of a service that did not become ready
+CONFIG_EXIT = 2  # a process that ends with this code was configured wrongly: starting it again will not help
+
+log = logging.getLogger("supervisor")
+
+
+class StartFailed(ZencellError):
+    """The cell did not come up, and not because of a wrong configuration."""
+
+
+class BadConfiguration(ZencellError):
+    """A process refused its configuration; the message is the line that it printed."""
+
+
+class Watched:
+    """A child, whether it may start and has done so, and how often it died."""
+
+    def __init__(self, child: Child) -> None:
+        self.child = child
+        self.admitted = False
+        self.backoff = Backoff()
+        self.ready = asyncio.Event()
+        self.gone = asyncio.Event()
+        self.status = ServiceStatus(name=child.name, state="waiting")
+
+
+class Supervisor:
+    """The processes of a cell: `start` returns when all are ready, `stop` when all are gone.
+
+    Readiness is told from outside (`mark_alive`), because it travels over the network that the first of the
+    processes, the router, provides.
+    """
+
+    def __init__(self, cell: Cell, launch: Launch, on_line: Callable[[str, str], None]) -> None:
+        """Prepare the processes without starting any.
+
+        Args:
+            cell: the resolved cell; its services are started in their order.
+            launch: how the cell was asked for.
+            on_line: called with the name of a process and each line that it writes.
+        """
+        environment = launch.environment()
+        self._services = [
+            Watched(Child(entry.name, launch.service_command(entry), environment, on_line))
+            for entry in cell.services.values()
+        ]
+        self._router = None if launch.connect else Watched(Child(ROUTER, launch.router_command(), environment, on_line))
+        self._all = [self._router, *self._services] if self._router else list(self._services)
+        self._by_name = {watched.child.name: watched for watched in self._all}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._failure: asyncio.Future[None] | None = None
+        self._up = False
+        self._stopping = asyncio.Event()
+        self.changed = asyncio.Event()  # set whenever `statuses` differs from before
+
+    @property
+    def statuses(self) -> list[ServiceStatus]:
+        """All processes as they are now, the router first."""
+        return [
+            watched.status.model_copy(update={"pid": watched.child.pid}) for watched in self._all
+        ]
+
+    @property
+    def restarts(self) -> dict[str, int]:
+        """How often each process was started again."""
+        return {watched.child.name: watched.status.restarts for watched in self._all}
+
+    def begin(self) -> None:
+        """Start all processes at once, the services behind their gates, so that their imports overlap."""
+        self._failure = asyncio.get_running_loop().create_future()
+        for watched in self._all:
+            watched.admitted = watched is self._router
+            task = asyncio.create_task(self._keep(watched), name=f"keep {watched.child.name}")
+            self._tasks.add(task)
+            task.add_done_callback(self._kept)
+
+    async def admit_all(self, router_ready: asyncio.Future[None]) -> None:
+        """Let the services through in order, each when those before it are ready; returns when all are.
+
+        Args:
+            router_ready: done when this process is connected to the router; its failure is raised.
+
+        Raises:
+            BadConfiguration: a process ended with exit code 2; the message is its last line.
+            StartFailed: a process was not ready in time; the message has its last lines.
+        """
+        await self._unless_failed(router_ready, self._router, "the router")
+        if self._router:
+            self._become_ready(self._router)
+        for watched in self._services:
+            watched.admitted = True
+            if watched.child.pid is not None:
+                self._set(watched, state="starting")
+                watched.child.release()
+            await self._unless_failed(asyncio.create_task(_until(watched.ready)), watched, watched.child.name)
+        self._up = True
+
+    def mark_alive(self, name: str, alive: bool) -> None:
+        """Take note that the readiness token of a service appeared or vanished; other names are ignored."""
+        watched = self._by_name.get(name)
+        if watched is None or watched is self._router or not watched.admitted:
+            return
+        if alive and watched.child.pid is not None:
+            self._become_ready(watched)
+        # A token also vanishes when the router dies. Only the end of the process counts as its death.
+
+    def mark_connected(self, connected: bool) -> None:
+        """Take note that the connection to the router was made or lost."""
+        if self._router and connected and self._router.child.pid is not None:
+            self._become_ready(self._router)
+
+    async def stop(self, hurry: asyncio.Event | None = None) -> None:
+        """End all processes in reverse order: SIGTERM, then SIGKILL; at once when `hurry` is set."""
+        self._stopping.set()
+        hurry = hurry or asyncio.Event()
+        deadline = time.monotonic() + STOP_TIMEOUT
+        ending: set[asyncio.Task[None]] = set()
+        for watched in reversed(self._all):
+            if watched is self._router and ending:  # the others say goodbye through it
+                await asyncio.wait(ending, timeout=max(0.0, deadline - 0.5 - time.monotonic()))
+            task = asyncio.create_task(self._end(watched, min(deadline, time.monotonic() + TERM_TIMEOUT), hurry))
+            ending.add(task)
+            await asyncio.wait({task}, timeout=0 if hurry.is_set() else HEAD_START)
+        await asyncio.wait(ending)
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    # --- one process ----------------------------------------------------------------------------------------------
+
+    async def _keep(self, watched: Watched) -> None:
+        """Start the process again whenever it ends, until the cell stops."""
+        child = watched.child
+        try:
+            while not self._stopping.is_set():
+                await child.start()
+                if watched.admitted:
+                    child.release()
+                if self._stopping.is_set():  # it was asked to end before there was anything to ask
+                    child.terminate()
+                self._set(watched, state="starting" if watched.admitted else "waiting")
+                code = await child.wait()
+                if self._stopping.is_set():
+                    break
+                watched.ready.clear()
+                if code == CONFIG_EXIT and not self._up:
+                    self._set(watched, state="failed", message=describe_exit(code))
+                    raise BadConfiguration(_last_message(child) or f"{child.name}: {describe_exit(code)}")
+                delay = watched.backoff.after(child.alive_seconds)
+                message = describe_exit(code)
+                log.warning("%s ended (%s); starting it again in %.1f s", child.name, message, delay)
+                self._set(watched, state="restarting", restarts=watched.status.restarts + 1, message=message)
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._stopping.wait(), delay)
+        finally:
+            self._set(watched, state="failed" if watched.status.state == "failed" else "stopped")
+            watched.gone.set()
+
+    def _kept(self, task: asyncio.Task[None]) -> None:
+        if task.cancelled() or self._failure is None or self._failure.done():
+            return
+        if error := task.exception():
+            self._failure.set_exception(error)
+            self._failure.exception()  # it may be that nobody waits for it any more
+
+    async def _end(self, watched: Watched, deadline: float, hurry: asyncio.Event) -> None:
+        """End one process by the deadline [s, monotonic], or as soon as there is a hurry."""
+        if watched.child.pid is not None:
+            self._set(watched, state="stopping")
+        watched.child.terminate()
+        gone = asyncio.create_task(watched.gone.wait())
+        hurried = asyncio.create_task(hurry.wait())
+        left = max(0.0, deadline - time.monotonic())
+        await asyncio.wait({gone, hurried}, timeout=left, return_when=asyncio.FIRST_COMPLETED)
+        if not gone.done():
+            if watched.child.pid is not None:
+                log.warning("%s does not end; killed", watched.child.name)
+            watched.child.kill()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(gone, 1.0)
+        hurried.cancel()
+
+    async def _unless_failed(self, waited: asyncio.Future[None], watched: Watched | None, name: str) -> None:
+        """Wait for something that a process has to reach in time, while no process has failed."""
+        assert self._failure is not None, "begin() comes first"
+        try:
+            await asyncio.wait({waited, self._failure}, timeout=START_TIMEOUT, return_when=asyncio.FIRST_COMPLETED)
+            if self._failure.done():
+                self._failure.result()
+            if waited.done():
+                waited.result()
+                return
+            tail: Sequence[str] = list(watched.child.tail)[-SHOWN_LINES:] if watched else []
+            said = "; its last lines:\n  " + "\n  ".join(tail) if tail else "; it said nothing"
+            if watched:
+                self._set(watched, state="failed", message=f"not ready within {START_TIMEOUT:g} s")
+            raise StartFailed(f"{name} was not ready within {START_TIMEOUT:g} s{said}")
+        finally:
+            waited.cancel()
+
+    def _become_ready(self, watched: Watched) -> None:
+        if watched.ready.is_set():
+            return
+        watched.ready.set()
+        seconds = watched.child.alive_seconds
+        if watched.status.restarts:
+            log.info("%s is ready again after %.1f s", watched.child.name, seconds)
+        self._set(watched, state="ready", ready_seconds=seconds, message="")
+
+    def _set(self, watched: Watched, **update: object) -> None:
+        watched.status = watched.status.model_copy(update=update)
+        self.changed.set()
+
+
+def _last_message(child: Child) -> str:
+    """The last line of a process, without the program's name in front."""
+    return child.tail[-1].removeprefix("zencell: ") if child.tail else ""
+
+
+async def _until(event: asyncio.Event) -> None:
+    await event.wait()
