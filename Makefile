@@ -1,0 +1,40 @@
+# `make run` and `make test` are all that is needed; each sets up .venv first and does nothing when it is up to date.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.up-to-date
+
+.PHONY: setup run up test check bench docs clean
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "zencell needs Python 3.11 or newer: make PYTHON=python3.11 ...")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+run: setup  ## clear the table into the box, print a summary
+	$(BIN)/zencell run panda
+
+up: setup  ## the same, and stay until Ctrl-C
+	$(BIN)/zencell up panda
+
+test: setup
+	$(BIN)/python -m pytest -q
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+bench: setup  ## every published figure, one script each
+	@for script in benchmarks/[a-z]*.py; do [ -e "$$script" ] || continue; echo "== $$script"; \
+	  $(BIN)/python "$$script" || exit 1; done
+
+docs: setup  ## write the generated tables and pages again
+	@for script in docs/generate*.py; do [ -e "$$script" ] || continue; echo "== $$script"; \
+	  $(BIN)/python "$$script" || exit 1; done
+
+clean:
+	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
