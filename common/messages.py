@@ -306,6 +306,7 @@ class PlanRequest(Message):
     straight: bool = Field(False, description="only a straight line of the tool will do")
     allowed_collisions: list[tuple[str, str]] = Field([], description="in addition to the planning scene's")
     attach: str = ""
+    attach_pose: Pose | None = Field(None, description="of the attached object in the tool frame, when not held yet")
     release: bool = False
     contact_distance: Annotated[float, Field(ge=0, le=0.2, allow_inf_nan=False)] = 0.02
     velocity_scaling: Annotated[float, Field(gt=0, le=1)] | None = None
