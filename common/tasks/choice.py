@@ -1,0 +1,93 @@
+"""Which ball comes next: the nearest that is seen, validated, reachable between its neighbours, and not given up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from common import messages as m
+from common.config import Container
+from common.tasks.grasp import HandShape, grasp_yaws
+from common.tasks.stages import Cycle, Place, Spots, Target, View, appeared, same_place
+
+
+class Choice:
+    """Chooses targets and remembers which places were missed or given up."""
+
+    def __init__(self, hand: HandShape, container: Container, radius: float, moved: float, max_retries: int) -> None:
+        """Start with nothing given up.
+
+        Args:
+            hand: shape of the open fingers.
+            container: where balls go.
+            radius: of a ball [m].
+            moved: an object further than this from where it was has moved [m].
+            max_retries: grasps of one place that may close on nothing before it is given up.
+        """
+        self.hand, self.container, self.radius, self.moved = hand, container, radius, moved
+        self.max_retries = max_retries
+        self._misses: list[tuple[Place, int]] = []
+        self._given_up: list[tuple[Target, str, Spots]] = []
+        self._released: list[float] = []
+
+    def next(self, view: View, origin: Sequence[float], under_way: Sequence[Cycle]) -> Cycle | None:
+        """The nearest ball to `origin` (x, y) that can be taken, with its yaws; None when there is none now."""
+        spots = view.spots(None, self.radius)
+        # Only while the table stays as it was: one ball less may be all that was needed.
+        self._given_up = [
+            g for g in self._given_up if not appeared(spots, g[2], self.moved) and not appeared(g[2], spots, self.moved)
+        ]
+        candidates = [ball for ball in view.balls() if self._is_open(ball, view, under_way)]
+        candidates.sort(key=lambda ball: math.dist(ball.position[:2], origin[:2]))
+        full = self._is_full(view, bool(under_way))
+        for ball in candidates:
+            others = view.spots(ball, self.radius)
+            yaws = grasp_yaws(self.hand, ball.position, others, self.radius, self.container)
+            if full:
+                self.give_up(ball, "the container is full", view)
+            elif not yaws:
+                self.give_up(ball, "no turn of the hand clears what stands beside it", view)
+            else:
+                return Cycle(ball, yaws)
+        return None
+
+    def _is_open(self, ball: Target, view: View, under_way: Sequence[Cycle]) -> bool:
+        seen = any(math.dist(t[:2], ball.position[:2]) <= self.moved for t in view.targets)
+        taken = any(same_place(c.target.position, ball.position, self.radius) for c in under_way)
+        given_up = any(same_place(g[0].position, ball.position, self.radius) for g in self._given_up)
+        return seen and not taken and not given_up
+
+    def _is_full(self, view: View, carrying: bool) -> bool:
+        """Whether no slot is left, counting what is on its way into the container or has just been let go."""
+        self._released = [t for t in self._released if view.scene_stamp - t < 1.5]
+        taken = len(view.objects("contained")) + len(self._released) + int(carrying)
+        return taken >= 4 * self.container.layers
+
+    def released(self, target: Target, view: View) -> None:
+        """A ball was let go above the container."""
+        self._released.append(view.now)
+        self._forget(target)
+
+    def missed(self, target: Target, view: View) -> None:
+        """The fingers closed on nothing there; after `max_retries` retries the place is given up."""
+        count = 1 + next((n for p, n in self._misses if same_place(p, target.position, self.radius)), 0)
+        self._forget(target)
+        if count > self.max_retries:
+            self.give_up(target, f"the fingers closed on nothing {count} times", view)
+        else:
+            self._misses.append((target.position, count))
+
+    def _forget(self, target: Target) -> None:
+        self._misses = [(p, n) for p, n in self._misses if not same_place(p, target.position, self.radius)]
+
+    def give_up(self, target: Target, reason: str, view: View) -> None:
+        """Leave a ball alone until something changes on the table."""
+        self._given_up = [g for g in self._given_up if not same_place(g[0].position, target.position, self.radius)]
+        self._given_up.append((target, reason, view.spots(None, self.radius)))
+
+    def rejections(self) -> list[m.Rejection]:
+        """What is given up now, and why."""
+        return [
+            m.Rejection(position=m.Vector3(x=t.position[0], y=t.position[1], z=t.position[2]), reason=reason)
+            for t, reason, _ in self._given_up
+        ]
