@@ -1,0 +1,54 @@
+"""Gripper goals: one at a time, a new one replaces the running one, a repeated id is only answered."""
+
+from __future__ import annotations
+
+from common.config import GripperConfig
+from common.hardware.goals import GoalMemory
+from common.hardware.interface import Gripper, GripperReading
+from common.messages import GripperCommand, GripperState
+
+SETTLED = 1e-3  # fingers that stop this near to the width they were told are there [m]
+
+
+class GripperController:
+    """Commands the fingers and reports what became of it."""
+
+    def __init__(self, gripper: Gripper, config: GripperConfig, remember: int = 1000) -> None:
+        """Command this gripper; `remember` so many goals by their ids."""
+        self._gripper = gripper
+        self._config = config
+        self._memory: GoalMemory[GripperState] = GoalMemory(remember)
+        self._target = 0.0
+        self.state = GripperState()
+
+    def command(self, request: GripperCommand, now: float) -> GripperState:
+        """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
+        known = self._memory.get(request.id)
+        if known is not None:
+            return known
+        reading = {"width": self.state.width, "holding": self.state.holding, "moving": self.state.moving}
+        if request.width > self._config.max_width:
+            message = f"width {request.width:g} m is more than the fingers open ({self._config.max_width:g} m)"
+            rejected = GripperState.model_validate(
+                {**reading, "id": request.id, "state": "rejected", "message": message})
+            return self._memory.put(request.id, rejected)
+        if self.state.state == "active":
+            replaced = {"state": "cancelled", "message": f"replaced by {request.id!r}"}
+            self._memory.put(self.state.id, self.state.model_copy(update=replaced))
+        self._gripper.command(request.width, now)
+        self._target = request.width
+        self.state = GripperState.model_validate({**reading, "moving": True, "id": request.id, "state": "active"})
+        return self._memory.put(request.id, self.state)
+
+    def update(self, reading: GripperReading) -> GripperState:
+        """The state with the newest reading: a goal is over when the fingers have stopped."""
+        changes: dict[str, object] = {"width": reading.width, "holding": reading.holding, "moving": reading.moving}
+        if self.state.state == "active" and not reading.moving:
+            changes["state"] = "succeeded"
+            if abs(reading.width - self._target) > SETTLED and not reading.holding:
+                changes["state"] = "aborted"
+                changes["message"] = f"fingers stopped at {reading.width:.4f} m, not at {self._target:.4f} m"
+        self.state = self.state.model_copy(update=changes)
+        if self.state.id:
+            self._memory.put(self.state.id, self.state)
+        return self.state

@@ -1,0 +1,89 @@
+"""The seam between the controller and whatever moves the joints: small, so that a real arm fits behind it.
+
+Times are cell time [s], passed in; a backend keeps no clock of its own. A backend is a module (of this folder, or a
+dotted one of the user's own) with
+
+    simulated: bool          # whether the simulated world goes with it
+    class Options(Parameters)
+    def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> Hardware
+
+where `start` is the pose at which a simulated arm begins; a real arm is where it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import ZencellError
+
+Vector = NDArray[np.float64]
+
+
+class HardwareFault(ZencellError):
+    """Raised by a backend when it can not read or move: ends the goal, and new ones are rejected until it is gone."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the joints can do, in the order of `names`; arrays are (dof,) in [rad], [rad/s], [rad/s^2]."""
+
+    names: tuple[str, ...]
+    lower: Vector
+    upper: Vector
+    velocity: Vector
+    acceleration: Vector
+
+
+@dataclass(frozen=True)
+class GripperReading:
+    """State of the fingers: `width` between their inner faces [m], its rate [m/s]."""
+
+    width: float
+    velocity: float
+    moving: bool
+    holding: bool
+
+
+class Gripper(Protocol):
+    """Two fingers that open and close."""
+
+    def command(self, width: float, now: float) -> None:
+        """Start to move the fingers to a width [m]; replaces a motion under way."""
+
+    def read(self, now: float) -> GripperReading:
+        """State of the fingers at a time that does not go back."""
+
+
+@runtime_checkable
+class SimulatedGripper(Gripper, Protocol):
+    """Fingers that the simulated world can be in the way of."""
+
+    def obstruct(self, width: float) -> None:
+        """Let the fingers close no further than a width [m]; 0 when nothing is between them."""
+
+
+class Hardware(Protocol):
+    """The joints of an arm, and its gripper where it has one."""
+
+    gripper: Gripper | None
+
+    def read(self, now: float) -> tuple[Vector, Vector]:
+        """Measured positions (dof,) [rad] and velocities (dof,) [rad/s].
+
+        Raises:
+            HardwareFault: with what is wrong, for the person.
+        """
+
+    def write(self, positions: Vector, velocities: Vector, now: float) -> None:
+        """Send set-points (dof,) [rad], [rad/s].
+
+        Raises:
+            HardwareFault: with what is wrong, for the person.
+        """
+
+    def close(self) -> None:
+        """Let go of the device."""

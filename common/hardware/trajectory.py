@@ -1,0 +1,98 @@
+"""A joint trajectory as a function of time: Hermite interpolation between its points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.hardware.interface import Limits, Vector
+from common.messages import JointTrajectory
+
+ACCELERATION_MISMATCH = 0.1  # share of the velocity changes that the given accelerations may leave unexplained
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Points of a trajectory: `times` (N,) [s] from 0, positions, velocities and accelerations (N, dof).
+
+    Between the points it is the quintic that meets all of them, or the cubic that meets positions and velocities:
+    the choice is made by `interpolation_order`.
+    """
+
+    times: Vector
+    positions: Vector
+    velocities: Vector
+    accelerations: Vector
+    quintic: bool = False
+
+    @property
+    def duration(self) -> float:
+        """Time of the last point [s]."""
+        return float(self.times[-1])
+
+    def at(self, time: float) -> tuple[Vector, Vector, Vector]:
+        """Positions, velocities and accelerations (dof,) at a time [s]; at rest at the ends outside of it."""
+        if time <= 0.0 or time >= self.duration:
+            end = 0 if time <= 0.0 else -1
+            zero = 0.0 * self.positions[end]
+            return self.positions[end], zero, zero
+        index = int(np.searchsorted(self.times, time, side="right")) - 1
+        step = self.times[index + 1] - self.times[index]
+        q, dq, ddq = self._interpolate(slice(index, index + 1), (time - self.times[index]) / step)
+        return q[0], dq[0], ddq[0]
+
+    def between(self, fraction: float) -> tuple[Vector, Vector, Vector]:
+        """Positions, velocities and accelerations (N - 1, dof) at a fraction, 0 to 1, of every segment."""
+        return self._interpolate(slice(0, len(self.times) - 1), fraction)
+
+    def _interpolate(self, segments: slice, u: float) -> tuple[Vector, Vector, Vector]:
+        after = slice(segments.start + 1, segments.stop + 1)
+        h = (self.times[after] - self.times[segments])[:, None]
+        q0, move = self.positions[segments], self.positions[after] - self.positions[segments]
+        v0, v1 = self.velocities[segments] * h, self.velocities[after] * h
+        if self.quintic:
+            a0, a1 = self.accelerations[segments] * h**2 / 2, self.accelerations[after] * h**2 / 2
+            rest, slope, bend = move - v0 - a0, v1 - v0 - 2 * a0, 2 * a1 - 2 * a0
+            c3 = 10 * rest - 4 * slope + bend / 2
+            c4 = -15 * rest + 7 * slope - bend
+            c5 = 6 * rest - 3 * slope + bend / 2
+        else:
+            a0, c3 = 3 * move - 2 * v0 - v1, v0 + v1 - 2 * move
+            c4 = c5 = np.zeros_like(move)
+        q = q0 + u * (v0 + u * (a0 + u * (c3 + u * (c4 + u * c5))))
+        dq = (v0 + u * (2 * a0 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / h
+        ddq = (2 * a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / h**2
+        return q, dq, ddq
+
+
+def from_message(message: JointTrajectory, names: tuple[str, ...]) -> Trajectory:
+    """The message's points with its joints, which must be the named ones, brought into their order."""
+    order = [message.joint_names.index(name) for name in names]
+    points = message.points
+    return Trajectory(
+        np.array([p.time_from_start for p in points], dtype=float),
+        np.array([p.positions for p in points], dtype=float)[:, order],
+        np.array([p.velocities for p in points], dtype=float)[:, order],
+        np.array([p.accelerations for p in points], dtype=float)[:, order],
+    )
+
+
+def with_best_interpolation(trajectory: Trajectory, limits: Limits, slack: float) -> Trajectory:
+    """The trajectory with quintic segments when its accelerations explain its velocities, else with cubic ones.
+
+    Accelerations that are all zero, or of another retiming, would make a quintic swing between the points.
+    """
+    step = np.diff(trajectory.times)[:, None]
+    change = np.diff(trajectory.velocities, axis=0)
+    explained = step * (trajectory.accelerations[1:] + trajectory.accelerations[:-1]) / 2
+    if np.abs(change - explained).sum() > ACCELERATION_MISMATCH * np.abs(change).sum():
+        return trajectory
+    quintic = Trajectory(
+        trajectory.times, trajectory.positions, trajectory.velocities, trajectory.accelerations, quintic=True
+    )
+    for fraction in (0.25, 0.5, 0.75):
+        _, dq, ddq = quintic.between(fraction)
+        if np.any(np.abs(dq) > limits.velocity * slack) or np.any(np.abs(ddq) > limits.acceleration * slack):
+            return trajectory
+    return quintic
