@@ -1,0 +1,244 @@
+"""What the robot may not touch on its way: the planning scene with the changes that a request asks for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from common.errors import UnknownName
+from common.messages import CollisionObject, PlanningScene
+from common.planning.obstacles import MARGINS, ObstacleCache, Solid
+from common.planning.robot_geometry import RobotGeometry
+from common.robot.model import RobotModel
+from common.robot.transforms import invert, pose_to_matrix
+
+Array = NDArray[np.float64]
+Pair = tuple[str, str]
+
+_PERCEIVED = ("target", "contained", "attached")
+_CONTACT_SLACK = 1  # margin level [1 mm] within which an attached object counts as touching at the start
+
+
+@dataclass(frozen=True)
+class Hit:
+    """Where along a path the first collision was found, and between what."""
+
+    index: int
+    q: Array
+    pair: Pair
+
+
+class CollisionWorld:
+    """Answers whether joint positions, edges and paths are free of collision, for one request on one scene.
+
+    Perceived objects keep `padding` more distance [m]. Three kinds of contact are excused:
+    - pairs in the scene's and the request's allowed collisions, always;
+    - an attached object with the gripper's links, always;
+    - what an attached object touches at the start, and perceived objects into whose padding (not into themselves) a
+      link reaches at the start: until the TCP is `contact_distance` away from where it was at the start.
+    Planners and validation ask the same world, so they hold the same rule.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        scene: PlanningScene,
+        *,
+        start: ArrayLike,
+        padding: float = 0.0,
+        allowed: Iterable[Pair] = (),
+        attach: str = "",
+        release: bool = False,
+        contact_distance: float = 0.02,
+        cache: ObstacleCache | None = None,
+    ) -> None:
+        """Set up the scene for a motion that begins at `start` (dof,) [rad].
+
+        Args:
+            robot: the model.
+            scene: what is to be avoided; its poses are in the base frame.
+            start: joint positions at which contact and the pose of the attached object are taken.
+            padding: more distance from perceived objects [m].
+            allowed: pairs of link or object names that may touch, besides the scene's.
+            attach: object that moves with the TCP: as in the scene's attached ones, or from where it lies.
+            release: nothing is attached.
+            contact_distance: travel of the TCP [m] until which contact at the start is excused.
+            cache: built geometry to use again; the world made before with it must not be used any more.
+
+        Raises:
+            UnknownName: `attach` is not in the scene.
+        """
+        self.robot = robot
+        self.start: Array = np.array(start, dtype=float)
+        self.cache = cache or ObstacleCache(RobotGeometry(robot))
+        self._T_world_tcp_start = robot.fk(self.start)
+        self._origin = self._T_world_tcp_start[:3, 3].copy()
+        self.contact_distance = contact_distance
+        environment, held = self._sort(scene, attach, release)
+        objects = [*environment, *(item for item, _, _ in held)]
+        solids = [Solid(o.shape, tuple(o.dimensions)) for o in environment]
+        solids += [
+            Solid(o.shape, tuple(o.dimensions), robot.model.frames[frame].parentJoint, frame) for o, frame, _ in held
+        ]
+        self._bank = self.cache.bank(tuple(solids))
+        self._bank.place([pose_to_matrix(o.pose) for o in environment] + [pose for _, _, pose in held])
+        self._names = [*self.cache.robot.links, *(o.id for o in objects)]
+        self._held_from = self._bank.robot_count + len(environment)
+        self.attached: list[str] = [o.id for o, _, _ in held]
+        padded = np.array([0.0] * self._bank.robot_count + [padding if o.role in _PERCEIVED else 0.0 for o in objects])
+        margins = padded[self._bank.first] + padded[self._bank.second]
+        excused = {frozenset(pair) for pair in (*scene.allowed_collisions, *allowed)}
+        disabled = frozenset(i for i in range(self._bank.pair_count) if frozenset(self._pair(i)) in excused)
+        self._far = self._bank.far
+        self._far.set(disabled, margins)
+        self._near = self._rules_at_start(disabled, margins)
+        self._lever = self._bank.lever
+        # How much the TCP may move per radian of each joint: it is not farther out than the farthest point or the TCP.
+        self._tcp_lever = np.maximum(self._lever, self.cache.robot.lever_with({robot.dof: _tcp_reach(robot)}))
+
+    def _sort(
+        self, scene: PlanningScene, attach: str, release: bool
+    ) -> tuple[list[CollisionObject], list[tuple[CollisionObject, int, Array]]]:
+        """The environment, and what is held: object, frame, (4, 4) pose in the frame of the joint that carries it."""
+        environment = list(scene.objects)
+        if release:
+            return environment, []
+        model = self.robot.model
+        held = []
+        for item in scene.attached:
+            if item.link not in self.robot.link_names:
+                raise UnknownName("link", item.link, self.robot.link_names)
+            frame = model.getFrameId(item.link)
+            T_joint_link = model.frames[frame].placement.homogeneous
+            held.append((item.object, frame, T_joint_link @ pose_to_matrix(item.object.pose)))
+        if attach and attach not in {item.id for item, _, _ in held}:
+            found = next((o for o in environment if o.id == attach), None)
+            if found is None:
+                raise UnknownName("object", attach, [o.id for o in environment] + [item.id for item, _, _ in held])
+            frame = self.robot.tcp_frame
+            T_joint_tcp = model.frames[frame].placement.homogeneous
+            T_tcp_object = invert(self._T_world_tcp_start) @ pose_to_matrix(found.pose)
+            held.append((found, frame, T_joint_tcp @ T_tcp_object))
+        names = {item.id for item, _, _ in held}
+        return [o for o in environment if o.id not in names], held
+
+    def _rules_at_start(self, disabled: frozenset[int], margins: Array):  # type: ignore[no-untyped-def]
+        """Rules while the TCP is near its start: the far ones, but for what is excused there."""
+        if not self._far.hit(self.start, _CONTACT_SLACK):
+            return self._far
+        first, second = self._bank.first, self._bank.second
+        touching = frozenset(
+            i for i in self._far.pairs(self.start, _CONTACT_SLACK) if max(first[i], second[i]) >= self._held_from
+        )
+        near_margins = margins.copy()
+        for i in self._far.pairs(self.start):
+            near_margins[i] = 0.0
+        if not touching and np.array_equal(near_margins, margins):
+            return self._far
+        self._bank.near.set(disabled | touching, near_margins)
+        return self._bank.near
+
+    def _pair(self, index: int) -> Pair:
+        return self._names[self._bank.first[index]], self._names[self._bank.second[index]]
+
+    def _travel(self, q: Array) -> float:
+        """Distance [m] of the TCP at q from where it was at the start."""
+        frame = self.robot.model.frames[self.robot.tcp_frame]
+        data = self._bank.data
+        pin.forwardKinematics(self.robot.model, data, q)
+        return math.dist(data.oMi[frame.parentJoint].act(frame.placement.translation), self._origin)
+
+    def collides(self, q: Array) -> bool:
+        """Whether the robot at q (dof,) [rad] touches itself or anything that it may not."""
+        if self._near is self._far:
+            return self._far.hit(q)
+        return (self._near if self._travel(q) < self.contact_distance else self._far).hit(q)
+
+    def colliding_pair(self, q: Array) -> Pair | None:
+        """Names of a link or attached object and of what it touches at q; None when nothing touches."""
+        rules = self._near if self._near is not self._far and self._travel(q) < self.contact_distance else self._far
+        if not rules.hit(q):
+            return None
+        found = rules.pairs(q)
+        return self._pair(found[0]) if found else None
+
+    def _proved_free(self, q: Array, moves: float, tcp_moves: float) -> bool:
+        """Whether all positions are free within which no point moves farther than `moves` [m] from where it is at q."""
+        level = next((i for i, margin in enumerate(MARGINS) if margin >= moves), None)
+        if level is None:
+            return False
+        if self._near is self._far:
+            return not self._far.hit(q, level)
+        travel = self._travel(q)
+        if travel - tcp_moves >= self.contact_distance:
+            return not self._far.hit(q, level)
+        if travel + tcp_moves < self.contact_distance:
+            return not self._near.hit(q, level)
+        return not (self._far.hit(q, level) or self._near.hit(q, level))
+
+    def edge_free(self, a: Array, b: Array) -> bool:
+        """Whether the straight line in joint space from a to b (dof,) [rad] is free.
+
+        Bisects: the middle being free with a margin of at least the way of any point to the ends proves the whole
+        piece. Where nothing can be proved the pieces end at ways of 1 mm, and their middles decide.
+        """
+        span = b - a
+        way = 0.5 * float(np.abs(span) @ self._lever)
+        tcp_way = 0.5 * float(np.abs(span) @ self._tcp_lever)
+        pieces = [0.5]
+        half = 0.5
+        while pieces:
+            left = []
+            for middle in pieces:
+                q = a + middle * span
+                if self._proved_free(q, way, tcp_way):
+                    continue
+                if self.collides(q):
+                    return False
+                if way > MARGINS[1]:
+                    left += [middle - half / 2, middle + half / 2]
+            pieces, half, way, tcp_way = left, half / 2, way / 2, tcp_way / 2
+        return True
+
+    def first_collision(self, path: Array) -> Hit | None:
+        """The first of the positions (N, dof) [rad] that collides; pieces between that are proved free are skipped."""
+        stack = [(0, len(path) - 1)]
+        while stack:
+            i, j = stack.pop()
+            m = (i + j) // 2
+            q = path[m]
+            if i < j:
+                away = np.abs(path[i : j + 1] - q).max(axis=0)
+                if self._proved_free(q, float(away @ self._lever), float(away @ self._tcp_lever)):
+                    continue
+                if m > i:
+                    stack += [(m + 1, j), (i, m)]
+                else:
+                    stack += [(j, j), (i, i)]
+                continue
+            if self.collides(q):
+                return Hit(m, q.copy(), self.colliding_pair(q) or ("unknown", "unknown"))
+        return None
+
+    def edge_collision(self, a: Array, b: Array, step: float = 0.005) -> Hit | None:
+        """The first collision on the straight line from a to b (dof,) [rad], looked for in steps [rad]."""
+        return self.first_collision(interpolate([a, b], step))
+
+
+def interpolate(waypoints: Sequence[Array] | Array, step: float) -> Array:
+    """Positions (N, dof) [rad] along straight lines between waypoints, no joint moving by more than `step` between."""
+    pieces = [np.asarray(waypoints[0], dtype=float)[None, :]]
+    for a, b in zip(waypoints[:-1], waypoints[1:], strict=True):
+        count = max(1, math.ceil(float(np.abs(b - a).max()) / step))
+        pieces.append(a + np.linspace(0, 1, count + 1)[1:, None] * (b - a))
+    return np.concatenate(pieces)
+
+
+def _tcp_reach(robot: RobotModel) -> float:
+    """Distance [m] of the TCP from the origin of the joint that carries it."""
+    return float(np.linalg.norm(robot.model.frames[robot.tcp_frame].placement.translation))
