@@ -1,0 +1,119 @@
+"""Blobs of a mask, and their outlines as rays from the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from common.perception.pinhole import Pinhole
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.uint8]
+
+_REACH = 3  # contour points to either side from which the direction of the outline is taken
+_LEAST_POINTS = 16  # shorter contours are specks or pin holes
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Points on the edge of something red, as rays; the edge of the picture is not an edge of it.
+
+    Attributes:
+        pixels: (n, 2) [px].
+        rays: (n, 3) unit vectors in world, from the optical centre.
+        inward: (n, 3) unit vectors in world, perpendicular to the ray and to the edge, into the red.
+    """
+
+    pixels: Array
+    rays: Array
+    inward: Array
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def take(self, which: npt.NDArray[np.bool_] | npt.NDArray[np.intp]) -> Outline:
+        """The points that an index or boolean array picks."""
+        return Outline(self.pixels[which], self.rays[which], self.inward[which])
+
+
+@dataclass(frozen=True)
+class Blob:
+    """One connected region.
+
+    Attributes:
+        contour: (n, 1, 2) integer pixels of its outer edge, as OpenCV gives them.
+        area: inside the contour [px^2].
+        centroid: (2,) of its area [px].
+        outline: of the regions of the finer mask within it, holes included.
+        border: (m, 2) its pixels at the border of the picture [px].
+    """
+
+    contour: npt.NDArray[np.int32]
+    area: float
+    centroid: Array
+    outline: Outline
+    border: Array
+
+
+def find_blobs(closed: Mask, fine: Mask, camera: Pinhole, min_area: float) -> list[Blob]:
+    """Blobs of the closed mask of at least `min_area` [px^2], outlined by the finer mask from before closing.
+
+    Closing bridges the gaps between near neighbours and fills notches: what a ball looks like is in the finer mask.
+    """
+    outer, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    large = [(c, area) for c in outer if (area := cv2.contourArea(c)) >= min_area]
+    if not large:
+        return []
+    contours, hierarchy = cv2.findContours(fine, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    within: list[list[tuple[npt.NDArray[np.int32], bool]]] = [[] for _ in large]
+    for contour, links in zip(contours, hierarchy[0] if hierarchy is not None else (), strict=True):
+        if len(contour) < _LEAST_POINTS:
+            continue
+        u, v = (float(value) for value in contour[0, 0])
+        for index, (outside, _) in enumerate(large):
+            if cv2.pointPolygonTest(outside, (u, v), False) >= 0:
+                within[index].append((contour, links[3] >= 0))
+                break
+    blobs = []
+    for (contour, area), parts in zip(large, within, strict=True):
+        moments = cv2.moments(contour)
+        centroid = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
+        flat = contour.reshape(-1, 2).astype(float)
+        border = flat[~_off_border(flat, camera)]
+        blobs.append(Blob(contour, area, centroid, _outline(parts, camera), border))
+    return blobs
+
+
+def _off_border(pixels: Array, camera: Pinhole) -> npt.NDArray[np.bool_]:
+    u, v = pixels[:, 0], pixels[:, 1]
+    clear: npt.NDArray[np.bool_] = (u >= 1) & (u <= camera.width - 2) & (v >= 1) & (v <= camera.height - 2)
+    return clear
+
+
+def _outline(parts: Sequence[tuple[npt.NDArray[np.int32], bool]], camera: Pinhole) -> Outline:
+    pixels, normals = [np.empty((0, 2))], [np.empty((0, 2))]
+    for contour, is_hole in parts:
+        points = contour.reshape(-1, 2).astype(float)
+        along = np.roll(points, -_REACH, axis=0) - np.roll(points, _REACH, axis=0)
+        turned = np.column_stack([-along[:, 1], along[:, 0]])
+        # Turning a quarter leads into the area that a contour with positive orientation encloses: for the edge of a
+        # hole that is the hole.
+        if (cv2.contourArea(contour, oriented=True) > 0) == is_hole:
+            turned = -turned
+        keep = _off_border(points, camera) & (np.abs(turned).sum(axis=1) > 0)
+        # A direction taken across the border of the picture is not that of the outline.
+        for shift in (-_REACH, _REACH):
+            keep &= _off_border(np.roll(points, shift, axis=0), camera)
+        pixels.append(points[keep])
+        normals.append(turned[keep])
+    p, n = np.concatenate(pixels), np.concatenate(normals)
+    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
+    rays = camera.directions(p)
+    inward = camera.directions(p + n) - rays
+    inward -= np.einsum("ij,ij->i", inward, rays)[:, None] * rays
+    inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
+    return Outline(p, rays, inward)

@@ -1,0 +1,73 @@
+"""Where balls can lie: on the table, or in layers in the container."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from common.config import Container, Surroundings
+from common.perception.pinhole import Pinhole
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Resting:
+    """Known size of the balls and the heights at which their centres can be, in world [m]."""
+
+    radius: float
+    table_height: float
+    container: Container
+
+    @classmethod
+    def of(cls, surroundings: Surroundings) -> Resting:
+        """What the surroundings say."""
+        return cls(surroundings.ball_radius, surroundings.table_height, surroundings.container)
+
+    @property
+    def plane(self) -> float:
+        """z of the centres of balls on the table [m]."""
+        return self.table_height + self.radius
+
+    @property
+    def layers(self) -> list[float]:
+        """z of the centres in each layer of the container, from below [m]."""
+        lowest = self.table_height + self.container.floor_thickness + self.radius
+        return [lowest + 2 * self.radius * layer for layer in range(self.container.layers)]
+
+    @property
+    def stack_height(self) -> float:
+        """z of the top of a full container's uppermost ball, or of its walls where these are higher [m]."""
+        stack = self.container.floor_thickness + 2 * self.radius * self.container.layers
+        return self.table_height + max(stack, self.container.wall_height)
+
+    def meets_container(self, origin: npt.ArrayLike, direction: npt.ArrayLike) -> bool:
+        """Whether a ray meets the volume of the container up to the stack height.
+
+        Args:
+            origin: (3,) in world [m].
+            direction: (3,) in world, of any length.
+
+        The slab method: the ray is inside between the last entry into and the first exit from the three pairs of
+        planes.
+        """
+        o, d = np.asarray(origin, dtype=float), np.asarray(direction, dtype=float)
+        c, h = self.container, self.container.half_side
+        low = np.array([c.x - h, c.y - h, self.table_height])
+        high = np.array([c.x + h, c.y + h, self.stack_height])
+        parallel = np.abs(d) < 1e-12
+        if bool(np.any(parallel & ((o < low) | (o > high)))):
+            return False
+        safe = np.where(parallel, 1.0, d)
+        first, second = (low - o) / safe, (high - o) / safe
+        entry = float(np.where(parallel, -np.inf, np.minimum(first, second)).max())
+        leave = float(np.where(parallel, np.inf, np.maximum(first, second)).min())
+        return max(entry, 0.0) <= leave
+
+    def heights(self, camera: Pinhole, pixel: npt.ArrayLike) -> list[float]:
+        """z [m] at which the centre of a ball seen at a pixel can be: the table's first."""
+        if self.meets_container(*camera.ray(pixel)):
+            return [self.plane, *self.layers]
+        return [self.plane]

@@ -1,0 +1,153 @@
+"""Tell how many balls a blob is made of, and about where they are.
+
+Each point of the outline votes for the centre of a sphere that it could belong to: known radius, one way in. Votes of
+one ball meet, also when others hide or touch parts of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from common.perception.fit import fit_spheres, misfit
+from common.perception.outline import Mask, Outline
+from common.perception.pinhole import Pinhole
+from common.perception.resting import Resting
+from common.perception.sphere import silhouette
+
+Array = npt.NDArray[np.float64]
+Chosen = npt.NDArray[np.bool_]
+
+_CELL = 0.003  # of the grid in which votes are counted [m]
+_LEAST_VOTES = 0.06  # at a peak, as part of the votes of a whole outline
+_LEAST_SUPPORT = 0.14  # part of a whole outline that a ball must show
+_NEAR = 2.0e-3  # a point this near to a silhouette belongs to it [m]
+_COVERED = 0.85  # part of a ball's silhouette that must be red
+_MOST_CANDIDATES = 40
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    center: Array  # (3,) relative to the optical centre [m]
+    on_table: bool
+    points: Chosen  # of the outline that belong to it
+    whole: float  # points that its whole outline has
+
+
+def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: Resting, offset: float) -> Array:
+    """First guesses of the balls in a blob: (k, 3) centres relative to the optical centre [m].
+
+    Args:
+        outline: of the blob.
+        mask: red pixels of the whole picture.
+        camera: the camera.
+        resting: radius and possible heights of the balls.
+        offset: expected offset of the outline from the silhouettes [m].
+    """
+    if len(outline) < 8:
+        return np.empty((0, 3))
+    candidates = []
+    for place in _peaks(_votes(outline, camera, resting, offset), camera, resting):
+        candidates += _refine(outline, camera, resting, offset, place)
+    chosen: list[_Candidate] = []
+    free = np.ones(len(outline), bool)
+    while candidates:
+        gains = [np.count_nonzero(c.points & free) / c.whole for c in candidates]
+        best = int(np.argmax(gains))
+        if gains[best] < _LEAST_SUPPORT:
+            break
+        candidate = candidates.pop(best)
+        if _clashes(candidate, chosen, resting.radius) or not _is_red(candidate, mask, camera, resting.radius):
+            continue
+        chosen.append(candidate)
+        free &= ~candidate.points
+    return np.array([c.center for c in chosen]).reshape(-1, 3)
+
+
+def _votes(outline: Outline, camera: Pinhole, resting: Resting, offset: float) -> Array:
+    """(n, 2) where each point puts the centre, on the plane of the balls on the table [m], world."""
+    drop = resting.plane - camera.position[2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.abs(drop / outline.rays[:, 2])
+    sine = np.clip((resting.radius + offset) / distance, 0, 0.9)[:, None]
+    toward = np.sqrt(1 - sine**2) * outline.rays + sine * outline.inward
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = drop / toward[:, 2]
+    votes = camera.position[:2] + t[:, None] * toward[:, :2]
+    good = np.isfinite(votes).all(axis=1) & (t > 0) & (np.abs(votes - camera.position[:2]).max(axis=1) < 20)
+    return votes[good]
+
+
+def _peaks(votes: Array, camera: Pinhole, resting: Resting) -> Array:
+    """(m, 2) places at which many votes meet, the most voted for first [m], world."""
+    if not len(votes):
+        return np.empty((0, 2))
+    low = votes.min(axis=0) - 3 * _CELL
+    cells = np.floor((votes - low) / _CELL).astype(np.int64)
+    shape = cells.max(axis=0) + 4
+    if shape.prod() > 4_000_000:
+        return np.empty((0, 2))
+    counts = np.bincount(np.ravel_multi_index((cells[:, 0], cells[:, 1]), shape), minlength=int(shape.prod()))
+    smooth = cv2.GaussianBlur(counts.reshape(shape).astype(np.float32), (7, 7), 1.2)
+    # A cell that holds all votes of a spread of one cell keeps about a tenth of them after smoothing.
+    least = 0.1 * _LEAST_VOTES * _whole_outline(camera, resting.radius, -float(resting.plane - camera.position[2]))
+    highest = cv2.dilate(smooth, np.ones((5, 5), np.uint8))
+    rows, columns = np.nonzero((smooth >= highest) & (smooth > least))
+    order = np.argsort(-smooth[rows, columns], kind="stable")[:_MOST_CANDIDATES]
+    peaks: Array = low + (np.column_stack([rows, columns])[order] + 0.5) * _CELL
+    return peaks
+
+
+def _whole_outline(camera: Pinhole, radius: float, distance: float) -> float:
+    """Points that the contour of a whole ball at a distance has: a circle takes 4 sqrt(2) steps for each radius."""
+    return 5.66 * radius / max(distance, radius) * (camera.fx + camera.fy) / 2
+
+
+def _refine(
+    outline: Outline, camera: Pinhole, resting: Resting, offset: float, place: Array
+) -> list[_Candidate]:
+    """The candidate near a place, at the height that fits best; none when few points support it."""
+    best: _Candidate | None = None
+    start = np.array([place[0], place[1], resting.plane])
+    ray = start - camera.position
+    for z in resting.heights(camera, camera.project(start)):
+        center = ray * ((z - camera.position[2]) / ray[2])
+        beyond, _, facing = misfit(outline, center, resting.radius + offset)
+        near = np.flatnonzero(facing & (np.abs(beyond) < 0.3 * resting.radius))
+        if len(near) < 6:
+            continue
+        fit = fit_spheres(
+            outline.take(near), center[None], resting.radius, offset=offset, offset_std=0.0, gates=(7e-3, 5e-3, 3e-3)
+        )
+        refined = fit.centers[0]
+        beyond, _, facing = misfit(outline, refined, resting.radius + offset)
+        points = facing & (np.abs(beyond) < _NEAR)
+        whole = _whole_outline(camera, resting.radius, float(np.linalg.norm(refined)))
+        candidate = _Candidate(refined, z == resting.plane, points, whole)
+        if best is None or np.count_nonzero(points) > 1.05 * np.count_nonzero(best.points):
+            best = candidate
+    if best is None or np.count_nonzero(best.points) < _LEAST_SUPPORT * best.whole:
+        return []
+    return [best]
+
+
+def _clashes(candidate: _Candidate, chosen: list[_Candidate], radius: float) -> bool:
+    """Whether a candidate is one of the chosen again, or inside of one: solid balls on a table are apart."""
+    for other in chosen:
+        distance = float(np.linalg.norm(candidate.center - other.center))
+        same_layer = abs(candidate.center[2] - other.center[2]) < 0.5 * radius
+        if distance < (1.6 if same_layer else 0.5) * radius:
+            return True
+    return False
+
+
+def _is_red(candidate: _Candidate, mask: Mask, camera: Pinhole, radius: float) -> bool:
+    """Whether what a ball there would cover of the picture is red."""
+    center = candidate.center + camera.position
+    rings = [silhouette(camera, center, part * radius, 16) for part in (0.2, 0.45, 0.65, 0.82)]
+    pixels = np.rint(np.concatenate(rings)).astype(int)
+    seen = pixels[camera.in_picture(pixels)]
+    return len(seen) > 0 and float(np.mean(mask[seen[:, 1], seen[:, 0]] > 0)) >= _COVERED
