@@ -1,0 +1,213 @@
+"""One cycle of control: read the joints, move the world on, judge and send set-points. The service gives it time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.config import GripperConfig
+from common.errors import ConfigError, Refused
+from common.hardware.checks import Tolerances
+from common.hardware.controller import TrajectoryController
+from common.hardware.gripper_controller import GripperController
+from common.hardware.interface import Hardware, HardwareFault, Limits, SimulatedGripper, Vector
+from common.messages import (
+    ExecuteRequest,
+    GripperCommand,
+    GripperState,
+    Header,
+    JointState,
+    MotionStatus,
+    PoseArray,
+    SceneUpdate,
+    StopRequest,
+    WorldEdit,
+    WorldEditReply,
+)
+
+PROGRESS_PERIOD = 0.1  # cell time between reports of progress [s]
+WORLD_PERIOD = 0.05  # cell time between reports of a ball that moves [s]
+
+
+class Kinematics(Protocol):
+    """What is asked of the robot's model."""
+
+    def fk(self, q: Vector) -> NDArray[np.float64]:
+        """(4, 4) T_world_tcp at q (dof,) [rad]."""
+
+
+class Truth(Protocol):
+    """What is asked of the simulated world (common.sim.world)."""
+
+    version: int
+
+    def obstruction(self, T_world_tcp: NDArray[np.float64], width: float) -> float:
+        """Width that the fingers can not close below [m]."""
+
+    def tick(self, now: float, T_world_tcp: NDArray[np.float64], width: float, gripping: bool) -> None:
+        """Move on to a time."""
+
+    def edit(self, request: WorldEdit, now: float) -> str:
+        """Change the world."""
+
+    @property
+    def ids(self) -> list[str]:
+        """What is in it."""
+
+    def scene_balls(self, header: Header) -> PoseArray:
+        """Where everything is."""
+
+    def take_events(self) -> list[SceneUpdate]:
+        """What happened since the last call."""
+
+
+@dataclass
+class Report:
+    """What there is to say after a cycle; None where nothing is new."""
+
+    joints: JointState | None = None
+    motion: MotionStatus | None = None
+    gripper: GripperState | None = None
+    balls: PoseArray | None = None
+    updates: list[SceneUpdate] = field(default_factory=list)
+
+
+class ControlCycle:
+    """The arm, its gripper and, with simulated hardware, the world about it."""
+
+    def __init__(
+        self,
+        hardware: Hardware,
+        limits: Limits,
+        start: Vector,
+        *,
+        tolerances: Tolerances | None = None,
+        gripper: GripperConfig | None = None,
+        kinematics: Kinematics | None = None,
+        world: Truth | None = None,
+    ) -> None:
+        """Control this hardware; `world` and `kinematics` with simulated hardware only.
+
+        Raises:
+            ConfigError: the backend's gripper can not feel the simulated world, or it has none.
+        """
+        self._hardware, self._limits = hardware, limits
+        self._kinematics, self._world = kinematics, world
+        self._arm = TrajectoryController(limits, start, tolerances)
+        self._gripper: GripperController | None = None
+        self._fingers: list[str] = []
+        self._obstructible: SimulatedGripper | None = None
+        if gripper is not None:
+            backend = type(hardware).__name__
+            if hardware.gripper is None:
+                raise ConfigError("robot.hardware.backend", backend, "has no gripper, but the robot has one")
+            if world is not None:
+                if not isinstance(hardware.gripper, SimulatedGripper):
+                    raise ConfigError("robot.hardware.backend", backend, "is simulated: its gripper needs obstruct()")
+                self._obstructible = hardware.gripper
+            self._gripper = GripperController(hardware.gripper, gripper)
+            self._fingers = list(gripper.joints)
+        self._q = start.copy()
+        self._finger_speed = 0.0
+        self._told_motion: MotionStatus | None = None
+        self._told_motion_at = self._told_gripper_at = self._told_world_at = -np.inf
+        self._told_gripper: GripperState | None = None
+        self._told_version = -1
+
+    def step(self, header: Header) -> Report:
+        """Do one cycle at the header's time and say what is new."""
+        now = header.stamp * 1e-9
+        report = Report()
+        try:
+            self._q, dq = self._hardware.read(now)
+            self._step_gripper(now)
+            self._hardware.write(*self._arm.update(now, self._q, dq), now)
+        except HardwareFault as fault:
+            self._arm.fault(str(fault))
+        else:
+            report.joints = self._joint_state(header, dq)
+        report.motion = self._news_of_motion(header, now)
+        report.gripper = self._news_of_gripper(header, now)
+        if self._world is not None:
+            report.updates = [update.model_copy(update={"header": header}) for update in self._world.take_events()]
+            due = now - self._told_world_at >= WORLD_PERIOD or bool(report.updates)
+            if self._world.version != self._told_version and due:
+                report.balls = self._world.scene_balls(header)
+                self._told_version, self._told_world_at = self._world.version, now
+        return report
+
+    def execute(self, request: ExecuteRequest, now: float) -> MotionStatus:
+        """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
+        return self._arm.accept(request.id, request.trajectory, now, self._q)
+
+    def stop(self, request: StopRequest, now: float) -> MotionStatus:
+        """The state of the goal, which is being brought to rest if it was moving the robot."""
+        return self._arm.cancel(request.id, request.reason, now)
+
+    def command(self, request: GripperCommand, now: float) -> GripperState:
+        """The state of the gripper's goal.
+
+        Raises:
+            Refused: this robot has no gripper.
+        """
+        if self._gripper is None:
+            raise Refused("no_gripper", "this robot has no gripper")
+        return self._gripper.command(request, now)
+
+    def edit(self, request: WorldEdit, now: float) -> WorldEditReply:
+        """What was changed in the simulated world.
+
+        Raises:
+            Refused: with the reason; nothing has changed then.
+        """
+        if self._world is None:
+            raise Refused("not_simulated", "the world of real hardware can not be edited")
+        return WorldEditReply(id=self._world.edit(request, now), ids=self._world.ids)
+
+    def close(self) -> None:
+        """Let go of the hardware."""
+        self._hardware.close()
+
+    def _step_gripper(self, now: float) -> None:
+        gripper = self._hardware.gripper
+        if self._gripper is None or gripper is None:
+            return
+        if self._world is None or self._kinematics is None or self._obstructible is None:
+            reading = gripper.read(now)
+        else:
+            T_world_tcp = self._kinematics.fk(self._q)
+            self._obstructible.obstruct(self._world.obstruction(T_world_tcp, self._gripper.state.width))
+            reading = gripper.read(now)
+            self._world.tick(now, T_world_tcp, reading.width, reading.holding)
+        self._finger_speed = reading.velocity / 2
+        self._gripper.update(reading)
+
+    def _joint_state(self, header: Header, dq: Vector) -> JointState:
+        width = self._gripper.state.width / 2 if self._gripper else 0.0
+        return JointState(
+            header=header,
+            name=[*self._limits.names, *self._fingers],
+            position=[*self._q.tolist(), *(width for _ in self._fingers)],
+            velocity=[*dq.tolist(), *(self._finger_speed for _ in self._fingers)],
+        )
+
+    def _news_of_motion(self, header: Header, now: float) -> MotionStatus | None:
+        status, told = self._arm.status, self._told_motion
+        same = told is not None and (told.id, told.state, told.message) == (status.id, status.state, status.message)
+        if same and (told == status or now - self._told_motion_at < PROGRESS_PERIOD):
+            return None
+        self._told_motion, self._told_motion_at = status, now
+        return status.model_copy(update={"header": header})
+
+    def _news_of_gripper(self, header: Header, now: float) -> GripperState | None:
+        if self._gripper is None:
+            return None
+        state, told = self._gripper.state, self._told_gripper
+        same = told is not None and told.model_copy(update={"width": state.width}) == state
+        if same and (told == state or now - self._told_gripper_at < PROGRESS_PERIOD):
+            return None
+        self._told_gripper, self._told_gripper_at = state, now
+        return state.model_copy(update={"header": header})

@@ -1,0 +1,151 @@
+"""Where a ball can lie: on the table, clear of other balls and of everything that stands there, or in the box."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.config import Fixture, World
+
+Array = NDArray[np.float64]
+Slot = tuple[int, int]  # layer, index within the layer
+
+GAP = 1e-3  # room that is left to what a ball rolls up to [m]
+RING = 2e-3  # step of the search for a free place [m]
+
+
+class Table:
+    """The surface on which balls rest, and what stands on it."""
+
+    def __init__(self, world: World) -> None:
+        """Find the tables among the fixtures: boxes whose top is at `table_height`. None: it has no end."""
+        self.height = world.table_height
+        self.radius = world.ball_radius
+        self._container = world.container
+        flat = [f for f in world.fixtures if f.shape == "box" and f.rpy[0] == 0.0 and f.rpy[1] == 0.0]
+        self._tables = [f for f in flat if abs(f.position[2] + f.dimensions[2] / 2 - self.height) < 1e-3]
+        self._obstacles = [f for f in world.fixtures if f not in self._tables and _rises_through(f, world)]
+
+    def carries(self, x: float, y: float) -> bool:
+        """Whether a centre at (x, y) [m] is above a table."""
+        return bool(self._carries(np.array([[x, y]]))[0])
+
+    def extent(self) -> str:
+        """The tables, for people."""
+        return " or ".join(
+            f"x {f.position[0] - f.dimensions[0] / 2:g} to {f.position[0] + f.dimensions[0] / 2:g}, "
+            f"y {f.position[1] - f.dimensions[1] / 2:g} to {f.position[1] + f.dimensions[1] / 2:g}"
+            for f in self._tables
+        )
+
+    def blocked(self, x: float, y: float) -> str:
+        """The thing into which a ball resting at (x, y) [m] would reach, or an empty string."""
+        point = np.array([[x, y]])
+        reach = self.radius - 1e-9
+        if _distance_to_box(point, self._container.x, self._container.y, self._container.half_side)[0] < reach:
+            return self._container.id
+        return next((f.id for f in self._obstacles if _distance(point, f)[0] < reach), "")
+
+    def free(self, points: Array, others: Array, gap: float = 0.0) -> NDArray[np.bool_]:
+        """Which of the points (N, 2) are on the table, clear of what stands there and of others' centres (M, 2)."""
+        good = self._carries(points)
+        c = self._container
+        good &= _distance_to_box(points, c.x, c.y, c.half_side) >= self.radius + gap
+        for fixture in self._obstacles:
+            good &= _distance(points, fixture) >= self.radius + gap
+        for other in others:
+            good &= np.hypot(*(points - other).T) >= 2 * self.radius + gap
+        return good
+
+    def nearest_free(self, x: float, y: float, others: Array) -> tuple[float, float] | None:
+        """The free place nearest to (x, y) [m], to within the search step; None when the table is full."""
+        if self.free(np.array([[x, y]]), others)[0]:
+            return x, y
+        for ring in range(1, int(2.5 / RING)):
+            angles = np.linspace(0.0, 2 * math.pi, max(8, 2 * ring), endpoint=False)
+            points = np.column_stack([x + ring * RING * np.cos(angles), y + ring * RING * np.sin(angles)])
+            good = self.free(points, others, GAP)
+            if good.any():
+                found = points[int(np.argmax(good))]
+                return float(found[0]), float(found[1])
+        return None
+
+    def _carries(self, points: Array) -> NDArray[np.bool_]:
+        if not self._tables:
+            return np.ones(len(points), dtype=bool)
+        carried = np.zeros(len(points), dtype=bool)
+        for table in self._tables:
+            carried |= _distance(points, table) <= 0.0
+        return carried
+
+
+class Slots:
+    """The places in the container: 2 x 2 in each layer, a ball of a layer lies on the one below."""
+
+    def __init__(self, world: World) -> None:
+        """Lay out the slots."""
+        c = world.container
+        self._container = c
+        self.centres = [(c.x + sx * c.slot_offset, c.y + sy * c.slot_offset) for sx, sy in product((-1, 1), (-1, 1))]
+        self.layers = c.layers
+        self._lowest = world.table_height + c.floor_thickness + world.ball_radius
+        self._radius = world.ball_radius
+        self.count = 4 * c.layers
+
+    def position(self, slot: Slot) -> Array:
+        """Centre of a ball in the slot (3,) [m]."""
+        layer, index = slot
+        return np.array([*self.centres[index], self._lowest + layer * 2 * self._radius])
+
+    def over(self, x: float, y: float) -> bool:
+        """Whether (x, y) is above the container, its walls included."""
+        return max(abs(x - self._container.x), abs(y - self._container.y)) <= self._container.half_side
+
+    def inside(self, x: float, y: float) -> bool:
+        """Whether (x, y) is between the container's walls."""
+        inner = self._container.half_side - self._container.wall_thickness
+        return max(abs(x - self._container.x), abs(y - self._container.y)) < inner
+
+    def choose(self, x: float, y: float, taken: Iterable[Slot]) -> Slot | None:
+        """The free slot nearest to (x, y) in the lowest layer that is not full; None when the container is."""
+        occupied = set(taken)
+        for layer in range(self.layers):
+            free = [i for i in range(4) if (layer, i) not in occupied]
+            if free:
+                return layer, min(free, key=lambda i: math.dist((x, y), self.centres[i]))
+        return None
+
+
+def _rises_through(fixture: Fixture, world: World) -> bool:
+    """Whether a fixture is anywhere as high as a ball on the table."""
+    if fixture.shape == "sphere":
+        half = fixture.dimensions[0]
+    elif any(fixture.rpy[:2]):
+        half = math.hypot(*fixture.dimensions)
+    else:
+        half = fixture.dimensions[-1] / 2
+    bottom, top = fixture.position[2] - half, fixture.position[2] + half
+    return bottom < world.table_height + 2 * world.ball_radius - 1e-6 and top > world.table_height + 1e-6
+
+
+def _distance(points: Array, fixture: Fixture) -> Array:
+    """Horizontal distance [m] of points (N, 2) to a fixture seen from above; 0 inside. A tilted one counts as round."""
+    x, y, _ = fixture.position
+    if fixture.shape == "box" and not any(fixture.rpy[:2]):
+        cos, sin = math.cos(fixture.rpy[2]), math.sin(fixture.rpy[2])
+        dx, dy = points[:, 0] - x, points[:, 1] - y
+        along, across = cos * dx + sin * dy, cos * dy - sin * dx
+        return np.hypot(np.maximum(np.abs(along) - fixture.dimensions[0] / 2, 0.0),
+                        np.maximum(np.abs(across) - fixture.dimensions[1] / 2, 0.0))
+    upright = fixture.shape != "box" and not any(fixture.rpy[:2])
+    radius = fixture.dimensions[0] if upright else math.hypot(*fixture.dimensions)
+    return np.maximum(np.hypot(points[:, 0] - x, points[:, 1] - y) - radius, 0.0)
+
+
+def _distance_to_box(points: Array, x: float, y: float, half_side: float) -> Array:
+    return np.hypot(np.maximum(np.abs(points[:, 0] - x) - half_side, 0.0),
+                    np.maximum(np.abs(points[:, 1] - y) - half_side, 0.0))
