@@ -33,6 +33,14 @@ class UnknownName(ZencellError):
         self.choices = listed
 
 
+class NoRouter(ZencellError):
+    """No router could be reached."""
+
+    def __init__(self, endpoint: str) -> None:
+        super().__init__(f"no router at {endpoint}: is the cell up, and is this its domain?")
+        self.endpoint = endpoint
+
+
 class RequestFailed(ZencellError):
     """Base of the four ways in which a request ends without an answer."""
 

@@ -1,0 +1,235 @@
+"""The bus: everything that a service may do on the network, the same over Zenoh and in process."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from typing import Any, TypeVar
+
+from common import topics
+from common.clock import Clock
+from common.messages import Header, Message, ServiceCounters
+from common.topics import Request, Topic
+from common.transport.alive import Alive, alive_key
+from common.transport.codec import DEFAULT_LIMIT
+from common.transport.handoff import Doorbell, call_on_loop
+from common.transport.reader import Reader
+from common.transport.requests import Client, Server, tokens_of
+from common.transport.session import Declared, RawReply, RawSample, Session
+from common.transport.writer import Writer
+
+M = TypeVar("M", bound=Message)
+Q = TypeVar("Q", bound=Message)
+A = TypeVar("A", bound=Message)
+
+REPEAT_SECONDS = 1.0  # wall time between repetitions of a state, and between counters
+_MOST_RAW = 1000
+
+
+class Bus:
+    """A service's place in its cell. Made on a running loop and used on it; writers may put from any thread."""
+
+    def __init__(
+        self, session: Session, *, service: str, cell: str, clock: Clock, limit: int = DEFAULT_LIMIT,
+    ) -> None:
+        """Take a place in a cell.
+
+        Args:
+            session: connection to the network.
+            service: name of the service.
+            cell: name of the cell, first part of every key.
+            clock: the cell's clock.
+            limit: largest payload that is read [bytes].
+        """
+        self.service = service
+        self.cell = cell
+        self.clock = clock
+        self.log = logging.getLogger(service)
+        self.ready_event = asyncio.Event()
+        self._session = session
+        self._limit = limit
+        self._loop = asyncio.get_running_loop()
+        self._crash: asyncio.Future[BaseException] = self._loop.create_future()
+        self._readers: list[Reader[Any]] = []
+        self._writers: list[Writer[Any]] = []
+        self._servers: list[Server[Any, Any]] = []
+        self._tokens: list[Declared] = []
+        self._alive: Alive | None = None
+        self._counters: Writer[ServiceCounters] | None = None
+        self._beat: asyncio.TimerHandle | None = None
+        self._closed = False
+        session.watch_connection(lambda there: call_on_loop(self._loop, lambda: self._on_connection(there)))
+        self._tick()
+
+    # --- declarations ---------------------------------------------------------------------------------------------
+
+    def reader(self, topic: Topic[M], *, size: int = 1000) -> Reader[M]:
+        """A reader of the topic; `size` is the most events that wait in it."""
+        reader = Reader(topic, self._loop, self.log, size=size, limit=self._limit)
+        self._readers.append(reader)
+        key = f"{self.cell}/{topic.key}"
+        self._session.subscriber(key, reader.arrive)
+        if topic.kind == "state":  # subscribed first: nothing can fall between the two
+
+            def on_reply(reply: RawReply) -> None:
+                if reply.sample is not None:
+                    reader.arrive(reply.sample)
+
+            self._session.get(key, on_reply, lambda: None, timeout=2.0)
+        return reader
+
+    def writer(self, topic: Topic[M]) -> Writer[M]:
+        """A writer of the topic."""
+        writer = Writer(self._session, self.cell, self.service, topic)
+        self._writers.append(writer)
+        return writer
+
+    def serve(self, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]]) -> None:
+        """Answer requests with `await handler(request)`, concurrently, from `ready` on.
+
+        The handler raises `Refused` to refuse one; any other exception is told to the requester and ends the service.
+        """
+        self._servers.append(
+            Server(
+                self._session, self.cell, self.service, topic, handler, loop=self._loop, log=self.log,
+                ready=self.ready_event, crash=self._on_crash, limit=self._limit,
+            )
+        )
+        if self.ready_event.is_set():
+            self._declare_token(tokens_of(self.cell, topic.key, self.service))
+
+    def client(self, topic: Request[Q, A]) -> Client[Q, A]:
+        """A client of the request key."""
+        return Client(self._session, self.cell, self.service, topic, loop=self._loop, limit=self._limit)
+
+    async def ready(self) -> None:
+        """Tell the cell that this service is ready: what it serves first, its own token last."""
+        self._counters = Writer(self._session, self.cell, self.service, topics.COUNTERS)
+        for server in self._servers:
+            self._declare_token(tokens_of(self.cell, server.topic.key, self.service))
+        self.ready_event.set()
+        self._declare_token(alive_key(self.cell, self.service))
+
+    def _declare_token(self, key: str) -> None:
+        self._tokens.append(self._session.token(key))
+
+    # --- what is known --------------------------------------------------------------------------------------------
+
+    @property
+    def connected(self) -> bool:
+        """Whether the router is reached."""
+        return self._session.connected
+
+    @property
+    def alive(self) -> Alive:
+        """The services of the cell that are ready; watched from the first use on."""
+        if self._alive is None:
+            self._alive = Alive(self._session, self.cell, self._loop)
+        return self._alive
+
+    def header(self, frame_id: str = "") -> Header:
+        """A header with the cell time of now."""
+        return Header(stamp=self.clock.now_ns(), frame_id=frame_id)
+
+    def counters(self) -> ServiceCounters:
+        """What was received, dropped and refused so far, by key."""
+        counted = ServiceCounters(header=self.header(), service=self.service)
+        sources: list[Reader[Any] | Server[Any, Any]] = [*self._readers, *self._servers]
+        for source in sources:
+            key = source.topic.key
+            counted.received[key] = counted.received.get(key, 0) + source.received
+            if source.invalid:
+                counted.invalid[key] = counted.invalid.get(key, 0) + source.invalid
+        for reader in self._readers:
+            key = reader.topic.key
+            if reader.dropped:
+                counted.dropped[key] = counted.dropped.get(key, 0) + reader.dropped
+            if reader.overflow:
+                counted.overflow[key] = counted.overflow.get(key, 0) + reader.overflow
+        return counted
+
+    # --- anything on the network, for tools -----------------------------------------------------------------------
+
+    async def raw_reader(self, key: str) -> AsyncIterator[RawSample]:
+        """Everything that is put under a full key expression, such as `panda/**`, from now on; the oldest give way."""
+        waiting: deque[RawSample] = deque(maxlen=_MOST_RAW)
+        came = asyncio.Event()
+        bell = Doorbell(self._loop, came.set)
+
+        def on_sample(sample: RawSample) -> None:
+            waiting.append(sample)
+            bell.ring()
+
+        declared = self._session.subscriber(key, on_sample)
+        try:
+            while True:
+                while waiting:
+                    yield waiting.popleft()
+                came.clear()
+                await came.wait()
+        finally:
+            declared.undeclare()
+
+    async def raw_get(self, key: str, timeout: float = 1.0) -> list[RawSample]:
+        """The values that can be asked for under a full key expression; requests refuse to be asked like this."""
+        samples: list[RawSample] = []
+        done = asyncio.Event()
+
+        def on_reply(reply: RawReply) -> None:
+            if reply.sample is not None:
+                samples.append(reply.sample)
+
+        cancel = self._session.get(key, on_reply, lambda: call_on_loop(self._loop, done.set), timeout=timeout)
+        try:
+            async with asyncio.timeout(timeout):
+                await done.wait()
+        except TimeoutError:
+            cancel()
+        return list(samples)
+
+    # --- life -----------------------------------------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        """Repeat states, so that a late plain client and a restarted router have them within a second."""
+        self._beat = self._loop.call_later(REPEAT_SECONDS, self._tick)
+        for writer in self._writers:
+            if writer.topic.kind == "state":
+                writer.repeat()
+        if self._counters is not None and self._counters.matched:
+            self._counters.put(self.counters())
+
+    def _on_connection(self, there: bool) -> None:
+        if not self._closed:
+            (self.log.info if there else self.log.warning)("the router %s", "is back" if there else "is lost")
+
+    def _on_crash(self, error: BaseException) -> None:
+        if not self._crash.done():
+            self._crash.set_result(error)
+
+    async def run(self, service: Coroutine[Any, Any, None]) -> None:
+        """Run a service's coroutine to its end; a handler that crashes ends it with that exception."""
+        task = asyncio.create_task(service, name=self.service)
+        both: set[asyncio.Future[Any]] = {task, self._crash}
+        try:
+            await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            if not task.done():
+                task.cancel()
+                await asyncio.wait({task})
+        if self._crash.done():
+            raise self._crash.result()
+        await task
+
+    async def close(self) -> None:
+        """Say goodbye: no token any more, requests in work are lost. The session is closed by its owner."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._beat is not None:
+            self._beat.cancel()
+        for token in reversed(self._tokens):
+            token.undeclare()
+        for server in self._servers:
+            await server.close()

@@ -1,0 +1,137 @@
+"""Messages to bytes and back: msgpack maps, checked on receive; nothing that comes in can do more than be refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import msgpack
+from pydantic import ValidationError
+
+from common.errors import DecodeError
+from common.messages import SCHEMA_VERSION, Message
+
+DEFAULT_LIMIT = 32 * 1024 * 1024  # [bytes]; a 4096 x 2560 bgr8 picture still fits
+MSGPACK = "application/msgpack"
+_SHOWN = 60  # characters of a value that an error shows
+
+M = TypeVar("M", bound=Message)
+
+
+def encoding_of(model: type[Message]) -> str:
+    """The encoding that tells any Zenoh client what the payload is, such as `application/msgpack;Image`."""
+    return f"{MSGPACK};{model.__name__}"
+
+
+def encode(message: Message) -> bytes:
+    """The message as a msgpack map; bytes stay bytes."""
+    packed: bytes = msgpack.packb(message.model_dump(), use_bin_type=True)
+    return packed
+
+
+def decode(model: type[M], payload: bytes, limit: int = DEFAULT_LIMIT) -> M:
+    """The message that a payload holds.
+
+    Raises:
+        DecodeError: one line: too large, not msgpack, bytes after the end, or the first field that does not fit.
+    """
+    value = _unpack(payload, limit, model.__name__)
+    if not isinstance(value, dict):
+        raise DecodeError(f"{model.__name__}: payload is {_kind(value)}, not a map")
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        raise DecodeError(_first_error(error, model.__name__)) from None
+
+
+def _unpack(payload: bytes, limit: int, name: str) -> Any:
+    if len(payload) > limit:
+        raise DecodeError(f"{name}: payload has {len(payload)} bytes, the limit is {limit}")
+    if not payload:
+        raise DecodeError(f"{name}: payload is empty")
+    try:
+        return msgpack.unpackb(payload, raw=False, strict_map_key=True)
+    except msgpack.ExtraData as error:
+        raise DecodeError(f"{name}: {len(error.extra)} bytes after the end of the message") from None
+    except (ValueError, TypeError, msgpack.UnpackException, RecursionError, OverflowError) as error:
+        raise DecodeError(f"{name}: not msgpack: {_one_line(str(error) or type(error).__name__)}") from None
+
+
+def _first_error(error: ValidationError, name: str) -> str:
+    errors = error.errors(include_url=False, include_context=False)
+    first = errors[0]
+    field = ".".join([name, *(str(part) for part in first["loc"])])
+    reason = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    given = "" if first["type"] in ("missing", "value_error") else f", not {_shown(first['input'])}"
+    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    return _one_line(f"{field}: {reason}{given}{more}")
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    if isinstance(value, list | dict):
+        return _kind(value)
+    text = repr(value)
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
+
+
+def _kind(value: object) -> str:
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    return "a map" if isinstance(value, dict) else f"{type(value).__name__} {_shown(value)}"
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """What rides beside a payload: who wrote it, which of his messages it is, and what it was caused by."""
+
+    writer: str
+    sequence: int
+    schema: int = SCHEMA_VERSION
+    trace: str = ""
+
+
+def encode_attachment(attachment: Attachment) -> bytes:
+    """The attachment as a small msgpack array."""
+    packed: bytes = msgpack.packb([attachment.writer, attachment.sequence, attachment.schema, attachment.trace])
+    return packed
+
+
+def decode_attachment(data: bytes | None) -> Attachment | None:
+    """The attachment, or None for a sender that sends none, such as a plain zenoh-cli put.
+
+    Raises:
+        DecodeError: it is not one of ours, or of another schema version.
+    """
+    if not data:
+        return None
+    value = _unpack(data, 1024, "attachment")
+    match value:
+        case [str(writer), int(sequence), int(schema), str(trace)]:
+            if schema != SCHEMA_VERSION:
+                raise DecodeError(f"attachment: schema version {schema}, this side has {SCHEMA_VERSION}")
+            return Attachment(writer, sequence, schema, trace)
+    raise DecodeError("attachment: not [writer, sequence, schema version, trace]")
+
+
+def encode_error(code: str, message: str) -> bytes:
+    """The payload of an error reply."""
+    packed: bytes = msgpack.packb({"code": code, "message": message})
+    return packed
+
+
+def decode_error(payload: bytes) -> tuple[str, str] | None:
+    """Code and message of an error reply, or None when it is not one of ours (Zenoh's own say b"Timeout")."""
+    try:
+        value = _unpack(payload, 64 * 1024, "error")
+    except DecodeError:
+        return None
+    match value:
+        case {"code": str(code), "message": str(message)}:
+            return code, message
+    return None

@@ -1,0 +1,43 @@
+"""A bus for tools: no readiness token, nothing served, closed at the end of the block."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from common.clock import Clock
+from common.errors import NoRouter
+from common.transport.bus import Bus
+from common.transport.zenoh_session import close_bounded, open_zenoh
+
+_CLOSE_SECONDS = 0.5
+
+
+@asynccontextmanager
+async def connect(
+    *, cell: str, service: str, endpoint: str, clock: Clock | None = None, timeout: float | None = 3.0,
+) -> AsyncIterator[Bus]:
+    """A bus at the router of an endpoint.
+
+    Args:
+        cell: name of the cell.
+        service: name of the tool, for its log lines.
+        endpoint: of the router, from `endpoint_of`.
+        clock: the cell's clock; one at speed 1 when not given.
+        timeout: how long to wait for the router [s]; None waits for ever.
+
+    Raises:
+        NoRouter: no router was there in time.
+    """
+    try:
+        async with asyncio.timeout(timeout):
+            session = await open_zenoh(endpoint)
+    except TimeoutError:
+        raise NoRouter(endpoint) from None
+    bus = Bus(session, service=service, cell=cell, clock=clock or Clock())
+    try:
+        yield bus
+    finally:
+        await bus.close()
+        await close_bounded(session, _CLOSE_SECONDS)

@@ -1,0 +1,100 @@
+"""Where the router of a domain is, and the one configuration of Zenoh that all processes share."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import zenoh
+
+from common.errors import ConfigError
+
+BASE_PORT = 7447
+DEFAULT_DOMAIN = 42
+MAX_DOMAIN = 232
+DOMAIN_VARIABLE = "ZENCELL_DOMAIN"
+CONNECT_VARIABLE = "ZENCELL_CONNECT"
+LEASE_MS = 2000  # a frozen process or cut link is noticed after this
+
+
+def parse_domain(value: object, field: str = "--domain") -> int:
+    """The domain as a number.
+
+    Raises:
+        ConfigError: it is not a whole number from 0 to 232.
+    """
+    try:
+        domain = int(str(value))
+    except ValueError:
+        domain = -1
+    if not 0 <= domain <= MAX_DOMAIN:
+        raise ConfigError(field, value, f"must be a whole number from 0 to {MAX_DOMAIN}")
+    return domain
+
+
+def port_of(domain: int) -> int:
+    """The TCP port of a domain's router."""
+    return BASE_PORT + domain
+
+
+def endpoint_of(domain: int | str | None = None, connect: str | None = None,
+                environ: Mapping[str, str] = os.environ) -> str:
+    """The endpoint to connect to, such as tcp/127.0.0.1:7489.
+
+    Args:
+        domain: 0 to 232; when not given `ZENCELL_DOMAIN`, else 42.
+        connect: an endpoint of someone else's router, which wins over the domain; when not given `ZENCELL_CONNECT`.
+        environ: where the variables are looked up.
+
+    Raises:
+        ConfigError: the domain is out of bounds or the endpoint is not one.
+    """
+    field = "--connect" if connect else CONNECT_VARIABLE
+    given = connect or ("" if domain is not None else environ.get(CONNECT_VARIABLE, ""))
+    if given:
+        return _checked_endpoint(field, given)
+    if domain is None:
+        return f"tcp/127.0.0.1:{port_of(parse_domain(environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN), DOMAIN_VARIABLE))}"
+    return f"tcp/127.0.0.1:{port_of(parse_domain(domain))}"
+
+
+def _checked_endpoint(field: str, endpoint: str) -> str:
+    protocol, slash, address = endpoint.partition("/")
+    host, colon, port = address.split("?")[0].split("#")[0].rpartition(":")
+    known = protocol in ("tcp", "tls", "quic", "ws", "udp")
+    if not (known and slash and colon and host and port.isdigit() and 0 < int(port) < 65536):
+        raise ConfigError(field, endpoint, "must be an endpoint such as tcp/192.168.1.10:7447")
+    return endpoint
+
+
+def client_config(endpoint: str, *, connect_ms: int) -> zenoh.Config:
+    """Configuration of a client of the router at an endpoint, which tries for `connect_ms` to reach it at first."""
+    return _config(
+        mode="client",
+        listen__endpoints=[],
+        connect__endpoints=[endpoint],
+        connect__timeout_ms=connect_ms,
+        connect__retry={"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
+    )
+
+
+def router_config(endpoint: str) -> zenoh.Config:
+    """Configuration of a router that listens at one endpoint only."""
+    return _config(mode="router", listen__endpoints=[endpoint], connect__endpoints=[])
+
+
+def _config(**values: Any) -> zenoh.Config:
+    config = zenoh.Config()
+    common = {
+        "scouting__multicast__enabled": False,
+        "scouting__gossip__enabled": False,
+        "timestamping__enabled": True,
+        "transport__link__tx__lease": LEASE_MS,
+        # Shared memory goes round the size limits of a link, and queries over it were lost when a receiver stalled.
+        "transport__shared_memory__enabled": False,
+    }
+    for key, value in {**common, **values}.items():
+        config.insert_json5(key.replace("__", "/"), json.dumps(value))
+    return config

@@ -1,0 +1,257 @@
+"""Requests: a server answers one exact key; a client's call ends in exactly one of five ways."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from typing import Generic, TypeVar
+
+from common.errors import DecodeError, NoResponder, Refused, RemoteError, RequestFailed, RequestLost, RequestTimeout
+from common.messages import Message
+from common.topics import Request
+from common.transport.codec import (
+    Attachment,
+    decode,
+    decode_attachment,
+    decode_error,
+    encode,
+    encode_attachment,
+    encode_error,
+    encoding_of,
+)
+from common.transport.handoff import call_on_loop
+from common.transport.reader import NO_SENDER, Refusals
+from common.transport.session import Query, RawReply, Session
+from common.transport.trace import current_trace, follow
+
+Q = TypeVar("Q", bound=Message)
+A = TypeVar("A", bound=Message)
+
+_LOOK_SECONDS = 1.0  # how long to look for a server before a request is given up unsent
+_VANISH_SECONDS = 0.25  # the token of a server that has just answered may be gone before its answer is here
+
+
+def tokens_of(cell: str, key: str, service: str = "*") -> str:
+    """Key of the liveliness token with which a service says that it serves a key."""
+    return f"{cell}/serves/{key}/{service}"
+
+
+class Server(Generic[Q, A]):
+    """Answers requests with a handler, each in a task of its own."""
+
+    def __init__(
+        self, session: Session, cell: str, service: str, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]],
+        *, loop: asyncio.AbstractEventLoop, log: logging.Logger, ready: asyncio.Event,
+        crash: Callable[[BaseException], None], limit: int,
+    ) -> None:
+        self.topic = topic
+        self.received = 0
+        self._key = f"{cell}/{topic.key}"
+        self._service = service
+        self._sequence = 0
+        self._handler = handler
+        self._ready = ready
+        self._crash = crash
+        self._limit = limit
+        self._refusals = Refusals(topic.key, loop, log)
+        self._tasks: set[asyncio.Task[None]] = set()
+        session.queryable(self._key, lambda query: call_on_loop(loop, lambda: self._start(query)), complete=True)
+
+    @property
+    def invalid(self) -> int:
+        """Requests that were refused because they are not valid requests."""
+        return self._refusals.count
+
+    def _start(self, query: Query) -> None:
+        self.received += 1
+        task = asyncio.create_task(self._serve(query), name=f"{self.topic.key} request")
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _serve(self, query: Query) -> None:
+        try:
+            payload = self._check(query)
+            if payload is None:
+                return
+            await self._ready.wait()
+            try:
+                request = decode(self.topic.message, payload, self._limit)
+                attachment = decode_attachment(query.attachment)
+            except DecodeError as error:
+                self._refuse(query, "invalid", error)
+                return
+            follow(attachment.trace if attachment else "")
+            await self._answer(query, request)
+        finally:
+            query.finish()
+
+    def _check(self, query: Query) -> bytes | None:
+        """The payload, or None when the query is refused: it may have come from someone who just looks around."""
+        if query.key != self._key or query.parameters:
+            asked = f"{query.key}?{query.parameters}" if query.parameters else query.key
+            self._refuse(query, "bad_request", ValueError(f"{self._key} is a request: ask exactly for it, not {asked}"))
+            return None
+        if not query.payload:
+            reason = f"{self._key} is a request: a {self.topic.message.__name__} as payload is needed"
+            self._refuse(query, "bad_request", ValueError(reason))
+            return None
+        return query.payload
+
+    def _refuse(self, query: Query, code: str, error: Exception) -> None:
+        self._refusals.add(NO_SENDER, error)
+        query.refuse(encode_error(code, str(error)))
+
+    async def _answer(self, query: Query, request: Q) -> None:
+        try:
+            answer = await self._handler(request)
+            if not isinstance(answer, self.topic.answer):
+                raise TypeError(f"handler of {self.topic.key} gave {answer!r}, not a {self.topic.answer.__name__}")
+            payload = encode(answer)
+        except Refused as refused:
+            query.refuse(encode_error(refused.code, str(refused)))
+        except RequestFailed as failed:  # of a request that the handler made itself
+            query.refuse(encode_error("upstream", str(failed)))
+        except Exception as error:
+            query.refuse(encode_error("internal", f"{type(error).__name__}: {error}"))
+            self._crash(error)
+        else:
+            self._sequence += 1
+            attachment = encode_attachment(Attachment(self._service, self._sequence, trace=current_trace()))
+            query.reply(self._key, payload, encoding_of(self.topic.answer), attachment)
+
+    async def close(self) -> None:
+        """Cancel what is being worked on: its requesters learn that it was lost."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+
+class Client(Generic[Q, A]):
+    """Calls a request key."""
+
+    def __init__(
+        self, session: Session, cell: str, service: str, topic: Request[Q, A], *, loop: asyncio.AbstractEventLoop,
+        limit: int,
+    ) -> None:
+        self.topic = topic
+        self._session = session
+        self._service = service
+        self._sequence = 0
+        self._loop = loop
+        self._limit = limit
+        self._key = f"{cell}/{topic.key}"
+        self._tokens = tokens_of(cell, topic.key)
+        self._servers: set[str] = set()
+        self._changed = asyncio.Event()
+        self._waiting: set[asyncio.Future[RawReply | None]] = set()
+        session.watch_tokens(
+            self._tokens, lambda token, there: call_on_loop(loop, lambda: self._on_token(token, there))
+        )
+
+    @property
+    def available(self) -> bool:
+        """Whether the router is reached and somebody serves the key."""
+        return self._session.connected and bool(self._servers)
+
+    async def wait_available(self, timeout: float | None = None) -> None:
+        """Return as soon as somebody serves the key.
+
+        Raises:
+            NoResponder: nobody did within `timeout` seconds.
+        """
+        try:
+            async with asyncio.timeout(timeout):
+                while not self._servers:
+                    self._changed.clear()
+                    await self._changed.wait()
+        except TimeoutError:
+            raise NoResponder(self.topic.key) from None
+
+    def _on_token(self, token: str, there: bool) -> None:
+        if there:
+            self._servers.add(token)
+            self._changed.set()
+            return
+        self._servers.discard(token)
+        if not self._servers:
+            for future in self._waiting:
+                self._loop.call_later(_VANISH_SECONDS, _settle, future, None)
+
+    async def call(self, request: Q, timeout: float = 5.0) -> A:
+        """The answer to a request.
+
+        Args:
+            request: what is asked.
+            timeout: for all of it [s], wall time.
+
+        Raises:
+            NoResponder: nobody serves the key, or the router is not reached: nothing was sent.
+            RemoteError: the responder refused, or its answer can not be read.
+            RequestLost: the responder or the router went away: it may have been done.
+            RequestTimeout: no answer in time: it may still be done.
+        """
+        if not isinstance(request, self.topic.message):
+            raise TypeError(f"{self.topic.key} takes {self.topic.message.__name__}, not {type(request).__name__}")
+        payload = encode(request)
+        deadline = self._loop.time() + timeout
+        if not self.available and not await self._look(min(timeout, _LOOK_SECONDS)):
+            raise NoResponder(self.topic.key)
+        reply = await self._ask(payload, max(0.0, deadline - self._loop.time()), timeout)
+        if reply is None:
+            raise RequestLost(self.topic.key)
+        if reply.sample is None:
+            refusal = decode_error(reply.error)
+            if refusal is None:  # what Zenoh says when its own time-out, a little later than ours, is up
+                raise RequestTimeout(self.topic.key, timeout)
+            raise RemoteError(self.topic.key, *refusal)
+        try:
+            return decode(self.topic.answer, reply.sample.payload, self._limit)
+        except DecodeError as error:
+            raise RemoteError(self.topic.key, "bad_answer", f"the answer can not be read: {error}") from None
+
+    async def _look(self, seconds: float) -> bool:
+        """Whether somebody serves the key after all: what the watch has seen may be a moment old."""
+        if not self._session.connected:
+            return False
+        found: asyncio.Future[bool] = self._loop.create_future()
+
+        def settle(there: bool) -> None:
+            call_on_loop(self._loop, lambda: _settle(found, there))
+
+        self._session.get_tokens(
+            self._tokens, lambda token, there: settle(True), lambda: settle(False), timeout=seconds
+        )
+        try:
+            return await asyncio.wait_for(found, seconds)
+        except TimeoutError:
+            return False
+
+    async def _ask(self, payload: bytes, seconds: float, timeout: float) -> RawReply | None:
+        future: asyncio.Future[RawReply | None] = self._loop.create_future()
+        self._sequence += 1
+        attachment = encode_attachment(Attachment(self._service, self._sequence, trace=current_trace()))
+
+        def settle(reply: RawReply | None) -> None:
+            call_on_loop(self._loop, lambda: _settle(future, reply))
+
+        cancel = self._session.get(
+            self._key, settle, lambda: settle(None), payload=payload, encoding=encoding_of(self.topic.message),
+            attachment=attachment, timeout=seconds + 1.0,
+        )
+        self._waiting.add(future)
+        try:
+            return await asyncio.wait_for(future, seconds)
+        except TimeoutError:
+            raise RequestTimeout(self.topic.key, timeout) from None
+        finally:
+            self._waiting.discard(future)
+            cancel()
+
+
+T = TypeVar("T")
+
+
+def _settle(future: asyncio.Future[T], value: T) -> None:
+    if not future.done():
+        future.set_result(value)

@@ -1,0 +1,198 @@
+"""The life that every service has: parse, connect, declare, be ready, run, and be gone within a second of a signal."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import logging
+import os
+import sys
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, NoReturn, TypeVar
+
+from common.clock import EPOCH_VARIABLE, SPEED_VARIABLE, Clock
+from common.config import Parameters, load_cell, service_config
+from common.errors import ConfigError, UnknownName, ZencellError
+from common.transport.bus import Bus
+from common.transport.endpoint import endpoint_of
+from common.transport.handoff import call_on_loop
+from common.transport.lifeline import Lifeline, fail, leave
+from common.transport.log import BusLog, log_to_stderr
+from common.transport.zenoh_session import ZenohSession, close_bounded, open_zenoh
+
+log = logging.getLogger(__name__)
+
+P = TypeVar("P", bound=Parameters)
+Run = Callable[[Bus, P], Coroutine[Any, Any, None]]
+
+CELL_VARIABLE = "ZENCELL_CELL"
+_CLOSE_SECONDS = 0.4
+_PATIENCE_SECONDS = 2.0  # without a router before this is said
+# A thread that computes gives the loop a turn this often: without it a message waits 5 ms for each turn.
+_SWITCH_SECONDS = 0.0005
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        fail(ConfigError(self.prog, message, "can not be used; --help lists the options"))
+
+
+@dataclass(frozen=True)
+class Start(Generic[P]):
+    """Everything that a service is started with."""
+
+    name: str
+    cell: str
+    config: P
+    clock: Clock
+    endpoint: str
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that every service process has."""
+    parser.add_argument("--cell", help=f"name or YAML file of the cell ({CELL_VARIABLE})")
+    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="override a value of the cell")
+    parser.add_argument("--world", help="name or YAML file of another world")
+    parser.add_argument("--seed", type=int, help="of everything random")
+    parser.add_argument("--speed", type=float, help=f"of cell time, 0.1 to 10 ({SPEED_VARIABLE})")
+    parser.add_argument("--domain", help="0 to 232 (ZENCELL_DOMAIN, 42)")
+    parser.add_argument("--connect", metavar="ENDPOINT", help="router to use instead (ZENCELL_CONNECT)")
+    add_process_options(parser)
+
+
+def add_process_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that every process has, the router too."""
+    parser.add_argument("--gate", action="store_true", help="wait for a line on stdin; its end ends the process")
+    parser.add_argument("--log-json", action="store_true", help="log lines as JSON")
+
+
+def clock_from(speed: float | None, environ: Mapping[str, str] = os.environ) -> Clock:
+    """The clock that was handed down, at the given speed if there is one.
+
+    Raises:
+        ConfigError: speed or epoch can not be used.
+    """
+    variables = dict(environ)
+    if speed is not None:
+        variables[SPEED_VARIABLE] = repr(speed)
+    try:
+        return Clock.from_environment(variables)
+    except ValueError as error:
+        given = {name: variables[name] for name in (SPEED_VARIABLE, EPOCH_VARIABLE) if name in variables}
+        raise ConfigError("speed", given, f"can not be used: {error}") from None
+
+
+def prepare(name: str, config: type[P], options: argparse.Namespace) -> Start[P]:
+    """Resolve everything that a service is started with.
+
+    Raises:
+        ConfigError, UnknownName: one line that names the field, the value and the choices.
+    """
+    chosen = options.cell or os.environ.get(CELL_VARIABLE)
+    if not chosen:
+        raise ConfigError("--cell", "", f"must name a cell, also as {CELL_VARIABLE}")
+    endpoint = endpoint_of(options.domain, options.connect)
+    cell = load_cell(chosen, options.set, world=options.world, seed=options.seed)
+    return Start(name, cell.name, service_config(cell, name, config), clock_from(options.speed), endpoint)
+
+
+def own_name() -> str:
+    """Name of the module that was started with `python -m`."""
+    main_module = sys.modules["__main__"]
+    spec = getattr(main_module, "__spec__", None)
+    if spec is not None:
+        return str(spec.name).rpartition(".")[2]
+    return Path(getattr(main_module, "__file__", None) or "service").stem
+
+
+def main(run: Run[P], config: type[P]) -> NoReturn:
+    """Be the service: `run(bus, config)` in a process of its own. Ends the process and does not return.
+
+    Exit codes: 0 after SIGINT, SIGTERM, the end of the supervisor or of `run`; 2 for bad input, with one line on
+    stderr; 1 for a crash, with its traceback.
+    """
+    sys.setswitchinterval(_SWITCH_SECONDS)
+    name = own_name()
+    parser = _Parser(prog=name)
+    add_options(parser)
+    options = parser.parse_args()
+    lifeline = Lifeline(gate=options.gate)
+    lifeline.start()
+    log_to_stderr(name, as_json=options.log_json)
+    try:
+        start = prepare(name, config, options)
+    except ZencellError as error:
+        fail(error)
+    leave(run_until_stopped(lambda: _live(run, start, lifeline), lifeline))
+
+
+def run_until_stopped(life: Callable[[], Coroutine[Any, Any, int]], lifeline: Lifeline) -> int:
+    """The exit code of a coroutine that is cancelled when the lifeline says so.
+
+    The loop is left as it is afterwards: asyncio's own end would wait for threads that still compute.
+    """
+    loop = asyncio.new_event_loop()
+    task = loop.create_task(life())
+    lifeline.on_stop(lambda: call_on_loop(loop, lambda: _drop(task)))
+    try:
+        return loop.run_until_complete(task)
+    except asyncio.CancelledError:
+        return 0 if lifeline.stopping else 1
+
+
+def _drop(task: asyncio.Task[int]) -> None:
+    task.cancel()
+
+
+async def _live(run: Run[P], start: Start[P], lifeline: Lifeline) -> int:
+    session = await _connected(start)
+    try:
+        await _gate(lifeline)
+        bus = Bus(session, service=start.name, cell=start.cell, clock=start.clock)
+        root = logging.getLogger()
+        to_topic = BusLog(bus)
+        root.addHandler(to_topic)
+        try:
+            return await _run(run, bus, start.config, lifeline)
+        finally:
+            root.removeHandler(to_topic)
+            await bus.close()
+    finally:
+        await close_bounded(session, _CLOSE_SECONDS)
+
+
+async def _connected(start: Start[P]) -> ZenohSession:
+    opening = asyncio.ensure_future(open_zenoh(start.endpoint))
+    try:
+        done, _ = await asyncio.wait({opening}, timeout=_PATIENCE_SECONDS)
+        if not done:
+            log.warning("no router at %s yet, waiting for it", start.endpoint)
+        return await opening
+    finally:
+        opening.cancel()
+
+
+async def _gate(lifeline: Lifeline) -> None:
+    opened = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    lifeline.on_gate(lambda: call_on_loop(loop, opened.set))
+    await opened.wait()
+
+
+async def _run(run: Run[P], bus: Bus, config: P, lifeline: Lifeline) -> int:
+    try:
+        await bus.run(run(bus, config))
+    except (ConfigError, UnknownName) as error:  # found only by using it: a description that is not there
+        bus.log.error("%s", error)
+        return 2
+    except asyncio.CancelledError:
+        if not lifeline.stopping:
+            bus.log.error("run was cancelled from within")
+            return 1
+        bus.log.info("stopped: %s", lifeline.reason)
+    except Exception:
+        bus.log.exception("crashed")
+        return 1
+    return 0

@@ -1,0 +1,88 @@
+"""What a service reads, writes, serves and calls, found by running it against a recorder."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from common.clock import Clock
+from common.messages import Message
+from common.topics import Request, Topic
+from common.transport.bus import Bus
+from common.transport.local import LocalNetwork
+from common.transport.reader import Reader
+from common.transport.requests import Client
+from common.transport.writer import Writer
+
+M = TypeVar("M", bound=Message)
+Q = TypeVar("Q", bound=Message)
+A = TypeVar("A", bound=Message)
+C = TypeVar("C")
+
+
+@dataclass
+class Wiring:
+    """The topics that a service has to do with; what every service writes, its log and counters, is left out."""
+
+    reads: set[Topic[Any]] = field(default_factory=set)
+    writes: set[Topic[Any]] = field(default_factory=set)
+    serves: set[Request[Any, Any]] = field(default_factory=set)
+    calls: set[Request[Any, Any]] = field(default_factory=set)
+
+
+class Recorder(Bus):
+    """A bus on a network of its own that notes what is declared, and never gets past `ready`."""
+
+    def __init__(self, service: str = "recorded") -> None:
+        super().__init__(LocalNetwork().session(), service=service, cell="recorded", clock=Clock())
+        self.wiring = Wiring()
+
+    def reader(self, topic: Topic[M], *, size: int = 1000) -> Reader[M]:
+        """A reader that gets nothing."""
+        self.wiring.reads.add(topic)
+        return super().reader(topic, size=size)
+
+    def writer(self, topic: Topic[M]) -> Writer[M]:
+        """A writer that nobody listens to."""
+        self.wiring.writes.add(topic)
+        return super().writer(topic)
+
+    def serve(self, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]]) -> None:
+        """Note what is served."""
+        self.wiring.serves.add(topic)
+        super().serve(topic, handler)
+
+    def client(self, topic: Request[Q, A]) -> Client[Q, A]:
+        """A client whose calls nobody answers."""
+        self.wiring.calls.add(topic)
+        return super().client(topic)
+
+    async def ready(self) -> None:
+        """Wait to be ended: all is declared."""
+        self.ready_event.set()
+        await asyncio.get_running_loop().create_future()
+
+
+async def wiring(run: Callable[[Bus, C], Coroutine[Any, Any, None]], config: C, *, timeout: float = 30.0) -> Wiring:
+    """What `run` declares before it says that it is ready.
+
+    Raises:
+        RuntimeError: it ended, or `timeout` seconds passed, before it was ready. What it raises itself is raised.
+    """
+    recorder = Recorder()
+    task = asyncio.create_task(recorder.run(run(recorder, config)))
+    is_ready = asyncio.create_task(recorder.ready_event.wait())
+    try:
+        await asyncio.wait({task, is_ready}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+        if task.done():
+            await task
+        if not recorder.ready_event.is_set():
+            raise RuntimeError(f"{'it ended' if task.done() else f'{timeout:g} s passed'} before ready()")
+    finally:
+        is_ready.cancel()
+        task.cancel()
+        await asyncio.wait({task})
+        await recorder.close()
+    return recorder.wiring

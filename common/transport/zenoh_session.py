@@ -1,0 +1,376 @@
+"""A `Session` over Zenoh: a client of one router."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+
+from common.transport.endpoint import client_config
+from common.transport.session import Declared, OnQuery, OnReply, OnSample, OnToken, RawReply, RawSample
+
+log = logging.getLogger(__name__)
+
+_CONNECT_MS = 250  # one try; short, so that an interrupt never waits for it
+_OUTBOX_SIZE = 10_000
+_FLUSH_SECONDS = 0.2
+
+
+def _direct(on_item: Callable[[Any], None], on_drop: Callable[[], None] | None = None) -> Any:
+    # The default, an indirect callback, makes a thread that keeps the interpreter from ending.
+    return zenoh.handlers.Callback(on_item, on_drop, indirect=False)
+
+
+def _sample(sample: zenoh.Sample) -> RawSample:
+    attachment = sample.attachment
+    return RawSample(
+        str(sample.key_expr),
+        sample.payload.to_bytes(),
+        str(sample.encoding),
+        attachment.to_bytes() if attachment is not None else None,
+    )
+
+
+class Outbox:
+    """A thread that sends what must arrive: such a put blocks while the network is congested, the loop never does."""
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self._calls: deque[Callable[[], None]] = deque()
+        self._changed = threading.Condition()
+        self._busy = False
+        self._closed = False
+        threading.Thread(target=self._work, name="outbox", daemon=True).start()
+
+    def post(self, call: Callable[[], None]) -> None:
+        """Have the call made in order; what does not fit is counted and reported."""
+        with self._changed:
+            if self._closed:
+                return
+            if len(self._calls) >= _OUTBOX_SIZE:
+                self.lost += 1
+                first = self.lost == 1
+            else:
+                self._calls.append(call)
+                self._changed.notify_all()
+                return
+        if first:
+            log.error("the network takes nothing: %d messages wait, further ones are lost", _OUTBOX_SIZE)
+
+    def close(self, timeout: float) -> None:
+        """Wait until all was sent, at most `timeout` seconds, and stop."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._calls and not self._busy, timeout)
+            self._closed = True
+            self._changed.notify_all()
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: self._calls or self._closed)
+                if self._closed:
+                    return
+                call = self._calls.popleft()
+                self._busy = True
+            try:
+                call()
+            except zenoh.ZError as error:  # the session closed, or the other side is gone: as a message lost on the way
+                log.debug("not sent: %s", error)
+
+
+class _Publisher:
+    def __init__(self, publisher: zenoh.Publisher, outbox: Outbox | None) -> None:
+        self._publisher = publisher
+        self._outbox = outbox
+        self._undeclared = False
+
+    @property
+    def matched(self) -> bool:
+        return not self._undeclared and self._publisher.matching_status.matching  # type: ignore[attr-defined]
+
+    def put(self, payload: bytes, attachment: bytes) -> None:
+        if self._undeclared:
+            return
+        if self._outbox is None:
+            self._publisher.put(payload, attachment=attachment)
+        else:
+            self._outbox.post(lambda: self._publisher.put(payload, attachment=attachment))
+
+    def undeclare(self) -> None:
+        if not self._undeclared:
+            self._undeclared = True
+            self._publisher.undeclare()  # type: ignore[no-untyped-call]
+
+
+class _Query:
+    def __init__(self, query: zenoh.Query, outbox: Outbox) -> None:
+        self._query = query
+        self._outbox = outbox
+        self.key = str(query.key_expr)
+        self.parameters = str(query.parameters)
+        self.payload = query.payload.to_bytes() if query.payload is not None else None
+        self.attachment = query.attachment.to_bytes() if query.attachment is not None else None
+
+    def reply(self, key: str, payload: bytes, encoding: str, attachment: bytes) -> None:
+        self._outbox.post(lambda: self._query.reply(key, payload, encoding=encoding, attachment=attachment))
+
+    def refuse(self, payload: bytes) -> None:
+        self._outbox.post(lambda: self._query.reply_err(payload, encoding="application/msgpack"))
+
+    def finish(self) -> None:
+        self._outbox.post(self._query.drop)
+
+
+class _Undeclare:
+    """Runs a zenoh undeclaration once."""
+
+    def __init__(self, undeclare: Callable[[], Any]) -> None:
+        self._undeclare: Callable[[], Any] | None = undeclare
+
+    def undeclare(self) -> None:
+        undeclare, self._undeclare = self._undeclare, None
+        if undeclare is not None:
+            undeclare()
+
+
+class ZenohSession:
+    """A `Session` on an open Zenoh client."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._outbox = Outbox()
+        self._declared: list[Declared] = []
+        self._lock = threading.Lock()
+        self._own_tokens: set[str] = set()
+        self._token_watchers: list[tuple[zenoh.KeyExpr, OnToken]] = []
+        self._connection_watchers: list[Callable[[bool], None]] = []
+        self._transports = 0
+        session.info.declare_transport_events_listener(_direct(self._on_transport), history=True)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the link to the router stands."""
+        return self._transports > 0
+
+    def _on_transport(self, event: Any) -> None:
+        with self._lock:
+            before = self._transports > 0
+            self._transports += 1 if event.kind == zenoh.SampleKind.PUT else -1
+            now = self._transports > 0
+            watchers = list(self._connection_watchers)
+        if now != before:
+            for watcher in watchers:
+                watcher(now)
+
+    def watch_connection(self, on_change: Callable[[bool], None]) -> None:
+        """Call back when the router is lost or reached again."""
+        with self._lock:
+            self._connection_watchers.append(on_change)
+
+    def _keep(self, declared: Declared) -> Declared:
+        self._declared.append(declared)
+        return declared
+
+    def publisher(self, key: str, encoding: str, *, reliable: bool) -> _Publisher:
+        """Declare a publisher; a stream is dropped by a network that can not take it, the rest waits in the outbox."""
+        control = zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP
+        # Apart from the streams, so that small messages do not queue behind pictures.
+        priority = zenoh.Priority.DATA_HIGH if reliable else zenoh.Priority.DATA
+        made = _Publisher(
+            self._session.declare_publisher(
+                key, encoding=encoding, express=True, congestion_control=control, priority=priority,
+                reliability=zenoh.Reliability.RELIABLE,
+            ),
+            self._outbox if reliable else None,
+        )
+        self._keep(made)
+        return made
+
+    def subscriber(self, key: str, on_sample: OnSample) -> Declared:
+        """Call back for each value put under a matching key."""
+
+        def on_zenoh(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                on_sample(_sample(sample))
+
+        return self._keep(_Undeclare(self._session.declare_subscriber(key, _direct(on_zenoh)).undeclare))
+
+    def queryable(self, key: str, on_query: OnQuery, *, complete: bool) -> Declared:
+        """Call back for each `get` that covers the key."""
+        made = self._session.declare_queryable(
+            key, _direct(lambda query: on_query(_Query(query, self._outbox))), complete=complete
+        )
+        return self._keep(_Undeclare(made.undeclare))
+
+    def get(
+        self,
+        key: str,
+        on_reply: OnReply,
+        on_done: Callable[[], None],
+        *,
+        payload: bytes | None = None,
+        encoding: str = "",
+        attachment: bytes | None = None,
+        timeout: float = 10.0,
+    ) -> Callable[[], None]:
+        """Ask everybody who serves the key; returns what cancels the question."""
+        token = zenoh.CancellationToken()
+
+        def on_zenoh(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                on_reply(RawReply(_sample(reply.ok)))
+            elif reply.err is not None:
+                on_reply(RawReply(None, reply.err.payload.to_bytes()))
+
+        def ask() -> None:
+            try:
+                self._session.get(
+                    key, _direct(on_zenoh, on_done), payload=payload, encoding=encoding or None,
+                    attachment=attachment, timeout=timeout, consolidation=zenoh.ConsolidationMode.NONE,
+                    priority=zenoh.Priority.DATA_HIGH, express=True, cancellation_token=token,
+                )
+            except zenoh.ZError:
+                on_done()
+                raise
+
+        self._outbox.post(ask)
+        return lambda: self._outbox.post(token.cancel)
+
+    def token(self, key: str) -> Declared:
+        """Declare a liveliness token."""
+        made = self._session.liveliness().declare_token(key)
+        self._own_token(key, there=True)
+
+        def undeclare() -> None:
+            made.undeclare()  # type: ignore[no-untyped-call]
+            self._own_token(key, there=False)
+
+        return self._keep(_Undeclare(undeclare))
+
+    def _own_token(self, key: str, *, there: bool) -> None:
+        # Zenoh does not report a session's own tokens to it.
+        with self._lock:
+            (self._own_tokens.add if there else self._own_tokens.discard)(key)
+            watchers = [on_token for pattern, on_token in self._token_watchers if pattern.intersects(key)]
+        for on_token in watchers:
+            on_token(key, there)
+
+    def watch_tokens(self, key: str, on_token: OnToken) -> Declared:
+        """Call back for each matching token that is there, appears or vanishes."""
+        entry = (zenoh.KeyExpr(key), on_token)
+        with self._lock:
+            self._token_watchers.append(entry)
+            own = [token for token in self._own_tokens if entry[0].intersects(token)]
+        for token in own:
+            on_token(token, True)
+        made = self._session.liveliness().declare_subscriber(
+            key,
+            _direct(lambda sample: on_token(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)),
+            history=True,
+        )
+
+        def undeclare() -> None:
+            with self._lock:
+                self._token_watchers.remove(entry)
+            made.undeclare()  # type: ignore[no-untyped-call]
+
+        return self._keep(_Undeclare(undeclare))
+
+    def get_tokens(self, key: str, on_token: OnToken, on_done: Callable[[], None], *, timeout: float) -> None:
+        """Call back for each matching token that is there now, then once `on_done`."""
+
+        def on_zenoh(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                on_token(str(reply.ok.key_expr), True)
+
+        def ask() -> None:
+            try:
+                self._session.liveliness().get(key, _direct(on_zenoh, on_done), timeout=timeout)
+            except zenoh.ZError:
+                on_done()
+                raise
+
+        self._outbox.post(ask)
+
+    def close(self) -> None:
+        """Take back everything in reverse order and leave; may block."""
+        self._outbox.close(_FLUSH_SECONDS)
+        while self._declared:
+            try:
+                self._declared.pop().undeclare()
+            except zenoh.ZError as error:
+                log.debug("not undeclared: %s", error)
+        self._session.close()  # type: ignore[no-untyped-call]
+
+
+async def open_zenoh(endpoint: str) -> ZenohSession:
+    """A session with the router at the endpoint, for which it waits as long as it takes; may be cancelled at once."""
+    loop = asyncio.get_running_loop()
+    opened: asyncio.Future[ZenohSession] = loop.create_future()
+    stop = threading.Event()
+
+    def deliver(session: ZenohSession) -> None:
+        if opened.cancelled():
+            threading.Thread(target=session.close, daemon=True).start()
+        else:
+            opened.set_result(session)
+
+    def work() -> None:
+        while not stop.is_set():
+            try:
+                session = zenoh.open(client_config(endpoint, connect_ms=_CONNECT_MS))
+            except zenoh.ZError as error:
+                log.debug("no router yet: %s", error)
+                stop.wait(0.02)
+                continue
+            made = ZenohSession(session)
+            try:
+                loop.call_soon_threadsafe(deliver, made)
+            except RuntimeError:  # the loop was closed meanwhile
+                made.close()
+            return
+
+    # A thread of our own: asyncio would wait at its end for one of its executor's.
+    threading.Thread(target=work, name="connect", daemon=True).start()
+    try:
+        return await opened
+    finally:
+        stop.set()
+
+
+async def wait_router(endpoint: str, timeout: float) -> None:
+    """Return as soon as a client can connect to the router.
+
+    Raises:
+        TimeoutError: none could within `timeout` seconds.
+    """
+    async with asyncio.timeout(timeout):
+        session = await open_zenoh(endpoint)
+    await close_bounded(session, 0.5)
+
+
+async def close_bounded(session: Any, seconds: float) -> bool:
+    """Close in a thread, and say whether that ended within the time: a dead network can hold it for many seconds."""
+    loop = asyncio.get_running_loop()
+    closed = asyncio.Event()
+
+    def work() -> None:
+        try:
+            session.close()
+        finally:
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(closed.set)
+
+    threading.Thread(target=work, name="close", daemon=True).start()
+    try:
+        await asyncio.wait_for(closed.wait(), seconds)
+    except TimeoutError:
+        return False
+    return True
