@@ -405,9 +405,12 @@ def load_cell(
     services = tree.get("services")
     if not isinstance(services, dict):
         raise ConfigError("services", services, "must be a mapping of services in start order")
+    by_name = {str(key).rpartition(".")[2]: key for key in services}  # a dotted module goes by its last part
     for parts, value in parsed:
         if parts[0] == "services" and len(parts) > 1 and parts[1] not in services:
-            raise UnknownName("service", parts[1], services)
+            if parts[1] not in by_name:
+                raise UnknownName("service", parts[1], by_name)
+            parts[1] = by_name[parts[1]]
         if len(parts) > 1 or parts[0] not in ("robot", "world", "pipeline"):
             _override(tree, parts, value)
     run = {"cell": tree.pop("cell", path.stem), "autostart": tree.pop("autostart", True), "seed": tree.pop("seed", 0)}
@@ -439,7 +442,7 @@ def service_config(cell: Cell, name: str, config: type[P]) -> P:
     Raises:
         ConfigError: names `services.<name>.<parameter>`, the value and the bounds or choices.
     """
-    entry = cell.services.get(name)
+    entry = next((entry for entry in cell.services.values() if entry.name == name), None)
     given = dict(entry.parameters) if entry else {}
     for field, info in config.model_fields.items():
         if _is_section(info.annotation):
