@@ -1,0 +1,95 @@
+"""Publishes where the robot's links are: tf from the joint states, tf_static for what never moves."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from common import topics
+from common.config import Parameters, RobotConfig, Surroundings
+from common.messages import Header, JointState, TFMessage, TransformStamped
+from common.robot.model import RobotModel
+from common.robot.transforms import invert, matrix_to_pose, rpy_to_matrix, transform
+from common.transport.bus import Bus
+from common.transport.service import main
+
+MOST_MESSAGES = 250.0  # per second of wall time
+WORLD = "world"
+
+
+class Config(Parameters):
+    """How often."""
+
+    robot: RobotConfig
+    surroundings: Surroundings
+    rate: float = Field(50.0, ge=1, le=250, description="at most so many tf messages, cell time [Hz]")
+
+
+def stamped(parent: str, child: str, T_parent_child: NDArray[np.float64], stamp: int) -> TransformStamped:
+    """The pose of child in parent as a message."""
+    header = Header(stamp=stamp, frame_id=parent)
+    return TransformStamped(header=header, child_frame_id=child, transform=matrix_to_pose(T_parent_child))
+
+
+class LinkFrames:
+    """The robot's links as a tree of frames, each in the frame of the link that it hangs on."""
+
+    def __init__(self, robot: RobotModel) -> None:
+        """Find out which links move against their parents and which are fixed to them."""
+        self._robot = robot
+        model = robot.full_model
+        joint = {frame.name: frame.parentJoint for frame in model.frames if frame.name in robot.link_names}
+        self.root = next(link for link in robot.link_names if link not in robot.link_parents)
+        self._fixed = [link for link, parent in robot.link_parents.items() if joint[link] == joint[parent]]
+        self._moving = [link for link in robot.link_parents if link not in self._fixed]
+
+    def fixed(self, stamp: int) -> list[TransformStamped]:
+        """Links that are fixed to the one they hang on, such as the tool centre point."""
+        return self._transforms(self._fixed, self._robot.link_poses(self._robot.named("home")), stamp)
+
+    def moving(self, state: JointState) -> list[TransformStamped]:
+        """Links that a joint moves, at that joint state; empty when a joint of the arm is missing in it."""
+        q = self._robot.order(state.name, state.position)
+        if q is None:
+            return []
+        others = {name: value for name, value in zip(state.name, state.position, strict=True)
+                  if name in self._robot.config.locked_joints}
+        return self._transforms(self._moving, self._robot.link_poses(q, others), state.header.stamp)
+
+    def _transforms(
+        self, links: list[str], T_world_link: dict[str, NDArray[np.float64]], stamp: int
+    ) -> list[TransformStamped]:
+        parents = self._robot.link_parents
+        return [stamped(parents[link], link, invert(T_world_link[parents[link]]) @ T_world_link[link], stamp)
+                for link in links]
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Publish until cancelled."""
+    joints = bus.reader(topics.JOINT_STATES)
+    tf, tf_static = bus.writer(topics.TF), bus.writer(topics.TF_STATIC)
+    frames = LinkFrames(RobotModel.load(config.robot))
+    camera, stamp = config.surroundings.camera, bus.header().stamp
+    T_world_camera = transform(rpy_to_matrix(*camera.rpy), camera.position)
+    base = stamped(WORLD, frames.root, np.eye(4), stamp)
+    fixed = [base, stamped(WORLD, camera.frame, T_world_camera, stamp), *frames.fixed(stamp)]
+    tf_static.put(TFMessage(transforms=fixed))
+    await bus.ready()
+    # A message that comes a little early still counts: otherwise jitter would halve the rate.
+    least_ns = 0.75e9 * bus.clock.speed / bus.clock.wall_rate(config.rate, MOST_MESSAGES)
+    newest, told = 0, False
+    async for state in joints:
+        if 0 <= state.header.stamp - newest < least_ns:
+            continue
+        newest = state.header.stamp
+        transforms = frames.moving(state)
+        if transforms:
+            tf.put(TFMessage(transforms=transforms))
+        elif not told:
+            bus.log.warning("joint_states has %s: a joint of the arm is missing", ", ".join(state.name))
+        told = not transforms
+
+
+if __name__ == "__main__":
+    main(run, Config)

@@ -1,0 +1,122 @@
+"""Moves the arm and the fingers: a trajectory controller at 100 Hz on top of a hardware backend.
+
+With simulated hardware the true world lives here too, because whether a grasp succeeds is decided by the fingers.
+"""
+
+from __future__ import annotations
+
+import asyncio
+
+from pydantic import Field
+
+from common import topics
+from common.config import Grasp, Parameters, RobotConfig, Run, World
+from common.hardware.checks import Tolerances
+from common.hardware.cycle import ControlCycle
+from common.hardware.interface import Limits
+from common.hardware.loading import find_backend, load_hardware
+from common.messages import (
+    ExecuteRequest,
+    GripperCommand,
+    GripperState,
+    MotionStatus,
+    StopRequest,
+    WorldEdit,
+    WorldEditReply,
+)
+from common.robot.model import RobotModel
+from common.scene.workspace import reach_reason
+from common.sim.layout import layout
+from common.sim.world import GraspTolerances, SimulatedWorld
+from common.transport.bus import Bus
+from common.transport.service import main
+
+MOST_CYCLES = 250.0  # per second of wall time
+
+
+class Config(Parameters):
+    """Rates and tolerances of the controller."""
+
+    robot: RobotConfig
+    world: World
+    run: Run
+    grasp: Grasp
+    joint_state_rate: float = Field(100.0, ge=10, le=1000, description="control cycles in cell time [Hz]")
+    tolerances: Tolerances = Tolerances()
+    grasp_tolerances: GraspTolerances = Field(GraspTolerances(), description="simulated hardware only")
+
+
+def make_cycle(config: Config, simulated: bool) -> ControlCycle:
+    """The controller with its hardware at the home pose and, when simulated, the balls laid out."""
+    robot = RobotModel.load(config.robot)
+    limits = Limits(tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration)
+    home = robot.named("home")
+    world = None
+    if simulated:
+        z = config.world.table_height + config.world.ball_radius
+        places = layout(config.world, config.run.seed, lambda x, y: not reach_reason(robot, (x, y, z), config.grasp))
+        world = SimulatedWorld(config.world, places, config.grasp_tolerances)
+    return ControlCycle(
+        load_hardware(config.robot, limits, home), limits, home,
+        tolerances=config.tolerances, gripper=config.robot.gripper, kinematics=robot, world=world,
+    )
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Control the arm until cancelled."""
+    simulated = find_backend(config.robot).simulated
+    joints, motion = bus.writer(topics.JOINT_STATES), bus.writer(topics.MOTION_STATUS)
+    gripper = bus.writer(topics.GRIPPER_STATE) if config.robot.gripper else None
+    balls = bus.writer(topics.SCENE_BALLS) if simulated else None
+    updates = bus.writer(topics.SCENE_OBJECT_UPDATES) if simulated else None
+
+    async def execute(request: ExecuteRequest) -> MotionStatus:
+        status = cycle.execute(request, bus.clock.now())
+        if status.state == "rejected":
+            bus.log.warning("goal %s rejected: %s [%s]", request.id, status.message, status.error)
+        return status.model_copy(update={"header": bus.header()})
+
+    async def stop(request: StopRequest) -> MotionStatus:
+        return cycle.stop(request, bus.clock.now()).model_copy(update={"header": bus.header()})
+
+    async def command(request: GripperCommand) -> GripperState:
+        return cycle.command(request, bus.clock.now()).model_copy(update={"header": bus.header()})
+
+    async def edit(request: WorldEdit) -> WorldEditReply:
+        return cycle.edit(request, bus.clock.now())
+
+    bus.serve(topics.MOTION_EXECUTE, execute)
+    bus.serve(topics.MOTION_STOP, stop)
+    if gripper is not None:
+        bus.serve(topics.GRIPPER_COMMAND, command)
+    if simulated:
+        bus.serve(topics.WORLD_EDIT, edit)
+    cycle = await asyncio.to_thread(make_cycle, config, simulated)
+    loop = asyncio.get_running_loop()
+    period = 1 / bus.clock.wall_rate(config.joint_state_rate, MOST_CYCLES)
+    try:
+        await bus.ready()
+        due = loop.time()
+        while True:
+            report = cycle.step(bus.header("world"))
+            if report.joints is not None:
+                joints.put(report.joints)
+            if report.motion is not None:
+                motion.put(report.motion)
+                if report.motion.state == "aborted":
+                    bus.log.warning("goal %s: %s [%s]", report.motion.id, report.motion.message, report.motion.error)
+            if report.gripper is not None and gripper is not None:
+                gripper.put(report.gripper)
+            if report.balls is not None and balls is not None:
+                balls.put(report.balls)
+            if updates is not None:
+                for update in report.updates:
+                    updates.put(update)
+            due = max(due + period, loop.time())  # after an overrun from now on: no burst
+            await asyncio.sleep(due - loop.time())
+    finally:
+        cycle.close()
+
+
+if __name__ == "__main__":
+    main(run, Config)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from common.config import Section
+from common.config import Parameters
 from common.errors import Refused
 from common.hardware.interface import Limits, Vector
 from common.hardware.trajectory import Trajectory, from_message, with_best_interpolation
 from common.messages import JointTrajectory
 
 
-class Tolerances(Section):
+class Tolerances(Parameters):
     """How exact a trajectory must be, and how exactly it must be followed."""
 
     start: float = Field(0.01, gt=0, le=1, description="first point to measured position, each joint [rad]")

@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import pkgutil
-from dataclasses import dataclass
+from typing import Any, Protocol, cast
 
-from common.config import RobotConfig, check
+from common.config import Parameters, RobotConfig, check
 from common.errors import ConfigError, UnknownName
 from common.hardware.interface import Hardware, Limits, Vector
 
 PACKAGE = "common.hardware"
-
-
-@dataclass(frozen=True)
-class LoadedHardware:
-    """A backend that was created, and whether the simulated world goes with it."""
-
-    hardware: Hardware
-    simulated: bool
 
 
 def backend_names() -> list[str]:
@@ -29,17 +20,22 @@ def backend_names() -> list[str]:
     return sorted(name for name in names if hasattr(importlib.import_module(f"{PACKAGE}.{name}"), "create"))
 
 
-def load_hardware(robot: RobotConfig, limits: Limits, start: Vector) -> LoadedHardware:
-    """The backend that `robot.hardware` names, created with its options.
+class Backend(Protocol):
+    """A module that moves joints: see common.hardware.interface."""
 
-    Args:
-        robot: its `hardware.backend` is a module of common.hardware, or a dotted module of the user's own.
-        limits: of the arm's joints.
-        start: where a simulated arm begins, (dof,) [rad].
+    simulated: bool
+    Options: type[Parameters]
+
+    def create(self, robot: RobotConfig, limits: Limits, start: Vector, options: Any, /) -> Hardware:
+        """The hardware; a simulated arm begins at `start` (dof,) [rad]."""
+
+
+def find_backend(robot: RobotConfig) -> Backend:
+    """The module that `robot.hardware.backend` names: one of common.hardware, or a dotted one of the user's own.
 
     Raises:
         UnknownName: no such backend; lists the choices.
-        ConfigError: a module that is no backend, or an option that does not fit.
+        ConfigError: a module that can not be imported, or is no backend.
     """
     name = robot.hardware.backend
     if "." not in name and name not in backend_names():
@@ -51,5 +47,15 @@ def load_hardware(robot: RobotConfig, limits: Limits, start: Vector) -> LoadedHa
     missing = [part for part in ("Options", "create", "simulated") if not hasattr(module, part)]
     if missing:
         raise ConfigError("robot.hardware.backend", name, f"is no backend: it has no {', '.join(missing)}")
-    options = check(module.Options, robot.hardware.options, "robot.hardware.options")
-    return LoadedHardware(module.create(robot, limits, start, options), bool(module.simulated))
+    return cast(Backend, module)
+
+
+def load_hardware(robot: RobotConfig, limits: Limits, start: Vector) -> Hardware:
+    """The robot's hardware, created with the options of the robot file.
+
+    Raises:
+        UnknownName, ConfigError: no such backend, or an option that does not fit.
+    """
+    backend = find_backend(robot)
+    options = check(backend.Options, robot.hardware.options, "robot.hardware.options")
+    return backend.create(robot, limits, start, options)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from common.config import Section, World
+from common.config import Parameters, World
 from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Header, Pose, PoseArray, SceneUpdate, Vector3, WorldEdit
 from common.sim.places import Slot, Slots, Table
@@ -27,7 +27,7 @@ GRAVITY = 9.81  # [m/s^2]
 FLOOR_BELOW_TABLE = 0.75  # what falls off the table lies this far below its surface [m]
 
 
-class GraspTolerances(Section):
+class GraspTolerances(Parameters):
     """Where a ball must be for the fingers to catch it, in the frame of the tool centre point."""
 
     across: float = Field(0.010, gt=0, le=0.05, description="centre from the finger pads' middle, tool x axis [m]")
