@@ -1,0 +1,210 @@
+"""Where the arm can take things from: bounds of the workspace, the container, and the chain of poses of a grasp."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
+
+from common.config import Grasp, Parameters, Surroundings
+from common.perception.pinhole import Pinhole
+from common.perception.resting import Resting
+from common.robot.ik import solve_ik
+from common.robot.model import RobotModel
+from common.robot.transforms import tool_down
+
+Array = npt.NDArray[np.float64]
+
+INSIDE_CONTAINER = "inside the container"
+PARTLY_OUT_OF_VIEW = "partly out of view"
+
+# Where there is a solution it is found within 12 steps from home, and within 4 from two centimetres away.
+_FROM_HOME = 16
+_FROM_NEAR = 8
+
+
+class WorkspaceBounds(Parameters):
+    """A cylindrical shell about the robot's base axis, and the effort to find a chain of poses within it."""
+
+    min_height: float = Field(-0.05, ge=-5, le=5, description="lowest z of an object [m]")
+    max_height: float = Field(0.98, ge=-5, le=5, description="highest z of an object [m]")
+    min_radius: float = Field(0.18, ge=0, le=5, description="least horizontal distance from the base axis [m]")
+    max_radius: float = Field(0.82, gt=0, le=5, description="largest horizontal distance from the base axis [m]")
+    singularity_radius: float = Field(
+        0.08, ge=0, le=5, description="column about the base axis in which the wrist axes line up [m]"
+    )
+    yaw_count: int = Field(8, ge=1, le=36, description="hand orientations tried, spread over half a turn")
+    line_step: float = Field(0.02, gt=0, le=0.2, description="between poses checked along straight lines [m]")
+    max_joint_step: float = Field(
+        0.5, gt=0, le=3.2, description="a joint that moves further from one pose to the next has changed branch [rad]"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> WorkspaceBounds:
+        for low, high in (("min_height", "max_height"), ("min_radius", "max_radius")):
+            if getattr(self, low) >= getattr(self, high):
+                raise ValueError(f"{low} {getattr(self, low):g} is not below {high} {getattr(self, high):g}")
+        return self
+
+
+def outside_reason(bounds: WorkspaceBounds, position: Sequence[float]) -> str:
+    """Why a place (x, y, z) [m] in world is out of bounds, with the value and the bound; empty when it is within.
+
+    The singularity column comes first: the least radius would hide it.
+    """
+    x, y, z = position
+    radius = math.hypot(x, y)
+    if radius < bounds.singularity_radius:
+        return f"singularity column: {radius:.3f} m from the base axis, less than {bounds.singularity_radius:.3f} m"
+    if z < bounds.min_height:
+        return f"too low: height {z:.3f} m is below {bounds.min_height:.3f} m"
+    if z > bounds.max_height:
+        return f"too high: height {z:.3f} m is above {bounds.max_height:.3f} m"
+    if radius < bounds.min_radius:
+        return f"too close: {radius:.3f} m from the base axis, less than {bounds.min_radius:.3f} m"
+    if radius > bounds.max_radius:
+        return f"too far: {radius:.3f} m from the base axis, more than {bounds.max_radius:.3f} m"
+    return ""
+
+
+def inside_container(camera: Pinhole, pixel: npt.ArrayLike, around: Surroundings) -> bool:
+    """Whether the ray through a pixel (u, v) meets the volume of the container up to the height of a full stack."""
+    return Resting.of(around).meets_container(*camera.ray(pixel))
+
+
+def chain_reason(robot: RobotModel, position: Sequence[float], grasp: Grasp, bounds: WorkspaceBounds) -> str:
+    """Which stage of a grasp has no solution at a place (x, y, z) [m], for any yaw; empty when one yaw has them all.
+
+    The stages: pre-grasp above it, the straight line down, the grasp, the straight lift; tool down, from home.
+    """
+    furthest, worst = -1, ""
+    for yaw in _yaws(bounds.yaw_count):
+        stage, reason = _chain(robot, position, yaw, grasp, bounds)
+        if not reason:
+            return ""
+        if stage > furthest:
+            furthest, worst = stage, reason
+    return worst
+
+
+def reach_reason(
+    robot: RobotModel,
+    position: Sequence[float],
+    grasp: Grasp | None = None,
+    bounds: WorkspaceBounds | None = None,
+) -> str:
+    """Why the arm can not take an object whose centre is at (x, y, z) [m] in world; empty when it can."""
+    limits = bounds or WorkspaceBounds()
+    return outside_reason(limits, position) or chain_reason(robot, position, grasp or Grasp(), limits)
+
+
+class ReachCache:
+    """Answers of `reach_reason` by place: inverse kinematics only where nothing was asked before."""
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        grasp: Grasp | None = None,
+        bounds: WorkspaceBounds | None = None,
+        *,
+        cell: float = 0.005,
+        size: int = 20_000,
+    ) -> None:
+        """Start empty.
+
+        Args:
+            robot: not to be used by another thread while `reason` runs.
+            grasp: heights of the stages.
+            bounds: of the workspace.
+            cell: places in the same cube of this side share their answer [m].
+            size: places that are remembered; the longest unused go first.
+        """
+        self._robot = robot
+        self._grasp = grasp or Grasp()
+        self._bounds = bounds or WorkspaceBounds()
+        self._cell = cell
+        self._size = size
+        self._known: OrderedDict[tuple[int, int, int], str] = OrderedDict()
+
+    def known(self, position: Sequence[float]) -> str | None:
+        """The reason at a place without any inverse kinematics; None when that would be needed."""
+        reason = outside_reason(self._bounds, position)
+        if reason:
+            return reason
+        key = self._key(position)
+        if key in self._known:
+            self._known.move_to_end(key)
+            return self._known[key]
+        return None
+
+    def reason(self, position: Sequence[float]) -> str:
+        """As `reach_reason`; the chain is computed for the place itself, the first that is asked for in its cell."""
+        known = self.known(position)
+        if known is None:
+            known = chain_reason(self._robot, position, self._grasp, self._bounds)
+            self._known[self._key(position)] = known
+            if len(self._known) > self._size:
+                self._known.popitem(last=False)
+        return known
+
+    def _key(self, position: Sequence[float]) -> tuple[int, int, int]:
+        x, y, z = (round(value / self._cell) for value in position)
+        return x, y, z
+
+
+def _yaws(count: int) -> list[float]:
+    """Yaws in (-pi/2, pi/2] [rad], the smallest turn first: a parallel gripper repeats after half a turn."""
+    steps = sorted(range(-((count - 1) // 2), count // 2 + 1), key=abs)
+    return [k * math.pi / count for k in steps]
+
+
+def _chain(
+    robot: RobotModel, position: Sequence[float], yaw: float, grasp: Grasp, bounds: WorkspaceBounds
+) -> tuple[int, str]:
+    """How far the chain goes with one yaw, and why it ends there; an empty reason for a whole chain.
+
+    The arm has a joint more than the pose needs, and a planner may come to the pre-grasp in another posture than the
+    one found from home. So the line must be there twice: downwards from the pre-grasp, upwards from the grasp.
+    """
+    x, y, z = position
+    low = max(z + grasp.grasp_clearance, grasp.min_grasp_z)
+    above, top = low + grasp.approach_clearance, low + grasp.lift_height
+    turned = f"with any of {bounds.yaw_count} hand orientations"
+    home = robot.named("home")
+    q = solve_ik(robot, tool_down(x, y, above, yaw), home, restarts=0, iterations=_FROM_HOME)
+    if q is None:
+        return 0, f"pre-grasp at ({x:.3f}, {y:.3f}, {above:.3f}) has no inverse kinematics {turned}"
+    for height in _line(above, low, bounds.line_step):
+        q = _next(robot, (x, y, height), yaw, q, bounds) if q is not None else None
+        if q is None:
+            return 1, f"straight line down to ({x:.3f}, {y:.3f}, {low:.3f}) ends at height {height:.3f} m {turned}"
+    at_grasp = solve_ik(robot, tool_down(x, y, low, yaw), home, restarts=0, iterations=_FROM_HOME)
+    if at_grasp is None:
+        return 2, f"grasp at ({x:.3f}, {y:.3f}, {low:.3f}) has no inverse kinematics {turned}"
+    for start in (q, at_grasp):
+        q = start
+        for height in _line(low, top, bounds.line_step):
+            q = _next(robot, (x, y, height), yaw, q, bounds) if q is not None else None
+            if q is None:
+                return 3, f"lift to ({x:.3f}, {y:.3f}, {top:.3f}) ends at height {height:.3f} m {turned}"
+    return 4, ""
+
+
+def _line(start: float, end: float, step: float) -> list[float]:
+    """Heights from start, which is left out, to end [m], evenly spaced, no further apart than step."""
+    count = max(1, math.ceil(abs(end - start) / step - 1e-9))
+    return [start + (end - start) * k / count for k in range(1, count + 1)]
+
+
+def _next(
+    robot: RobotModel, place: tuple[float, float, float], yaw: float, q: Array, bounds: WorkspaceBounds
+) -> Array | None:
+    """Joint positions of the next pose of a line, near the last ones; None when there are none."""
+    found = solve_ik(robot, tool_down(*place, yaw), q, restarts=0, iterations=_FROM_NEAR)
+    if found is None or float(np.abs(found - q).max()) > bounds.max_joint_step:
+        return None
+    return found
