@@ -10,6 +10,8 @@ from common.config import Container
 from common.tasks.grasp import HandShape, grasp_yaws
 from common.tasks.stages import Cycle, Place, Spots, Target, View, appeared, same_place
 
+SETTLING = 1.5  # [s] from letting go until the ball lies in the container and was seen there
+
 
 class Choice:
     """Chooses targets and remembers which places were missed or given up."""
@@ -28,7 +30,7 @@ class Choice:
         self.max_retries = max_retries
         self._misses: list[tuple[Place, int]] = []
         self._given_up: list[tuple[Target, str, Spots]] = []
-        self._released: list[float] = []
+        self._expected = (0, 0.0)  # balls that will be in the container soon, and until when that is only expected
 
     def next(self, view: View, origin: Sequence[float], under_way: Sequence[Cycle]) -> Cycle | None:
         """The nearest ball to `origin` (x, y) that can be taken, with its yaws; None when there is none now."""
@@ -58,14 +60,16 @@ class Choice:
         return seen and not taken and not given_up
 
     def _is_full(self, view: View, carrying: bool) -> bool:
-        """Whether no slot is left, counting what is on its way into the container or has just been let go."""
-        self._released = [t for t in self._released if view.scene_stamp - t < 1.5]
-        taken = len(view.objects("contained")) + len(self._released) + int(carrying)
-        return taken >= 4 * self.container.layers
+        """Whether no slot is left, counting what is on its way into the container."""
+        return self._contained(view) + int(carrying) >= 4 * self.container.layers
+
+    def _contained(self, view: View) -> int:
+        count, until = self._expected
+        return max(len(view.objects("contained")), count if view.scene_stamp < until else 0)
 
     def released(self, target: Target, view: View) -> None:
-        """A ball was let go above the container."""
-        self._released.append(view.now)
+        """A ball was let go above the container, where it will be seen when it has come to rest."""
+        self._expected = (self._contained(view) + 1, view.now + SETTLING)
         self._forget(target)
 
     def missed(self, target: Target, view: View) -> None:

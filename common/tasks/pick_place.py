@@ -348,6 +348,10 @@ class PickPlace:
         if self._running is not None or not self._stages:
             return
         stage = self._stages[0]
+        needs_ball = stage.carries if isinstance(stage, Move) else stage.name == "release"
+        if needs_ball and not view.holding:
+            self._fail(f"the ball fell before {stage.name}", view, go_home=False)
+            return
         if isinstance(stage, Move):
             if not self._is_planned(stage):
                 return

@@ -1,0 +1,56 @@
+"""The places of balls in the container, and which of them are taken as seen in the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.config import Container, Surroundings
+from common.perception.pinhole import Pinhole
+
+Array = NDArray[np.float64]
+
+
+def slot_positions(box: Container, radius: float, table_height: float) -> Array:
+    """Centres (layers, 4, 3) of the balls that fill the container [m], world: 2 x 2 in each layer.
+
+    A layer stands straight on the one below it.
+    """
+    d = box.slot_offset
+    corners = [(-d, -d), (-d, d), (d, -d), (d, d)]
+    lowest = table_height + box.floor_thickness + radius
+    return np.array([
+        [(box.x + dx, box.y + dy, lowest + 2 * radius * layer) for dx, dy in corners] for layer in range(box.layers)
+    ])
+
+
+def occupied_slots(pixels: Iterable[tuple[float, float]], camera: Pinhole, around: Surroundings) -> set[int]:
+    """Which slots hold a ball, as indices into the flattened slots.
+
+    Each seen ball belongs to the slot whose centre is imaged nearest to it, the nearest pairs first, one to one. Below a
+    ball that is seen stand the balls that carry it, though they are hidden.
+
+    Args:
+        pixels: (u, v) of the balls that are seen inside the container.
+        camera: with its pose in world.
+        around: the container and the size of a ball.
+    """
+    slots = slot_positions(around.container, around.ball_radius, around.table_height).reshape(-1, 3)
+    images = camera.project(slots)
+    seen = list(pixels)
+    reach = camera.fx * around.ball_radius / float(np.min(camera.to_camera(slots)[:, 2]))
+    pairs = sorted(
+        (float(np.hypot(*(images[slot] - pixel))), slot, number)
+        for number, pixel in enumerate(seen)
+        for slot in range(len(slots))
+    )
+    taken: set[int] = set()
+    matched: set[int] = set()
+    for distance, slot, number in pairs:
+        if distance > reach or slot in taken or number in matched:
+            continue
+        taken.add(slot)
+        matched.add(number)
+    return taken | {slot - 4 * below for slot in taken for below in range(1, slot // 4 + 1)}
