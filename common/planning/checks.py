@@ -1,0 +1,108 @@
+"""Checks of a request before any planner sees it: each failure is named once, here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import UnknownName, ZencellError
+from common.messages import JointGoal, PlanRequest, PlanningScene
+from common.planning.collision import CollisionWorld, Pair
+from common.planning.problem import Region
+from common.robot.model import RobotModel
+from common.robot.transforms import pose_to_matrix
+
+Array = NDArray[np.float64]
+
+
+class BadRequest(ZencellError):
+    """A request that no planner could serve: code for programs, message for people, the pair where two things touch."""
+
+    def __init__(self, code: str, message: str, colliding: Pair | None = None) -> None:
+        super().__init__(message)
+        self.code = code
+        self.colliding = colliding
+
+
+@dataclass(frozen=True)
+class CheckedRequest:
+    """Start (dof,) [rad] and goal, joint positions or a region, of a request whose numbers fit the robot."""
+
+    start: Array
+    goal: Array | Region
+
+
+def check_request(robot: RobotModel, request: PlanRequest, scene: PlanningScene, current: Array | None) -> CheckedRequest:
+    """Start and goal of a request.
+
+    Raises:
+        BadRequest: start or goal do not fit the robot, names that are not known, a scene in another frame.
+    """
+    frame = scene.header.frame_id
+    if frame not in ("", "world", robot.config.base_link):
+        raise BadRequest("bad_scene", f"planning scene is in frame {frame!r}, not in world")
+    if request.attach and request.release:
+        raise BadRequest("bad_request", f"attach {request.attach!r} and release contradict each other")
+    if request.start:
+        start = _positions(robot, request.start, "start", "bad_start")
+    elif current is None:
+        raise BadRequest("no_state", "no start is given and the robot's joint states are not known yet")
+    else:
+        start = _positions(robot, list(current), "current state", "bad_start")
+    _within_limits(robot, start, "start", "start_out_of_limits")
+    goal = request.goal
+    if isinstance(goal, JointGoal):
+        return CheckedRequest(start, _joint_goal(robot, goal))
+    tolerance = goal.position_tolerance
+    sides = np.array([tolerance.x, tolerance.y, tolerance.z])
+    if (sides < 0).any():
+        raise BadRequest("bad_goal", f"goal has a negative position tolerance {float(sides.min()):g} m")
+    return CheckedRequest(start, Region(pose_to_matrix(goal.pose), sides / 2, goal.tilt_tolerance, goal.yaw_tolerance))
+
+
+def check_collisions(world: CollisionWorld, checked: CheckedRequest) -> None:
+    """Nothing, when start and joint goal are free.
+
+    Raises:
+        BadRequest: start_in_collision or goal_in_collision with the pair.
+    """
+    ends = [("start", checked.start)]
+    if isinstance(checked.goal, np.ndarray):
+        ends.append(("goal", checked.goal))
+    for what, q in ends:
+        pair = world.colliding_pair(q)
+        if pair:
+            raise BadRequest(f"{what}_in_collision", f"{what} is in collision: {pair[0]} with {pair[1]}", pair)
+
+
+def _joint_goal(robot: RobotModel, goal: JointGoal) -> Array:
+    if goal.positions:
+        positions = _positions(robot, goal.positions, "goal", "bad_goal")
+    elif goal.named:
+        try:
+            positions = robot.named(goal.named)
+        except UnknownName as error:
+            raise BadRequest("unknown_pose", str(error)) from None
+    else:
+        raise BadRequest("bad_goal", "joint goal has neither positions nor the name of a pose")
+    _within_limits(robot, positions, "goal", "goal_out_of_limits")
+    return positions
+
+
+def _positions(robot: RobotModel, values: list[float], what: str, code: str) -> Array:
+    if len(values) != robot.dof:
+        raise BadRequest(code, f"{what} has {len(values)} positions for {robot.dof} joints")
+    return np.array(values, dtype=float)
+
+
+def _within_limits(robot: RobotModel, q: Array, what: str, code: str) -> None:
+    excess = np.maximum(robot.lower - q, q - robot.upper)
+    joint = int(np.argmax(excess))
+    if excess[joint] > 1e-4:  # a measured state may stand this far beyond its limit
+        raise BadRequest(
+            code,
+            f"{what} puts {robot.joint_names[joint]} at {q[joint]:.4f} rad, "
+            f"not within {robot.lower[joint]:.4f} to {robot.upper[joint]:.4f}",
+        )

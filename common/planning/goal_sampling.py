@@ -1,0 +1,78 @@
+"""Joint positions that put the TCP somewhere in a goal region."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.planning.collision import Pair
+from common.planning.problem import Cancel, Problem, Region
+from common.robot.ik import solve_ik
+from common.robot.transforms import invert, transform
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class GoalSamples:
+    """Free positions (dof,) [rad], nearest to the start first, and what was in the way of the others."""
+
+    goals: list[Array] = field(default_factory=list)
+    reached: int = 0
+    colliding: Pair | None = None
+
+
+def sample_pose(region: Region, rng: np.random.Generator) -> Array:
+    """(4, 4) T_world_tcp, uniform in the region's box, tilt and yaw."""
+    axis = rng.uniform(-math.pi, math.pi)
+    tilt = rotation_about((math.cos(axis), math.sin(axis), 0.0), rng.uniform(0, 1) * region.tilt)
+    turn = rotation_about((0.0, 0.0, 1.0), rng.uniform(-1, 1) * region.yaw)
+    T = region.T_world_tcp
+    return transform(T[:3, :3] @ tilt @ turn, T[:3, 3] + rng.uniform(-1, 1, 3) * region.half_sides)
+
+
+def rotation_about(axis: tuple[float, float, float], angle: float) -> Array:
+    """(3, 3) rotation by an angle [rad] about a unit axis: Rodrigues' formula."""
+    x, y, z = axis
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.array(np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K)
+
+
+def in_region(region: Region, T_world_tcp: Array, slack: float = 1e-3) -> bool:
+    """Whether a (4, 4) pose lies in the region, give or take the slack [m], [rad]."""
+    T = invert(region.T_world_tcp) @ T_world_tcp
+    tilt = math.acos(float(np.clip(T[2, 2], -1, 1)))
+    # The turn that is left once the tool axis was brought back by the shortest way.
+    yaw = math.atan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1])
+    away = np.abs(T_world_tcp[:3, 3] - region.T_world_tcp[:3, 3])
+    return bool((away <= region.half_sides + slack).all() and tilt <= region.tilt + slack and abs(yaw) <= region.yaw + slack)
+
+
+def sample_goals(problem: Problem, region: Region, cancel: Cancel, *, wanted: int, tries: int) -> GoalSamples:
+    """Up to `wanted` free goal positions: the region's own pose first, then others drawn from the region."""
+    samples = GoalSamples()
+    robot, rng = problem.robot, problem.rng
+    point = not region.half_sides.any() and region.tilt == 0 and region.yaw == 0
+    for attempt in range(tries):
+        if len(samples.goals) >= wanted or cancel.reason(problem):
+            break
+        T = region.T_world_tcp if attempt == 0 or point else sample_pose(region, rng)
+        seed = problem.start if attempt == 0 or (attempt % 2 and not point) else rng.uniform(robot.lower, robot.upper)
+        q = solve_ik(robot, T, seed, rng=rng, restarts=5 if attempt == 0 else 1)
+        if q is None:
+            continue
+        samples.reached += 1
+        if problem.world.collides(q):
+            samples.colliding = samples.colliding or problem.world.colliding_pair(q)
+        else:
+            samples.goals.append(q)
+    samples.goals.sort(key=lambda goal: least_time(problem.start, goal, problem.velocity))
+    return samples
+
+
+def least_time(a: Array, b: Array, velocity: Array) -> float:
+    """Seconds that the straight edge takes at least: the slowest joint at its velocity limit."""
+    return float((np.abs(b - a) / velocity).max())

@@ -1,0 +1,106 @@
+"""Smooth paths through waypoints: straight lines in joint space with parabolic blends at the corners."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_SAME = 1e-9  # [rad] waypoints closer than this are one
+_TURN_BACK = -0.985  # cosine of the angle at a corner that is too sharp to blend
+
+
+@dataclass(frozen=True)
+class SmoothPath:
+    """Parabolic pieces that join with one direction: q(s) = start + d0 s + (d1 - d0) s^2 / (2 length), 0 <= s <= length.
+
+    Attributes:
+        starts: (P, dof) [rad]; d0, d1: (P, dof) derivative dq/ds at the piece's ends; lengths: (P,).
+    """
+
+    starts: Array
+    d0: Array
+    d1: Array
+    lengths: Array
+
+    @property
+    def end(self) -> Array:
+        """(dof,) the last position [rad]."""
+        return np.array(self.starts[-1] + 0.5 * (self.d0[-1] + self.d1[-1]) * self.lengths[-1])
+
+    def divided(self, step: float) -> SmoothPath:
+        """The same path in pieces in which no joint moves by more than `step` [rad]."""
+        moves = np.maximum(np.abs(self.d0), np.abs(self.d1)).max(axis=1) * self.lengths
+        counts = np.maximum(1, np.ceil(moves / step - 1e-9).astype(int))
+        owner = np.repeat(np.arange(len(counts)), counts)
+        number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+        lengths = (self.lengths / counts)[owner]
+        slope = ((self.d1 - self.d0) / self.lengths[:, None])[owner]
+        s = (number * lengths)[:, None]
+        d0 = self.d0[owner] + slope * s
+        starts = self.starts[owner] + (self.d0[owner] + 0.5 * slope * s) * s
+        return SmoothPath(starts, d0, d0 + slope * lengths[:, None], lengths)
+
+    def positions(self, step: float) -> Array:
+        """(N, dof) positions [rad] along the path, no joint moving by more than `step` [rad] between."""
+        return np.concatenate([self.divided(step).starts, self.end[None, :]])
+
+
+def distinct(waypoints: Sequence[Array] | Array) -> Array:
+    """(N, dof) waypoints without those that repeat the one before; the last one is kept as it is."""
+    points = np.array(waypoints, dtype=float)
+    keep = np.concatenate([[True], np.abs(np.diff(points, axis=0)).max(axis=1) > _SAME])
+    kept = points[keep]
+    kept[-1] = points[-1]
+    return kept
+
+
+def dense_path(waypoints: Array) -> SmoothPath:
+    """The uniform quadratic B-spline with these control points (N, dof), which starts and ends at the outer ones.
+
+    For waypoints that lie close together, such as those of a straight line of the tool: the middles of the edges are
+    met, the waypoints themselves missed by an eighth of the second difference.
+    """
+    edges = np.diff(waypoints, axis=0)
+    if len(edges) == 1:
+        return SmoothPath(waypoints[:1], edges, edges, np.ones(1))
+    middles = waypoints[:-1] + 0.5 * edges
+    starts = np.concatenate([waypoints[:1], middles])
+    d0 = np.concatenate([edges[:1], edges])
+    d1 = np.concatenate([edges, edges[-1:]])
+    lengths = np.ones(len(starts))
+    lengths[[0, -1]] = 0.5
+    return SmoothPath(starts, d0, d1, lengths)
+
+
+def blended_path(waypoints: Array, blends: Array) -> list[SmoothPath]:
+    """Straight edges with a parabola about each corner; one path for each stretch between corners without a blend.
+
+    Args:
+        waypoints: (N, dof) [rad], each other than the one before.
+        blends: (N,) length [rad] taken from both edges at each waypoint; 0 means to stop there. Half the shorter edge
+            at most is used.
+    """
+    edges = np.diff(waypoints, axis=0)
+    lengths = np.linalg.norm(edges, axis=1)
+    directions = edges / lengths[:, None]
+    cut = np.zeros(len(waypoints))
+    for i in range(1, len(waypoints) - 1):
+        if directions[i - 1] @ directions[i] > _TURN_BACK:
+            cut[i] = min(blends[i], 0.5 * lengths[i - 1], 0.5 * lengths[i])
+    paths = []
+    pieces: list[tuple[Array, Array, Array, float]] = []
+    for i, (direction, length) in enumerate(zip(directions, lengths, strict=True)):
+        straight = length - cut[i] - cut[i + 1]
+        if straight > _SAME:
+            pieces.append((waypoints[i] + cut[i] * direction, direction, direction, straight))
+        if cut[i + 1] > 0:
+            pieces.append((waypoints[i + 1] - cut[i + 1] * direction, direction, directions[i + 1], 2 * cut[i + 1]))
+        else:
+            paths.append(SmoothPath(*(np.array(column) for column in zip(*pieces, strict=True))))
+            pieces = []
+    return paths

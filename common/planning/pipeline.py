@@ -1,0 +1,240 @@
+"""From a request to a trajectory: checks, planners in order, retiming, validation."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from common.config import Motion, Parameters, Pipeline
+from common.errors import UnknownName
+from common.messages import JointTrajectory, JointTrajectoryPoint, PlanAttempt, PlanningScene, PlanRequest, PlanResponse
+from common.planning.checks import BadRequest, CheckedRequest, check_collisions, check_request
+from common.planning.collision import CollisionWorld, Pair
+from common.planning.obstacles import ObstacleCache
+from common.planning.planners import Plan, load_planner
+from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result
+from common.planning.retiming import TimedPath, stretch
+from common.planning.robot_geometry import RobotGeometry
+from common.planning.timing import retime
+from common.planning.validation import validate
+from common.robot.model import RobotModel
+
+Array = NDArray[np.float64]
+
+CHECKS = "request_checks"
+
+
+class PlanningPipeline:
+    """Answers plan requests, one after the other. Not for several threads at once."""
+
+    def __init__(self, robot: RobotModel, motion: Motion, pipeline: Pipeline, *, seed: int = 0) -> None:
+        """Load the robot's collision geometry and the planners.
+
+        Raises:
+            ConfigError, UnknownName: a planner, an option or a mesh that can not be used.
+        """
+        self.robot = robot
+        self._motion = motion
+        self._step = pipeline.validation_step
+        self._seed = seed
+        self._planners: dict[str, tuple[Plan, Parameters]] = {}
+        for entry in pipeline.planners:
+            self._planners[entry.name.rpartition(".")[2]] = load_planner(entry.name, entry.options)
+        self._cache = ObstacleCache(RobotGeometry(robot))
+
+    @property
+    def planners(self) -> list[str]:
+        """Names of the planners in the order in which they are tried."""
+        return list(self._planners)
+
+    def plan(
+        self,
+        request: PlanRequest,
+        scene: PlanningScene,
+        current: ArrayLike | None = None,
+        cancel: Cancel | None = None,
+    ) -> PlanResponse:
+        """A validated trajectory, or the error of the planner that got furthest; never raises for a bad request.
+
+        Args:
+            request: what is asked for.
+            scene: what is to be avoided.
+            current: (dof,) [rad] where the robot is, used when the request has no start.
+            cancel: set from another thread to end planning early.
+        """
+        began = time.monotonic()
+        flag = cancel or Cancel()
+        attempts: list[PlanAttempt] = []
+        try:
+            names = self._chosen(request)
+            state = None if current is None else np.asarray(current, dtype=float)
+            checked = check_request(self.robot, request, scene, state)
+            world = self._world(request, scene, checked)
+            check_collisions(world, checked)
+        except BadRequest as error:
+            failure = Result(error=error.code, message=str(error), colliding=error.colliding)
+            return _failed(request, began, CHECKS, failure, attempts)
+        problem = self._problem(request, checked, world, began)
+        best: tuple[str, Result] | None = None
+        for name in names:
+            since = time.monotonic()
+            plan, options = self._planners[name]
+            result = plan(problem, options, flag)
+            trajectory = None
+            if not result.error:
+                trajectory, result = self._finish(problem, result)
+            if result.error != NOT_APPLICABLE:
+                attempts += _recorded(name, result, time.monotonic() - since)
+            if trajectory is not None:
+                message = _message(self.robot, trajectory)
+                return PlanResponse(
+                    id=request.id,
+                    ok=True,
+                    trajectory=message,
+                    planner=name,
+                    seconds=time.monotonic() - began,
+                    fraction=result.fraction,
+                    attempts=attempts,
+                )
+            if best is None or best[1].error == NOT_APPLICABLE or _further(result, best[1]):
+                best = (name, result)
+            if flag.reason(problem):
+                break
+        assert best is not None  # a pipeline has at least one planner
+        return _failed(request, began, best[0], best[1], attempts)
+
+    def world(self, request: PlanRequest, scene: PlanningScene, start: ArrayLike) -> CollisionWorld:
+        """The collision world of a request, apart from those that `plan` uses: to check a trajectory again."""
+        geometry = ObstacleCache(self._cache.robot)
+        return self._make_world(request, scene, np.asarray(start, dtype=float), geometry)
+
+    def _chosen(self, request: PlanRequest) -> list[str]:
+        if not request.planner:
+            return list(self._planners)
+        if request.planner not in self._planners:
+            raise BadRequest("unknown_planner", str(UnknownName("planner", request.planner, self._planners)))
+        return [request.planner]
+
+    def _world(self, request: PlanRequest, scene: PlanningScene, checked: CheckedRequest) -> CollisionWorld:
+        try:
+            return self._make_world(request, scene, checked.start, self._cache)
+        except UnknownName as error:
+            raise BadRequest(f"unknown_{error.what}", str(error)) from None
+
+    def _make_world(
+        self, request: PlanRequest, scene: PlanningScene, start: Array, cache: ObstacleCache
+    ) -> CollisionWorld:
+        return CollisionWorld(
+            self.robot,
+            scene,
+            start=start,
+            padding=self._motion.object_padding,
+            allowed=request.allowed_collisions,
+            attach=request.attach,
+            release=request.release,
+            contact_distance=request.contact_distance,
+            cache=cache,
+        )
+
+    def _problem(
+        self, request: PlanRequest, checked: CheckedRequest, world: CollisionWorld, began: float
+    ) -> Problem:
+        robot, motion = self.robot, self._motion
+        acceleration = request.acceleration_scaling or motion.acceleration_scaling
+        return Problem(
+            robot=robot,
+            world=world,
+            start=np.clip(checked.start, robot.lower, robot.upper),
+            goal=checked.goal,
+            straight=request.straight,
+            velocity=robot.velocity * (request.velocity_scaling or motion.velocity_scaling),
+            acceleration=robot.acceleration * acceleration,
+            jerk=robot.jerk * acceleration,
+            attempts=request.planning_attempts or motion.planning_attempts,
+            deadline=began + (request.planning_time or motion.planning_time),
+            rng=np.random.default_rng(self._seed if request.seed is None else abs(request.seed)),
+        )
+
+    def _finish(self, problem: Problem, result: Result) -> tuple[TimedPath | None, Result]:
+        """The timed and validated trajectory and the result, or None and the result with what is wrong."""
+        trajectory = result.trajectory if result.trajectory is not None else retime(problem, result)
+        if result.tool_line and self._motion.cartesian_speed_scale < 1:
+            trajectory = stretch(trajectory, self._motion.cartesian_speed_scale)
+        fault = validate(
+            trajectory,
+            problem.robot,
+            problem.world,
+            start=problem.start,
+            velocity=problem.velocity,
+            acceleration=problem.acceleration,
+            step=self._step,
+        )
+        if fault is None:
+            return trajectory, result
+        return None, replace(
+            result,
+            error=fault.code,
+            message=f"validation: {fault.message}",
+            waypoint=fault.waypoint,
+            colliding=fault.colliding,
+        )
+
+
+def _further(one: Result, other: Result) -> bool:
+    return one.error != NOT_APPLICABLE and one.fraction >= other.fraction
+
+
+def _recorded(name: str, result: Result, seconds: float) -> list[PlanAttempt]:
+    """The attempts of a planner; its own, and one for the outcome where they do not tell it."""
+    own = result.attempts
+    if own and (not result.error or own[-1].error == result.error):
+        return own
+    return [
+        *own,
+        PlanAttempt(
+            planner=name,
+            seconds=seconds,
+            error=result.error,
+            message=result.message,
+            fraction=result.fraction,
+            waypoint=result.waypoint,
+            colliding=result.colliding,
+        ),
+    ]
+
+
+def _failed(
+    request: PlanRequest, began: float, planner: str, result: Result, attempts: list[PlanAttempt]
+) -> PlanResponse:
+    error = "no_planner" if result.error == NOT_APPLICABLE else result.error
+    where = f"{request.stage}: {planner}" if request.stage else planner
+    pair: Pair | None = result.colliding
+    return PlanResponse(
+        id=request.id,
+        ok=False,
+        planner=planner,
+        seconds=time.monotonic() - began,
+        fraction=result.fraction,
+        error=error,
+        message=f"{where}: {result.message}",
+        colliding=pair,
+        attempts=attempts,
+    )
+
+
+def _message(robot: RobotModel, trajectory: TimedPath) -> JointTrajectory:
+    # Built from numbers that validation has just found finite and in shape: checking each again would take milliseconds.
+    columns = (
+        trajectory.times.tolist(),
+        trajectory.positions.tolist(),
+        trajectory.velocities.tolist(),
+        trajectory.accelerations.tolist(),
+    )
+    points = [
+        JointTrajectoryPoint.model_construct(time_from_start=t, positions=q, velocities=dq, accelerations=ddq)
+        for t, q, dq, ddq in zip(*columns, strict=True)
+    ]
+    return JointTrajectory.model_construct(joint_names=list(robot.joint_names), points=points)

@@ -1,0 +1,43 @@
+"""Planners, one module each with `Options` and `plan(problem, options, cancel) -> Result`, found by name."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from common.config import Parameters, check
+from common.errors import ConfigError, UnknownName
+from common.planning.problem import Cancel, Problem, Result
+
+Plan = Callable[[Problem, Any, Cancel], Result]
+
+
+def planner_names() -> list[str]:
+    """Planners that come with the project."""
+    return sorted(module.name for module in pkgutil.iter_modules(__path__))
+
+
+def load_planner(name: str, options: Mapping[str, Any]) -> tuple[Plan, Parameters]:
+    """The `plan` function and the checked options of a planner.
+
+    Args:
+        name: a module of this package, or a dotted module of your own.
+        options: values for its `Options`.
+
+    Raises:
+        UnknownName: with the choices.
+        ConfigError: a module that is no planner, or an option that does not fit.
+    """
+    if "." not in name and name not in planner_names():
+        raise UnknownName("planner", name, planner_names())
+    path = name if "." in name else f"{__name__}.{name}"
+    try:
+        module = importlib.import_module(path)
+    except ModuleNotFoundError as error:
+        raise ConfigError("pipeline.planners", name, f"can not be imported: {error}") from None
+    plan, model = getattr(module, "plan", None), getattr(module, "Options", None)
+    if not callable(plan) or not (isinstance(model, type) and issubclass(model, Parameters)):
+        raise ConfigError("pipeline.planners", name, "must have plan() and Options(Parameters)")
+    return plan, check(model, options, f"pipeline.planners.{name}")

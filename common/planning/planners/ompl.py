@@ -1,0 +1,163 @@
+"""A path through joint space by OMPL's sampling planners: for joint goals and for regions about a pose."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from ompl import base as ob
+from ompl import geometric as og
+from ompl import util as ou
+from pydantic import Field
+
+from common.config import Parameters
+from common.messages import PlanAttempt
+from common.planning.collision import CollisionWorld
+from common.planning.goal_sampling import least_time, sample_goals
+from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result
+from common.robot.model import RobotModel
+
+Array = NDArray[np.float64]
+
+ou.setLogLevel(ou.LogLevel.LOG_NONE)  # what went wrong is in the answer
+
+# These go on to improve their path until their time is up.
+_IMPROVING = ("AORRTC", "BITstar", "InformedRRTstar", "RRTstar")
+
+
+class Options(Parameters):
+    """Which of OMPL's planners, and how many goals it may choose from."""
+
+    algorithm: Literal[
+        "RRTConnect", "RRT", "PRM", "KPIECE1", "BKPIECE1", "LBKPIECE1", "AORRTC", "BITstar", "InformedRRTstar", "RRTstar"
+    ] = "RRTConnect"
+    goals: int = Field(6, ge=1, le=100, description="IK solutions of a pose goal to choose from")
+    goal_tries: int = Field(40, ge=1, le=1000, description="poses and seeds tried to find them")
+    improving_time: float = Field(
+        1.0, gt=0, le=60, description="wall time of an attempt of planners that improve until it is up [s]"
+    )
+
+
+def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
+    """The best path of several attempts to a joint goal or into the region of a pose goal.
+
+    A straight edge to one of the goals is taken when there is one: it is free for most pairs and nothing is shorter.
+    """
+    if problem.straight:
+        return Result(error=NOT_APPLICABLE, message="a sampled path is no straight line of the tool")
+    if isinstance(problem.goal, Region):
+        samples = sample_goals(problem, problem.goal, cancel, wanted=options.goals, tries=options.goal_tries)
+        goals = samples.goals
+        if not goals:
+            return _no_goal(cancel.reason(problem), samples.reached, samples.colliding)
+    else:
+        goals = [problem.goal]
+    began = time.monotonic()
+    for goal in goals:
+        if problem.world.edge_free(problem.start, goal):
+            attempt = PlanAttempt(
+                planner="ompl", seconds=time.monotonic() - began, fraction=1.0, message="straight edge in joint space"
+            )
+            return Result(waypoints=np.array([problem.start, goal]), fraction=1.0, attempts=[attempt])
+    return _best(problem, options, cancel, goals)
+
+
+def _no_goal(stop: str, reached: int, pair: tuple[str, str] | None) -> Result:
+    if stop:
+        return Result(error=stop, message="planning was ended while goals were sampled")
+    if pair:
+        message = f"all {reached} poses found in the goal region collide; {pair[0]} collides with {pair[1]}"
+        return Result(error="goal_in_collision", message=message, colliding=pair)
+    return Result(error="no_ik", message="no pose of the goal region can be reached")
+
+
+def _best(problem: Problem, options: Options, cancel: Cancel, goals: Sequence[Array]) -> Result:
+    best: Array | None = None
+    attempts: list[PlanAttempt] = []
+    for _ in range(problem.attempts):
+        began = time.monotonic()
+        stop = cancel.reason(problem)
+        path = None if stop else _attempt(problem, options, cancel, goals)
+        stop = stop or cancel.reason(problem)
+        if path is None:
+            error = stop or "no_path"
+            message = f"{options.algorithm} found no path"
+            attempts.append(
+                PlanAttempt(planner="ompl", seconds=time.monotonic() - began, error=error, message=message)
+            )
+        else:
+            message = f"{options.algorithm}: {len(path)} waypoints, {_cost(path, problem.velocity):.2f} s at least"
+            attempts.append(
+                PlanAttempt(planner="ompl", seconds=time.monotonic() - began, message=message, fraction=1.0)
+            )
+            if best is None or _cost(path, problem.velocity) < _cost(best, problem.velocity):
+                best = path
+        if stop:
+            break
+    if best is None or attempts[-1].error == "cancelled":
+        last = attempts[-1]
+        return Result(error=last.error, message=last.message, attempts=attempts)
+    return Result(waypoints=best, fraction=1.0, attempts=attempts)
+
+
+def _cost(path: Array, velocity: Array) -> float:
+    return sum(least_time(a, b, velocity) for a, b in zip(path[:-1], path[1:], strict=True))
+
+
+class _EdgeValidator(ob.MotionValidator):  # type: ignore[misc]
+    """Asks the collision world about whole edges, which it can prove free with few checks."""
+
+    def __init__(self, si: Any, world: CollisionWorld, dof: int) -> None:
+        super().__init__(si)
+        self._world = world
+        self._dof = dof
+
+    def checkMotion(self, a: Any, b: Any, *rest: Any) -> bool:  # noqa: N802 - OMPL's name
+        """Whether the edge between two states is free."""
+        return self._world.edge_free(np.array(a[0 : self._dof]), np.array(b[0 : self._dof]))
+
+
+def _space(robot: RobotModel) -> Any:
+    space = ob.RealVectorStateSpace(robot.dof)
+    bounds = ob.RealVectorBounds(robot.dof)
+    for i, (low, high) in enumerate(zip(robot.lower, robot.upper, strict=True)):
+        bounds.setLow(i, float(low))
+        bounds.setHigh(i, float(high))
+    space.setBounds(bounds)
+    return space
+
+
+def _attempt(problem: Problem, options: Options, cancel: Cancel, goals: Sequence[Array]) -> Array | None:
+    """One solution of the algorithm, shortened; all of OMPL's state is made anew so that the seed decides it."""
+    dof, world = problem.robot.dof, problem.world
+    ou.RNG.setSeed(int(problem.rng.integers(1, 2**31 - 1)))
+    space = _space(problem.robot)
+    setup = og.SimpleSetup(space)
+    si = setup.getSpaceInformation()
+    setup.setStateValidityChecker(lambda state: not world.collides(np.array(state[0:dof])))
+    validator = _EdgeValidator(si, world, dof)
+    si.setMotionValidator(validator)
+    setup.setPlanner(getattr(og, options.algorithm)(si))
+    start = space.allocState()
+    start[0:dof] = problem.start.tolist()
+    setup.setStartState(start)
+    region = ob.GoalStates(si)
+    for goal in goals:
+        state = space.allocState()
+        state[0:dof] = goal.tolist()
+        region.addState(state)
+    setup.setGoal(region)
+    end = problem.deadline
+    if options.algorithm in _IMPROVING:
+        end = min(end, time.monotonic() + options.improving_time)
+    ended = ob.PlannerTerminationCondition(lambda: cancel.is_set or time.monotonic() >= end)
+    if setup.solve(ended).getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
+        return None
+    path = setup.getSolutionPath()
+    simplifier = og.PathSimplifier(si)  # simplifySolution takes several times as long for the same length
+    simplifier.reduceVertices(path)
+    simplifier.ropeShortcutPath(path)
+    return np.array([state[0:dof] for state in path.getStates()])

@@ -1,0 +1,110 @@
+"""What a planner is asked, and what it answers."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.messages import PlanAttempt
+from common.planning.collision import CollisionWorld, Pair
+from common.planning.retiming import TimedPath
+from common.robot.model import RobotModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Region:
+    """Where the TCP may end: about T_world_tcp (4, 4), within half sides (3,) [m], tilt and yaw [rad]."""
+
+    T_world_tcp: Array
+    half_sides: Array
+    tilt: float
+    yaw: float
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One checked request: the start is free and within limits.
+
+    Attributes:
+        start: (dof,) [rad].
+        goal: (dof,) [rad] for a joint goal, else a region for the TCP.
+        straight: only a straight line of the TCP will do.
+        velocity, acceleration, jerk: scaled limits (dof,).
+        attempts: how many tries a sampling planner has.
+        deadline: on time.monotonic() [s].
+    """
+
+    robot: RobotModel
+    world: CollisionWorld
+    start: Array
+    goal: Array | Region
+    straight: bool
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+    attempts: int
+    deadline: float
+    rng: np.random.Generator
+
+    @property
+    def seconds_left(self) -> float:
+        """Wall time left for planning [s]."""
+        return self.deadline - time.monotonic()
+
+
+class Cancel:
+    """A flag that another thread may set; planners look at it and at the time that is left."""
+
+    def __init__(self) -> None:
+        self._event = threading.Event()
+
+    def set(self) -> None:
+        """Ask the planner to give up."""
+        self._event.set()
+
+    @property
+    def is_set(self) -> bool:
+        """Whether somebody asked."""
+        return self._event.is_set()
+
+    def reason(self, problem: Problem) -> str:
+        """Why planning must end now: cancelled, timeout, or nothing."""
+        if self._event.is_set():
+            return "cancelled"
+        return "timeout" if problem.seconds_left <= 0 else ""
+
+
+@dataclass(frozen=True)
+class Result:
+    """A path or a trajectory, or the error of a planner; what it tried is in `attempts`.
+
+    `not_applicable` as error says that the planner is not for this kind of goal.
+
+    Attributes:
+        waypoints: (N, dof) [rad], to be retimed.
+        dense: the waypoints lie close together: smooth through all of them; else blend at the corners.
+        tool_line: the TCP follows a straight line (its speed scale applies).
+        trajectory: already timed; then there are no waypoints.
+        fraction: how much of the way is covered.
+        waypoint, colliding: where and between what a failure was found.
+    """
+
+    waypoints: Array | None = None
+    dense: bool = False
+    tool_line: bool = False
+    trajectory: TimedPath | None = None
+    fraction: float = 0.0
+    error: str = ""
+    message: str = ""
+    waypoint: int | None = None
+    colliding: Pair | None = None
+    attempts: list[PlanAttempt] = field(default_factory=list)
+
+
+NOT_APPLICABLE = "not_applicable"

@@ -1,0 +1,190 @@
+"""The fastest timing of a path within velocity and acceleration limits, from rest to rest.
+
+Reachability analysis along the path after Pham & Pham, "A New Approach to Time-Optimal Path Parameterization Based
+on Reachability Analysis" (IEEE T-RO 2018): a backward pass finds the highest speed at each grid point from which the end
+can still be reached, a forward pass goes as fast as that allows. The path's pieces are parabolas and the grid ends where
+they end, so that joint accelerations are linear between grid points and the limits, held at both ends of an interval,
+hold all along it. Between two grid points, x = (ds/dt)^2 changes linearly and u = d2s/dt2 is constant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from common.planning.path import SmoothPath
+
+Array = NDArray[np.float64]
+
+_TINY = 1e-12
+_LEAST_INTERVALS = 20  # also on a short path: speed changes at grid points only
+
+
+@dataclass(frozen=True)
+class TimedPath:
+    """States of the joints at times from the start: times (N,) [s], positions, velocities, accelerations (N, dof)."""
+
+    times: Array
+    positions: Array
+    velocities: Array
+    accelerations: Array
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last state."""
+        return float(self.times[-1])
+
+
+class RetimingFailed(Exception):
+    """A path that can not be followed within the limits, which only a broken path or limit brings about."""
+
+
+def parametrise(path: SmoothPath, velocity: ArrayLike, acceleration: ArrayLike, step: float = 0.02) -> TimedPath:
+    """The time-optimal trajectory along a path, at rest at both ends.
+
+    Args:
+        path: pieces (P, dof).
+        velocity, acceleration: limits (dof,) [rad/s], [rad/s^2].
+        step: largest joint movement between grid points [rad].
+
+    Raises:
+        RetimingFailed: no speed is feasible somewhere.
+    """
+    limit_v, limit_a = np.asarray(velocity, dtype=float), np.asarray(acceleration, dtype=float)
+    move = float((np.maximum(np.abs(path.d0), np.abs(path.d1)).max(axis=1) * path.lengths).sum())
+    grid = path.divided(min(step, move / _LEAST_INTERVALS))
+    x, u = _profile(grid, limit_v, limit_a)
+    root = np.sqrt(x)
+    durations = 2 * grid.lengths / (root[:-1] + root[1:])
+    times = np.concatenate([[0.0], np.cumsum(durations)])
+    slopes = np.concatenate([grid.d0, grid.d1[-1:]])
+    bends = (grid.d1 - grid.d0) / grid.lengths[:, None]
+    accelerations = grid.d0 * u[:, None] + bends * x[:-1, None]
+    last = grid.d1[-1] * u[-1] + bends[-1] * x[-1]
+    return TimedPath(
+        times,
+        np.concatenate([grid.starts, grid.end[None, :]]),
+        slopes * root[:, None],
+        np.concatenate([accelerations, last[None, :]]),
+    )
+
+
+def _profile(grid: SmoothPath, limit_v: Array, limit_a: Array) -> tuple[Array, Array]:
+    """x (N + 1,) at the grid points and u (N,) between them."""
+    d0, d1, lengths = grid.d0, grid.d1, grid.lengths
+    bends = (d1 - d0) / lengths[:, None]
+    # Joint accelerations at both ends of an interval, as D u + C x with the x of its beginning.
+    D = np.concatenate([d0, d1 + 2 * lengths[:, None] * bends], axis=1)
+    C = np.concatenate([bends, bends], axis=1)
+    limits = np.concatenate([limit_a, limit_a])
+    flat = np.abs(D) < _TINY
+    sign = np.where(D < 0, -1.0, 1.0)
+    safe = np.where(flat, 1.0, np.abs(D))
+    A = np.where(flat, np.inf, limits / safe)  # -A - B x <= u <= A - B x
+    B = np.where(flat, 0.0, sign * C / safe)
+    most = _highest_x(grid, limit_v, limits, A, B, C, flat)
+    highest = _backward(most, lengths, A, B)
+    return _forward(highest, lengths, A, B)
+
+
+def _highest_x(
+    grid: SmoothPath, limit_v: Array, limits: Array, A: Array, B: Array, C: Array, flat: Array
+) -> list[float]:
+    """(N + 1,) x at which velocities and, whatever u is, accelerations are within limits."""
+    slopes = np.abs(np.concatenate([grid.d0, grid.d1[-1:]]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        most = ((limit_v / np.maximum(slopes, _TINY)) ** 2).min(axis=1)
+        bound = np.where(flat & (np.abs(C) > _TINY), limits / np.maximum(np.abs(C), _TINY), np.inf).min(axis=1)
+        difference = B[:, :, None] - B[:, None, :]  # of the upper line l and the lower line k: u_low <= u_high
+        room = A[:, :, None] + A[:, None, :]
+        pairs = np.where(difference > _TINY, room / np.maximum(difference, _TINY), np.inf).min(axis=(1, 2))
+    most[:-1] = np.minimum(most[:-1], np.minimum(bound, pairs))
+    most[0] = most[-1] = 0.0
+    return [float(v) for v in most]
+
+
+def _backward(most: list[float], lengths: Array, A: Array, B: Array) -> list[float]:
+    """(N + 1,) highest x from which the next point's range can be reached, from the end to the start.
+
+    x + 2 L u <= next, with the lowest u = max(-A - B x): each line gives x (1 - 2 L B) <= next + 2 L A.
+    """
+    L2 = 2 * lengths[:, None]
+    slope = 1 - L2 * B
+    usable = (slope > _TINY) & np.isfinite(A)
+    gain = np.where(usable, 1 / np.where(usable, slope, 1.0), 0.0)
+    offset = np.where(usable, np.where(np.isfinite(A), L2 * A, 0.0) * gain, np.inf)
+    gains, offsets = gain.tolist(), offset.tolist()
+    highest = list(most)
+    for i in range(len(lengths) - 1, -1, -1):
+        following = highest[i + 1]
+        x = highest[i]
+        for g, o in zip(gains[i], offsets[i], strict=True):
+            reach = g * following + o
+            x = min(x, reach)
+        if not x >= 0:
+            raise RetimingFailed(f"no feasible speed at grid point {i} of {len(lengths)}")
+        highest[i] = x
+    return highest
+
+
+def _forward(highest: list[float], lengths: Array, A: Array, B: Array) -> tuple[Array, Array]:
+    """The fastest x and u, from the start to the end."""
+    As, Bs, Ls = A.tolist(), B.tolist(), lengths.tolist()
+    x, xs, us = 0.0, [0.0], []
+    for i, length in enumerate(Ls):
+        u = min(a - b * x for a, b in zip(As[i], Bs[i], strict=True))
+        following = min(highest[i + 1], x + 2 * length * u)
+        if following < 0 or (following <= 0 and x <= 0):
+            raise RetimingFailed(f"the path can not be left at grid point {i} of {len(Ls)}")
+        us.append((following - x) / (2 * length))
+        x = following
+        xs.append(x)
+    return np.array(xs), np.array(us)
+
+
+def stretch(trajectory: TimedPath, scale: float) -> TimedPath:
+    """The same motion slower: times t / s, velocities v s, accelerations a s^2.
+
+    Raises:
+        ValueError: the scale is not within 0 to 1.
+    """
+    if not (0 < scale <= 1 and math.isfinite(scale)):
+        raise ValueError(f"scale {scale:g} is not within 0 to 1")
+    return TimedPath(
+        trajectory.times / scale,
+        trajectory.positions,
+        trajectory.velocities * scale,
+        trajectory.accelerations * scale**2,
+    )
+
+
+def join(parts: Sequence[TimedPath]) -> TimedPath:
+    """Trajectories one after the other; each begins at rest where the one before came to rest."""
+    times, last = [parts[0].times], parts[0].duration
+    for part in parts[1:]:
+        times.append(part.times[1:] + last)
+        last += part.duration
+    rest = parts[1:]
+    return TimedPath(
+        np.concatenate(times),
+        np.concatenate([parts[0].positions, *(part.positions[1:] for part in rest)]),
+        np.concatenate([parts[0].velocities, *(part.velocities[1:] for part in rest)]),
+        np.concatenate([parts[0].accelerations, *(part.accelerations[1:] for part in rest)]),
+    )
+
+
+def sample(trajectory: TimedPath, times: ArrayLike) -> Array:
+    """(N, dof) positions at times [s]: cubic Hermite interpolation between states, as the controller does."""
+    t = np.clip(np.asarray(times, dtype=float), 0.0, trajectory.duration)
+    i = np.clip(np.searchsorted(trajectory.times, t, side="right") - 1, 0, len(trajectory.times) - 2)
+    span = (trajectory.times[i + 1] - trajectory.times[i])[:, None]
+    r = (t - trajectory.times[i])[:, None] / span
+    q0, q1 = trajectory.positions[i], trajectory.positions[i + 1]
+    v0, v1 = trajectory.velocities[i] * span, trajectory.velocities[i + 1] * span
+    return np.array(
+        q0 + r * v0 + r**2 * (3 * (q1 - q0) - 2 * v0 - v1) + r**3 * (2 * (q0 - q1) + v0 + v1)
+    )

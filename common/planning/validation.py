@@ -1,0 +1,128 @@
+"""The last check of a trajectory before it leaves: what a real controller would refuse, and collisions at a finer step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from common.messages import JointTrajectory
+from common.planning.collision import CollisionWorld, Pair
+from common.planning.retiming import TimedPath, sample
+from common.robot.model import RobotModel
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 0.02  # of velocity and acceleration limits
+_CLOSE = 1e-4  # [rad]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Why a trajectory may not be executed: `code` for programs, the message for people."""
+
+    code: str
+    message: str
+    waypoint: int | None = None
+    colliding: Pair | None = None
+
+
+def validate(
+    trajectory: TimedPath,
+    robot: RobotModel,
+    world: CollisionWorld,
+    *,
+    start: ArrayLike,
+    velocity: ArrayLike,
+    acceleration: ArrayLike,
+    step: float,
+) -> Fault | None:
+    """The first fault of a trajectory, or None.
+
+    Args:
+        trajectory: states (N, dof).
+        robot: the model, for position limits and names.
+        world: what may not be touched; its rule for contact at the start holds here as well.
+        start: (dof,) [rad] where the robot is.
+        velocity, acceleration: limits (dof,) [rad/s], [rad/s^2].
+        step: largest joint step between states that are checked for collision [rad].
+    """
+    fault = check_numbers(trajectory, robot, start=start, velocity=velocity, acceleration=acceleration)
+    if fault is not None:
+        return fault
+    path, owners = fine_samples(trajectory, step)
+    hit = world.first_collision(path)
+    if hit is None:
+        return None
+    waypoint = int(owners[hit.index])
+    message = f"waypoint {waypoint} of {len(trajectory.times)}: {hit.pair[0]} collides with {hit.pair[1]}"
+    return Fault("collision", message, waypoint, hit.pair)
+
+
+def fine_samples(trajectory: TimedPath, step: float) -> tuple[Array, NDArray[np.int64]]:
+    """(N, dof) positions along a trajectory, no joint moving by more than `step` [rad] between, and their intervals."""
+    spans = np.diff(trajectory.times)
+    speeds = np.abs(trajectory.velocities).max(axis=1)
+    moves = np.maximum(
+        np.abs(np.diff(trajectory.positions, axis=0)).max(axis=1), np.maximum(speeds[:-1], speeds[1:]) * spans
+    )
+    counts = np.maximum(1, np.ceil(moves / step).astype(int))
+    owners = np.repeat(np.arange(len(counts)), counts)
+    number = np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)
+    times = trajectory.times[owners] + number * (spans / counts)[owners]
+    path = np.concatenate([sample(trajectory, times), trajectory.positions[-1:]])
+    return path, np.append(owners, len(counts))
+
+
+def check_numbers(
+    trajectory: TimedPath, robot: RobotModel, *, start: ArrayLike, velocity: ArrayLike, acceleration: ArrayLike
+) -> Fault | None:
+    """The first fault of a trajectory's numbers: finite, times, start, rest at both ends, limits, and that they agree."""
+    times, q, dq, ddq = trajectory.times, trajectory.positions, trajectory.velocities, trajectory.accelerations
+    limit_v, limit_a = np.asarray(velocity, dtype=float), np.asarray(acceleration, dtype=float)
+    if len(times) < 2 or not (len(times) == len(q) == len(dq) == len(ddq)) or q.shape[1] != robot.dof:
+        return Fault("bad_trajectory", f"has {len(times)} points of {q.shape[1]} joints")
+    if not all(np.isfinite(values).all() for values in (times, q, dq, ddq)):
+        return Fault("not_finite", "holds a number that is not finite")
+    spans = np.diff(times)
+    if times[0] != 0 or (spans <= 0).any():
+        return Fault("bad_times", f"times do not increase strictly from 0 at waypoint {int(np.argmin(spans)) + 1}")
+    away = np.abs(q[0] - np.asarray(start, dtype=float))
+    if (away > _CLOSE).any():
+        joint = int(np.argmax(away))
+        return Fault("start_mismatch", f"begins {away[joint]:.4f} rad away from {robot.joint_names[joint]}'s start", 0)
+    if max(np.abs(dq[0]).max(), np.abs(dq[-1]).max()) > 1e-6:
+        return Fault("not_at_rest", "does not start and end at rest")
+    h = spans[:, None]
+    ahead = np.diff(q, axis=0) / h
+    peak = 1.5 * ahead - 0.25 * (dq[:-1] + dq[1:])  # velocity in the middle of the cubic
+    begin = (6 * ahead - 4 * dq[:-1] - 2 * dq[1:]) / h  # accelerations at the ends of the cubic
+    finish = (-6 * ahead + 2 * dq[:-1] + 4 * dq[1:]) / h
+    checks: list[tuple[str, Array, Callable[[int], str]]] = [
+        ("position_limit", np.maximum(robot.lower - 1e-6 - q, q - robot.upper - 1e-6), lambda j: "its position limit"),
+        ("velocity_limit", np.abs(dq) - (1 + TOLERANCE) * limit_v, lambda j: f"{limit_v[j]:.3f} rad/s"),
+        ("velocity_limit", np.abs(peak) - (1 + TOLERANCE) * limit_v, lambda j: f"{limit_v[j]:.3f} rad/s"),
+        ("acceleration_limit", np.abs(ddq) - (1 + TOLERANCE) * limit_a, lambda j: f"{limit_a[j]:.3f} rad/s^2"),
+        ("inconsistent", np.abs(begin) - (1 + TOLERANCE) * limit_a - 1e-6 / h, lambda j: "what its states say"),
+        ("inconsistent", np.abs(finish) - (1 + TOLERANCE) * limit_a - 1e-6 / h, lambda j: "what its states say"),
+    ]
+    for code, excess, limit in checks:
+        if (excess > 0).any():
+            waypoint, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
+            message = f"waypoint {waypoint} of {len(times)}: {robot.joint_names[joint]} exceeds {limit(int(joint))}"
+            return Fault(code, message, int(waypoint))
+    return None
+
+
+def timed_path(trajectory: JointTrajectory) -> TimedPath:
+    """The arrays of a trajectory message."""
+    points = trajectory.points
+    dof = len(trajectory.joint_names)
+    return TimedPath(
+        np.array([p.time_from_start for p in points]),
+        np.array([p.positions for p in points]).reshape(-1, dof),
+        np.array([p.velocities for p in points]).reshape(-1, dof),
+        np.array([p.accelerations for p in points]).reshape(-1, dof),
+    )
