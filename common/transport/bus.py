@@ -26,6 +26,7 @@ A = TypeVar("A", bound=Message)
 
 REPEAT_SECONDS = 1.0  # wall time between repetitions of a state, and between counters
 _MOST_RAW = 1000
+_END_SECONDS = 1.0  # for a cancelled service to end
 
 
 class Bus:
@@ -60,6 +61,7 @@ class Bus:
         self._counters: Writer[ServiceCounters] | None = None
         self._beat: asyncio.TimerHandle | None = None
         self._closed = False
+        self._running = False
         session.watch_connection(lambda there: call_on_loop(self._loop, lambda: self._on_connection(there)))
         self._tick()
 
@@ -205,22 +207,33 @@ class Bus:
             (self.log.info if there else self.log.warning)("the router %s", "is back" if there else "is lost")
 
     def _on_crash(self, error: BaseException) -> None:
-        if not self._crash.done():
+        if not self._running:  # a bus without a service has nothing to end
+            self.log.error("the handler of a request crashed", exc_info=error)
+        elif not self._crash.done():
             self._crash.set_result(error)
 
     async def run(self, service: Coroutine[Any, Any, None]) -> None:
         """Run a service's coroutine to its end; a handler that crashes ends it with that exception."""
+        self._running = True
         task = asyncio.create_task(service, name=self.service)
         both: set[asyncio.Future[Any]] = {task, self._crash}
         try:
             await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            if not task.done():
-                task.cancel()
-                await asyncio.wait({task})
+            await self._end(task)
         if self._crash.done():
             raise self._crash.result()
         await task
+
+    async def _end(self, task: asyncio.Task[None]) -> None:
+        if task.done():
+            return
+        task.cancel()
+        await asyncio.wait({task}, timeout=_END_SECONDS)
+        if not task.done():
+            self.log.error("does not end when it is cancelled")
+        elif not task.cancelled() and task.exception() is not None:
+            self.log.error("crashed while it ended", exc_info=task.exception())
 
     async def close(self) -> None:
         """Say goodbye: no token any more, requests in work are lost. The session is closed by its owner."""

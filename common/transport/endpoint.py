@@ -76,7 +76,7 @@ def client_config(endpoint: str, *, connect_ms: int) -> zenoh.Config:
         listen__endpoints=[],
         connect__endpoints=[endpoint],
         connect__timeout_ms=connect_ms,
-        connect__retry={"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
+        connect__retry={"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -14,6 +15,7 @@ import zenoh
 from common.clock import Clock
 from common.transport.bus import Bus
 from common.transport.codec import DEFAULT_LIMIT
+from common.transport.log import BusLog
 from common.transport.session import Declared, OnQuery, OnReply, OnSample, OnToken, RawReply, RawSample
 
 C = TypeVar("C")
@@ -41,8 +43,6 @@ class _Entry:
         with self._network.lock:
             if self in self._table:
                 self._table.remove(self)
-                return
-        return
 
     @property
     def declared(self) -> bool:
@@ -247,6 +247,9 @@ class LocalNetwork:
         """A service that runs inside the block, from its `ready` on; its crash ends the block and is raised there."""
         session = self.session()
         bus = Bus(session, service=name, cell=cell, clock=clock or Clock())
+        to_topic = BusLog(bus)
+        bus.log.addHandler(to_topic)
+        bus.log.setLevel(logging.INFO)
         crash: BaseException | None = None
         body = asyncio.current_task()
         inside = False
@@ -281,6 +284,7 @@ class LocalNetwork:
             is_ready.cancel()
             task.cancel()
             await asyncio.wait({task})
+            bus.log.removeHandler(to_topic)
             await bus.close()
             session.close()
             if crash is not None:

@@ -51,6 +51,7 @@ class Server(Generic[Q, A]):
         self._service = service
         self._sequence = 0
         self._handler = handler
+        self._closed = False
         self._ready = ready
         self._crash = crash
         self._limit = limit
@@ -64,6 +65,9 @@ class Server(Generic[Q, A]):
         return self._refusals.count
 
     def _start(self, query: Query) -> None:
+        if self._closed:
+            query.finish()
+            return
         self.received += 1
         task = asyncio.create_task(self._serve(query), name=f"{self.topic.key} request")
         self._tasks.add(task)
@@ -75,11 +79,13 @@ class Server(Generic[Q, A]):
             if payload is None:
                 return
             await self._ready.wait()
+            sender = NO_SENDER
             try:
-                request = decode(self.topic.message, payload, self._limit)
                 attachment = decode_attachment(query.attachment)
+                sender = attachment.writer if attachment else NO_SENDER
+                request = decode(self.topic.message, payload, self._limit)
             except DecodeError as error:
-                self._refuse(query, "invalid", error)
+                self._refuse(query, "invalid", error, sender)
                 return
             follow(attachment.trace if attachment else "")
             await self._answer(query, request)
@@ -98,8 +104,8 @@ class Server(Generic[Q, A]):
             return None
         return query.payload
 
-    def _refuse(self, query: Query, code: str, error: Exception) -> None:
-        self._refusals.add(NO_SENDER, error)
+    def _refuse(self, query: Query, code: str, error: Exception, sender: str = NO_SENDER) -> None:
+        self._refusals.add(sender, error)
         query.refuse(encode_error(code, str(error)))
 
     async def _answer(self, query: Query, request: Q) -> None:
@@ -122,6 +128,7 @@ class Server(Generic[Q, A]):
 
     async def close(self) -> None:
         """Cancel what is being worked on: its requesters learn that it was lost."""
+        self._closed = True
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)

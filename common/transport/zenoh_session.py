@@ -16,7 +16,7 @@ from common.transport.session import Declared, OnQuery, OnReply, OnSample, OnTok
 
 log = logging.getLogger(__name__)
 
-_CONNECT_MS = 250  # one try; short, so that an interrupt never waits for it
+_CONNECT_MS = 1000  # one try
 _OUTBOX_SIZE = 10_000
 _FLUSH_SECONDS = 0.2
 
@@ -83,6 +83,8 @@ class Outbox:
                 call()
             except zenoh.ZError as error:  # the session closed, or the other side is gone: as a message lost on the way
                 log.debug("not sent: %s", error)
+            except Exception:  # a bug; without this thread the service would be mute
+                log.exception("sending failed")
 
 
 class _Publisher:
@@ -99,9 +101,9 @@ class _Publisher:
         if self._undeclared:
             return
         if self._outbox is None:
-            self._publisher.put(payload, attachment=attachment)
+            self._publisher.put(payload, attachment=attachment or None)
         else:
-            self._outbox.post(lambda: self._publisher.put(payload, attachment=attachment))
+            self._outbox.post(lambda: self._publisher.put(payload, attachment=attachment or None))
 
     def undeclare(self) -> None:
         if not self._undeclared:
