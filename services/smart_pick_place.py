@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import uuid
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
@@ -14,7 +15,9 @@ from common.errors import RemoteError, RequestFailed
 from common.robot.model import RobotModel
 from common.tasks.pick_place import PickPlace, PickPlaceParameters
 from common.tasks.stages import Command, View
-from common.transport.bus import Bus, Client, Reader
+from common.transport.bus import Bus
+from common.transport.reader import Reader
+from common.transport.requests import Client
 from common.transport.service import main
 
 A = TypeVar("A", bound=m.Message)
@@ -44,7 +47,8 @@ async def run(bus: Bus, config: Config) -> None:
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
         raise ValueError("the task needs a robot with a gripper")
-    task = PickPlace(config, config.grasp, config.world, config.robot.gripper, uuid.uuid4().hex[:8], config.run.autostart)
+    prefix = uuid.uuid4().hex[:8]
+    task = PickPlace(config, config.grasp, config.world, config.robot.gripper, prefix, config.run.autostart)
     view = View(now=bus.clock.now())
     woken = asyncio.Event()
 
@@ -117,10 +121,8 @@ async def run(bus: Bus, config: Config) -> None:
             group.create_task(wake)
         before = m.PickPlaceStatus()
         while True:
-            try:
+            with contextlib.suppress(TimeoutError):  # time passes too: a grace period may have ended
                 await asyncio.wait_for(woken.wait(), 0.05)
-            except TimeoutError:
-                pass  # time passes too: a grace period may have ended
             woken.clear()
             for command in task.step(look()):
                 group.create_task(work(command))

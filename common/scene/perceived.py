@@ -33,7 +33,9 @@ class SceneParameters(Parameters):
 class PerceivedScene:
     """Keeps what was seen and felt, and says it as a planning scene."""
 
-    def __init__(self, parameters: SceneParameters, around: Surroundings, gripper: GripperConfig, tcp_link: str) -> None:
+    def __init__(
+        self, parameters: SceneParameters, around: Surroundings, gripper: GripperConfig, tcp_link: str
+    ) -> None:
         """Start with the fixtures alone.
 
         Args:

@@ -29,8 +29,8 @@ def slot_positions(box: Container, radius: float, table_height: float) -> Array:
 def occupied_slots(pixels: Iterable[tuple[float, float]], camera: Pinhole, around: Surroundings) -> set[int]:
     """Which slots hold a ball, as indices into the flattened slots.
 
-    Each seen ball belongs to the slot whose centre is imaged nearest to it, the nearest pairs first, one to one. Below a
-    ball that is seen stand the balls that carry it, though they are hidden.
+    Each seen ball belongs to the slot whose centre is imaged nearest to it, the nearest pairs first, one to one. Below
+    a ball that is seen stand the balls that carry it, though they are hidden.
 
     Args:
         pixels: (u, v) of the balls that are seen inside the container.

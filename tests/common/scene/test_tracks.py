@@ -7,7 +7,8 @@ from common.scene.tracks import Tracks
 
 
 def tracks(**options: float) -> Tracks:
-    return Tracks(**{"match_radius": 0.08, "confirm": 2, "forget_after": 0.5, "smoothing": 0.5, "still": 0.003, **options})
+    defaults = {"match_radius": 0.08, "confirm": 2, "forget_after": 0.5, "smoothing": 0.5, "still": 0.003}
+    return Tracks(**{**defaults, **options})
 
 
 def test_ball_exists_after_two_frames_and_is_forgotten_after_a_while() -> None:
