@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from typing import Any
-
-import zenoh
+from typing import TYPE_CHECKING, Any
 
 from common.errors import ConfigError
+
+if TYPE_CHECKING:
+    import zenoh
 
 BASE_PORT = 7447
 DEFAULT_DOMAIN = 42
@@ -86,6 +87,8 @@ def router_config(endpoint: str) -> zenoh.Config:
 
 
 def _config(**values: Any) -> zenoh.Config:
+    import zenoh  # here: the command line asks for endpoints before it has started anything
+
     config = zenoh.Config()
     common = {
         "scouting__multicast__enabled": False,
