@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
@@ -190,6 +191,17 @@ class Bus:
         except TimeoutError:
             cancel()
         return list(samples)
+
+    async def raw_tokens(self, key: str, timeout: float = 1.0) -> list[str]:
+        """The liveliness tokens that match a full key expression, such as `*/alive/*`, now."""
+        tokens: list[str] = []
+        done = asyncio.Event()
+        self._session.get_tokens(
+            key, lambda token, there: tokens.append(token), lambda: call_on_loop(self._loop, done.set), timeout=timeout
+        )
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(done.wait(), timeout)
+        return sorted(tokens)
 
     # --- life -----------------------------------------------------------------------------------------------------
 
