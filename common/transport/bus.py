@@ -21,6 +21,8 @@ from common.transport.requests import Client, Server, tokens_of
 from common.transport.session import Declared, RawReply, RawSample, Session
 from common.transport.writer import Writer
 
+__all__ = ["Bus", "Client", "Reader", "Writer"]  # what the type hints of a service name
+
 M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=Message)
 A = TypeVar("A", bound=Message)
