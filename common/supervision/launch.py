@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import socket
 import sys
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from common.clock import Clock
-from common.config import ServiceEntry
+from common.clock import MAX_SPEED, MIN_SPEED, Clock
+from common.config import Cell, ServiceEntry
 from common.errors import ConfigError
 
 ROUTER = "router"
 ROUTER_MODULE = "services.router"
-LOG_JSON_VARIABLE = "ZENCELL_LOG_JSON"
 PROJECT_ROOT = Path(__file__).resolve().parent.parent.parent
 
 
@@ -34,10 +35,10 @@ class Launch:
 
     def router_command(self) -> list[str]:
         """Command line of the router."""
-        return [*python_module(ROUTER_MODULE), "--domain", str(self.domain), "--gate"]
+        return [*python_module(ROUTER_MODULE), "--domain", str(self.domain), *self._process_options()]
 
-    def service_command(self, entry: ServiceEntry) -> list[str]:
-        """Command line of a service."""
+    def service_command(self, entry: ServiceEntry, *, gate: bool = True) -> list[str]:
+        """Command line of a service, which waits behind its gate unless told otherwise."""
         command = [*python_module(entry.module), "--cell", self.cell]
         for text in self.overrides:
             command += ["--set", text]
@@ -46,13 +47,43 @@ class Launch:
         if self.seed is not None:
             command += ["--seed", str(self.seed)]
         command += ["--connect", self.connect] if self.connect else ["--domain", str(self.domain)]
-        return [*command, "--gate"]
+        return [*command, *self._process_options()] if gate else command
+
+    def _process_options(self) -> list[str]:
+        return ["--gate", "--log-json"] if self.log_json else ["--gate"]
 
     def environment(self, inherited: Mapping[str, str] = os.environ) -> dict[str, str]:
         """Environment of every process: the caller's, the cell's clock, and where packages are found."""
-        environment = {**inherited, **self.clock.environment(), "PYTHONPATH": python_path(inherited)}
-        environment[LOG_JSON_VARIABLE] = "1" if self.log_json else ""
-        return environment
+        return {**inherited, **self.clock.environment(), "PYTHONPATH": python_path(inherited)}
+
+
+def clock_of(speed: float) -> Clock:
+    """A clock of that speed.
+
+    Raises:
+        ConfigError: the speed is out of bounds.
+    """
+    try:
+        return Clock(speed)
+    except ValueError:
+        raise ConfigError("--speed", speed, f"must be {MIN_SPEED:g} to {MAX_SPEED:g}") from None
+
+
+def place_of(
+    domain: str | None, connect: str | None, environ: Mapping[str, str] = os.environ
+) -> tuple[int, str | None]:
+    """The domain, and the endpoint of a router that runs already or None, from options and environment.
+
+    Raises:
+        ConfigError: one of them is not valid.
+    """
+    from common.transport.endpoint import CONNECT_VARIABLE, DEFAULT_DOMAIN, DOMAIN_VARIABLE, endpoint_of, parse_domain
+
+    if connect or (domain is None and environ.get(CONNECT_VARIABLE)):
+        return DEFAULT_DOMAIN, endpoint_of(None, connect, environ)
+    if domain is not None:
+        return parse_domain(domain), None
+    return parse_domain(environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN), DOMAIN_VARIABLE), None
 
 
 def python_module(module: str) -> list[str]:
@@ -67,35 +98,44 @@ def python_path(inherited: Mapping[str, str] = os.environ) -> str:
     return os.pathsep.join(dict.fromkeys([str(PROJECT_ROOT), *given, str(Path.cwd())]))
 
 
-def require_free_port(host: str, port: int, domain: int) -> None:
-    """Return when the router can listen there.
+def require_modules(cell: Cell) -> None:
+    """Return when every service of the cell that is not the project's own can be found.
 
     Raises:
-        ConfigError: names the domain, the port and, where it can be seen, the process that holds it.
+        ConfigError: names the first that can not.
     """
+    for folder in python_path().split(os.pathsep):
+        if folder not in sys.path:
+            sys.path.append(folder)
+    for key, entry in cell.services.items():
+        try:
+            found = importlib.util.find_spec(entry.module) is not None
+        except ModuleNotFoundError:
+            found = False
+        if not found:
+            raise ConfigError(f"services.{key}", entry.module, "is not a module that can be found from here")
+
+
+def require_free_port(endpoint: str) -> None:
+    """Return when a router can listen at an endpoint of this host.
+
+    Raises:
+        PortInUse: names the domain, the port and, where it can be seen, the process that holds it.
+    """
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections that just closed do not matter
         try:
-            probe.bind((host, port))
+            probe.bind((host, int(port)))
         except OSError:
-            raise ConfigError(
-                "--domain", domain,
-                f"has its port {port} in use by {port_holder(port)}; "
-                "stop that, choose another --domain, or join it with --connect",
-            ) from None
+            from common.transport.router import PortInUse, holder_of
+
+            raise PortInUse(endpoint, holder_of(int(port))) from None
 
 
-def port_holder(port: int) -> str:
-    """The process that listens on a TCP port, for people: "zencell run panda (pid 123)"."""
+def process_began() -> float:
+    """When this process was started [s, monotonic], its imports included."""
     import psutil
 
-    try:
-        for connection in psutil.net_connections("tcp"):
-            if connection.laddr and connection.laddr.port == port and connection.status == psutil.CONN_LISTEN:
-                if connection.pid is None:
-                    break
-                command = " ".join(psutil.Process(connection.pid).cmdline())
-                return f"pid {connection.pid} ({command[:120]})"
-    except (psutil.Error, OSError):  # other people's processes may be hidden from us
-        return "another process"
-    return "another process"
+    age = time.time() - psutil.Process().create_time()
+    return time.monotonic() - (age if 0 <= age < 60 else 0.0)

@@ -10,6 +10,7 @@ from typing import Any
 from common.messages import MotionStatus, PickPlaceStatus, PlanFigure, PoseArray, Rejection, Vector3
 
 SAME_PLACE = 0.03  # [m] rejections closer than this are of the same thing
+NOT_LEFT_BEHIND = "inside the container"  # such a detection is of what was placed
 MAX_LATENCIES = 100_000  # of frames; the oldest are forgotten: three hours at 10 Hz
 
 
@@ -22,6 +23,8 @@ class Rejected:
     def add(self, rejections: Iterable[Rejection]) -> None:
         """Take note of rejections; of the same place only the newest reason is kept."""
         for rejection in rejections:
+            if NOT_LEFT_BEHIND in rejection.reason:
+                continue
             for index, known in enumerate(self.places):
                 if _distance(known.position, rejection.position) < SAME_PLACE:
                     self.places[index] = rejection
@@ -176,6 +179,20 @@ def percentile(values: Sequence[float], fraction: float) -> float | None:
     if not values:
         return None
     return sorted(values)[max(0, math.ceil(fraction * len(values)) - 1)]
+
+
+def progress_line(task: PickPlaceStatus | None) -> str:
+    """Where the task is, as "3 of 7 placed - GRASPING ball_4"."""
+    if task is None:
+        return "the task has not spoken yet"
+    line = f"{task.placed} of {task.targets} placed - {task.state}"
+    if task.target:
+        line += f" {task.target}"
+    if task.paused:
+        line += " (paused)"
+    elif not task.started and task.state == "IDLE":
+        line += " (waits for `zencell task start`)"
+    return line
 
 
 def describe(summary: dict[str, Any]) -> list[str]:

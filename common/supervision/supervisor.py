@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import logging
+import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable
+from typing import Any, TypeVar
 
 from common.config import Cell
 from common.errors import ZencellError
@@ -14,6 +17,8 @@ from common.messages import ServiceStatus
 from common.supervision.backoff import Backoff
 from common.supervision.child import Child, describe_exit
 from common.supervision.launch import ROUTER, Launch
+
+T = TypeVar("T")
 
 START_TIMEOUT = 15.0  # [s] from being let through the gate to the readiness token
 HEAD_START = 0.5  # [s] between SIGTERM to one service and to the one before it, when it does not end sooner
@@ -27,6 +32,8 @@ log = logging.getLogger("supervisor")
 
 class StartFailed(ZencellError):
     """The cell did not come up, and not because of a wrong configuration."""
+
+    exit_code = 1
 
 
 class BadConfiguration(ZencellError):
@@ -77,9 +84,7 @@ class Supervisor:
     @property
     def statuses(self) -> list[ServiceStatus]:
         """All processes as they are now, the router first."""
-        return [
-            watched.status.model_copy(update={"pid": watched.child.pid}) for watched in self._all
-        ]
+        return [watched.status.model_copy(update={"pid": watched.child.pid}) for watched in self._all]
 
     @property
     def restarts(self) -> dict[str, int]:
@@ -95,25 +100,31 @@ class Supervisor:
             self._tasks.add(task)
             task.add_done_callback(self._kept)
 
-    async def admit_all(self, router_ready: asyncio.Future[None]) -> None:
-        """Let the services through in order, each when those before it are ready; returns when all are.
-
-        Args:
-            router_ready: done when this process is connected to the router; its failure is raised.
+    async def reach_router(self, reaching: Awaitable[T]) -> T:
+        """The result of reaching the router, unless a process fails first or it takes too long.
 
         Raises:
             BadConfiguration: a process ended with exit code 2; the message is its last line.
-            StartFailed: a process was not ready in time; the message has its last lines.
+            StartFailed: the router was not reached in time; the message has its last lines.
         """
-        await self._unless_failed(router_ready, self._router, "the router")
+        reached = await self._unless_failed(reaching, self._router, ROUTER)
         if self._router:
             self._become_ready(self._router)
+        return reached
+
+    async def admit_all(self) -> None:
+        """Let the services through in order, each when those before it are ready; returns when all are.
+
+        Raises:
+            BadConfiguration: a process ended with exit code 2; the message is its last line.
+            StartFailed: a service was not ready in time; the message has its last lines.
+        """
         for watched in self._services:
             watched.admitted = True
             if watched.child.pid is not None:
                 self._set(watched, state="starting")
                 watched.child.release()
-            await self._unless_failed(asyncio.create_task(_until(watched.ready)), watched, watched.child.name)
+            await self._unless_failed(watched.ready.wait(), watched, watched.child.name)
         self._up = True
 
     def mark_alive(self, name: str, alive: bool) -> None:
@@ -201,21 +212,22 @@ class Supervisor:
                 await asyncio.wait_for(gone, 1.0)
         hurried.cancel()
 
-    async def _unless_failed(self, waited: asyncio.Future[None], watched: Watched | None, name: str) -> None:
-        """Wait for something that a process has to reach in time, while no process has failed."""
+    async def _unless_failed(self, reaching: Awaitable[T], watched: Watched | None, name: str) -> T:
+        """The result of something that a process has to reach in time, while no process has failed."""
         assert self._failure is not None, "begin() comes first"
+        waited = asyncio.ensure_future(reaching)
         try:
-            await asyncio.wait({waited, self._failure}, timeout=START_TIMEOUT, return_when=asyncio.FIRST_COMPLETED)
+            either: set[asyncio.Future[Any]] = {waited, self._failure}
+            await asyncio.wait(either, timeout=START_TIMEOUT, return_when=asyncio.FIRST_COMPLETED)
             if self._failure.done():
                 self._failure.result()
             if waited.done():
-                waited.result()
-                return
-            tail: Sequence[str] = list(watched.child.tail)[-SHOWN_LINES:] if watched else []
+                return waited.result()
+            tail = list(watched.child.tail)[-SHOWN_LINES:] if watched else []
             said = "; its last lines:\n  " + "\n  ".join(tail) if tail else "; it said nothing"
             if watched:
                 self._set(watched, state="failed", message=f"not ready within {START_TIMEOUT:g} s")
-            raise StartFailed(f"{name} was not ready within {START_TIMEOUT:g} s{said}")
+            raise StartFailed(f"{name} was not ready within {START_TIMEOUT:g} s{said if watched else ''}")
         finally:
             waited.cancel()
 
@@ -234,9 +246,18 @@ class Supervisor:
 
 
 def _last_message(child: Child) -> str:
-    """The last line of a process, without the program's name in front."""
-    return child.tail[-1].removeprefix("zencell: ") if child.tail else ""
+    """What a process said last, without level and name in front: plain, logged as text, or logged as JSON."""
+    said = [_message_of(line) for line in child.tail]
+    errors = [message for level, message in said if level == "error"]
+    return errors[-1] if errors else said[-1][1] if said else ""
 
 
-async def _until(event: asyncio.Event) -> None:
-    await event.wait()
+def _message_of(line: str) -> tuple[str, str]:
+    """Level and message of a line; the level is empty where there is none."""
+    if line.startswith("{"):
+        with contextlib.suppress(ValueError, KeyError):
+            value = json.loads(line)
+            return str(value.get("level", "")), str(value["message"])
+    if match := re.match(r"(DEBUG|INFO|WARNING|ERROR|CRITICAL) [\w.]+: (.*)", line):
+        return match[1].lower(), match[2]
+    return "", line.removeprefix("zencell: ")

@@ -1,0 +1,237 @@
+"""Bring a cell up: `run` to the end of its task, `up` until Ctrl-C."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import signal
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli import options
+
+if TYPE_CHECKING:
+    from cli.screens import Content, Screen
+    from common.config import Cell
+    from common.supervision.collector import Collector
+    from common.supervision.supervisor import Supervisor
+    from common.transport.bus import Bus
+
+VIEWER = "viewer"
+START_REQUEST_TIMEOUT = 5.0  # [s]
+
+Speed = Annotated[float, typer.Option("--speed", metavar="X", help="cell time per wall time, 0.1 to 10")]
+NoViewer = Annotated[bool, typer.Option("--no-viewer", help="without the operator's page")]
+SummaryFile = Annotated[str | None, typer.Option("--summary", metavar="FILE.json", help="write the figures there")]
+LogJson = Annotated[bool, typer.Option("--log-json", help="log lines as JSON objects")]
+
+
+def run(
+    cell: options.CellArgument,
+    overrides: options.Overrides = None,
+    world: options.WorldName = None,
+    seed: options.Seed = None,
+    speed: Speed = 1.0,
+    domain: options.Domain = None,
+    connect: options.Connect = None,
+    no_viewer: NoViewer = False,
+    summary: SummaryFile = None,
+    log_json: LogJson = False,
+) -> None:
+    """Bring a cell up, run its task to the end, print a summary and shut down; exit 0 only if the task is DONE."""
+    operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json)
+    raise typer.Exit(operation.run_to_end())
+
+
+def up(
+    cell: options.CellArgument,
+    overrides: options.Overrides = None,
+    world: options.WorldName = None,
+    seed: options.Seed = None,
+    speed: Speed = 1.0,
+    domain: options.Domain = None,
+    connect: options.Connect = None,
+    no_viewer: NoViewer = False,
+    summary: SummaryFile = None,
+    log_json: LogJson = False,
+) -> None:
+    """Bring a cell up and stay until Ctrl-C; the task starts by itself unless the cell says `autostart: false`."""
+    operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json)
+    raise typer.Exit(operation.stay())
+
+
+class Operation:
+    """One bring-up, as a person asked for it."""
+
+    def __init__(
+        self, cell: str, overrides: list[str] | None, world: str | None, seed: int | None, speed: float,
+        domain: str | None, connect: str | None, no_viewer: bool, summary: str | None, log_json: bool,
+    ) -> None:
+        """Check everything that was asked for; nothing is started yet.
+
+        Raises:
+            ConfigError, UnknownName: one line naming the option, the value and the choices.
+        """
+        from common.config import load_cell
+        from common.errors import ConfigError
+        from common.supervision.launch import (
+            Launch,
+            clock_of,
+            place_of,
+            process_began,
+            require_free_port,
+            require_modules,
+        )
+        from common.supervision.summary import Summary
+        from common.transport.endpoint import endpoint_of
+
+        self.began = process_began()
+        self.file = Path(summary) if summary else None
+        if self.file and not self.file.absolute().parent.is_dir():
+            raise ConfigError("--summary", summary, "is in a folder that does not exist")
+        number, endpoint = place_of(domain, connect)
+        self.launch = Launch(
+            cell=cell, overrides=tuple(overrides or ()), world=world, seed=seed, domain=number, connect=endpoint,
+            log_json=log_json, clock=clock_of(speed),
+        )
+        loaded = load_cell(cell, self.launch.overrides, world=world, seed=seed)
+        if no_viewer:
+            kept = {name: entry for name, entry in loaded.services.items() if entry.name != VIEWER}
+            loaded = loaded.model_copy(update={"services": kept})
+        self.cell: Cell = loaded
+        self.summary = Summary(loaded.name, loaded.run.seed, speed)
+        require_modules(loaded)
+        if endpoint is None:
+            require_free_port(endpoint_of(number))
+        self._supervisor: Supervisor | None = None
+        self._collector: Collector | None = None
+        self._screen: Screen | None = None
+
+    def run_to_end(self) -> int:
+        """Exit code of a run: 0 when the task is DONE, 1 when it is not, 130 after Ctrl-C."""
+        from common.supervision.summary import describe
+        from common.supervision.supervisor import StartFailed
+
+        try:
+            code = asyncio.run(self._operate(self._until_ended))
+        except StartFailed:
+            self.summary.failed = True
+            self._write_summary()
+            raise
+        self._write_summary()
+        for line in describe(self.summary.as_dict()):
+            typer.echo(line)
+        return code
+
+    def stay(self) -> int:
+        """Exit code of staying up until a signal: 0 when that came after the cell was up."""
+        code = asyncio.run(self._operate(self._until_interrupted))
+        self._write_summary()
+        return 0 if self.summary.ready is not None else code
+
+    async def _operate(self, work: Callable[[Bus], Awaitable[int]]) -> int:
+        from common.supervision.interrupts import Interrupts
+        from common.supervision.operation import Interrupted, operate
+        from common.supervision.supervisor import Supervisor
+
+        interrupts = Interrupts()
+        interrupts.install()
+        early: list[tuple[str, str]] = []
+
+        def show(name: str, text: str) -> None:
+            if self._screen is None:
+                early.append((name, text))
+            else:
+                self._screen.line(name, text)
+
+        self._supervisor = Supervisor(self.cell, self.launch, show)
+        self._supervisor.begin()  # before the rest of our own imports, which take as long as theirs
+        try:
+            self._open_screen(early)
+            return await operate(self.cell, self.launch, self._supervisor, interrupts, work, self._prepare)
+        except Interrupted:
+            return 128 + (interrupts.signal or signal.SIGINT)
+        finally:
+            if self._collector:
+                self._collector.read_truth()
+            self.summary.restarts = self._supervisor.restarts
+            if self._screen:
+                self._screen.close()
+
+    def _open_screen(self, early: list[tuple[str, str]]) -> None:
+        from cli.screens import ScreenHandler, open_screen
+
+        self._screen = open_screen(self._content, log_json=self.launch.log_json)
+        for name, text in early:
+            self._screen.line(name, text)
+        root = logging.getLogger()
+        root.addHandler(ScreenHandler(self._screen, log_json=self.launch.log_json))
+        root.setLevel(logging.INFO)
+
+    def _content(self) -> Content:
+        from cli.screens import Content
+
+        assert self._supervisor is not None
+        statuses = self._supervisor.statuses
+        if self._collector is None:
+            return Content(statuses, {}, None)
+        rates = {status.name: self._collector.rates.busiest_of(status.name) for status in statuses}
+        return Content(statuses, {name: rate for name, rate in rates.items() if rate}, self._collector.task_status)
+
+    def _prepare(self, bus: Bus) -> None:
+        from common.supervision.collector import Collector
+
+        assert self._screen is not None
+        self._collector = Collector(bus, self.cell.task, self.summary, self.began, self._screen.progress)
+
+    async def _until_ended(self, bus: Bus) -> int:
+        from common import topics
+        from common.messages import TaskCommand
+        from common.supervision.operation import beside
+
+        collector = self._came_up()
+        if not self.cell.run.autostart:
+            await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"), START_REQUEST_TIMEOUT)
+
+        async def end() -> None:
+            await collector.ended.wait()
+            await collector.settle()
+
+        await beside(collector.run(), end())
+        return 0 if self.summary.state == "DONE" else 1
+
+    async def _until_interrupted(self, bus: Bus) -> int:
+        from common.transport.endpoint import endpoint_of
+
+        collector = self._came_up()
+        assert self._screen is not None
+        endpoint = endpoint_of(None if self.launch.connect else self.launch.domain, self.launch.connect)
+        took = f"{self.summary.ready:.1f} s"
+        self._screen.note(f"{self.cell.name} is up at {endpoint} after {took}. Read it from outside:")
+        self._screen.note(zenoh_cli_line(endpoint, self.cell.name))
+        await collector.run()
+        return 0
+
+    def _came_up(self) -> Collector:
+        assert self._collector is not None
+        self.summary.ready = time.monotonic() - self.began
+        return self._collector
+
+    def _write_summary(self) -> None:
+        if self.file is None:
+            return
+        text = json.dumps(self.summary.as_dict(), indent=2) + "\n"
+        beside_it = self.file.with_name(self.file.name + ".part")
+        beside_it.write_text(text, encoding="utf-8")
+        beside_it.replace(self.file)  # a reader sees all of it or none
+
+
+def zenoh_cli_line(endpoint: str, cell: str) -> str:
+    """A command line to paste that shows all of a cell with zenoh-cli."""
+    line = "{key} {value}"
+    return f"zenoh --mode client --connect {endpoint} subscribe -k '{cell}/**' --decoder msgpack --line '{line}'"

@@ -1,0 +1,152 @@
+"""Requests: any of them as JSON, and the two that a person sends most often."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cli import options
+from common.errors import ConfigError, UnknownName
+
+if TYPE_CHECKING:
+    from common.messages import Message, TaskCommand, WorldEdit
+    from common.topics import Request
+    from common.transport.bus import Bus
+
+task = typer.Typer(help="Tell the task what to do.", no_args_is_help=True)
+world = typer.Typer(help="Change the simulated world.", no_args_is_help=True)
+
+TIMEOUT = 5.0  # [s]
+X = Annotated[float, typer.Argument(metavar="X", help="[m] in world")]
+Y = Annotated[float, typer.Argument(metavar="Y", help="[m] in world")]
+Id = Annotated[str, typer.Argument(metavar="ID", help="as in `zencell topic echo scene_balls`")]
+NEGATIVE_NUMBERS = {"ignore_unknown_options": True}  # -0.2 is a coordinate, not an option
+
+
+def call(
+    key: Annotated[str, typer.Argument(metavar="KEY", help="of a request, as in `zencell topic list`")],
+    body: Annotated[str, typer.Argument(metavar="JSON", help="its fields; `zencell topic info KEY` has an example")],
+    cell: options.CellName = None,
+    timeout: Annotated[float, typer.Option("--timeout", min=0.01, metavar="S", help="[s]")] = TIMEOUT,
+    domain: options.Domain = None,
+    connect: options.Connect = None,
+) -> None:
+    """Send a request and print the answer as JSON; exit 1 with one line if there is none."""
+    from common.config import check
+    from common.topics import Request, all_topics
+
+    requests = {name: topic for name, topic in all_topics().items() if isinstance(topic, Request)}
+    if key not in requests:
+        raise UnknownName("request", key, requests)
+    request = requests[key]
+    message = check(request.message, _parse(key, body), key)
+    _send(request, message, timeout, cell, domain, connect)
+
+
+def _parse(key: str, body: str) -> dict[str, Any]:
+    from cli.rendering import from_json
+
+    try:
+        given = from_json(json.loads(body))
+    except ValueError as error:
+        raise ConfigError(key, body, f"is not JSON: {error}") from None
+    if not isinstance(given, dict):
+        raise ConfigError(key, body, "must be a JSON object")
+    return given
+
+
+def _send(
+    request: Request[Any, Any], message: Message, timeout: float, cell: str | None, domain: str | None,
+    connect: str | None,
+) -> None:
+    from cli.inspection import inspect
+    from cli.rendering import to_json
+
+    async def visit(bus: Bus) -> Message:
+        answer: Message = await bus.client(request).call(message, timeout)
+        return answer
+
+    typer.echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
+
+
+# --- task -------------------------------------------------------------------------------------------------------
+
+
+def _task(command: str, cell: str | None, domain: str | None, connect: str | None) -> None:
+    from common import topics
+    from common.config import check
+    from common.messages import TaskCommand
+
+    message: TaskCommand = check(TaskCommand, {"command": command})
+    _send(topics.TASK_COMMAND, message, TIMEOUT, cell, domain, connect)
+
+
+@task.command()
+def start(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
+    """Start the task of a cell that was told to wait, or start it again."""
+    _task("start", cell, domain, connect)
+
+
+@task.command()
+def pause(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
+    """Finish the motion under way and wait."""
+    _task("pause", cell, domain, connect)
+
+
+@task.command()
+def resume(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
+    """Carry on after a pause."""
+    _task("resume", cell, domain, connect)
+
+
+@task.command()
+def stop(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
+    """Stop the robot and the task."""
+    _task("stop", cell, domain, connect)
+
+
+# --- world ------------------------------------------------------------------------------------------------------
+
+
+def _edit(values: dict[str, Any], cell: str | None, domain: str | None, connect: str | None) -> None:
+    from common import topics
+    from common.config import check
+    from common.messages import WorldEdit
+
+    message: WorldEdit = check(WorldEdit, values, "world")
+    _send(topics.WORLD_EDIT, message, TIMEOUT, cell, domain, connect)
+
+
+@world.command(context_settings=NEGATIVE_NUMBERS)
+def add(
+    x: X, y: Y,
+    name: Annotated[str, typer.Option("--id", metavar="ID", help="chosen for you if not given")] = "",
+    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+) -> None:
+    """Put one more ball on the table."""
+    _edit({"op": "add", "id": name, "position": {"x": x, "y": y}}, cell, domain, connect)
+
+
+@world.command(context_settings=NEGATIVE_NUMBERS)
+def move(
+    name: Id, x: X, y: Y,
+    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+) -> None:
+    """Put a ball elsewhere."""
+    _edit({"op": "move", "id": name, "position": {"x": x, "y": y}}, cell, domain, connect)
+
+
+@world.command()
+def remove(
+    name: Id, cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
+) -> None:
+    """Take a ball away."""
+    _edit({"op": "remove", "id": name}, cell, domain, connect)
+
+
+@world.command()
+def reset(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
+    """Bring the first layout back."""
+    _edit({"op": "reset"}, cell, domain, connect)

@@ -1,0 +1,75 @@
+"""The `zencell` command: runs, inspects and commands work cells.
+
+The verbs live beside this file, one file for each group of them, and import what is heavy when they are called.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from typing import Any, NoReturn
+
+import typer
+
+from cli import bringup, catalogue, commands, doctor, node, topic
+from common.errors import RequestFailed, ZencellError
+
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+
+
+class CommandLine(typer.Typer):
+    """Verbs whose errors come out as one line: exit code 1 for what failed, 2 for bad input, 130 for Ctrl-C."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> None:
+        """Run the verb that the arguments name and exit with its code."""
+        try:
+            code = typer.main.get_command(self)(*args, standalone_mode=False, prog_name="zencell", **kwargs)
+        except typer.TyperException as error:
+            code = _fail(error.format_message(), error.exit_code)
+        except RequestFailed as error:
+            code = _fail(str(error), EXIT_FAILED)
+        except ZencellError as error:
+            code = _fail(str(error), getattr(error, "exit_code", EXIT_BAD_INPUT))
+        except (KeyboardInterrupt, typer.Abort):
+            code = EXIT_INTERRUPTED
+        except BrokenPipeError:  # as in `zencell topic echo ... | head`
+            code = EXIT_FAILED
+        _leave(code if isinstance(code, int) else 0)
+
+
+def _fail(message: str, code: int) -> int:
+    typer.echo(f"zencell: {message}", err=True)
+    return code
+
+
+def _leave(code: int) -> NoReturn:
+    """End the process without waiting for threads that are still in foreign code, such as one that connects."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):  # nobody reads any more
+            stream.flush()
+    os._exit(code)
+
+
+app = CommandLine(
+    help="Robot work cells as a mesh of processes over Zenoh.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+app.command()(bringup.run)
+app.command()(bringup.up)
+app.command()(catalogue.cells)
+app.command()(catalogue.services)
+app.command()(catalogue.service)
+app.add_typer(topic.app, name="topic")
+app.command(context_settings={"ignore_unknown_options": True})(commands.call)
+app.add_typer(node.app, name="node")
+app.add_typer(commands.task, name="task")
+app.add_typer(commands.world, name="world")
+app.command()(doctor.doctor)
+
+
+if __name__ == "__main__":
+    app()

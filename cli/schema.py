@@ -1,0 +1,88 @@
+"""What a message is made of, in lines for people, and an example of a request."""
+
+from __future__ import annotations
+
+import types
+import typing
+from collections.abc import Iterator
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+# What a person would send first. Each is checked by a test against its message.
+EXAMPLES: dict[str, dict[str, Any]] = {
+    "motion/plan": {"id": "try-1", "goal": {"kind": "joints", "named": "home"}},
+    "motion/stop": {"reason": "asked to"},
+    "gripper/command": {"id": "open-1", "width": 0.08},
+    "world/edit": {"op": "add", "position": {"x": 0.45, "y": -0.1, "z": 0.03}},
+    "task/command": {"command": "pause"},
+}
+
+
+def example_of(key: str, model: type[BaseModel]) -> dict[str, Any]:
+    """An example of a request: the one for its key, or one made of the fields that are required."""
+    return EXAMPLES.get(key) or {name: _sample(field.annotation) for name, field in _required(model)}
+
+
+def fields_of(model: type[BaseModel], indent: int = 0, seen: tuple[type[BaseModel], ...] = ()) -> Iterator[str]:
+    """The fields of a message and of the messages in it: name, type, default, description."""
+    for name, field in model.model_fields.items():
+        line = f"{'  ' * indent}{name}: {type_name(field.annotation)}"
+        if bounds := ", ".join(text for text in map(_bound, field.metadata) if text):
+            line += f" ({bounds})"
+        if not field.is_required() and isinstance(field.default, str | int | float | bool):
+            line += f" = {field.default!r}"
+        if field.description:
+            line += f"  # {field.description}"
+        yield line
+        for inner in _models_in(field.annotation):
+            if inner not in seen:
+                yield from fields_of(inner, indent + 1, (*seen, inner))
+
+
+def type_name(annotation: Any) -> str:
+    """A type as a person would write it."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated:
+        return type_name(arguments[0])
+    if origin is typing.Literal:
+        return " | ".join(repr(value) for value in arguments)
+    if origin in (typing.Union, types.UnionType):
+        return " | ".join(type_name(argument) for argument in arguments)
+    if origin is not None:
+        inner = ", ".join("..." if argument is ... else type_name(argument) for argument in arguments)
+        return f"{origin.__name__}[{inner}]"
+    return "None" if annotation is type(None) else getattr(annotation, "__name__", str(annotation))
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in typing.get_args(annotation):
+        yield from _models_in(argument)
+
+
+def _bound(metadata: Any) -> str:
+    for name, sign in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<=")):
+        if getattr(metadata, name, None) is not None:
+            return f"{sign} {getattr(metadata, name):g}"
+    return ""
+
+
+def _required(model: type[BaseModel]) -> Iterator[tuple[str, FieldInfo]]:
+    return ((name, field) for name, field in model.model_fields.items() if field.is_required())
+
+
+def _sample(annotation: Any) -> Any:
+    """A value of the type that is valid in most places."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated:
+        return _sample(arguments[0])
+    if origin is typing.Literal or origin in (typing.Union, types.UnionType):
+        return arguments[0] if origin is typing.Literal else _sample(arguments[0])
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return {name: _sample(field.annotation) for name, field in _required(annotation)}
+    if origin is list:
+        return [_sample(arguments[0])]
+    return {str: "name", int: 1, float: 0.0, bool: False}.get(annotation, [])

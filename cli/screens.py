@@ -1,0 +1,129 @@
+"""What a person sees while a cell is up: lines on stderr, as text or JSON, or a live table on a terminal."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from common.messages import PickPlaceStatus, ServiceStatus
+
+
+@dataclass(frozen=True)
+class Content:
+    """What the live table shows."""
+
+    services: list[ServiceStatus]
+    rates: dict[str, tuple[str, float]]  # by service: the topic that it writes most often, and how often [Hz]
+    task: PickPlaceStatus | None
+
+
+class Screen(Protocol):
+    """Where lines and the state of the cell are shown."""
+
+    def line(self, service: str, text: str) -> None:
+        """Show one line that a process wrote."""
+
+    def note(self, text: str) -> None:
+        """Show a line of the supervisor's own for the person in front of it."""
+
+    def progress(self, text: str) -> None:
+        """Show how far the task is."""
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+
+
+class PlainScreen:
+    """Lines on stderr, each with the name of who wrote it; no control characters. Notes go to stdout."""
+
+    def line(self, service: str, text: str) -> None:
+        """Show one line that a process wrote."""
+        _write(text if f" {service}: " in text[:80] else f"{service}: {text}")
+
+    def note(self, text: str) -> None:
+        """Show a line for the person in front of it."""
+        sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+
+    def progress(self, text: str) -> None:
+        """Show how far the task is."""
+        self.line("task", text)
+
+    def close(self) -> None:
+        """Nothing to leave behind."""
+
+
+class JsonScreen:
+    """One JSON object a line on stderr: time, service, level, message."""
+
+    def line(self, service: str, text: str) -> None:
+        """Pass on what is such an object already, wrap what is not."""
+        if text.startswith("{"):
+            try:
+                value = json.loads(text)
+            except ValueError:
+                value = None
+            if isinstance(value, dict) and "message" in value:
+                _write(json.dumps({"service": service, **value}))
+                return
+        self._object(service, "info", text)
+
+    def note(self, text: str) -> None:
+        """Show a line for the person in front of it."""
+        self._object("supervisor", "info", text)
+
+    def progress(self, text: str) -> None:
+        """Show how far the task is."""
+        self._object("task", "info", text)
+
+    def _object(self, service: str, level: str, message: str) -> None:
+        _write(json.dumps({"time": round(time.time(), 6), "service": service, "level": level, "message": message}))
+
+    def close(self) -> None:
+        """Nothing to leave behind."""
+
+
+def open_screen(content: Callable[[], Content], *, log_json: bool) -> Screen:
+    """The screen that suits where stderr goes."""
+    if log_json:
+        return JsonScreen()
+    if sys.stderr.isatty() and os.environ.get("TERM", "dumb") != "dumb":
+        from rich.console import Console
+
+        from cli.live import LiveScreen
+
+        return LiveScreen(Console(stderr=True), content)
+    return PlainScreen()
+
+
+class ScreenHandler(logging.Handler):
+    """Shows the supervisor's own log among the lines of its processes."""
+
+    def __init__(self, screen: Screen, *, log_json: bool) -> None:
+        """Show on a screen, as JSON objects if asked to."""
+        super().__init__(logging.INFO)
+        self._screen = screen
+        self._json = log_json
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Show one record."""
+        level, message = record.levelname.lower(), record.getMessage()
+        if record.exc_info and record.exc_info[1] is not None:
+            message += f": {record.exc_info[1]!r}"
+        if self._json:
+            line = {"time": round(record.created, 6), "service": record.name, "level": level, "message": message}
+            text = json.dumps(line)
+        else:
+            text = f"{record.levelname} {record.name}: {message}"
+        self._screen.line(record.name, text)
+
+
+def _write(text: str) -> None:
+    sys.stderr.write(text + "\n")
+    sys.stderr.flush()
