@@ -9,7 +9,7 @@ import numpy as np
 from common.hardware.interface import Limits, Vector
 from common.messages import JointTrajectory
 
-ACCELERATION_MISMATCH = 0.1  # share of the velocity changes that the given accelerations may leave unexplained
+ACCELERATION_MISMATCH = 0.3  # share of the velocity changes that the given accelerations may leave unexplained
 
 
 @dataclass(frozen=True)

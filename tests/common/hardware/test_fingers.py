@@ -1,0 +1,83 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.config import GripperConfig
+from common.hardware.fingers import Fingers
+
+CONFIG = GripperConfig(joints=["left", "right"], links=[])
+WIDTHS = st.floats(0.0, 0.08)
+
+
+def read(fingers: Fingers, start: float, end: float, step: float = 0.005) -> list[float]:
+    return [fingers.read(float(t)).width for t in np.arange(start, end, step)]
+
+
+def test_fingers_close_smoothly_and_stop_at_the_width() -> None:
+    fingers = Fingers(CONFIG, 0.08)
+    fingers.command(0.02, 10.0)
+    widths = read(fingers, 10.0, 12.0)
+    assert widths == sorted(widths, reverse=True) and widths[-1] == 0.02
+    assert np.max(np.abs(np.diff(widths))) <= CONFIG.speed * 0.005 + 1e-9
+    reading = fingers.read(12.0)
+    assert not reading.moving and not reading.holding and reading.velocity == 0.0
+
+
+@given(st.lists(st.tuples(WIDTHS, st.floats(0.0, 0.5)), min_size=1, max_size=6))
+def test_commands_on_the_way_never_break_limits_and_the_last_is_reached(commands: list[tuple[float, float]]) -> None:
+    fingers, now, before = Fingers(CONFIG, 0.08), 0.0, 0.08
+    for width, wait in [*commands, (commands[-1][0], 2.0)]:
+        fingers.command(width, now)
+        for _ in range(int(wait / 0.01)):
+            now += 0.01
+            reading = fingers.read(now)
+            assert 0.0 <= reading.width <= CONFIG.max_width
+            assert abs(reading.width - before) <= CONFIG.speed * 0.01 * 1.01 + 1e-9
+            before = reading.width
+    assert before == pytest.approx(commands[-1][0], abs=1e-9) and not fingers.read(now).moving
+
+
+@given(obstruction=st.floats(0.01, 0.07), step=st.floats(0.002, 0.3))
+def test_fingers_stop_at_what_is_between_them_and_hold_it(obstruction: float, step: float) -> None:
+    fingers = Fingers(CONFIG, 0.08)
+    fingers.command(0.0, 0.0)
+    fingers.obstruct(obstruction)
+    assert min(read(fingers, 0.0, 2.0, step)) >= obstruction
+    reading = fingers.read(2.5)
+    assert reading.width == obstruction and reading.holding and not reading.moving
+
+
+def test_fingers_that_lose_what_they_hold_close_on() -> None:
+    fingers = Fingers(CONFIG, 0.08)
+    fingers.command(0.0, 0.0)
+    fingers.obstruct(0.06)
+    fingers.read(2.0)
+    fingers.obstruct(0.0)
+    assert fingers.read(2.01).moving and not fingers.read(2.01).holding
+    assert fingers.read(4.0).width == 0.0
+
+
+def test_opening_lets_go() -> None:
+    fingers = Fingers(CONFIG, 0.08)
+    fingers.command(0.0, 0.0)
+    fingers.obstruct(0.06)
+    fingers.read(2.0)
+    fingers.command(0.08, 2.0)
+    assert not fingers.read(2.0).holding
+    assert fingers.read(4.0).width == 0.08
+
+
+def test_second_close_command_keeps_the_hold() -> None:
+    fingers = Fingers(CONFIG, 0.08)
+    fingers.command(0.0, 0.0)
+    fingers.obstruct(0.06)
+    fingers.read(2.0)
+    fingers.command(0.01, 2.0)
+    assert fingers.read(2.0).holding and fingers.read(2.0).width == 0.06
+
+
+def test_fingers_told_to_be_where_they_are_do_not_move() -> None:
+    fingers = Fingers(CONFIG, 0.08)
+    fingers.command(0.08, 0.0)
+    assert not fingers.read(0.0).moving

@@ -1,0 +1,238 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.hardware.checks import Tolerances
+from common.hardware.controller import LARGEST_STEP, TrajectoryController
+from common.hardware.lag import LagHardware
+from common.hardware.mock import MockHardware
+
+START = np.zeros(2)
+STEP = 0.01
+T0 = 1.7e9
+
+
+class Rig:
+    """A controller on some hardware, and a clock that is moved by hand."""
+
+    def __init__(self, limits, hardware=None, **tolerances):
+        self.hardware = hardware or MockHardware(START, None)
+        self.controller = TrajectoryController(limits, START, Tolerances(**tolerances))
+        self.now = T0
+        self.positions, self.velocities = [START], [START]
+
+    def accept(self, goal, trajectory):
+        return self.controller.accept(goal, trajectory, self.now, self.hardware.read(self.now)[0])
+
+    def step(self, seconds=STEP):
+        self.now += seconds
+        q, dq = self.hardware.read(self.now)
+        set_point, velocity = self.controller.update(self.now, q, dq)
+        self.hardware.write(set_point, velocity, self.now)
+        self.positions.append(set_point)
+        self.velocities.append(velocity)
+        return self.controller.status
+
+    def until_over(self, most=20.0):
+        end = self.now + most
+        while self.controller.status.state == "active":
+            assert self.now < end
+            self.step()
+        return self.controller.status
+
+    @property
+    def q(self):
+        return self.hardware.read(self.now)[0]
+
+
+@pytest.fixture
+def rig(limits):
+    return Rig(limits)
+
+
+@pytest.mark.parametrize("hardware", [None, LagHardware(START, 0.03, None)])
+def test_goal_is_followed_to_its_end(limits, rest_to_rest, hardware):
+    rig = Rig(limits, hardware)
+    assert rig.accept("a", rest_to_rest([0, 0], [1, -0.5])).state == "active"
+    status = rig.until_over()
+    assert (status.id, status.state, status.progress) == ("a", "succeeded", 1.0)
+    assert np.allclose(rig.q, [1, -0.5], atol=2e-3)
+
+
+def test_progress_grows_with_time(rig, rest_to_rest):
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    seen = [rig.step().progress for _ in range(50)]
+    assert seen == sorted(seen) and seen[-1] == pytest.approx(0.5)
+
+
+def test_next_goal_starts_where_the_last_ended(rig, rest_to_rest):
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    rig.until_over()
+    assert rig.accept("b", rest_to_rest([1, 1], [0, 0])).state == "active"
+    assert rig.until_over().state == "succeeded"
+
+
+def test_second_goal_is_rejected_as_busy_and_the_first_goes_on(rig, rest_to_rest):
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    rig.step()
+    refused = rig.accept("b", rest_to_rest([0, 0], [1, 1]))
+    assert (refused.state, refused.error) == ("rejected", "busy") and "'a'" in refused.message
+    assert rig.controller.status.id == "a" and rig.until_over().state == "succeeded"
+
+
+def test_rejected_goal_does_not_move_the_robot(rig, rest_to_rest):
+    assert rig.accept("a", rest_to_rest([0.5, 0], [1, 1])).error == "start_mismatch"
+    rig.step()
+    assert np.array_equal(rig.q, START) and rig.controller.status.state == "none"
+
+
+@pytest.mark.parametrize("when", ["active", "over", "rejected"])
+def test_same_id_again_gives_the_state_of_that_goal_and_moves_nothing(rig, rest_to_rest, when):
+    there, back = rest_to_rest([0, 0], [1, 1]), rest_to_rest([1, 1], [0, 0])
+    if when == "rejected":
+        first = rig.accept("a", back)
+        assert first.state == "rejected" and rig.accept("a", there) == first
+        return
+    rig.accept("a", there)
+    rig.step()
+    if when == "over":
+        rig.until_over()
+    before = rig.q
+    again = rig.accept("a", back)
+    assert again == rig.controller.status and again.state == ("succeeded" if when == "over" else "active")
+    if when == "over":
+        rig.step()
+        assert np.array_equal(rig.q, before)
+
+
+def test_a_thousand_goals_are_remembered_and_a_running_one_always(rig, rest_to_rest):
+    there, back = rest_to_rest([0, 0], [0.01, 0], 0.5), rest_to_rest([0.01, 0], [0, 0], 0.5)
+    rig.accept("first", there)
+    rig.until_over()
+    rig.accept("running", back)
+    for number in range(999):
+        rig.accept(f"busy {number}", there)
+        rig.step(1e-4)
+    assert rig.accept("running", there).state == "active"
+    assert rig.accept("busy 500", there).error == "busy"
+    rig.until_over()
+    assert rig.accept("first", there).state == "active", "forgotten by now: a new goal"
+
+
+@given(fraction=st.floats(0.02, 0.98), end=st.floats(0.1, 1.0))
+def test_cancelled_goal_comes_to_rest_on_its_path_within_limits(limits, rest_to_rest, fraction, end):
+    rig = Rig(limits)
+    rig.accept("a", rest_to_rest([0, 0], [end, -end / 2]))
+    while rig.now - T0 < fraction:
+        rig.step()
+    answer = rig.controller.cancel("a", "tested", rig.now)
+    assert answer.state == "active" and "tested" in answer.message
+    status = rig.until_over()
+    assert (status.state, status.error, status.message) == ("cancelled", "cancelled", "tested")
+    positions, velocities = np.array(rig.positions), np.array(rig.velocities)
+    assert np.allclose(positions[:, 1], -positions[:, 0] / 2, atol=1e-9), "the path is a straight line"
+    assert np.allclose(velocities[-1], 0.0, atol=1e-2)
+    acceleration = np.abs(np.diff(velocities, axis=0)) / STEP
+    assert np.all(acceleration <= limits.acceleration * 1.1)
+    assert positions[-1, 0] <= end + 1e-9
+    assert rig.step().state == "cancelled" and np.allclose(rig.positions[-1], rig.positions[-2], atol=1e-9)
+
+
+def test_stop_is_quick(limits, rest_to_rest):
+    rig = Rig(limits)
+    rig.accept("a", rest_to_rest([0, 0], [2, 0], 10.0))
+    while rig.now - T0 < 5:
+        rig.step()
+    rig.controller.cancel("", "now", rig.now)
+    rig.until_over()
+    assert rig.now - T0 < 5.5
+
+
+def test_stop_with_another_id_is_ignored_and_told(rig, rest_to_rest):
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    rig.step()
+    unknown = rig.controller.cancel("b", "?", rig.now)
+    assert (unknown.state, unknown.error) == ("none", "unknown_goal")
+    assert rig.until_over().state == "succeeded"
+    assert rig.controller.cancel("a", "late", rig.now).state == "succeeded"
+    assert rig.controller.cancel("", "late", rig.now).state == "succeeded"
+
+
+def test_goal_while_stopping_is_rejected_as_busy(rig, rest_to_rest):
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    for _ in range(30):
+        rig.step()
+    rig.controller.cancel("a", "tested", rig.now)
+    assert rig.accept("b", rest_to_rest([0, 0], [1, 1])).error == "busy"
+
+
+def test_arm_that_falls_behind_ends_the_goal_where_it_is(limits, rest_to_rest):
+    rig = Rig(limits, LagHardware(START, 1.0, None), path=0.1)
+    rig.accept("a", rest_to_rest([0, 0], [0.2, 1.0]))
+    status = rig.until_over()
+    assert (status.state, status.error, status.source) == ("aborted", "path_tolerance", "controller")
+    assert "elbow" in status.message and status.progress < 1
+    assert np.allclose(rig.positions[-1], rig.q, atol=0.02), "it holds where the arm is"
+
+
+def test_arm_that_does_not_arrive_ends_the_goal_after_the_goal_time(limits, rest_to_rest):
+    class Sticky(MockHardware):
+        def read(self, now):
+            q, dq = super().read(now)
+            return q * 0.95, 0 * dq
+
+    rig = Rig(limits, Sticky(START, None), goal_time=0.5)
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    status = rig.until_over()
+    assert (status.state, status.error) == ("aborted", "goal_tolerance") and 1.5 < rig.now - T0 < 1.6
+
+
+def test_start_within_tolerance_is_blended_without_a_jump(limits, rest_to_rest):
+    rig = Rig(limits)
+    assert rig.accept("a", rest_to_rest([0.009, -0.009], [0.5, 0.5])).state == "active"
+    rig.until_over()
+    assert np.all(np.abs(np.diff(rig.positions, axis=0)) <= 1.1 * STEP * limits.velocity)
+    assert np.all(np.abs(rig.positions[1] - START) < 1e-3) and np.allclose(rig.q, [0.5, 0.5])
+
+
+def test_arm_moved_from_outside_is_taken_from_where_it_is(limits, rest_to_rest):
+    hardware = MockHardware(START, None)
+    rig = Rig(limits, hardware)
+    hardware.write(np.array([0.3, 0.0]), START, rig.now)
+    assert rig.accept("a", rest_to_rest([0.3, 0], [0.5, 0.5])).state == "active"
+    rig.step()
+    assert rig.positions[-1][0] == pytest.approx(0.3, abs=1e-2)
+
+
+def test_stall_of_the_loop_does_not_make_the_set_point_jump(rig, limits, rest_to_rest):
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    for _ in range(30):
+        rig.step()
+    rig.step(seconds=5.0)
+    assert np.all(np.abs(rig.positions[-1] - rig.positions[-2]) <= LARGEST_STEP * limits.velocity)
+    assert rig.until_over().state == "succeeded"
+
+
+def test_fault_ends_the_goal_and_rejects_others_until_it_is_gone(rig, rest_to_rest):
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    rig.step()
+    rig.controller.fault("bus is off")
+    status = rig.controller.status
+    assert (status.state, status.error, status.source) == ("aborted", "hardware_fault", "hardware")
+    refused = rig.accept("b", rest_to_rest([0, 0], [1, 1]))
+    assert (refused.error, refused.message) == ("hardware_fault", "bus is off")
+    rig.step()
+    assert rig.accept("c", rest_to_rest(rig.q.tolist(), [1, 1])).state == "active"
+
+
+def test_trajectory_at_the_limits_can_be_stopped(limits, rest_to_rest):
+    tight = replace(limits, acceleration=limits.acceleration * 0.58)  # the quintic peaks at 5.77 rad/s^2
+    rig = Rig(tight)
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    for _ in range(79):
+        rig.step()
+    rig.controller.cancel("", "now", rig.now)
+    assert rig.until_over().state == "cancelled"
