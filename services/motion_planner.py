@@ -63,7 +63,7 @@ def _load(config: Config) -> PlanningPipeline:
 async def _plan(
     pipeline: PlanningPipeline, request: PlanRequest, scene: PlanningScene, current: list[float] | None
 ) -> PlanResponse:
-    """Plan in a thread; when this is cancelled the planner is told and waited for, so that none runs beside the next."""
+    """Plan in a thread; when this is cancelled the planner is told and waited for: never two at once."""
     cancel = Cancel()
     planning = asyncio.create_task(asyncio.to_thread(pipeline.plan, request, scene, current, cancel))
     try:

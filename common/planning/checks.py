@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import UnknownName, ZencellError
-from common.messages import JointGoal, PlanRequest, PlanningScene
+from common.messages import JointGoal, PlanningScene, PlanRequest
 from common.planning.collision import CollisionWorld, Pair
 from common.planning.problem import Region
 from common.robot.model import RobotModel
@@ -34,7 +34,9 @@ class CheckedRequest:
     goal: Array | Region
 
 
-def check_request(robot: RobotModel, request: PlanRequest, scene: PlanningScene, current: Array | None) -> CheckedRequest:
+def check_request(
+    robot: RobotModel, request: PlanRequest, scene: PlanningScene, current: Array | None
+) -> CheckedRequest:
     """Start and goal of a request.
 
     Raises:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
+import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from common.errors import UnknownName
-from common.messages import CollisionObject, PlanningScene
-from common.planning.obstacles import MARGINS, ObstacleCache, Solid
+from common.messages import CollisionObject, PlanningScene, Pose
+from common.planning.obstacles import MARGINS, ObstacleCache, Rules, Solid
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, pose_to_matrix
@@ -53,6 +55,7 @@ class CollisionWorld:
         padding: float = 0.0,
         allowed: Iterable[Pair] = (),
         attach: str = "",
+        attach_pose: Pose | None = None,
         release: bool = False,
         contact_distance: float = 0.02,
         cache: ObstacleCache | None = None,
@@ -65,7 +68,8 @@ class CollisionWorld:
             start: joint positions at which contact and the pose of the attached object are taken.
             padding: more distance from perceived objects [m].
             allowed: pairs of link or object names that may touch, besides the scene's.
-            attach: object that moves with the TCP: as in the scene's attached ones, or from where it lies.
+            attach: the only object that moves with the TCP: as in the scene's attached ones, or from where it lies.
+            attach_pose: of that object in the TCP frame, when not held yet; else as it lies relative to the start.
             release: nothing is attached.
             contact_distance: travel of the TCP [m] until which contact at the start is excused.
             cache: built geometry to use again; the world made before with it must not be used any more.
@@ -79,7 +83,7 @@ class CollisionWorld:
         self._T_world_tcp_start = robot.fk(self.start)
         self._origin = self._T_world_tcp_start[:3, 3].copy()
         self.contact_distance = contact_distance
-        environment, held = self._sort(scene, attach, release)
+        environment, held = self._sort(scene, attach, attach_pose, release)
         objects = [*environment, *(item for item, _, _ in held)]
         solids = [Solid(o.shape, tuple(o.dimensions)) for o in environment]
         solids += [
@@ -98,11 +102,13 @@ class CollisionWorld:
         self._far.set(disabled, margins)
         self._near = self._rules_at_start(disabled, margins)
         self._lever = self._bank.lever
-        # How much the TCP may move per radian of each joint: it is not farther out than the farthest point or the TCP.
-        self._tcp_lever = np.maximum(self._lever, self.cache.robot.lever_with({robot.dof: _tcp_reach(robot)}))
+        # The TCP need not be within the hulls, so it has a lever of its own.
+        tcp = robot.model.frames[robot.tcp_frame]
+        point = pin.GeometryObject("tcp", tcp.parentJoint, robot.tcp_frame, tcp.placement, coal.Sphere(1e-6))
+        self._tcp_lever = self.cache.robot.lever(point)
 
     def _sort(
-        self, scene: PlanningScene, attach: str, release: bool
+        self, scene: PlanningScene, attach: str, attach_pose: Pose | None, release: bool
     ) -> tuple[list[CollisionObject], list[tuple[CollisionObject, int, Array]]]:
         """The environment, and what is held: object, frame, (4, 4) pose in the frame of the joint that carries it."""
         environment = list(scene.objects)
@@ -111,6 +117,8 @@ class CollisionWorld:
         model = self.robot.model
         held = []
         for item in scene.attached:
+            if attach and item.object.id != attach:
+                continue  # let go by the time that this one is taken
             if item.link not in self.robot.link_names:
                 raise UnknownName("link", item.link, self.robot.link_names)
             frame = model.getFrameId(item.link)
@@ -123,11 +131,13 @@ class CollisionWorld:
             frame = self.robot.tcp_frame
             T_joint_tcp = model.frames[frame].placement.homogeneous
             T_tcp_object = invert(self._T_world_tcp_start) @ pose_to_matrix(found.pose)
+            if attach_pose is not None:
+                T_tcp_object = pose_to_matrix(attach_pose)
             held.append((found, frame, T_joint_tcp @ T_tcp_object))
         names = {item.id for item, _, _ in held}
         return [o for o in environment if o.id not in names], held
 
-    def _rules_at_start(self, disabled: frozenset[int], margins: Array):  # type: ignore[no-untyped-def]
+    def _rules_at_start(self, disabled: frozenset[int], margins: Array) -> Rules:
         """Rules while the TCP is near its start: the far ones, but for what is excused there."""
         if not self._far.hit(self.start, _CONTACT_SLACK):
             return self._far
@@ -188,21 +198,23 @@ class CollisionWorld:
         piece. Where nothing can be proved the pieces end at ways of 1 mm, and their middles decide.
         """
         span = b - a
-        way = 0.5 * float(np.abs(span) @ self._lever)
-        tcp_way = 0.5 * float(np.abs(span) @ self._tcp_lever)
-        pieces = [0.5]
-        half = 0.5
+        whole = float(np.abs(span) @ self._lever)
+        tcp_whole = float(np.abs(span) @ self._tcp_lever)
+        count = max(1, math.ceil(whole / (2 * MARGINS[-1])))
+        half = 0.5 / count
+        pieces = (np.arange(count) * 2 * half + half).tolist()
         while pieces:
             left = []
             for middle in pieces:
                 q = a + middle * span
-                if self._proved_free(q, way, tcp_way):
+                if self._proved_free(q, whole * half, tcp_whole * half):
                     continue
                 if self.collides(q):
                     return False
-                if way > MARGINS[1]:
-                    left += [middle - half / 2, middle + half / 2]
-            pieces, half, way, tcp_way = left, half / 2, way / 2, tcp_way / 2
+                left += [middle - half / 2, middle + half / 2]
+            if whole * half <= MARGINS[1]:
+                return True
+            pieces, half = left, half / 2
         return True
 
     def first_collision(self, path: Array) -> Hit | None:
@@ -233,12 +245,7 @@ class CollisionWorld:
 def interpolate(waypoints: Sequence[Array] | Array, step: float) -> Array:
     """Positions (N, dof) [rad] along straight lines between waypoints, no joint moving by more than `step` between."""
     pieces = [np.asarray(waypoints[0], dtype=float)[None, :]]
-    for a, b in zip(waypoints[:-1], waypoints[1:], strict=True):
+    for a, b in pairwise(waypoints):
         count = max(1, math.ceil(float(np.abs(b - a).max()) / step))
         pieces.append(a + np.linspace(0, 1, count + 1)[1:, None] * (b - a))
     return np.concatenate(pieces)
-
-
-def _tcp_reach(robot: RobotModel) -> float:
-    """Distance [m] of the TCP from the origin of the joint that carries it."""
-    return float(np.linalg.norm(robot.model.frames[robot.tcp_frame].placement.translation))

@@ -48,7 +48,8 @@ def in_region(region: Region, T_world_tcp: Array, slack: float = 1e-3) -> bool:
     # The turn that is left once the tool axis was brought back by the shortest way.
     yaw = math.atan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1])
     away = np.abs(T_world_tcp[:3, 3] - region.T_world_tcp[:3, 3])
-    return bool((away <= region.half_sides + slack).all() and tilt <= region.tilt + slack and abs(yaw) <= region.yaw + slack)
+    within = (away <= region.half_sides + slack).all()
+    return bool(within and tilt <= region.tilt + slack and abs(yaw) <= region.yaw + slack)
 
 
 def sample_goals(problem: Problem, region: Region, cancel: Cancel, *, wanted: int, tries: int) -> GoalSamples:

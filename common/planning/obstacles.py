@@ -16,11 +16,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from common.planning.robot_geometry import RobotGeometry, shape_reach
+from common.planning.robot_geometry import RobotGeometry, largest
 
 Array = NDArray[np.float64]
 
-MARGINS = (0.0, 0.001, 0.004, 0.012, 0.03, 0.07, 0.15)  # [m]
+MARGINS = (0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)  # [m]
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class _Level:
             self.data.activateCollisionPair(pair)
         for pair in disabled - self.disabled:
             self.data.deactivateCollisionPair(pair)
-        for pair in np.flatnonzero(self.margins != margins):
-            self.data.collisionRequests[int(pair)].security_margin = float(margins[pair])
+        for pair in np.flatnonzero(self.margins != margins).tolist():
+            self.data.collisionRequests[pair].security_margin = float(margins[pair])
         self.disabled = disabled
         self.margins = margins
 
@@ -74,20 +74,24 @@ class Rules:
     def set(self, disabled: frozenset[int], margins: Array) -> None:
         """Disable pairs and set the least distance (pairs,) [m] of the others."""
         if disabled != self.disabled or not np.array_equal(margins, self.margins):
-            self._current = [False] * len(MARGINS)
+            self.margins_changed()
             self.disabled, self.margins = disabled, margins
+
+    def margins_changed(self) -> None:
+        """Have the levels set their margins again before they are used."""
+        self._current = [False] * len(MARGINS)
 
     def _level(self, index: int) -> _Level:
         level = self._levels[index]
         if level is None:
             level = self._levels[index] = _Level(self._bank.model, self._bank.geometry)
         if not self._current[index]:
-            level.apply(self.disabled, self.margins + MARGINS[index])
+            level.apply(self.disabled, self.margins + MARGINS[index] * self._bank.shares)
             self._current[index] = True
         return level
 
     def hit(self, q: Array, level: int = 0) -> bool:
-        """Whether any pair is closer at q than its own distance and the level's margin together."""
+        """Whether any pair is closer at q than its own distance and its share of the level's margin together."""
         broadphase = self._level(level).broadphase
         return bool(pin.computeCollisions(self._bank.model, self._bank.data, broadphase, q, True))
 
@@ -105,7 +109,8 @@ class ObstacleBank:
     Attributes:
         first, second: geometry indices of each pair; robot geometries come first, then the solids in their order.
         near, far: two sets of rules over the same geometry.
-        lever: see RobotGeometry, with what is attached.
+        lever: (dof,) [m] the farthest that a radian of each joint moves any point of the robot or of what is attached.
+        shares: (pairs,) how much closer two things can come, as a share of the way of the point that moves most.
     """
 
     def __init__(self, robot: RobotGeometry, solids: tuple[Solid, ...]) -> None:
@@ -139,7 +144,9 @@ class ObstacleBank:
         self._solids = solids
         self.near = Rules(self)
         self.far = Rules(self)
-        self.lever = robot.lever
+        self.lever = np.zeros(self.model.nq)
+        self.shares = np.zeros(self.pair_count)
+        self._measure()
 
     def _add_pairs(self, one: int, others: list[int]) -> None:
         for other in others:
@@ -147,15 +154,29 @@ class ObstacleBank:
 
     def place(self, poses: list[Array]) -> None:
         """Put each solid at its (4, 4) pose in the frame of its joint (the world for the environment)."""
-        reach: dict[int, float] = {}
         items: Any = self.geometry.geometryObjects
+        moved = False
         for number, (solid, pose) in enumerate(zip(self._solids, poses, strict=True)):
             item = items[self.robot_count + number]
-            item.placement = pin.SE3(pose)
-            if solid.joint:
-                distance = shape_reach(item.geometry, item.placement)
-                reach[solid.joint] = max(reach.get(solid.joint, 0.0), distance)
-        self.lever = self._robot.lever_with(reach) if reach else self._robot.lever
+            placement = pin.SE3(pose)
+            moved = moved or (solid.joint != 0 and not item.placement.isApprox(placement, 1e-9))
+            item.placement = placement
+        if moved:
+            self._measure()
+
+    def _measure(self) -> None:
+        """Levers, and each pair's share: joints between two links alone move them towards each other."""
+        items = self.geometry.geometryObjects
+        held = [self._robot.lever(items[i]) for i in range(self.robot_count, len(items))]
+        levers = np.array([*self._robot.levers, *held])
+        self.lever = largest(list(levers))
+        between = np.where((levers[self.first] > 0) & (levers[self.second] > 0), 0.0, 1.0)
+        way = np.maximum(levers[self.first], levers[self.second]) * between
+        shares = np.max(way / np.maximum(self.lever, 1e-9), axis=1, initial=0.0)
+        if not np.array_equal(shares, self.shares):
+            self.shares = shares
+            self.near.margins_changed()
+            self.far.margins_changed()
 
 
 class ObstacleCache:

@@ -16,7 +16,7 @@ _TURN_BACK = -0.985  # cosine of the angle at a corner that is too sharp to blen
 
 @dataclass(frozen=True)
 class SmoothPath:
-    """Parabolic pieces that join with one direction: q(s) = start + d0 s + (d1 - d0) s^2 / (2 length), 0 <= s <= length.
+    """Parabolic pieces that join smoothly: q(s) = start + d0 s + (d1 - d0) s^2 / (2 length), 0 <= s <= length.
 
     Attributes:
         starts: (P, dof) [rad]; d0, d1: (P, dof) derivative dq/ds at the piece's ends; lengths: (P,).
@@ -30,7 +30,7 @@ class SmoothPath:
     @property
     def end(self) -> Array:
         """(dof,) the last position [rad]."""
-        return np.array(self.starts[-1] + 0.5 * (self.d0[-1] + self.d1[-1]) * self.lengths[-1])
+        return np.asarray(self.starts[-1] + 0.5 * (self.d0[-1] + self.d1[-1]) * self.lengths[-1])
 
     def divided(self, step: float) -> SmoothPath:
         """The same path in pieces in which no joint moves by more than `step` [rad]."""
@@ -54,7 +54,7 @@ def distinct(waypoints: Sequence[Array] | Array) -> Array:
     """(N, dof) waypoints without those that repeat the one before; the last one is kept as it is."""
     points = np.array(waypoints, dtype=float)
     keep = np.concatenate([[True], np.abs(np.diff(points, axis=0)).max(axis=1) > _SAME])
-    kept = points[keep]
+    kept: Array = points[keep]
     kept[-1] = points[-1]
     return kept
 

@@ -134,6 +134,7 @@ class PlanningPipeline:
             padding=self._motion.object_padding,
             allowed=request.allowed_collisions,
             attach=request.attach,
+            attach_pose=request.attach_pose,
             release=request.release,
             contact_distance=request.contact_distance,
             cache=cache,
@@ -226,7 +227,7 @@ def _failed(
 
 
 def _message(robot: RobotModel, trajectory: TimedPath) -> JointTrajectory:
-    # Built from numbers that validation has just found finite and in shape: checking each again would take milliseconds.
+    # Validation has just found these numbers finite and in shape: checking each again would take milliseconds.
     columns = (
         trajectory.times.tolist(),
         trajectory.positions.tolist(),

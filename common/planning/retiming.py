@@ -1,10 +1,10 @@
 """The fastest timing of a path within velocity and acceleration limits, from rest to rest.
 
-Reachability analysis along the path after Pham & Pham, "A New Approach to Time-Optimal Path Parameterization Based
-on Reachability Analysis" (IEEE T-RO 2018): a backward pass finds the highest speed at each grid point from which the end
-can still be reached, a forward pass goes as fast as that allows. The path's pieces are parabolas and the grid ends where
-they end, so that joint accelerations are linear between grid points and the limits, held at both ends of an interval,
-hold all along it. Between two grid points, x = (ds/dt)^2 changes linearly and u = d2s/dt2 is constant.
+Reachability analysis along the path after Pham & Pham, "A New Approach to Time-Optimal Path Parameterization
+Based on Reachability Analysis" (IEEE T-RO 2018): a backward pass finds the highest speed at each grid point from
+which the end can still be reached, a forward pass goes as fast as that allows. The path's pieces are parabolas and
+the grid ends where they end, so that joint accelerations are linear between grid points and the limits, held at both
+ends of an interval, hold all along it. Between grid points x = (ds/dt)^2 is linear and u = d2s/dt2 constant.
 """
 
 from __future__ import annotations

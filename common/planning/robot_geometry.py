@@ -1,6 +1,8 @@
-"""The robot's collision geometry, loaded once: convex hulls, pairs that may touch removed, how far joints move points."""
+"""The robot's collision geometry, loaded once: convex hulls, pairs that can collide, how far joints move points."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import coal
 import numpy as np
@@ -18,8 +20,7 @@ class RobotGeometry:
 
     Attributes:
         geometry: pinocchio geometry model with the pairs that can collide: all but those the SRDF disables.
-        links: link name of each geometry.
-        lever: (dof,) [m]: one radian of joint j moves no point of the robot by more than lever[j].
+        links: link name of each hull; joints: index of the joint in `robot.model` that carries it, 0 for the base.
     """
 
     def __init__(self, robot: RobotModel) -> None:
@@ -47,40 +48,57 @@ class RobotGeometry:
         self.geometry = geometry
         self.links: list[str] = [robot.model.frames[item.parentFrame].name for item in geometry.geometryObjects]
         self.joints: list[int] = [item.parentJoint for item in geometry.geometryObjects]
-        self._reach = _own_reach(geometry, robot.dof)
-        self._offsets = [np.array(robot.model.jointPlacements[j + 1].translation) for j in range(robot.dof)]
-        self.lever = self.lever_with({})
+        self._axes = _joint_axes(robot.model)
+        self.levers = [self.lever(item) for item in geometry.geometryObjects]
 
-    def lever_with(self, attached_reach: dict[int, float]) -> Array:
-        """`lever` with objects attached: joint index -> distance [m] of their farthest point from its origin.
+    def lever(self, item: pin.GeometryObject) -> Array:
+        """(dof,) [m]: while joint j turns by one radian no point of the shape moves farther than lever[j].
 
-        Walks from the tool to the base: a point lies no farther from a joint's origin than the path along the chain.
+        A point lies no farther from a joint's axis than the path to it along the chain of joints between. Zero for
+        joints that do not move the shape.
         """
         model = self.robot.model
-        reach = self._reach.copy()
-        for joint, distance in attached_reach.items():
-            if joint > 0:
-                reach[joint - 1] = max(reach[joint - 1], distance)
-        for j in range(model.nq - 1, 0, -1):
-            parent = model.parents[j + 1] - 1
-            if parent >= 0:
-                reach[parent] = max(reach[parent], reach[j] + float(np.linalg.norm(self._offsets[j])))
-        return reach
+        lever = np.zeros(model.nq)
+        joint = item.parentJoint
+        if joint == 0:
+            return lever
+        corners = shape_corners(item.geometry, item.placement)
+        lever[joint - 1] = _farthest_from_axis(corners, self._axes[joint])
+        beyond = float(np.linalg.norm(corners, axis=1).max())  # from the origin of `joint`
+        while model.parents[joint] != 0:
+            offset = np.array(model.jointPlacements[joint].translation)[None, :]
+            joint = model.parents[joint]
+            lever[joint - 1] = _farthest_from_axis(offset, self._axes[joint]) + beyond
+            beyond += float(np.linalg.norm(offset))
+        return lever
 
 
-def _own_reach(geometry: pin.GeometryModel, dof: int) -> Array:
-    """(dof,) distance [m] from each joint's origin to the farthest point of the hulls that it carries."""
-    reach = np.zeros(dof)
-    for item in geometry.geometryObjects:
-        if item.parentJoint > 0:
-            reach[item.parentJoint - 1] = max(reach[item.parentJoint - 1], shape_reach(item.geometry, item.placement))
-    return reach
+def _joint_axes(model: pin.Model) -> list[Array | None]:
+    """Unit axis of each revolute joint in its own frame; None for joints that do not turn about one axis."""
+    data = model.createData()
+    jacobian = np.array(pin.computeJointJacobians(model, data, pin.neutral(model)))
+    axes: list[Array | None] = [None]
+    for joint in range(1, model.njoints):
+        axis = np.array(data.oMi[joint].rotation).T @ jacobian[3:, model.joints[joint].idx_v]
+        axes.append(axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 0.5 else None)
+    return axes
 
 
-def shape_reach(shape: coal.CollisionGeometry, placement: pin.SE3) -> float:
-    """Distance [m] from the frame's origin to the farthest corner of the box about a shape placed in that frame."""
+def _farthest_from_axis(points: Array, axis: Array | None) -> float:
+    """Largest distance [m] of points (N, 3) from an axis through the origin; a prismatic joint moves all by one."""
+    if axis is None:
+        return 1.0
+    return float(np.linalg.norm(points - np.outer(points @ axis, axis), axis=1).max())
+
+
+def shape_corners(shape: coal.CollisionGeometry, placement: pin.SE3) -> Array:
+    """(8, 3) corners [m] of the box about a shape, in the frame in which the shape is placed."""
     shape.computeLocalAABB()
     low, high = np.array(shape.aabb_local.min_), np.array(shape.aabb_local.max_)
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    placed = corners @ np.array(placement.rotation).T + np.array(placement.translation)
-    return float(np.linalg.norm(placed, axis=1).max())
+    return np.asarray(corners @ np.array(placement.rotation).T + np.array(placement.translation))
+
+
+def largest(levers: Sequence[Array]) -> Array:
+    """(dof,) the largest lever of each joint."""
+    return np.asarray(np.max(np.array(levers), axis=0))

@@ -1,4 +1,4 @@
-"""The last check of a trajectory before it leaves: what a real controller would refuse, and collisions at a finer step."""
+"""The last check of a trajectory before it leaves: what a real controller would refuse, and collisions."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def fine_samples(trajectory: TimedPath, step: float) -> tuple[Array, NDArray[np.
 def check_numbers(
     trajectory: TimedPath, robot: RobotModel, *, start: ArrayLike, velocity: ArrayLike, acceleration: ArrayLike
 ) -> Fault | None:
-    """The first fault of a trajectory's numbers: finite, times, start, rest at both ends, limits, and that they agree."""
+    """The first fault of a trajectory's numbers: finite, times, start, rest, limits, and that they agree."""
     times, q, dq, ddq = trajectory.times, trajectory.positions, trajectory.velocities, trajectory.accelerations
     limit_v, limit_a = np.asarray(velocity, dtype=float), np.asarray(acceleration, dtype=float)
     if len(times) < 2 or not (len(times) == len(q) == len(dq) == len(ddq)) or q.shape[1] != robot.dof:
@@ -110,9 +110,9 @@ def check_numbers(
     ]
     for code, excess, limit in checks:
         if (excess > 0).any():
-            waypoint, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
-            message = f"waypoint {waypoint} of {len(times)}: {robot.joint_names[joint]} exceeds {limit(int(joint))}"
-            return Fault(code, message, int(waypoint))
+            waypoint, joint = divmod(int(np.argmax(excess)), robot.dof)
+            message = f"waypoint {waypoint} of {len(times)}: {robot.joint_names[joint]} exceeds {limit(joint)}"
+            return Fault(code, message, waypoint)
     return None
 
 

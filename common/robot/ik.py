@@ -32,22 +32,33 @@ def converge(robot: RobotModel, target: pin.SE3, seed: Array, iterations: int) -
             return q
         jacobian = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL)
         damping = (0.05 * min(1.0, float(error @ error)) + 1e-7) * _EYE
-        free = np.ones(len(q))
-        for _ in range(3):
-            J = jacobian * free
-            step = J.T @ np.linalg.solve(J @ J.T + damping, error)
-            largest = np.abs(step).max()
-            if largest > _LARGEST_STEP:
-                step *= _LARGEST_STEP / largest
-            blocked = ((q + step < lower) & (q <= lower)) | ((q + step > upper) & (q >= upper))
-            if not (blocked & (free > 0)).any():
-                break
-            free[blocked] = 0.0
-        q = np.clip(q + step, lower, upper)
+        following = q + _step(jacobian, error, damping)
+        if (following < lower).any() or (following > upper).any():
+            following = _step_within(q, jacobian, error, damping, lower, upper)
+        q = following
     return None
 
 
 _EYE = np.eye(6)
+
+
+def _step(jacobian: Array, error: Array, damping: Array) -> Array:
+    step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping, error)
+    largest = float(np.abs(step).max())
+    return np.asarray(step * (_LARGEST_STEP / largest)) if largest > _LARGEST_STEP else np.asarray(step)
+
+
+def _step_within(q: Array, jacobian: Array, error: Array, damping: Array, lower: Array, upper: Array) -> Array:
+    """The next position within the limits: joints that stand at a limit and would go on are left out of the step."""
+    free = np.ones(len(q))
+    step = np.zeros(len(q))
+    for _ in range(3):
+        step = _step(jacobian * free, error, damping)
+        blocked = ((q + step < lower) & (q <= lower)) | ((q + step > upper) & (q >= upper))
+        if not (blocked & (free > 0)).any():
+            break
+        free[blocked] = 0.0
+    return np.asarray(np.clip(q + step * free, lower, upper))
 
 
 def solve_ik(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -32,7 +33,8 @@ class Options(Parameters):
     """Which of OMPL's planners, and how many goals it may choose from."""
 
     algorithm: Literal[
-        "RRTConnect", "RRT", "PRM", "KPIECE1", "BKPIECE1", "LBKPIECE1", "AORRTC", "BITstar", "InformedRRTstar", "RRTstar"
+        "RRTConnect", "RRT", "PRM", "KPIECE1", "BKPIECE1", "LBKPIECE1",
+        "AORRTC", "BITstar", "InformedRRTstar", "RRTstar",
     ] = "RRTConnect"
     goals: int = Field(6, ge=1, le=100, description="IK solutions of a pose goal to choose from")
     goal_tries: int = Field(40, ge=1, le=1000, description="poses and seeds tried to find them")
@@ -104,7 +106,7 @@ def _best(problem: Problem, options: Options, cancel: Cancel, goals: Sequence[Ar
 
 
 def _cost(path: Array, velocity: Array) -> float:
-    return sum(least_time(a, b, velocity) for a, b in zip(path[:-1], path[1:], strict=True))
+    return sum(least_time(a, b, velocity) for a, b in pairwise(path))
 
 
 class _EdgeValidator(ob.MotionValidator):  # type: ignore[misc]
