@@ -1,0 +1,71 @@
+"""Draws what a camera would see of the simulated world and sends it as a camera does."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import numpy as np
+from pydantic import Field
+
+from common import topics
+from common.config import Parameters, Run, Surroundings
+from common.messages import PoseArray
+from common.perception.drawing import draw
+from common.perception.image import array_to_image
+from common.perception.pinhole import Pinhole
+from common.transport.bus import Bus
+from common.transport.service import main
+
+UNSEEN = ("held", "elsewhere")  # hidden by the hand; off the table
+
+
+class Config(Parameters):
+    """Rate and quality of the picture."""
+
+    world: Surroundings
+    run: Run
+    rate: float = Field(10.0, gt=0, le=250, description="frames per second of cell time [Hz]")
+    max_rate: float = Field(50.0, gt=0, le=250, description="frames per second of wall time at most [Hz]")
+    noise_std: float = Field(0.0, ge=0, le=100, description="standard deviation of Gaussian noise [0..255]")
+    brightness: float = Field(0.0, ge=-255, le=255, description="added to every channel [0..255]")
+
+
+def seen(balls: PoseArray) -> list[tuple[float, float, float]]:
+    """Centres of the balls that the camera can see (x, y, z) [m], world."""
+    labels = balls.labels or [""] * len(balls.poses)
+    return [
+        (pose.position.x, pose.position.y, pose.position.z)
+        for pose, label in zip(balls.poses, labels, strict=True)
+        if label not in UNSEEN
+    ]
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Send a picture at the rate, from the first time on that the world says where its balls are."""
+    truth = bus.reader(topics.SCENE_BALLS)
+    images, infos = bus.writer(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_INFO)
+    frame = config.world.camera.frame
+    camera = Pinhole.from_config(config.world.camera)
+    rng = np.random.default_rng(config.run.seed)
+    await bus.ready()
+    await truth.next()
+    infos.put(camera.info(bus.header(frame)))
+    loop = asyncio.get_running_loop()
+    period = 1.0 / bus.clock.wall_rate(config.rate, config.max_rate)
+    due = loop.time()
+    while True:
+        header = bus.header(frame)  # the instant of exposure: what is drawn is where the balls are now
+        balls = truth.latest
+        if balls is not None:
+            picture = draw(
+                seen(balls), camera, config.world, noise_std=config.noise_std, brightness=config.brightness, rng=rng
+            )
+            images.put(array_to_image(picture, "bgr8", header))
+        # Due times lie on a fixed grid: a late frame makes neither drift nor a burst, the ones it missed are left out.
+        due += period * max(1, math.ceil((loop.time() - due) / period))
+        await asyncio.sleep(due - loop.time())
+
+
+if __name__ == "__main__":
+    main(run, Config)

@@ -1,0 +1,75 @@
+"""Finds the balls in the picture and says where they are in the world."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import cv2
+
+from common import topics
+from common.config import Surroundings
+from common.messages import Color, Header, Marker, MarkerArray, Pose, Vector3
+from common.perception.annotation import annotate
+from common.perception.detector import Detection, Detector, DetectorOptions
+from common.perception.image import array_to_image
+from common.perception.intake import Unusable, camera_of, picture_of
+from common.transport.bus import Bus
+from common.transport.service import main
+
+WORLD = "world"
+
+
+class Config(DetectorOptions):
+    """How red is told from the rest."""
+
+    world: Surroundings
+
+
+def markers(detections: list[Detection], around: Surroundings, stamp: int) -> MarkerArray:
+    """The message of what was found in the frame that was exposed at `stamp`."""
+    size = 2 * around.ball_radius
+    r, g, b = around.ball_color
+    return MarkerArray(
+        header=Header(stamp=stamp, frame_id=WORLD),
+        markers=[
+            Marker(
+                ns="ball",
+                id=index,
+                type="sphere",
+                pose=Pose(position=Vector3(x=d.position[0], y=d.position[1], z=d.position[2])),
+                scale=Vector3(x=size, y=size, z=size),
+                color=Color(r=r, g=g, b=b),
+                pixel=d.pixel,
+                partial=d.partial,
+            )
+            for index, d in enumerate(detections)
+        ],
+    )
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Look at every picture as it comes; what can not be looked at is dropped, counted and told once."""
+    images = bus.reader(topics.CAMERA_IMAGE)
+    infos, statics = bus.reader(topics.CAMERA_INFO), bus.reader(topics.TF_STATIC)
+    found, shown = bus.writer(topics.DETECTED_OBJECTS), bus.writer(topics.DETECTION_IMAGE)
+    cv2.setNumThreads(1)  # the other cores have other services
+    detector = Detector(config.world, config)
+    unusable: Counter[str] = Counter()
+    await bus.ready()
+    async for image in images:
+        try:
+            camera = camera_of(infos.latest, statics.latest, image.header.frame_id)
+            picture = picture_of(image, camera)
+        except Unusable as error:
+            unusable[error.kind] += 1
+            if unusable[error.kind] == 1 and error.kind != "unknown_camera":  # which is usual in the first moments
+                bus.log.warning("image dropped: %s (told once; further ones are counted)", error)
+            continue
+        detections = detector.detect(picture, camera)
+        found.put(markers(detections, config.world, image.header.stamp))
+        if shown.matched:
+            shown.put(array_to_image(annotate(picture, detections), "bgr8", image.header))
+
+
+if __name__ == "__main__":
+    main(run, Config)

@@ -1,0 +1,115 @@
+"""Offers the detections that the arm can take to the task, and says why it does not offer the others."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from contextlib import suppress
+
+from pydantic import Field
+
+from common import topics
+from common.config import Grasp, RobotConfig, Surroundings
+from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
+from common.perception.intake import Unusable, camera_of
+from common.perception.pinhole import Pinhole
+from common.robot.model import RobotModel
+from common.scene.validation import Validation
+from common.scene.workspace import ReachCache, WorkspaceBounds
+from common.transport.bus import Bus
+from common.transport.service import main
+
+WORLD = "world"
+PATIENCE = 0.008  # wall time for which a frame with new places waits for their inverse kinematics [s]
+
+
+class Config(WorkspaceBounds):
+    """Bounds of the workspace."""
+
+    world: Surroundings
+    robot: RobotConfig
+    grasp: Grasp
+    forget_after: float = Field(
+        2.0, ge=0, le=3600, description="a rejection is told again once its place was empty for so long [s, cell time]"
+    )
+
+
+def shells(config: Config, header: Header) -> MarkerArray:
+    """The reachable shell, and the column about the base axis that is left out of it."""
+    height = config.max_height - config.min_height
+    inner = max(config.min_radius, config.singularity_radius)
+    cylinders = (("reachable shell", config.max_radius, (0.2, 0.8, 0.3)), ("excluded column", inner, (0.9, 0.2, 0.2)))
+    pose = Pose(position=Vector3(z=(config.max_height + config.min_height) / 2))
+    return MarkerArray(
+        header=header,
+        markers=[
+            Marker(
+                ns="workspace", id=index, type="cylinder", pose=pose, text=text,
+                scale=Vector3(x=2 * radius, y=2 * radius, z=height), color=Color(r=r, g=g, b=b, a=0.15),
+            )
+            for index, (text, radius, (r, g, b)) in enumerate(cylinders)
+        ],
+    )
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Judge every frame with what is known; the inverse kinematics of new places is worked out beside that."""
+    detected = bus.reader(topics.DETECTED_OBJECTS)
+    infos, statics = bus.reader(topics.CAMERA_INFO), bus.reader(topics.TF_STATIC)
+    validated, rejected = bus.writer(topics.VALIDATED_TARGETS), bus.writer(topics.REJECTED_TARGETS)
+    markers = bus.writer(topics.WORKSPACE_MARKERS)
+    reach = ReachCache(RobotModel.load(config.robot), config.grasp, config)
+    validation = Validation(config.world, reach, forget_after=config.forget_after)
+    markers.put(shells(config, bus.header(WORLD)))
+    places: list[tuple[float, float, float]] = []
+    work, idle = asyncio.Event(), asyncio.Event()
+    unfinished: tuple[MarkerArray, Pinhole] | None = None  # sent without the places that were still worked on
+    unusable: Counter[str] = Counter()
+    await bus.ready()
+
+    def send(frame: MarkerArray, camera: Pinhole) -> None:
+        nonlocal unfinished
+        verdict = validation.judge(frame, camera)
+        unfinished = (frame, camera) if verdict.unknown else None
+        header = Header(stamp=frame.header.stamp, frame_id=WORLD)
+        poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in verdict.targets]
+        validated.put(PoseArray(header=header, poses=poses))
+        if verdict.rejections:
+            rejected.put(Rejections(header=header, rejected=verdict.rejections))
+        for one in verdict.rejections:
+            bus.log.info("rejected (%.3f, %.3f): %s", one.position.x, one.position.y, one.reason)
+
+    async def watch() -> None:
+        async for frame in detected:
+            try:
+                camera = camera_of(infos.latest, statics.latest)
+            except Unusable as error:
+                unusable[error.kind] += 1
+                if unusable[error.kind] == 1 and error.kind != "unknown_camera":  # usual in the first moments
+                    bus.log.warning("detections dropped: %s (told once; further ones are counted)", error)
+                continue
+            places[:] = validation.unknown(frame, camera)
+            if places:
+                idle.clear()
+                work.set()
+                with suppress(TimeoutError):  # what is not known by then goes out with a later frame
+                    await asyncio.wait_for(idle.wait(), PATIENCE)
+            send(frame, camera)
+
+    async def work_out() -> None:
+        while True:
+            await work.wait()
+            work.clear()
+            while places:
+                await asyncio.to_thread(reach.reason, places.pop(0))
+            idle.set()
+            if unfinished is not None:
+                send(*unfinished)
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(watch())
+        group.create_task(work_out())
+
+
+if __name__ == "__main__":
+    main(run, Config)

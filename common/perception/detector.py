@@ -87,10 +87,11 @@ class Detector:
         """What is red in a bgr8 picture: opened, and then closed; 255 where it is."""
         o = self.options
         hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
-        red = cv2.inRange(hsv, np.array(o.hsv_red_lo1), np.array(o.hsv_red_hi1))
-        red |= cv2.inRange(hsv, np.array(o.hsv_red_lo2), np.array(o.hsv_red_hi2))
-        opened = cv2.morphologyEx(red, cv2.MORPH_OPEN, self._kernel)
-        return opened, cv2.morphologyEx(opened, cv2.MORPH_CLOSE, self._kernel)
+        low = cv2.inRange(hsv, np.array(o.hsv_red_lo1), np.array(o.hsv_red_hi1))
+        high = cv2.inRange(hsv, np.array(o.hsv_red_lo2), np.array(o.hsv_red_hi2))
+        opened = cv2.morphologyEx(cv2.bitwise_or(low, high), cv2.MORPH_OPEN, self._kernel)
+        closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, self._kernel)
+        return np.asarray(opened, np.uint8), np.asarray(closed, np.uint8)
 
     def detect(self, picture: Picture, camera: Pinhole) -> list[Detection]:
         """Balls in a bgr8 picture (height, width, 3), nearest to the upper left corner first."""
@@ -173,17 +174,3 @@ class Detector:
         rays = camera.directions(blob.border)
         away = center - (rays @ center)[:, None] * rays
         return bool((np.linalg.norm(away, axis=1) < self.resting.radius).any())
-
-
-def annotate(picture: Picture, detections: list[Detection]) -> Picture:
-    """A copy of the bgr8 picture with the outline, the centre and the place [m] of each detection."""
-    shown = picture.copy()
-    for d in detections:
-        color = (0, 200, 255) if d.partial else (0, 255, 0)
-        points = np.rint(np.clip(d.outline, -4000, 20000) * 16).astype(np.int32)
-        cv2.polylines(shown, [points], True, color, 1, cv2.LINE_AA, 4)
-        u, v = (round(value) for value in d.pixel)
-        cv2.drawMarker(shown, (u, v), color, cv2.MARKER_CROSS, 9, 1)
-        label = f"{d.position[0]:.3f} {d.position[1]:+.3f}{' partial' if d.partial else ''}"
-        cv2.putText(shown, label, (u - 40, v - 26), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (0, 0, 0), 1, cv2.LINE_AA)
-    return shown

@@ -65,7 +65,7 @@ def find_blobs(closed: Mask, fine: Mask, camera: Pinhole, min_area: float) -> li
     Closing bridges the gaps between near neighbours and fills notches: what a ball looks like is in the finer mask.
     """
     outer, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    large = [(c, area) for c in outer if (area := cv2.contourArea(c)) >= min_area]
+    large = [(np.asarray(c, np.int32), area) for c in outer if (area := cv2.contourArea(c)) >= min_area]
     if not large:
         return []
     contours, hierarchy = cv2.findContours(fine, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -76,7 +76,7 @@ def find_blobs(closed: Mask, fine: Mask, camera: Pinhole, min_area: float) -> li
         u, v = (float(value) for value in contour[0, 0])
         for index, (outside, _) in enumerate(large):
             if cv2.pointPolygonTest(outside, (u, v), False) >= 0:
-                within[index].append((contour, links[3] >= 0))
+                within[index].append((np.asarray(contour, np.int32), bool(links[3] >= 0)))
                 break
     blobs = []
     for (contour, area), parts in zip(large, within, strict=True):

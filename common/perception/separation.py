@@ -78,7 +78,8 @@ def _votes(outline: Outline, camera: Pinhole, resting: Resting, offset: float) -
         t = drop / toward[:, 2]
     votes = camera.position[:2] + t[:, None] * toward[:, :2]
     good = np.isfinite(votes).all(axis=1) & (t > 0) & (np.abs(votes - camera.position[:2]).max(axis=1) < 20)
-    return votes[good]
+    kept: Array = votes[good]
+    return kept
 
 
 def _peaks(votes: Array, camera: Pinhole, resting: Resting) -> Array:

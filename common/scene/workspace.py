@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 
@@ -117,7 +118,7 @@ class ReachCache:
         """Start empty.
 
         Args:
-            robot: not to be used by another thread while `reason` runs.
+            robot: not to be used by another thread while `reason` runs; `known` may be called from any.
             grasp: heights of the stages.
             bounds: of the workspace.
             cell: places in the same cube of this side share their answer [m].
@@ -128,6 +129,7 @@ class ReachCache:
         self._bounds = bounds or WorkspaceBounds()
         self._cell = cell
         self._size = size
+        self._lock = threading.Lock()
         self._known: OrderedDict[tuple[int, int, int], str] = OrderedDict()
 
     def known(self, position: Sequence[float]) -> str | None:
@@ -136,19 +138,20 @@ class ReachCache:
         if reason:
             return reason
         key = self._key(position)
-        if key in self._known:
-            self._known.move_to_end(key)
-            return self._known[key]
-        return None
+        with self._lock:
+            if key in self._known:
+                self._known.move_to_end(key)
+            return self._known.get(key)
 
     def reason(self, position: Sequence[float]) -> str:
         """As `reach_reason`; the chain is computed for the place itself, the first that is asked for in its cell."""
         known = self.known(position)
         if known is None:
             known = chain_reason(self._robot, position, self._grasp, self._bounds)
-            self._known[self._key(position)] = known
-            if len(self._known) > self._size:
-                self._known.popitem(last=False)
+            with self._lock:
+                self._known[self._key(position)] = known
+                if len(self._known) > self._size:
+                    self._known.popitem(last=False)
         return known
 
     def _key(self, position: Sequence[float]) -> tuple[int, int, int]:

@@ -1,0 +1,67 @@
+"""From messages to a picture and the camera that took it, or the reason why that can not be."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from common.errors import ZencellError
+from common.messages import CameraInfo, Image, TFMessage
+from common.perception.image import ImageError, image_to_array
+from common.perception.pinhole import CameraError, Pinhole
+from common.robot.transforms import pose_to_matrix
+
+Picture = npt.NDArray[np.uint8]
+
+
+class Unusable(ZencellError):
+    """A picture that can not be looked at. `kind` tells causes apart: unknown_camera, camera, size, encoding, ..."""
+
+    def __init__(self, kind: str, message: str) -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+def camera_of(info: CameraInfo | None, transforms: TFMessage | None, frame_id: str = "") -> Pinhole:
+    """The camera that camera_info and tf describe.
+
+    Args:
+        info: intrinsics.
+        transforms: of which the one with the camera's frame as its child is taken; its parent is the world.
+        frame_id: of the picture; that of `info` when empty.
+
+    Raises:
+        Unusable: one of them is missing or says something that no pinhole camera does.
+    """
+    if info is None or transforms is None:
+        missing = "camera_info" if info is None else "tf_static"
+        raise Unusable("unknown_camera", f"no {missing} came yet")
+    frame = frame_id or info.header.frame_id
+    pose = next((t.transform for t in transforms.transforms if t.child_frame_id == frame), None)
+    if pose is None:
+        known = ", ".join(t.child_frame_id for t in transforms.transforms)
+        raise Unusable("unknown_frame", f"tf_static has no frame {frame!r}; it has: {known or 'none'}")
+    try:
+        return Pinhole.from_info(info, pose_to_matrix(pose))
+    except CameraError as error:
+        raise Unusable("camera", str(error)) from None
+
+
+def picture_of(image: Image, camera: Pinhole) -> Picture:
+    """The bgr8 picture (height, width, 3) of an image message.
+
+    Raises:
+        Unusable: another size than the camera has, not a colour picture, or bytes that do not add up.
+    """
+    if (image.width, image.height) != (camera.width, camera.height):
+        raise Unusable(
+            "size", f"image of {image.width}x{image.height}, but camera_info says {camera.width}x{camera.height}"
+        )
+    if image.encoding not in ("bgr8", "rgb8"):
+        raise Unusable("encoding", f"encoding {image.encoding!r} is no colour picture; choices: bgr8, rgb8")
+    try:
+        pixels: Picture = image_to_array(image)
+    except ImageError as error:
+        raise Unusable(error.kind, str(error)) from None
+    return pixels if image.encoding == "bgr8" else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), np.uint8)

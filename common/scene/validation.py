@@ -1,0 +1,95 @@
+"""Which detections are offered to the task, and why the others are not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from common.config import Surroundings
+from common.messages import Marker, MarkerArray, Rejection, Vector3
+from common.perception.pinhole import Pinhole
+from common.scene.workspace import INSIDE_CONTAINER, PARTLY_OUT_OF_VIEW, ReachCache, inside_container
+
+Place = tuple[float, float, float]
+
+
+@dataclass
+class Verdict:
+    """What became of the detections of one frame; places are (x, y, z) [m] in world.
+
+    Attributes:
+        targets: can be taken.
+        rejections: can not, with the reason; only those that were not told before.
+        inside: number of those in the container, which are nobody's target and no rejection.
+        unknown: inverse kinematics has to tell first.
+    """
+
+    targets: list[Place] = field(default_factory=list)
+    rejections: list[Rejection] = field(default_factory=list)
+    inside: int = 0
+    unknown: list[Place] = field(default_factory=list)
+
+
+@dataclass
+class _Told:
+    place: Place
+    seen: int  # stamp of the newest frame that shows something there [ns]
+
+
+class Validation:
+    """Judges the detections of frame after frame. Says each rejection once for each place."""
+
+    def __init__(
+        self, around: Surroundings, reach: ReachCache, *, forget_after: float = 2.0, same_place: float = 0.03
+    ) -> None:
+        """Start with nothing told.
+
+        Args:
+            around: container and size of the balls.
+            reach: answers for places on the table.
+            forget_after: a place that was empty for so long is told again [s, cell time].
+            same_place: detections within this are at the same place [m]; less than balls are apart.
+        """
+        self._around = around
+        self._reach = reach
+        self._forget_ns = int(forget_after * 1e9)
+        self._same_place = same_place
+        self._told: list[_Told] = []
+
+    def judge(self, frame: MarkerArray, camera: Pinhole) -> Verdict:
+        """What becomes of the detections of a frame. The same frame may be judged again when more is known."""
+        verdict = Verdict()
+        stamp = frame.header.stamp
+        self._told = [told for told in self._told if stamp - told.seen <= self._forget_ns]
+        for marker in frame.markers:
+            place, reason = self._reason(marker, camera)
+            if reason is None:
+                verdict.unknown.append(place)
+            elif reason == INSIDE_CONTAINER:
+                verdict.inside += 1
+            elif reason:
+                self._tell(verdict, place, reason, stamp)
+            else:
+                verdict.targets.append(place)
+        return verdict
+
+    def unknown(self, frame: MarkerArray, camera: Pinhole) -> list[Place]:
+        """Places in a frame that need inverse kinematics before they can be judged."""
+        judged = (self._reason(marker, camera) for marker in frame.markers)
+        return [place for place, reason in judged if reason is None]
+
+    def _reason(self, marker: Marker, camera: Pinhole) -> tuple[Place, str | None]:
+        """Where a detection is, and why it is no target: empty when it is one, None when that is not known yet."""
+        place = (marker.pose.position.x, marker.pose.position.y, marker.pose.position.z)
+        pixel = marker.pixel if marker.pixel is not None else camera.project(place)
+        if inside_container(camera, pixel, self._around):
+            return place, INSIDE_CONTAINER
+        return place, PARTLY_OUT_OF_VIEW if marker.partial else self._reach.known(place)
+
+    def _tell(self, verdict: Verdict, place: Place, reason: str, stamp: int) -> None:
+        for told in self._told:
+            if math.dist(told.place, place) < self._same_place:
+                told.seen, told.place = max(told.seen, stamp), place
+                return
+        self._told.append(_Told(place, stamp))
+        verdict.rejections.append(Rejection(position=Vector3(x=place[0], y=place[1], z=place[2]), reason=reason))

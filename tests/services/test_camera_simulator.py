@@ -1,0 +1,115 @@
+import asyncio
+
+import numpy as np
+import pytest
+
+from common import topics
+from common.clock import Clock
+from common.config import Run, Surroundings
+from common.messages import Pose, PoseArray, Vector3
+from common.perception.image import image_to_array
+from common.transport.local import LocalNetwork
+from common.transport.wiring import wiring
+from services.camera_simulator import Config, run, seen
+
+config = Config(world=Surroundings(), run=Run(cell="test", seed=4))
+
+
+def balls(*places, labels=()):
+    return PoseArray(
+        poses=[Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in places],
+        ids=[f"ball_{i}" for i in range(len(places))],
+        labels=list(labels) or ["table"] * len(places),
+    )
+
+
+async def next_of(reader):
+    return await asyncio.wait_for(reader.next(), 10)
+
+
+def red_at(image, x, y):
+    u, v = round(320 - y * 520 / 0.77), round(240 - (x - 0.40) * 520 / 0.77)
+    return image_to_array(image)[v, u].tolist() == [26, 38, 255]
+
+
+async def test_one_layout_in_pictures_and_camera_info_out():
+    net = LocalNetwork()
+    tester = net.bus()
+    images, infos = tester.reader(topics.CAMERA_IMAGE), tester.reader(topics.CAMERA_INFO)
+    truth = tester.writer(topics.SCENE_BALLS)
+    async with net.running(run, config, name="camera_simulator"):
+        truth.put(balls((0.5, -0.2, 0.03)))
+        image, info = await next_of(images), await next_of(infos)
+        assert (image.width, image.height, image.encoding) == (640, 480, "bgr8")
+        assert image.header.frame_id == info.header.frame_id == "camera_optical_frame"
+        assert info.k == [520, 0, 320, 0, 520, 240, 0, 0, 1] and (info.width, info.height) == (640, 480)
+        assert red_at(image, 0.5, -0.2)
+
+
+async def test_nothing_is_sent_before_the_world_says_where_its_balls_are():
+    net = LocalNetwork()
+    tester = net.bus()
+    images, infos = tester.reader(topics.CAMERA_IMAGE), tester.reader(topics.CAMERA_INFO)
+    truth = tester.writer(topics.SCENE_BALLS)
+    async with net.running(run, config.model_copy(update={"rate": 200.0, "max_rate": 200.0})):
+        await asyncio.sleep(0.1)
+        assert images.latest is None and infos.latest is None
+        truth.put(balls())
+        await next_of(images)
+
+
+async def test_what_is_drawn_follows_the_world_and_leaves_out_what_can_not_be_seen():
+    net = LocalNetwork()
+    tester = net.bus()
+    images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_BALLS)
+    async with net.running(run, config):
+        truth.put(balls((0.5, -0.2, 0.03), (0.6, 0.0, 0.03)))
+        while not red_at(await next_of(images), 0.6, 0.0):
+            pass
+        truth.put(balls((0.5, -0.2, 0.03), (0.6, 0.0, 0.03), labels=("held", "table")))
+        while red_at(image := await next_of(images), 0.5, -0.2):
+            pass
+        assert red_at(image, 0.6, 0.0)
+
+
+def test_held_and_lost_balls_are_not_seen_but_falling_and_boxed_ones_are():
+    places = [(0.1 * i, 0, 0.03) for i in range(5)]
+    labels = ("table", "held", "falling", "box", "elsewhere")
+    assert seen(balls(*places, labels=labels)) == [places[0], places[2], places[3]]
+    assert seen(PoseArray(poses=[Pose()])) == [(0, 0, 0)]
+
+
+async def test_stamps_are_cell_time_at_the_rate_in_cell_time():
+    net = LocalNetwork()
+    clock = Clock(speed=5.0)
+    tester = net.bus(clock=clock)
+    images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_BALLS)
+    async with net.running(run, config, clock=clock):
+        truth.put(balls())
+        stamps = [(await next_of(images)).header.stamp for _ in range(8)]
+        assert stamps == sorted(set(stamps)) and stamps[-1] <= clock.now_ns()
+        # 0.1 s apart in cell time, or whole multiples when frames were missed: a fixed grid, give or take the jitter.
+        assert np.median(np.diff(stamps)) > 0.05e9
+
+
+async def test_noise_comes_from_the_seed_of_the_run():
+    async def first(seed):
+        net = LocalNetwork()
+        tester = net.bus()
+        images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_BALLS)
+        truth.put(balls())
+        noisy = Config(world=Surroundings(), run=Run(cell="test", seed=seed), noise_std=8, brightness=-20)
+        async with net.running(run, noisy):
+            return image_to_array(await next_of(images))
+
+    one, again, other = await first(1), await first(1), await first(2)
+    np.testing.assert_array_equal(one, again)
+    assert (one != other).any()
+    assert one[300:, 300:].mean() == pytest.approx(128 - 20 - 1, abs=1)
+
+
+async def test_it_is_the_only_one_here_that_reads_the_truth():
+    found = await wiring(run, config)
+    assert found.reads == {topics.SCENE_BALLS}
+    assert found.writes == {topics.CAMERA_IMAGE, topics.CAMERA_INFO}
+    assert not found.serves and not found.calls
