@@ -1,0 +1,117 @@
+"""Listens to a cell for the summary of a run and for the table that a person watches."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from common import topics
+from common.messages import PickPlaceStatus
+from common.supervision.rates import Rates
+from common.supervision.summary import Summary, is_settled, progress_line
+from common.topics import Topic
+
+if TYPE_CHECKING:
+    from common.transport.bus import Bus
+
+SETTLE_TIMEOUT = 2.0  # [s] for what still falls after the task ended
+ENDED = ("DONE", "ERROR")
+
+# On which topic a task says how far it is, where it is not pick_place_status.
+STATUS_OF_TASK: dict[str, Topic[PickPlaceStatus]] = {}
+
+
+def status_topic(task: str) -> Topic[PickPlaceStatus]:
+    """The topic on which a task's service publishes its status."""
+    return STATUS_OF_TASK.get(task, topics.PICK_PLACE_STATUS)
+
+
+class Collector:
+    """Feeds a `Summary` and `Rates` from a cell's topics."""
+
+    def __init__(
+        self, bus: Bus, task: str, summary: Summary, started_at: float, on_progress: Callable[[str], None]
+    ) -> None:
+        """Declare what is listened to.
+
+        Args:
+            bus: of the cell.
+            task: the service whose status says when the run has ended.
+            summary: is fed.
+            started_at: when this process began [s, monotonic].
+            on_progress: called with a line whenever the task got further.
+        """
+        self.summary = summary
+        self.rates = Rates(topics.all_topics())
+        self.task_status: PickPlaceStatus | None = None
+        self.ended = asyncio.Event()
+        self._clock = bus.clock
+        self._started_at = started_at
+        self._on_progress = on_progress
+        self._progress = ""
+        self._status = bus.reader(status_topic(task))
+        self._motion = bus.reader(topics.MOTION_STATUS)
+        self._targets = bus.reader(topics.VALIDATED_TARGETS)
+        self._rejected = bus.reader(topics.REJECTED_TARGETS)
+        self._balls = bus.reader(topics.SCENE_BALLS)
+        self._counters = bus.reader(topics.COUNTERS)
+
+    async def run(self) -> None:
+        """Listen until cancelled."""
+        following = [
+            asyncio.create_task(follow)
+            for follow in (
+                self._follow_status(), self._follow_motion(), self._follow_targets(), self._follow_rejections(),
+                self._follow_counters(),
+            )
+        ]
+        try:
+            await asyncio.gather(*following)
+        finally:
+            for task in following:
+                task.cancel()
+
+    async def settle(self) -> None:
+        """Wait until nothing is on its way any more, for a short time at most, and read the truth."""
+        deadline = time.monotonic() + SETTLE_TIMEOUT
+        try:
+            async with asyncio.timeout(SETTLE_TIMEOUT):
+                while not is_settled(self._balls.latest):
+                    await self._balls.next()
+        except TimeoutError:
+            pass
+        # The task may say DONE a moment before the world says that the last ball has come to rest.
+        await asyncio.sleep(min(0.2, max(0.0, deadline - time.monotonic())))
+        self.read_truth()
+
+    def read_truth(self) -> None:
+        """Take note of where everything really lies now."""
+        self.summary.truth = self._balls.latest
+
+    async def _follow_status(self) -> None:
+        async for status in self._status:
+            self.task_status = status
+            self.summary.on_status(status)
+            if (line := progress_line(status)) != self._progress:
+                self._progress = line
+                self._on_progress(line)
+            if status.state in ENDED:
+                self.ended.set()
+
+    async def _follow_motion(self) -> None:
+        async for status in self._motion:
+            self.summary.on_motion(status, time.monotonic() - self._started_at)
+
+    async def _follow_targets(self) -> None:
+        async for targets in self._targets:
+            self.summary.on_latency(self._clock.age_ms(targets.header.stamp))
+
+    async def _follow_rejections(self) -> None:
+        async for rejections in self._rejected:
+            self.summary.rejected.add(rejections.rejected)
+
+    async def _follow_counters(self) -> None:
+        async for counters in self._counters:
+            self.rates.update(counters, time.monotonic())

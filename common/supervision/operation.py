@@ -1,0 +1,143 @@
+"""A cell from bring-up to shutdown: the supervisor, its place on the network, and the signals that end it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from common import topics
+from common.config import Cell
+from common.errors import ConfigError, ZencellError
+from common.messages import SupervisorStatus
+from common.supervision.interrupts import Interrupts
+from common.supervision.launch import Launch
+from common.supervision.supervisor import Supervisor
+
+if TYPE_CHECKING:
+    from common.transport.bus import Bus
+
+T = TypeVar("T")
+
+NAME = "supervisor"
+CONNECT_TIMEOUT = 5.0  # [s] to reach somebody else's router
+LOOK_TIMEOUT = 1.0  # [s] to hear who is up there
+STATUS_PERIOD = 0.25  # [s] between looks at the connection to the router
+
+log = logging.getLogger(NAME)
+
+
+class Interrupted(ZencellError):
+    """A signal asked for the end."""
+
+    exit_code = 130
+
+    def __init__(self) -> None:
+        super().__init__("interrupted")
+
+
+async def operate(
+    cell: Cell, launch: Launch, supervisor: Supervisor, interrupts: Interrupts, work: Callable[[Bus], Awaitable[T]],
+    prepare: Callable[[Bus], None] = lambda bus: None,
+) -> T:
+    """Bring the cell up, do the work, and leave no process behind, however it ends.
+
+    Args:
+        cell: the resolved cell.
+        launch: how the cell was asked for.
+        supervisor: of its processes; they have begun.
+        interrupts: already installed.
+        work: is done when all services are ready; cancelled by a signal.
+        prepare: is called with the bus as soon as there is one, before the services are ready.
+
+    Returns:
+        What the work returns.
+
+    Raises:
+        ConfigError, BadConfiguration: bad input.
+        StartFailed: the cell did not come up.
+        Interrupted: by a signal.
+    """
+    from common.transport.endpoint import endpoint_of
+
+    endpoint = endpoint_of(None if launch.connect else launch.domain, launch.connect)
+    working = asyncio.create_task(_work(cell, launch, endpoint, supervisor, work, prepare))
+    stopped = asyncio.create_task(interrupts.stop.wait())
+    try:
+        await asyncio.wait({working, stopped}, return_when=asyncio.FIRST_COMPLETED)
+        if not working.done():
+            working.cancel()
+            await asyncio.wait({working})
+        if working.cancelled():
+            raise Interrupted
+        return working.result()
+    finally:
+        stopped.cancel()
+        await supervisor.stop(interrupts.hurry)
+
+
+async def _work(
+    cell: Cell, launch: Launch, endpoint: str, supervisor: Supervisor, work: Callable[[Bus], Awaitable[T]],
+    prepare: Callable[[Bus], None],
+) -> T:
+    from common.transport.connect import connect
+    from common.transport.log import BusLog
+
+    timeout = CONNECT_TIMEOUT if launch.connect else None  # our own router is watched by the supervisor
+    connecting = connect(cell=cell.name, service=NAME, endpoint=endpoint, clock=launch.clock, timeout=timeout)
+    bus = await supervisor.reach_router(connecting.__aenter__())
+    to_topic = BusLog(bus)
+    log.addHandler(to_topic)
+    try:
+        if launch.connect:
+            await _require_unused(bus, endpoint)
+        prepare(bus)
+        bus.alive.on_change(supervisor.mark_alive)
+        return await beside(_publish(bus, supervisor), _bring_up_and_work(bus, supervisor, work))
+    finally:
+        log.removeHandler(to_topic)
+        await connecting.__aexit__(None, None, None)
+
+
+async def _bring_up_and_work(bus: Bus, supervisor: Supervisor, work: Callable[[Bus], Awaitable[T]]) -> T:
+    await supervisor.admit_all()
+    await bus.ready()
+    return await work(bus)
+
+
+async def _require_unused(bus: Bus, endpoint: str) -> None:
+    """Return when no other supervisor has the cell up on somebody else's router.
+
+    Raises:
+        ConfigError: one has.
+    """
+    if await bus.raw_get(f"{bus.cell}/{topics.SUPERVISOR_STATUS.key}", LOOK_TIMEOUT):
+        raise ConfigError("--connect", endpoint, f"is where a cell named {bus.cell} is up already")
+
+
+async def _publish(bus: Bus, supervisor: Supervisor) -> None:
+    """Say on supervisor/status whenever something has changed; take note of a router that is back."""
+    out = bus.writer(topics.SUPERVISOR_STATUS)
+    while True:
+        supervisor.mark_connected(bus.connected)
+        if supervisor.changed.is_set():
+            supervisor.changed.clear()
+            out.put(SupervisorStatus(header=bus.header(), cell=bus.cell, services=supervisor.statuses))
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(supervisor.changed.wait(), STATUS_PERIOD)
+
+
+async def beside(background: Coroutine[Any, Any, None], main: Coroutine[Any, Any, T]) -> T:
+    """The result of `main`, while `background` runs until then; what either raises is raised."""
+    tasks = asyncio.create_task(background), asyncio.create_task(main)
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        if tasks[0].done():
+            tasks[0].result()
+        return await tasks[1]
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
