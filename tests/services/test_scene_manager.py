@@ -1,0 +1,49 @@
+from __future__ import annotations
+
+from common import messages as m
+from common import topics
+from common.clock import Clock
+from common.config import Surroundings, load_cell, service_config
+from common.perception.pinhole import Pinhole
+from common.robot.transforms import matrix_to_pose
+from common.transport.local import LocalNetwork
+from services import scene_manager
+
+CELL = load_cell("panda")
+CAMERA = Pinhole.from_config(CELL.world.camera)
+
+
+def frame(bus_stamp: int, *balls: tuple[float, float]) -> m.MarkerArray:
+    markers = []
+    for number, (x, y) in enumerate(balls):
+        u, v = CAMERA.project([x, y, 0.03])
+        markers.append(m.Marker(ns="ball", id=number, type="sphere", scale=m.Vector3(x=0.06, y=0.06, z=0.06),
+                                pixel=(u, v), pose=m.Pose(position=m.Vector3(x=x, y=y, z=0.03))))
+    return m.MarkerArray(header=m.Header(stamp=bus_stamp, frame_id="world"), markers=markers)
+
+
+async def test_seen_ball_becomes_an_object_with_an_id_and_moves_into_the_hand_that_takes_it() -> None:
+    net = LocalNetwork()
+    bus = net.bus("tester", cell="test", clock=Clock())
+    detected, scene = bus.writer(topics.DETECTED_OBJECTS), bus.reader(topics.PLANNING_SCENE)
+    bus.writer(topics.CAMERA_INFO).put(CAMERA.info(bus.header("camera_optical_frame")))
+    bus.writer(topics.TF_STATIC).put(m.TFMessage(transforms=[m.TransformStamped(
+        header=bus.header("world"), child_frame_id="camera_optical_frame",
+        transform=matrix_to_pose(CAMERA.T_world_optical))]))
+    home = CELL.robot.named_poses["home"]
+    bus.writer(topics.JOINT_STATES).put(m.JointState(header=bus.header(), name=CELL.robot.joints, position=home))
+    grip = bus.writer(topics.GRIPPER_STATE)
+    grip.put(m.GripperState(header=bus.header(), width=0.08))
+    config = service_config(CELL, "scene_manager", scene_manager.Config)
+    async with net.running(scene_manager.run, config, name="scene_manager"):
+        first = await scene.next()
+        assert {o.role for o in first.objects} == {"fixture", "container"}
+        ball = (0.307, 0.0)  # below the hand at home, as far as the match radius is concerned not in it
+        while not [o for o in (await scene.next()).objects if o.role == "target"]:
+            detected.put(frame(bus.clock.now_ns(), ball))
+        grip.put(m.GripperState(header=bus.header(), width=0.06, holding=True))
+        held = await scene.next()
+        while not held.attached:
+            held = await scene.next()
+        assert held.attached[0].link == "panda_hand_tcp"
+        assert ("panda_hand", held.attached[0].object.id) in held.allowed_collisions

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import asyncio
+
+from common import messages as m
+from common import topics
+from common.clock import Clock
+from common.config import load_cell, service_config
+from common.transport.bus import Bus
+from common.transport.local import LocalNetwork
+from services import smart_pick_place
+
+CELL = load_cell("panda")
+CONFIG = service_config(CELL, "smart_pick_place", smart_pick_place.Config)
+
+
+def ball(name: str, x: float, y: float) -> m.CollisionObject:
+    return m.CollisionObject(id=name, role="target", shape="sphere", dimensions=[0.03],
+                             pose=m.Pose(position=m.Vector3(x=x, y=y, z=0.03)))
+
+
+def show(bus: Bus, targets: list[tuple[float, float]]) -> None:
+    """What the other services would say of an arm at home and balls on the table."""
+    header = bus.header("world")
+    bus.writer(topics.GRIPPER_STATE).put(m.GripperState(header=header, width=0.08))
+    bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(header=header))
+    bus.writer(topics.JOINT_STATES).put(
+        m.JointState(header=header, name=CELL.robot.joints, position=CELL.robot.named_poses["home"]))
+    bus.writer(topics.PLANNING_SCENE).put(
+        m.PlanningScene(header=header, objects=[ball(f"track_{k}", *t) for k, t in enumerate(targets)]))
+    bus.writer(topics.VALIDATED_TARGETS).put(m.PoseArray(
+        header=header, poses=[m.Pose(position=m.Vector3(x=x, y=y, z=0.03)) for x, y in targets]))
+
+
+async def test_validated_target_makes_it_ask_for_a_plan_to_above_that_ball() -> None:
+    net = LocalNetwork()
+    bus = net.bus("tester", cell="test", clock=Clock())
+    asked: asyncio.Queue[m.PlanRequest] = asyncio.Queue()
+
+    async def plan(request: m.PlanRequest) -> m.PlanResponse:
+        asked.put_nowait(request)
+        return m.PlanResponse(id=request.id, ok=False, error="no_ik", message="not today")
+
+    bus.serve(topics.MOTION_PLAN, plan)
+    await bus.ready()
+    async with net.running(smart_pick_place.run, CONFIG, name="smart_pick_place"):
+        show(bus, [(0.40, -0.17)])
+        request = await asyncio.wait_for(asked.get(), 5)
+        assert request.stage == "pre-grasp"
+        assert isinstance(request.goal, m.PoseGoal)
+        assert (request.goal.pose.position.x, request.goal.pose.position.y) == (0.40, -0.17)
+        assert abs(request.goal.pose.position.z - 0.13) < 1e-9
+
+
+async def test_status_is_a_state_that_a_late_reader_gets() -> None:
+    net = LocalNetwork()
+    bus = net.bus("tester", cell="test", clock=Clock())
+    async with net.running(smart_pick_place.run, CONFIG, name="smart_pick_place"):
+        first = await asyncio.wait_for(bus.reader(topics.PICK_PLACE_STATUS).next(), 5)
+        late = await asyncio.wait_for(bus.reader(topics.PICK_PLACE_STATUS).next(), 5)
+        assert first.state == late.state == "IDLE"
+        assert "waiting for" in late.message
+
+
+async def test_pause_is_answered_with_the_status() -> None:
+    net = LocalNetwork()
+    bus = net.bus("tester", cell="test", clock=Clock())
+    command = bus.client(topics.TASK_COMMAND)
+    async with net.running(smart_pick_place.run, CONFIG, name="smart_pick_place"):
+        assert (await command.call(m.TaskCommand(command="pause"))).paused
+        assert not (await command.call(m.TaskCommand(command="resume"))).paused
