@@ -13,12 +13,13 @@ from common import topics
 from common.clock import Clock
 from common.messages import Header, Message, ServiceCounters
 from common.topics import Request, Topic
-from common.transport.alive import Alive, alive_key
+from common.transport.alive import Alive
 from common.transport.codec import DEFAULT_LIMIT
 from common.transport.handoff import Doorbell, call_on_loop
 from common.transport.reader import Reader
-from common.transport.requests import Client, Server, tokens_of
+from common.transport.requests import Client, Server
 from common.transport.session import Declared, RawReply, RawSample, Session
+from common.transport.tokens import TokenWatch, alive_key, serves_key
 from common.transport.writer import Writer
 
 __all__ = ["Bus", "Client", "Reader", "Writer"]  # what the type hints of a service name
@@ -60,6 +61,7 @@ class Bus:
         self._writers: list[Writer[Any]] = []
         self._servers: list[Server[Any, Any]] = []
         self._tokens: list[Declared] = []
+        self._watches: dict[str, TokenWatch] = {}
         self._alive: Alive | None = None
         self._counters: Writer[ServiceCounters] | None = None
         self._beat: asyncio.TimerHandle | None = None
@@ -103,19 +105,26 @@ class Bus:
             )
         )
         if self.ready_event.is_set():
-            self._declare_token(tokens_of(self.cell, topic.key, self.service))
+            self._declare_token(serves_key(self.cell, topic.key, self.service))
 
     def client(self, topic: Request[Q, A]) -> Client[Q, A]:
         """A client of the request key."""
-        return Client(self._session, self.cell, self.service, topic, loop=self._loop, limit=self._limit)
+        servers = self._watch(serves_key(self.cell, topic.key))
+        return Client(self._session, self.cell, self.service, topic, servers, loop=self._loop, limit=self._limit)
 
     async def ready(self) -> None:
         """Tell the cell that this service is ready: what it serves first, its own token last."""
         self._counters = Writer(self._session, self.cell, self.service, topics.COUNTERS)
         for server in self._servers:
-            self._declare_token(tokens_of(self.cell, server.topic.key, self.service))
+            self._declare_token(serves_key(self.cell, server.topic.key, self.service))
         self.ready_event.set()
         self._declare_token(alive_key(self.cell, self.service))
+
+    def _watch(self, key: str) -> TokenWatch:
+        # One for each key: a second would be answered from what the first has seen so far, which may be nothing yet.
+        if key not in self._watches:
+            self._watches[key] = TokenWatch(self._session, key, self._loop)
+        return self._watches[key]
 
     def _declare_token(self, key: str) -> None:
         self._tokens.append(self._session.token(key))
@@ -131,7 +140,7 @@ class Bus:
     def alive(self) -> Alive:
         """The services of the cell that are ready; watched from the first use on."""
         if self._alive is None:
-            self._alive = Alive(self._session, self.cell, self._loop)
+            self._alive = Alive(self._watch(alive_key(self.cell)))
         return self._alive
 
     def header(self, frame_id: str = "") -> Header:
@@ -199,7 +208,7 @@ class Bus:
         tokens: list[str] = []
         done = asyncio.Event()
         self._session.get_tokens(
-            key, lambda token, there: tokens.append(token), lambda: call_on_loop(self._loop, done.set), timeout=timeout
+            key, tokens.append, lambda: call_on_loop(self._loop, done.set), timeout=timeout
         )
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(done.wait(), timeout)

@@ -189,16 +189,22 @@ class LocalSession:
         self._network.announce(key, there=True)
         return made
 
-    def watch_tokens(self, key: str, on_token: OnToken) -> Declared:
-        """Call back for each matching token that is there, appears or vanishes."""
-        entry = self._keep(_Entry(self._network, self._network.watchers, key, on_token))
-        self.get_tokens(key, on_token, lambda: None, timeout=0)
-        return entry
-
-    def get_tokens(self, key: str, on_token: OnToken, on_done: Callable[[], None], *, timeout: float) -> None:
-        """Call back for each matching token that is there now, then once `on_done`."""
+    def watch_tokens(
+        self, key: str, on_token: OnToken, on_first: Callable[[str], None], on_known: Callable[[], None]
+    ) -> Declared:
+        """Call back for each matching token that is there, appears or vanishes; all are known at once."""
+        watcher = self._keep(_Entry(self._network, self._network.watchers, key, on_token))
         for entry in self._network.matching(self._network.tokens, key):
             on_token(entry.key, True)
+        on_known()
+        return watcher
+
+    def get_tokens(
+        self, key: str, on_token: Callable[[str], None], on_done: Callable[[], None], *, timeout: float
+    ) -> None:
+        """Call back for each matching token that is there now, then once `on_done`."""
+        for entry in self._network.matching(self._network.tokens, key):
+            on_token(entry.key)
         on_done()
 
     def close(self) -> None:

@@ -23,18 +23,14 @@ from common.transport.codec import (
 from common.transport.handoff import call_on_loop
 from common.transport.reader import NO_SENDER, Refusals
 from common.transport.session import Query, RawReply, Session
+from common.transport.tokens import TokenWatch
 from common.transport.trace import current_trace, follow
 
 Q = TypeVar("Q", bound=Message)
 A = TypeVar("A", bound=Message)
 
-_LOOK_SECONDS = 1.0  # how long to look for a server before a request is given up unsent
+_LOOK_SECONDS = 1.0  # how long a new client looks for servers before a request is given up unsent
 _VANISH_SECONDS = 0.25  # the token of a server that has just answered may be gone before its answer is here
-
-
-def tokens_of(cell: str, key: str, service: str = "*") -> str:
-    """Key of the liveliness token with which a service says that it serves a key."""
-    return f"{cell}/serves/{key}/{service}"
 
 
 class Server(Generic[Q, A]):
@@ -138,8 +134,8 @@ class Client(Generic[Q, A]):
     """Calls a request key."""
 
     def __init__(
-        self, session: Session, cell: str, service: str, topic: Request[Q, A], *, loop: asyncio.AbstractEventLoop,
-        limit: int,
+        self, session: Session, cell: str, service: str, topic: Request[Q, A], servers: TokenWatch, *,
+        loop: asyncio.AbstractEventLoop, limit: int,
     ) -> None:
         self.topic = topic
         self._session = session
@@ -148,18 +144,14 @@ class Client(Generic[Q, A]):
         self._loop = loop
         self._limit = limit
         self._key = f"{cell}/{topic.key}"
-        self._tokens = tokens_of(cell, topic.key)
-        self._servers: set[str] = set()
-        self._changed = asyncio.Event()
+        self._servers = servers
         self._waiting: set[asyncio.Future[RawReply | None]] = set()
-        session.watch_tokens(
-            self._tokens, lambda token, there: call_on_loop(loop, lambda: self._on_token(token, there))
-        )
+        servers.on_change(self._on_servers)
 
     @property
     def available(self) -> bool:
         """Whether the router is reached and somebody serves the key."""
-        return self._session.connected and bool(self._servers)
+        return self._session.connected and bool(self._servers.names)
 
     async def wait_available(self, timeout: float | None = None) -> None:
         """Return as soon as somebody serves the key.
@@ -168,20 +160,12 @@ class Client(Generic[Q, A]):
             NoResponder: nobody did within `timeout` seconds.
         """
         try:
-            async with asyncio.timeout(timeout):
-                while not self._servers:
-                    self._changed.clear()
-                    await self._changed.wait()
+            await self._servers.wait(bool, timeout)
         except TimeoutError:
             raise NoResponder(self.topic.key) from None
 
-    def _on_token(self, token: str, there: bool) -> None:
-        if there:
-            self._servers.add(token)
-            self._changed.set()
-            return
-        self._servers.discard(token)
-        if not self._servers:
+    def _on_servers(self, _name: str, _there: bool) -> None:
+        if not self._servers.names:
             for future in self._waiting:
                 self._loop.call_later(_VANISH_SECONDS, _settle, future, None)
 
@@ -202,8 +186,11 @@ class Client(Generic[Q, A]):
             raise TypeError(f"{self.topic.key} takes {self.topic.message.__name__}, not {type(request).__name__}")
         payload = encode(request)
         deadline = self._loop.time() + timeout
-        if not self.available and not await self._look(min(timeout, _LOOK_SECONDS)):
-            raise NoResponder(self.topic.key)
+        if not self.available:
+            if self._session.connected:  # a client that was just made may not know its servers yet
+                await self._servers.known(min(timeout, _LOOK_SECONDS))
+            if not self.available:
+                raise NoResponder(self.topic.key)
         reply = await self._ask(payload, max(0.0, deadline - self._loop.time()), timeout)
         if reply is None:
             raise RequestLost(self.topic.key)
@@ -216,23 +203,6 @@ class Client(Generic[Q, A]):
             return decode(self.topic.answer, reply.sample.payload, self._limit)
         except DecodeError as error:
             raise RemoteError(self.topic.key, "bad_answer", f"the answer can not be read: {error}") from None
-
-    async def _look(self, seconds: float) -> bool:
-        """Whether somebody serves the key after all: what the watch has seen may be a moment old."""
-        if not self._session.connected:
-            return False
-        found: asyncio.Future[bool] = self._loop.create_future()
-
-        def settle(there: bool) -> None:
-            call_on_loop(self._loop, lambda: _settle(found, there))
-
-        self._session.get_tokens(
-            self._tokens, lambda token, there: settle(True), lambda: settle(False), timeout=seconds
-        )
-        try:
-            return await asyncio.wait_for(found, seconds)
-        except TimeoutError:
-            return False
 
     async def _ask(self, payload: bytes, seconds: float, timeout: float) -> RawReply | None:
         future: asyncio.Future[RawReply | None] = self._loop.create_future()

@@ -102,11 +102,19 @@ class Session(Protocol):
     def token(self, key: str) -> Declared:
         """Declare a liveliness token: it vanishes when this session does."""
 
-    def watch_tokens(self, key: str, on_token: OnToken) -> Declared:
-        """Call back for each matching token that is there, appears or vanishes."""
+    def watch_tokens(
+        self, key: str, on_token: OnToken, on_first: Callable[[str], None], on_known: Callable[[], None]
+    ) -> Declared:
+        """Call back for each matching token that is there, appears or vanishes.
 
-    def get_tokens(self, key: str, on_token: OnToken, on_done: Callable[[], None], *, timeout: float) -> None:
-        """Call back for each matching token that is there now, then once `on_done`."""
+        A question comes before the watch, since a watch does not say when it has told all that was there: `on_first`
+        for each token that it finds, then once `on_known`.
+        """
+
+    def get_tokens(
+        self, key: str, on_token: Callable[[str], None], on_done: Callable[[], None], *, timeout: float
+    ) -> None:
+        """Call back for each matching token that is there now, then once `on_done`; before any watch that covers it."""
 
     def watch_connection(self, on_change: Callable[[bool], None]) -> None:
         """Call back when the router is lost or reached again."""

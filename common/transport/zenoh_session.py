@@ -19,6 +19,7 @@ log = logging.getLogger(__name__)
 _CONNECT_MS = 1000  # one try
 _OUTBOX_SIZE = 10_000
 _FLUSH_SECONDS = 0.2
+_LIVELINESS_SECONDS = 2.0
 
 
 def _direct(on_item: Callable[[Any], None], on_drop: Callable[[], None] | None = None) -> Any:
@@ -264,14 +265,18 @@ class ZenohSession:
         for on_token in watchers:
             on_token(key, there)
 
-    def watch_tokens(self, key: str, on_token: OnToken) -> Declared:
-        """Call back for each matching token that is there, appears or vanishes."""
+    def watch_tokens(
+        self, key: str, on_token: OnToken, on_first: Callable[[str], None], on_known: Callable[[], None]
+    ) -> Declared:
+        """Call back for each matching token that is there, appears or vanishes, after a first question for them."""
         entry = (zenoh.KeyExpr(key), on_token)
         with self._lock:
             self._token_watchers.append(entry)
             own = [token for token in self._own_tokens if entry[0].intersects(token)]
         for token in own:
             on_token(token, True)
+        # Before the watch: afterwards Zenoh would answer it from what the watch has seen so far, which may be nothing.
+        self.get_tokens(key, on_first, on_known, timeout=_LIVELINESS_SECONDS)
         made = self._session.liveliness().declare_subscriber(
             key,
             _direct(lambda sample: on_token(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)),
@@ -285,21 +290,16 @@ class ZenohSession:
 
         return self._keep(_Undeclare(undeclare))
 
-    def get_tokens(self, key: str, on_token: OnToken, on_done: Callable[[], None], *, timeout: float) -> None:
+    def get_tokens(
+        self, key: str, on_token: Callable[[str], None], on_done: Callable[[], None], *, timeout: float
+    ) -> None:
         """Call back for each matching token that is there now, then once `on_done`."""
 
-        def on_zenoh(reply: zenoh.Reply) -> None:
+        def on_found(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                on_token(str(reply.ok.key_expr), True)
+                on_token(str(reply.ok.key_expr))
 
-        def ask() -> None:
-            try:
-                self._session.liveliness().get(key, _direct(on_zenoh, on_done), timeout=timeout)
-            except zenoh.ZError:
-                on_done()
-                raise
-
-        self._outbox.post(ask)
+        self._session.liveliness().get(key, _direct(on_found, on_done), timeout=timeout)
 
     def close(self) -> None:
         """Take back everything in reverse order and leave; may block."""

@@ -1,0 +1,105 @@
+"""Which liveliness tokens are there: by them one knows who is ready and who serves, before anything is sent."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from common.transport.handoff import call_on_loop
+from common.transport.session import Session
+
+_OVERLAP_SECONDS = 1.0  # in which the watch has surely reported what the first question found
+
+
+def alive_key(cell: str, service: str = "*") -> str:
+    """Key of the token with which a service says that it is ready."""
+    return f"{cell}/alive/{service}"
+
+
+def serves_key(cell: str, key: str, service: str = "*") -> str:
+    """Key of the token with which a service says that it serves a request key."""
+    return f"{cell}/serves/{key}/{service}"
+
+
+class TokenWatch:
+    """The tokens under a key expression; services are named by the last part of their tokens."""
+
+    def __init__(self, session: Session, key: str, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._watched: set[str] = set()
+        self._first: set[str] = set()  # what the first question found and the watch has not reported yet
+        self._known = asyncio.Event()
+        self._callbacks: list[Callable[[str, bool], None]] = []
+        self._waiters: set[asyncio.Event] = set()
+        session.watch_tokens(
+            key,
+            lambda token, there: call_on_loop(loop, lambda: self._on_token(_name(token), there)),
+            lambda token: call_on_loop(loop, lambda: self._on_first(_name(token))),
+            lambda: call_on_loop(loop, self._on_known),
+        )
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the services whose token is there."""
+        return frozenset(self._watched | self._first)
+
+    def on_change(self, callback: Callable[[str, bool], None]) -> None:
+        """Have `callback(name, there)` called on the loop for each token that appears or vanishes."""
+        self._callbacks.append(callback)
+
+    async def known(self, timeout: float) -> None:
+        """Return when the tokens that were there from the start are known, or after `timeout` seconds."""
+        try:
+            await asyncio.wait_for(self._known.wait(), timeout)
+        except TimeoutError:
+            return  # no router answers: nobody is there
+
+    async def wait(self, condition: Callable[[frozenset[str]], bool], timeout: float | None) -> None:
+        """Return as soon as the names fulfil a condition.
+
+        Raises:
+            TimeoutError: they did not within `timeout` seconds.
+        """
+        changed = asyncio.Event()
+        self._waiters.add(changed)
+        try:
+            async with asyncio.timeout(timeout):
+                while not condition(self.names):
+                    changed.clear()
+                    await changed.wait()
+        finally:
+            self._waiters.discard(changed)
+
+    def _on_token(self, name: str, there: bool) -> None:
+        before = self.names
+        self._first.discard(name)
+        (self._watched.add if there else self._watched.discard)(name)
+        self._tell(before)
+
+    def _on_first(self, name: str) -> None:
+        if name not in self._watched:
+            before = self.names
+            self._first.add(name)
+            self._tell(before)
+
+    def _on_known(self) -> None:
+        self._known.set()
+        self._loop.call_later(_OVERLAP_SECONDS, self._forget_first)
+
+    def _forget_first(self) -> None:
+        before = self.names
+        self._first.clear()  # vanished between the question and the watch
+        self._tell(before)
+
+    def _tell(self, before: frozenset[str]) -> None:
+        now = self.names
+        for name in before ^ now:
+            for callback in self._callbacks:
+                callback(name, name in now)
+        if before != now:
+            for changed in self._waiters:
+                changed.set()
+
+
+def _name(token: str) -> str:
+    return token.rpartition("/")[2]

@@ -1,0 +1,129 @@
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import uuid
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AsyncExitStack
+from pathlib import Path
+
+import pytest
+
+from common.clock import Clock
+from common.transport.bus import Bus
+from common.transport.connect import connect
+from common.transport.endpoint import endpoint_of, port_of
+from common.transport.local import LocalNetwork
+from common.transport.zenoh_session import wait_router
+
+ROOT = Path(__file__).resolve().parents[3]
+PATIENCE = 20.0  # only ever waited for by a test that fails
+
+
+def find_domain() -> int:
+    for domain in random.SystemRandom().sample(range(100, 233), 100):
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port_of(domain)))
+            except OSError:
+                continue
+            return domain
+    raise RuntimeError("no domain is free")
+
+
+class Processes:
+    """Starts modules of the project as processes and leaves none behind."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._started: list[subprocess.Popen[bytes]] = []
+
+    def start(self, module: str, *arguments: str) -> subprocess.Popen[bytes]:
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("ZENCELL_")} | {"PYTHONPATH": str(ROOT)}
+        with self.log_of(len(self._started)).open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", module, *arguments], cwd=ROOT, stdin=subprocess.PIPE, stderr=log,
+                env=environment,
+            )
+        self._started.append(process)
+        return process
+
+    def log_of(self, index: int) -> Path:
+        return self._folder / f"process_{index}.log"
+
+    def output(self, process: subprocess.Popen[bytes]) -> str:
+        return self.log_of(self._started.index(process)).read_text()
+
+    async def said(self, process: subprocess.Popen[bytes], text: str) -> None:
+        async with asyncio.timeout(PATIENCE):
+            while text not in self.output(process):
+                await asyncio.sleep(0.01)
+
+    def end(self) -> None:
+        for process in self._started:
+            if process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+                process.kill()
+            process.wait()
+            if process.stdin:
+                process.stdin.close()
+
+
+async def ended(process: subprocess.Popen[bytes]) -> int:
+    return await asyncio.to_thread(process.wait, PATIENCE)
+
+
+@pytest.fixture
+def domain() -> int:
+    return find_domain()
+
+
+@pytest.fixture
+def processes(tmp_path: Path) -> Iterator[Processes]:
+    started = Processes(tmp_path)
+    yield started
+    started.end()
+
+
+@pytest.fixture(scope="session")
+def shared_router(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Endpoint of a router for all tests that leave it alone; they keep apart by the names of their cells."""
+    processes = Processes(tmp_path_factory.mktemp("router"))
+    domain = find_domain()
+    processes.start("services.router", "--domain", str(domain))
+    try:
+        with ThreadPoolExecutor(1) as thread:  # this thread may already run a loop
+            thread.submit(lambda: asyncio.run(wait_router(endpoint_of(domain), PATIENCE))).result()
+        yield endpoint_of(domain)
+    finally:
+        processes.end()
+
+
+NewBus = Callable[..., Awaitable[Bus]]
+
+
+@pytest.fixture(params=["local", "zenoh"])
+async def new_bus(request: pytest.FixtureRequest) -> AsyncIterator[NewBus]:
+    """Makes buses that meet on one network: in process, and over a real router."""
+    cell = f"test_{uuid.uuid4().hex[:8]}"
+    async with AsyncExitStack() as stack:
+        if request.param == "local":
+            net = LocalNetwork()
+
+            async def make(service: str = "tester") -> Bus:
+                bus = net.bus(service, cell=cell, clock=Clock())
+                stack.push_async_callback(bus.close)
+                return bus
+        else:
+            endpoint = request.getfixturevalue("shared_router")
+
+            async def make(service: str = "tester") -> Bus:
+                return await stack.enter_async_context(connect(cell=cell, service=service, endpoint=endpoint))
+
+        yield make

@@ -1,0 +1,251 @@
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from common import topics
+from common.errors import NoResponder, Refused, RemoteError, RequestLost, RequestTimeout
+from common.messages import PickPlaceStatus, TaskCommand
+from common.topics import Request
+from common.transport.bus import Bus
+from common.transport.codec import decode_error, encode
+from common.transport.session import RawReply
+
+PATIENCE = 20.0
+START = TaskCommand(command="start")
+
+
+async def answer(request: TaskCommand) -> PickPlaceStatus:
+    return PickPlaceStatus(message=request.command)
+
+
+async def ask_raw(bus: Bus, key: str, payload: bytes | None) -> list[RawReply]:
+    """Replies to a `get` as any plain client would send it."""
+    replies: list[RawReply] = []
+    done = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    bus._session.get(key, replies.append, lambda: loop.call_soon_threadsafe(done.set), payload=payload)
+    await asyncio.wait_for(done.wait(), PATIENCE)
+    return replies
+
+
+async def served(bus: Bus, handler=answer) -> None:
+    bus.serve(topics.TASK_COMMAND, handler)
+    await bus.ready()
+
+
+async def test_request_is_answered(new_bus) -> None:
+    server, client = await new_bus("server"), await new_bus("client")
+    await served(server)
+    call = client.client(topics.TASK_COMMAND)
+    await call.wait_available(PATIENCE)
+    assert call.available
+    assert (await call.call(TaskCommand(command="pause"))).message == "pause"
+
+
+async def test_service_can_call_itself(new_bus) -> None:
+    bus = await new_bus()
+    await served(bus)
+    assert (await bus.client(topics.TASK_COMMAND).call(START)).message == "start"
+
+
+async def test_call_right_after_the_client_was_made_finds_the_server(new_bus) -> None:
+    server, client = await new_bus("server"), await new_bus("client")
+    await served(server)
+    await client.alive.wait("server", PATIENCE)
+    assert (await client.client(topics.TASK_COMMAND).call(START)).message == "start"
+
+
+async def test_nobody_serves_the_key_is_known_before_sending(new_bus) -> None:
+    bus = await new_bus()
+    call = bus.client(topics.TASK_COMMAND)
+    with pytest.raises(NoResponder, match="task/command"):
+        await call.call(START)
+    assert not call.available
+    with pytest.raises(NoResponder):
+        await call.wait_available(0.01)
+
+
+async def test_server_that_is_not_ready_is_no_responder(new_bus) -> None:
+    server, client = await new_bus("server"), await new_bus("client")
+    server.serve(topics.TASK_COMMAND, answer)
+    with pytest.raises(NoResponder):
+        await client.client(topics.TASK_COMMAND).call(START)
+
+
+async def test_refusal_reaches_the_requester_with_code_and_reason(new_bus) -> None:
+    async def refuse(_: TaskCommand) -> PickPlaceStatus:
+        raise Refused("full", "the container is full")
+
+    server, client = await new_bus("server"), await new_bus("client")
+    await served(server, refuse)
+    call = client.client(topics.TASK_COMMAND)
+    await call.wait_available(PATIENCE)
+    with pytest.raises(RemoteError, match="the container is full") as caught:
+        await call.call(START)
+    assert caught.value.code == "full"
+
+
+async def test_held_request_times_out_and_the_next_is_served_meanwhile(new_bus) -> None:
+    async def hold_first(request: TaskCommand) -> PickPlaceStatus:
+        if request.command == "pause":
+            await asyncio.Event().wait()
+        return await answer(request)
+
+    server, client = await new_bus("server"), await new_bus("client")
+    await served(server, hold_first)
+    call = client.client(topics.TASK_COMMAND)
+    await call.wait_available(PATIENCE)
+    held = asyncio.create_task(call.call(TaskCommand(command="pause"), timeout=0.5))
+    assert (await call.call(START)).message == "start"
+    with pytest.raises(RequestTimeout, match=r"within 0\.5 s"):
+        await held
+
+
+async def test_server_that_closes_loses_the_request_in_work(new_bus) -> None:
+    began = asyncio.Event()
+
+    async def hold(_: TaskCommand) -> PickPlaceStatus:
+        began.set()
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    server, client = await new_bus("server"), await new_bus("client")
+    await served(server, hold)
+    call = client.client(topics.TASK_COMMAND)
+    await call.wait_available(PATIENCE)
+    waiting = asyncio.create_task(call.call(START, timeout=PATIENCE))
+    await began.wait()
+    await server.close()
+    with pytest.raises(RequestLost):
+        await waiting
+    with pytest.raises(NoResponder):
+        async with asyncio.timeout(PATIENCE):
+            while True:  # the token may vanish a moment after the query has ended
+                await call.call(START, timeout=0.2)
+
+
+async def test_handler_with_a_bug_is_told_to_the_requester_and_ends_the_service(new_bus) -> None:
+    async def crash(_: TaskCommand) -> PickPlaceStatus:
+        raise KeyError("slot")
+
+    async def service(bus: Bus) -> None:
+        await served(bus, crash)
+        await asyncio.Event().wait()
+
+    server, client = await new_bus("server"), await new_bus("client")
+    running = asyncio.create_task(server.run(service(server)))
+    call = client.client(topics.TASK_COMMAND)
+    await call.wait_available(PATIENCE)
+    with pytest.raises(RemoteError, match="KeyError") as caught:
+        await call.call(START)
+    assert caught.value.code == "internal"
+    with pytest.raises(KeyError, match="slot"):
+        await asyncio.wait_for(running, PATIENCE)
+
+
+async def test_failure_of_a_request_within_a_handler_is_told_and_does_not_end_the_service(new_bus) -> None:
+    server, client = await new_bus("server"), await new_bus("client")
+    inner = server.client(topics.MOTION_STOP)
+
+    async def ask_on(_: TaskCommand) -> PickPlaceStatus:
+        raise NoResponder(inner.topic.key)
+
+    await served(server, ask_on)
+    call = client.client(topics.TASK_COMMAND)
+    await call.wait_available(PATIENCE)
+    with pytest.raises(RemoteError, match="motion/stop: no service") as caught:
+        await call.call(START)
+    assert caught.value.code == "upstream"
+
+
+async def test_bad_requests_are_refused_with_the_reason_and_the_next_is_served(new_bus) -> None:
+    server, client = await new_bus("server"), await new_bus("client")
+    await served(server)
+    call = client.client(topics.TASK_COMMAND)
+    await call.wait_available(PATIENCE)
+    key = f"{server.cell}/task/command"
+    cases = [
+        (f"{server.cell}/**", b"", "bad_request", f"{key} is a request"),
+        (f"{server.cell}/task/*", encode(START), "bad_request", f"{key} is a request"),
+        (f"{key}?now=1", encode(START), "bad_request", f"{key} is a request"),
+        (key, None, "bad_request", "a TaskCommand as payload is needed"),
+        (key, b"\xc1", "invalid", "not msgpack"),
+        (key, encode(START)[:-1], "invalid", "not msgpack"),
+        (key, encode(PickPlaceStatus()), "invalid", "TaskCommand"),
+    ]
+    for asked, payload, code, reason in cases:
+        replies = await ask_raw(client, asked, payload)
+        assert [reply.sample for reply in replies] == [None], asked
+        given, message = decode_error(replies[0].error)
+        assert given == code
+        assert reason in message
+    assert server.counters().invalid == {"task/command": len(cases)}
+    assert (await call.call(START)).message == "start"
+
+
+async def test_plain_client_is_answered_under_the_exact_key(new_bus) -> None:
+    server, client = await new_bus("server"), await new_bus("client")
+    await served(server)
+    await client.client(topics.TASK_COMMAND).wait_available(PATIENCE)
+    [reply] = await ask_raw(client, f"{server.cell}/task/command", encode(START))
+    assert reply.sample.key == f"{server.cell}/task/command"
+    assert reply.sample.encoding == "application/msgpack;PickPlaceStatus"
+
+
+async def test_answer_of_another_kind_is_a_remote_error(new_bus) -> None:
+    other = Request("task/command", TaskCommand, TaskCommand, "server", "")
+
+    async def echo(request: TaskCommand) -> TaskCommand:
+        return request
+
+    server, client = await new_bus("server"), await new_bus("client")
+    server.serve(other, echo)
+    await server.ready()
+    call = client.client(topics.TASK_COMMAND)
+    await call.wait_available(PATIENCE)
+    with pytest.raises(RemoteError, match="can not be read") as caught:
+        await call.call(START)
+    assert caught.value.code == "bad_answer"
+
+
+async def test_one_of_two_servers_acts(new_bus) -> None:
+    acted = []
+
+    async def act(request: TaskCommand) -> PickPlaceStatus:
+        acted.append(request)
+        return PickPlaceStatus()
+
+    first, second, client = await new_bus("first"), await new_bus("second"), await new_bus("client")
+    await served(first, act)
+    await served(second, act)
+    await client.alive.wait("first", PATIENCE)
+    await client.alive.wait("second", PATIENCE)
+    await client.client(topics.TASK_COMMAND).call(START)
+    assert len(acted) == 1
+
+
+async def test_alive_names_services_that_are_ready(new_bus) -> None:
+    service, tool = await new_bus("service"), await new_bus("tool")
+    changes = []
+    tool.alive.on_change(lambda name, there: changes.append((name, there)))
+    with pytest.raises(TimeoutError):
+        await tool.alive.wait("service", 0.01)
+    await service.ready()
+    await tool.alive.wait("service", PATIENCE)
+    assert tool.alive.names == {"service"}
+    await service.close()
+    await tool.alive.wait("service", PATIENCE, there=False)
+    assert "service" not in tool.alive
+    assert changes == [("service", True), ("service", False)]
+
+
+async def test_alive_changes_can_be_iterated(new_bus) -> None:
+    service, tool = await new_bus("service"), await new_bus("tool")
+    changes = tool.alive.changes()
+    first = asyncio.ensure_future(anext(changes))
+    await asyncio.sleep(0)
+    await service.ready()
+    assert await asyncio.wait_for(first, PATIENCE) == ("service", True)
+    await changes.aclose()

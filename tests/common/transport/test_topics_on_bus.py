@@ -1,0 +1,279 @@
+from __future__ import annotations
+
+import asyncio
+import logging
+
+import msgpack
+import pytest
+
+from common import topics
+from common.messages import Image, LogLine, PickPlaceStatus, Rejections
+from common.transport.bus import Bus, Reader, Writer
+from common.transport.codec import Attachment, encode, encode_attachment
+from common.transport.log import BusLog
+
+PATIENCE = 20.0
+
+
+def image(number: int) -> Image:
+    return Image(header={"stamp": number}, height=1, width=1, encoding="mono8", data=b"x")
+
+
+def status(placed: int) -> PickPlaceStatus:
+    return PickPlaceStatus(placed=placed)
+
+
+def event(number: int) -> LogLine:
+    return LogLine(service="tester", level="info", message=str(number))
+
+
+async def matched(writer: Writer) -> None:
+    async with asyncio.timeout(PATIENCE):
+        while not writer.matched:
+            await asyncio.sleep(0.005)
+
+
+async def until(condition) -> None:
+    async with asyncio.timeout(PATIENCE):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+async def next_of(reader: Reader):
+    return await asyncio.wait_for(reader.next(), PATIENCE)
+
+
+def put_raw(bus: Bus, topic, payload: bytes, attachment: bytes = b"") -> None:
+    bus._session.publisher(f"{bus.cell}/{topic.key}", "", reliable=True).put(payload, attachment)
+
+
+async def test_stream_reader_gets_the_newest_and_counts_what_it_replaced(new_bus) -> None:
+    sender, receiver = await new_bus("sender"), await new_bus("receiver")
+    reader = receiver.reader(topics.CAMERA_IMAGE)
+    writer = sender.writer(topics.CAMERA_IMAGE)
+    await matched(writer)
+    for number in range(10):
+        writer.put(image(number))
+    await until(lambda: reader.received == 10)
+    assert (await next_of(reader)).header.stamp == 9
+    assert reader.dropped == 9
+    assert (reader.invalid, reader.overflow) == (0, 0)
+
+
+async def test_latest_does_not_consume(new_bus) -> None:
+    bus = await new_bus()
+    reader, writer = bus.reader(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_IMAGE)
+    assert reader.latest is None
+    await matched(writer)
+    writer.put(image(1))
+    await until(lambda: reader.latest is not None)
+    assert (await next_of(reader)) is reader.latest
+    assert reader.dropped == 0
+
+
+async def test_stream_message_is_returned_once(new_bus) -> None:
+    bus = await new_bus()
+    reader, writer = bus.reader(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_IMAGE)
+    await matched(writer)
+    writer.put(image(1))
+    await next_of(reader)
+    waiting = asyncio.create_task(reader.next())
+    writer.put(image(2))
+    assert (await asyncio.wait_for(waiting, PATIENCE)).header.stamp == 2
+
+
+async def test_events_come_all_and_in_order(new_bus) -> None:
+    sender, receiver = await new_bus("sender"), await new_bus("receiver")
+    reader, writer = receiver.reader(topics.LOG), sender.writer(topics.LOG)
+    await matched(writer)
+    for number in range(500):
+        writer.put(event(number))
+    got = [int((await next_of(reader)).message) for _ in range(500)]
+    assert got == list(range(500))
+    assert reader.overflow == 0
+    assert reader.latest.message == "499"
+
+
+async def test_events_that_overflow_are_counted_and_reported(new_bus, caplog) -> None:
+    sender, receiver = await new_bus("sender"), await new_bus("receiver")
+    reader, writer = receiver.reader(topics.LOG, size=10), sender.writer(topics.LOG)
+    await matched(writer)
+    for number in range(25):
+        writer.put(event(number))
+    await until(lambda: reader.received == 25)
+    await until(lambda: "fell behind" in caplog.text)
+    assert reader.overflow == 15
+    assert [int((await next_of(reader)).message) for _ in range(10)] == list(range(15, 25))
+    assert [r.levelno for r in caplog.records if "fell behind" in r.message] == [logging.ERROR]
+
+
+async def test_late_reader_gets_the_state_at_once(new_bus) -> None:
+    sender, receiver = await new_bus("sender"), await new_bus("receiver")
+    sender.writer(topics.PICK_PLACE_STATUS).put(status(3))
+    assert (await next_of(receiver.reader(topics.PICK_PLACE_STATUS))).placed == 3
+
+
+@pytest.mark.parametrize("pattern", ["pick_place_status", "**", "*"])
+async def test_state_can_be_asked_for_also_with_wildcards(new_bus, pattern: str) -> None:
+    sender, plain = await new_bus("sender"), await new_bus("plain")
+    sender.writer(topics.PICK_PLACE_STATUS).put(status(3))
+    samples = []
+    async with asyncio.timeout(PATIENCE):
+        while not samples:
+            samples = await plain.raw_get(f"{plain.cell}/{pattern}", 2.0)
+    assert [sample.key for sample in samples] == [f"{plain.cell}/pick_place_status"]
+    assert samples[0].encoding == "application/msgpack;PickPlaceStatus"
+    assert msgpack.unpackb(samples[0].payload)["placed"] == 3
+
+
+async def test_state_that_was_never_put_has_no_value_to_ask_for(new_bus) -> None:
+    bus = await new_bus()
+    bus.writer(topics.PICK_PLACE_STATUS)
+    assert await bus.raw_get(f"{bus.cell}/**", 2.0) == []
+
+
+async def test_plain_late_subscriber_sees_the_state_repeated_and_readers_do_not(new_bus) -> None:
+    sender, receiver = await new_bus("sender"), await new_bus("receiver")
+    reader = receiver.reader(topics.PICK_PLACE_STATUS)
+    sender.writer(topics.PICK_PLACE_STATUS).put(status(3))
+    await next_of(reader)
+    async with asyncio.timeout(PATIENCE):
+        seen = []
+        async for sample in receiver.raw_reader(f"{receiver.cell}/**"):
+            seen.append(sample)
+            if len(seen) == 2:
+                break
+    assert seen[0] == seen[1]
+    assert reader.received == 1
+    assert reader.dropped == 0
+
+
+async def test_restarted_writer_is_heard_though_it_counts_from_the_start(new_bus) -> None:
+    sender, receiver = await new_bus("sender"), await new_bus("receiver")
+    reader = receiver.reader(topics.PICK_PLACE_STATUS)
+    first = sender.writer(topics.PICK_PLACE_STATUS)
+    for number in range(5):
+        first.put(status(number))
+    await until(lambda: reader.latest is not None and reader.latest.placed == 4)
+    sender.writer(topics.PICK_PLACE_STATUS).put(status(9))
+    await until(lambda: reader.latest.placed == 9)
+
+
+async def test_message_that_is_not_newer_is_dropped(new_bus) -> None:
+    bus = await new_bus()
+    reader = bus.reader(topics.LOG)
+    await matched(bus.writer(topics.LOG))
+    for sequence, number in ((5, 1), (5, 2), (4, 3), (6, 4)):
+        put_raw(bus, topics.LOG, encode(event(number)), encode_attachment(Attachment("w", sequence)))
+    assert (await next_of(reader)).message == "1"
+    assert (await next_of(reader)).message == "4"
+    assert reader.received == 2
+
+
+async def test_plain_put_without_attachment_is_accepted_every_time(new_bus) -> None:
+    bus = await new_bus()
+    reader = bus.reader(topics.LOG)
+    await matched(bus.writer(topics.LOG))
+    put_raw(bus, topics.LOG, encode(event(1)))
+    put_raw(bus, topics.LOG, encode(event(1)))
+    assert (await next_of(reader)) == (await next_of(reader)) == event(1)
+
+
+BAD = [b"garbage", b"", encode(event(1))[:-3], encode(status(1)), msgpack.packb({"data": float("nan")})]
+
+
+async def test_bad_payloads_are_dropped_counted_and_reported_once(new_bus, caplog) -> None:
+    bus = await new_bus()
+    reader, writer = bus.reader(topics.LOG), bus.writer(topics.LOG)
+    await matched(writer)
+    for payload in BAD:
+        put_raw(bus, topics.LOG, payload)
+    put_raw(bus, topics.LOG, encode(event(1)), b"no attachment of ours")
+    for sequence in (1, 2):
+        put_raw(bus, topics.LOG, b"garbage", encode_attachment(Attachment("somebody", sequence)))
+    writer.put(event(7))
+    assert (await next_of(reader)).message == "7"
+    assert reader.invalid == len(BAD) + 3
+    await until(lambda: "somebody" in caplog.text)
+    assert len([r for r in caplog.records if r.levelno == logging.WARNING]) == 2
+    assert bus.counters().invalid == {"log": len(BAD) + 3}
+
+
+async def test_rubbish_does_not_displace_a_state_that_was_not_read_yet(new_bus) -> None:
+    bus = await new_bus()
+    reader, writer = bus.reader(topics.PICK_PLACE_STATUS), bus.writer(topics.PICK_PLACE_STATUS)
+    await matched(writer)
+    writer.put(status(3))
+    put_raw(bus, topics.PICK_PLACE_STATUS, b"garbage")
+    put_raw(bus, topics.PICK_PLACE_STATUS, b"garbage", encode_attachment(Attachment("somebody", 1)))
+    await until(lambda: reader.received == 3)
+    assert (await next_of(reader)).placed == 3
+
+
+async def test_put_of_another_message_is_a_bug_that_shows(new_bus) -> None:
+    bus = await new_bus()
+    with pytest.raises(TypeError, match="carries Image, not LogLine"):
+        bus.writer(topics.CAMERA_IMAGE).put(event(1))
+
+
+async def test_trace_rides_from_what_was_read_to_what_is_put(new_bus) -> None:
+    sender, middle, end = await new_bus("sender"), await new_bus("middle"), await new_bus("end")
+    images, log = sender.writer(topics.CAMERA_IMAGE), middle.writer(topics.LOG)
+    reader = middle.reader(topics.CAMERA_IMAGE)
+    seen = {}
+
+    async def watch() -> None:
+        async for sample in end.raw_reader(f"{end.cell}/**"):
+            seen[sample.key.rpartition("/")[2]] = msgpack.unpackb(sample.attachment)[3]
+
+    async def forward() -> None:
+        log.put(event((await reader.next()).header.stamp))
+
+    watching = asyncio.create_task(watch())
+    forwarding = asyncio.create_task(forward())
+    await matched(images)
+    await matched(log)
+    images.put(image(1))
+    await until(lambda: len(seen) == 2)
+    assert seen["log"] == seen["image_raw"] != ""
+    watching.cancel()
+    await forwarding
+
+
+async def test_counters_are_published_while_somebody_reads_them(new_bus) -> None:
+    service, tool = await new_bus("service"), await new_bus("tool")
+    reader, writer = service.reader(topics.REJECTED_TARGETS), service.writer(topics.REJECTED_TARGETS)
+    await matched(writer)
+    writer.put(Rejections(header={}, rejected=[]))
+    await next_of(reader)
+    await service.ready()
+    counters = tool.reader(topics.COUNTERS)
+    counted = await next_of(counters)
+    assert counted.service == "service"
+    assert counted.received == {"rejected_targets": 1}
+
+
+async def test_log_lines_are_put_on_the_log_topic(new_bus) -> None:
+    service, tool = await new_bus("talker"), await new_bus("tool")
+    reader = tool.reader(topics.LOG)
+    handler = BusLog(service)
+    await matched(handler._writer)
+    service.log.addHandler(handler)
+    service.log.setLevel(logging.INFO)
+    try:
+        service.log.debug("hidden")
+        service.log.info("said on the loop")
+        await asyncio.to_thread(service.log.warning, "said in a thread")
+    finally:
+        service.log.removeHandler(handler)
+    lines = [await next_of(reader), await next_of(reader)]
+    assert [(line.service, line.level, line.message) for line in lines] == [
+        ("talker", "info", "said on the loop"), ("talker", "warning", "said in a thread")
+    ]
+
+
+async def test_header_has_cell_time(new_bus) -> None:
+    bus = await new_bus()
+    before = bus.clock.now_ns()
+    assert before <= bus.header("world").stamp <= bus.clock.now_ns()
+    assert bus.header("world").frame_id == "world"

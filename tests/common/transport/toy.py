@@ -1,0 +1,53 @@
+"""A service for tests of the transport, run as a process: its answers show every end of a request."""
+
+import asyncio
+from typing import Literal
+
+from common import topics
+from common.config import ConfigError, Parameters
+from common.errors import Refused
+from common.messages import PickPlaceStatus, TaskCommand
+from common.transport.bus import Bus
+from common.transport.service import main
+
+
+class Config(Parameters):
+    mode: Literal["serve", "busy", "stubborn", "crash", "bad_config", "end"] = "serve"
+    placed: int = 7
+
+
+async def run(bus: Bus, config: Config) -> None:
+    status = bus.writer(topics.PICK_PLACE_STATUS)
+
+    async def handle(request: TaskCommand) -> PickPlaceStatus:
+        if request.command == "pause":
+            bus.log.info("holding")
+            await asyncio.Event().wait()
+        if request.command == "stop":
+            raise Refused("busy", "not now")
+        if request.command == "resume":
+            raise RuntimeError("the handler has a bug")
+        return PickPlaceStatus(placed=config.placed)
+
+    bus.serve(topics.TASK_COMMAND, handle)
+    await bus.ready()
+    status.put(PickPlaceStatus(state="GRASPING", placed=config.placed))
+    bus.log.info("is ready")
+    if config.mode == "busy":
+        await asyncio.to_thread(lambda: [None for _ in iter(int, 1)])
+    if config.mode == "stubborn":
+        while True:
+            try:
+                await asyncio.sleep(1000)
+            except asyncio.CancelledError:
+                bus.log.info("does not care")
+    if config.mode == "crash":
+        raise RuntimeError("the service has a bug")
+    if config.mode == "bad_config":
+        raise ConfigError("services.toy.mode", config.mode, "can not be used")
+    if config.mode != "end":
+        await asyncio.Event().wait()
+
+
+if __name__ == "__main__":
+    main(run, Config)
