@@ -239,7 +239,7 @@ class Cell(Section):
     run: Run
     robot: RobotConfig
     world: World
-    motion: Motion
+    motion: Motion = Motion()
     grasp: Grasp = Grasp()
     pipeline: Pipeline
     services: dict[str, ServiceEntry]
@@ -354,8 +354,10 @@ def _first_error(error: ValidationError, model: type[BaseModel], prefix: str) ->
     if first["type"] == "extra_forbidden":
         names = _fields_at(model, first["loc"][:-1])
         return ConfigError(field, first["input"], f"is not a parameter; choices: {', '.join(names)}")
+    if first["type"] == "missing":
+        return ConfigError(field, ..., "is missing")
     if first["type"] == "value_error":
-        return ConfigError(field or prefix or "cell", "", message)
+        return ConfigError(field or "cell", ..., message)
     return ConfigError(field, first["input"], message)
 
 

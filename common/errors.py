@@ -5,16 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+LONGEST_SHOWN = 120  # characters of a value
+
 
 class ZencellError(Exception):
     """An error that is shown to the person as one line, without a traceback."""
 
 
 class ConfigError(ZencellError):
-    """A value of the configuration that can not be used: names the field, the value and what would do."""
+    """A value of the configuration that can not be used: names the field, the value and what would do.
+
+    The value `...` stands for none, where one is missing or several do not fit together.
+    """
 
     def __init__(self, field: str, value: object, expected: str) -> None:
-        super().__init__(f"{field}: {value!r} {expected}")
+        shown = repr(value)
+        if len(shown) > LONGEST_SHOWN:
+            shown = shown[: LONGEST_SHOWN - 3] + "..."
+        super().__init__(f"{field}: {expected}" if value is ... else f"{field}: {shown} {expected}")
         self.field = field
         self.value = value
         self.expected = expected
