@@ -39,8 +39,10 @@ async def test_seen_ball_becomes_an_object_with_an_id_and_moves_into_the_hand_th
         first = await scene.next()
         assert {o.role for o in first.objects} == {"fixture", "container"}
         ball = (0.307, 0.0)  # below the hand at home, as far as the match radius is concerned not in it
-        while not [o for o in (await scene.next()).objects if o.role == "target"]:
+        seen = first
+        while not [o for o in seen.objects if o.role == "target"]:
             detected.put(frame(bus.clock.now_ns(), ball))
+            seen = await scene.next()
         grip.put(m.GripperState(header=bus.header(), width=0.06, holding=True))
         held = await scene.next()
         while not held.attached:
