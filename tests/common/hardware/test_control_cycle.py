@@ -1,0 +1,213 @@
+import numpy as np
+import pytest
+
+from common.config import Fixture, GripperConfig, World
+from common.errors import ConfigError, Refused
+from common.hardware.cycle import ControlCycle
+from common.hardware.fingers import Fingers
+from common.hardware.interface import HardwareFault
+from common.hardware.lag import LagHardware
+from common.hardware.mock import MockHardware
+from common.messages import ExecuteRequest, GripperCommand, Header, StopRequest, Vector3, WorldEdit
+from common.robot.transforms import tool_down
+from common.sim.world import SimulatedWorld
+
+START = np.zeros(2)
+GRIPPER = GripperConfig(joints=["left", "right"], links=[])
+TABLE = Fixture(id="table", dimensions=[1.0, 1.0, 0.05], position=(0.5, 0.0, -0.025))
+
+
+class Gantry:
+    """A hand over the table that the two joints move along x and z from (0.5, 0, 0.03)."""
+
+    def fk(self, q):
+        return tool_down(0.5 + q[0], 0.0, 0.03 + q[1])
+
+
+class Rig:
+    def __init__(self, limits, hardware=None, balls=((0.5, 0.0),), **changes):
+        self.hardware = hardware or MockHardware(START, Fingers(GRIPPER, 0.08))
+        config = World(fixtures=[TABLE], balls=list(balls))
+        self.world = SimulatedWorld(config, config.balls)
+        given = {"gripper": GRIPPER, "kinematics": Gantry(), "world": self.world, **changes}
+        self.cycle = ControlCycle(self.hardware, limits, START, **given)
+        self.stamp = int(1.7e18)
+        self.motions, self.grippers, self.updates, self.balls, self.joints = [], [], [], [], []
+
+    @property
+    def now(self):
+        return self.stamp * 1e-9
+
+    def step(self, seconds=0.01):
+        self.stamp += int(seconds * 1e9)
+        report = self.cycle.step(Header(stamp=self.stamp, frame_id="world"))
+        self.motions += [report.motion] if report.motion else []
+        self.grippers += [report.gripper] if report.gripper else []
+        self.balls += [report.balls] if report.balls else []
+        self.joints += [report.joints] if report.joints else []
+        self.updates += [update.data for update in report.updates]
+        return report
+
+    def run(self, seconds):
+        for _ in range(round(seconds / 0.01)):
+            self.step()
+
+    def execute(self, goal, trajectory):
+        return self.cycle.execute(ExecuteRequest(id=goal, trajectory=trajectory), self.now)
+
+    def grip(self, goal, width):
+        return self.cycle.command(GripperCommand(id=goal, width=width), self.now)
+
+
+@pytest.fixture
+def rig(limits):
+    made = Rig(limits)
+    made.step()
+    return made
+
+
+def test_first_cycle_tells_everything_and_then_only_the_joints(rig):
+    assert rig.motions[0].state == "none" and rig.grippers[0].width == 0.08 and rig.balls[0].ids == ["ball_1"]
+    assert rig.joints[0].name == ["shoulder", "elbow", "left", "right"]
+    assert rig.joints[0].position == [0, 0, 0.04, 0.04] and rig.joints[0].header.stamp == rig.stamp
+    rig.run(1.0)
+    assert (len(rig.motions), len(rig.grippers), len(rig.balls), len(rig.joints)) == (1, 1, 1, 101)
+
+
+@pytest.mark.parametrize("make", [MockHardware, lambda start, fingers: LagHardware(start, 0.03, fingers)])
+def test_ball_is_grasped_lifted_carried_and_let_go(limits, rest_to_rest, make):
+    rig = Rig(limits, make(START, Fingers(GRIPPER, 0.08)))
+    rig.step()
+    assert rig.grip("close", 0.0).state == "active"
+    rig.run(1.0)
+    assert rig.grippers[-1].holding and rig.grippers[-1].state == "succeeded"
+    assert rig.grippers[-1].width == pytest.approx(0.06) and rig.updates == ["remove:ball_1"]
+    rig.execute("lift", rest_to_rest([0, 0], [-0.2, 0.2]))
+    rig.run(1.5)
+    assert rig.motions[-1].state == "succeeded" and rig.balls[-1].labels == ["held"]
+    assert rig.balls[-1].poses[0].position.z == pytest.approx(0.23, abs=2e-3)
+    rig.grip("open", 0.08)
+    rig.run(1.0)
+    assert not rig.grippers[-1].holding and rig.balls[-1].labels == ["table"]
+    assert rig.balls[-1].poses[0].position.x == pytest.approx(0.3, abs=2e-3)
+    assert rig.updates == ["remove:ball_1", "add:ball_1"]
+
+
+def test_fingers_that_close_on_air_succeed_without_holding(limits):
+    rig = Rig(limits, balls=[(0.8, 0.0)])
+    rig.grip("close", 0.0)
+    rig.run(1.0)
+    state = rig.grippers[-1]
+    assert (state.id, state.state, state.holding, state.width) == ("close", "succeeded", False, 0.0)
+
+
+def test_ball_taken_from_the_fingers_is_reported(rig):
+    rig.grip("close", 0.0)
+    rig.run(1.0)
+    rig.cycle.edit(WorldEdit(op="move", id="ball_1", position=Vector3(x=0.3)), rig.now)
+    rig.run(1.0)
+    assert not rig.grippers[-1].holding and rig.grippers[-1].width == 0.0
+
+
+def test_same_gripper_id_again_moves_nothing(rig):
+    rig.grip("close", 0.0)
+    rig.run(1.0)
+    rig.grip("open", 0.08)
+    rig.run(1.0)
+    again = rig.grip("close", 0.0)
+    assert (again.id, again.state) == ("close", "succeeded")
+    rig.run(0.5)
+    assert rig.grippers[-1].width == 0.08 and rig.grippers[-1].id == "open"
+
+
+def test_new_gripper_command_replaces_the_running_one(rig):
+    rig.grip("close", 0.0)
+    rig.run(0.1)
+    rig.grip("open", 0.08)
+    assert rig.grip("close", 0.0).state == "cancelled" and "open" in rig.grip("close", 0.0).message
+    rig.run(1.0)
+    assert (rig.grippers[-1].id, rig.grippers[-1].state) == ("open", "succeeded")
+
+
+def test_width_that_the_fingers_do_not_have_is_rejected(rig):
+    answer = rig.grip("wide", 0.1)
+    assert answer.state == "rejected" and "0.08" in answer.message
+    rig.run(0.5)
+    assert rig.grippers[-1].id == "" and rig.grippers[-1].width == 0.08
+
+
+def test_progress_is_told_about_ten_times_a_second(rig, rest_to_rest):
+    rig.execute("a", rest_to_rest([0, 0], [0.5, 0.5], 2.0))
+    rig.run(2.5)
+    told = [m for m in rig.motions if m.id == "a"]
+    assert told[0].state == "active" and told[-1].state == "succeeded" and 19 <= len(told) <= 24
+    assert [m.progress for m in told] == sorted(m.progress for m in told)
+
+
+def test_stop_reports_cancelled(rig, rest_to_rest):
+    rig.execute("a", rest_to_rest([0, 0], [0.5, 0.5], 2.0))
+    rig.run(1.0)
+    assert rig.cycle.stop(StopRequest(id="a", reason="person"), rig.now).state == "active"
+    rig.run(0.5)
+    assert (rig.motions[-1].state, rig.motions[-1].message) == ("cancelled", "person")
+    assert not any(rig.joints[-1].velocity)
+
+
+def test_fault_of_the_hardware_is_reported_and_survived(limits, rest_to_rest):
+    class Flaky(MockHardware):
+        broken = False
+
+        def read(self, now):
+            if self.broken:
+                raise HardwareFault("cable is off")
+            return super().read(now)
+
+    hardware = Flaky(START, Fingers(GRIPPER, 0.08))
+    rig = Rig(limits, hardware)
+    rig.step()
+    rig.execute("a", rest_to_rest([0, 0], [0.5, 0.5]))
+    rig.run(0.3)
+    hardware.broken = True
+    rig.run(0.3)
+    assert (rig.motions[-1].state, rig.motions[-1].source) == ("aborted", "hardware")
+    assert rig.execute("b", rest_to_rest([0, 0], [0.5, 0.5])).error == "hardware_fault"
+    assert rig.step().joints is None, "nothing is invented"
+    hardware.broken = False
+    rig.step()
+    here = rig.joints[-1].position[:2]
+    assert rig.execute("c", rest_to_rest(here, [0.5, 0.5])).state == "active"
+
+
+def test_real_hardware_has_no_world_to_edit(limits):
+    cycle = ControlCycle(MockHardware(START, Fingers(GRIPPER, 0.08)), limits, START, gripper=GRIPPER)
+    with pytest.raises(Refused, match="real hardware"):
+        cycle.edit(WorldEdit(op="reset"), 1.0)
+    cycle.command(GripperCommand(id="close", width=0.0), 1.0)
+    for tick in range(200):
+        report = cycle.step(Header(stamp=int(1e9 + tick * 1e7)))
+        assert report.balls is None and not report.updates
+    assert report.joints is not None and report.joints.position[2:] == [0, 0]
+
+
+def test_arm_without_gripper_refuses_gripper_commands(limits):
+    cycle = ControlCycle(MockHardware(START, None), limits, START)
+    with pytest.raises(Refused, match="no gripper"):
+        cycle.command(GripperCommand(id="close", width=0.0), 1.0)
+    report = cycle.step(Header(stamp=1))
+    assert report.gripper is None and report.joints is not None and len(report.joints.name) == 2
+
+
+class Numb:
+    """Fingers of a simulated arm that feel nothing."""
+
+    def command(self, width, now):
+        pass
+
+    def read(self, now):
+        raise AssertionError
+
+
+@pytest.mark.parametrize("fingers", [None, Numb()])
+def test_backend_whose_gripper_does_not_fit_is_a_configuration_error(limits, fingers):
+    with pytest.raises(ConfigError, match=r"robot\.hardware\.backend"):
+        Rig(limits, MockHardware(START, fingers))

@@ -1,0 +1,246 @@
+import asyncio
+import json
+from contextlib import asynccontextmanager
+
+import msgpack
+import numpy as np
+import pytest
+import ruckig
+
+from common import topics
+from common.clock import Clock
+from common.config import load_cell, service_config
+from common.errors import ConfigError, RemoteError, UnknownName
+from common.messages import (
+    ExecuteRequest,
+    GripperCommand,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    StopRequest,
+    Vector3,
+    WorldEdit,
+)
+from common.robot.ik import solve_ik
+from common.robot.model import RobotModel
+from common.robot.transforms import tool_down
+from common.transport.local import LocalNetwork
+from common.transport.wiring import wiring
+from services import trajectory_executor
+from services.trajectory_executor import Config
+
+CELL = "test"
+SPEED = 10.0
+
+
+def config(*overrides: str) -> Config:
+    return service_config(load_cell("panda", list(overrides)), "trajectory_executor", Config)
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    return RobotModel.load(load_cell("panda").robot)
+
+
+class Person:
+    """Somebody outside who sees and asks."""
+
+    def __init__(self, net: LocalNetwork, clock: Clock) -> None:
+        self.bus = net.bus("tester", cell=CELL, clock=clock)
+        self.joints = self.bus.reader(topics.JOINT_STATES)
+        self.motion = self.bus.reader(topics.MOTION_STATUS)
+        self.gripper = self.bus.reader(topics.GRIPPER_STATE)
+        self.balls = self.bus.reader(topics.SCENE_BALLS)
+        self.updates = self.bus.reader(topics.SCENE_OBJECT_UPDATES)
+        self.execute = self.bus.client(topics.MOTION_EXECUTE)
+        self.stop = self.bus.client(topics.MOTION_STOP)
+        self.command = self.bus.client(topics.GRIPPER_COMMAND)
+        self.edit = self.bus.client(topics.WORLD_EDIT)
+
+    async def see(self, reader, test):
+        """The first message for which test is true."""
+        async with asyncio.timeout(20):
+            message = reader.latest
+            while message is None or not test(message):
+                message = await reader.next()
+            return message
+
+    async def follow(self, goal, trajectory):
+        answer = await self.execute.call(ExecuteRequest(id=goal, trajectory=trajectory))
+        assert answer.state == "active", answer.message
+        return await self.see(self.motion, lambda m: m.id == goal and m.state != "active")
+
+    async def grip(self, goal, width):
+        await self.command.call(GripperCommand(id=goal, width=width))
+        return await self.see(self.gripper, lambda g: g.id == goal and g.state != "active" and not g.moving)
+
+
+@asynccontextmanager
+async def executor(*overrides: str):
+    net, clock = LocalNetwork(), Clock(SPEED)
+    given = config(*overrides)
+    async with net.running(trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
+        yield Person(net, clock)
+
+
+def move(robot: RobotModel, start, end, scaling=0.5) -> JointTrajectory:
+    """A point-to-point motion within the robot's limits."""
+    asked = ruckig.InputParameter(robot.dof)
+    asked.current_position, asked.target_position = list(start), list(end)
+    asked.max_velocity = list(robot.velocity * scaling)
+    asked.max_acceleration = list(robot.acceleration * scaling)
+    asked.max_jerk = list(robot.jerk * scaling)
+    found = ruckig.Trajectory(robot.dof)
+    ruckig.Ruckig(robot.dof).calculate(asked, found)
+    points = []
+    for t in np.linspace(0.0, found.duration, max(2, round(found.duration / 0.02))):
+        q, dq, ddq = found.at_time(float(t))
+        points.append(JointTrajectoryPoint(time_from_start=float(t), positions=q, velocities=dq, accelerations=ddq))
+    return JointTrajectory(joint_names=robot.joint_names, points=points)
+
+
+async def test_it_reads_nothing_and_serves_motion_gripper_and_world() -> None:
+    found = await wiring(trajectory_executor.run, config())
+    assert found.reads == set() and found.calls == set()
+    assert found.writes == {topics.JOINT_STATES, topics.MOTION_STATUS, topics.GRIPPER_STATE, topics.SCENE_BALLS,
+                            topics.SCENE_OBJECT_UPDATES}
+    assert found.serves == {topics.MOTION_EXECUTE, topics.MOTION_STOP, topics.GRIPPER_COMMAND, topics.WORLD_EDIT}
+
+
+async def test_it_starts_at_home_with_open_fingers_and_the_balls_of_the_world(robot: RobotModel) -> None:
+    async with executor("world.count=3") as person:
+        state = await person.joints.next()
+        assert state.name == [*robot.joint_names, "panda_finger_joint1", "panda_finger_joint2"]
+        assert np.allclose(state.position, [*robot.named("home"), 0.04, 0.04])
+        balls = await person.see(person.balls, lambda b: True)
+        assert balls.ids == ["ball_1", "ball_2", "ball_3"] and set(balls.labels) == {"table"}
+        assert balls.header.frame_id == "world"
+        later = await person.see(person.joints, lambda s: s.header.stamp > state.header.stamp)
+        assert (await person.see(person.motion, lambda m: True)).state == "none"
+        assert later.position == state.position
+
+
+@pytest.mark.parametrize("backend", ["mock", "lag"])
+async def test_ball_is_picked_up_and_dropped_into_the_box(robot: RobotModel, backend: str) -> None:
+    home = robot.named("home")
+    above, at, over = (solve_ik(robot, tool_down(*place), home) for place in
+                       ((0.5, 0.0, 0.15), (0.5, 0.0, 0.03), (0.55, 0.25, 0.25)))
+    async with executor(f"robot.hardware.backend={backend}", "world.balls=[[0.5, 0.0]]") as person:
+        assert (await person.follow("1", move(robot, home, above))).state == "succeeded"
+        assert (await person.follow("2", move(robot, above, at))).state == "succeeded"
+        closed = await person.grip("3", 0.0)
+        assert closed.holding and closed.width == pytest.approx(0.06)
+        assert (await person.follow("4", move(robot, at, above))).state == "succeeded"
+        assert (await person.follow("5", move(robot, above, over))).state == "succeeded"
+        assert (await person.see(person.balls, lambda b: b.labels == ["held"])).poses[0].position.z > 0.1
+        assert not (await person.grip("6", 0.08)).holding
+        dropped = await person.see(person.balls, lambda b: b.labels == ["box"])
+        assert dropped.poses[0].position.z == pytest.approx(0.035)
+        assert [(await person.updates.next()).data for _ in range(2)] == ["remove:ball_1", "add:ball_1"]
+
+
+async def test_same_goal_again_is_answered_and_not_done_twice(robot: RobotModel) -> None:
+    home = robot.named("home")
+    there = move(robot, home, home + 0.2)
+    async with executor() as person:
+        await person.follow("a", there)
+        again = await person.execute.call(ExecuteRequest(id="a", trajectory=there))
+        assert (again.id, again.state) == ("a", "succeeded")
+        state = await person.see(person.joints, lambda s: s.header.stamp > again.header.stamp)
+        assert np.allclose(state.position[:7], home + 0.2) and not any(state.velocity)
+
+
+async def test_refused_trajectories_are_answered_with_the_reason_and_the_next_is_followed(robot: RobotModel) -> None:
+    home = robot.named("home")
+    good = move(robot, home, home + 0.2)
+    elsewhere = move(robot, home + 0.1, home + 0.2)
+    other = good.model_copy(update={"joint_names": [f"ur5_{i}" for i in range(7)]})
+    backwards = good.model_copy(update={"points": [*good.points[:5], good.points[3], *good.points[6:]]})
+    async with executor() as person:
+        for code, trajectory in (("start_mismatch", elsewhere), ("joint_names", other), ("bad_times", backwards)):
+            answer = await person.execute.call(ExecuteRequest(id=code, trajectory=trajectory))
+            assert (answer.state, answer.error) == ("rejected", code) and answer.message
+        assert (await person.follow("good", good)).state == "succeeded"
+
+
+async def test_stop_brings_the_arm_to_rest(robot: RobotModel) -> None:
+    home = robot.named("home")
+    async with executor() as person:
+        await person.execute.call(ExecuteRequest(id="a", trajectory=move(robot, home, home + 0.5, 0.02)))
+        await person.see(person.motion, lambda m: m.progress > 0.2)
+        await person.stop.call(StopRequest(reason="tested"))
+        status = await person.see(person.motion, lambda m: m.state != "active")
+        assert (status.state, status.message) == ("cancelled", "tested") and status.progress < 0.9
+        state = await person.see(person.joints, lambda s: s.header.stamp > status.header.stamp)
+        assert not any(state.velocity)
+
+
+async def test_world_edits_show_in_the_truth_and_bad_ones_are_refused() -> None:
+    async with executor("world.count=2") as person:
+        reply = await person.edit.call(WorldEdit(op="add", position=Vector3(x=0.4, y=0.2)))
+        assert reply.id == "ball_3" and reply.ids == ["ball_1", "ball_2", "ball_3"]
+        await person.see(person.balls, lambda b: len(b.ids) == 3)
+        with pytest.raises(RemoteError) as refusal:
+            await person.edit.call(WorldEdit(op="remove", id="ball_9"))
+        assert refusal.value.code == "unknown_id" and "ball_3" in refusal.value.message
+        await person.edit.call(WorldEdit(op="remove", id="ball_3"))
+        await person.see(person.balls, lambda b: len(b.ids) == 2)
+
+
+async def test_goal_outlives_its_requester(robot: RobotModel) -> None:
+    home = robot.named("home")
+    async with executor() as person:
+        asking = asyncio.create_task(
+            person.execute.call(ExecuteRequest(id="a", trajectory=move(robot, home, home + 0.3, 0.1))))
+        await person.see(person.motion, lambda m: m.id == "a" and m.state == "active")
+        asking.cancel()
+        assert (await person.see(person.motion, lambda m: m.state != "active")).state == "succeeded"
+
+
+def bad_execute(robot: RobotModel, **changes: object) -> bytes:
+    home = robot.named("home")
+    request = json.loads(ExecuteRequest(id="bad", trajectory=move(robot, home, home + 0.1)).model_dump_json())
+    request["trajectory"]["points"][2].update(changes)
+    return msgpack.packb(request)
+
+
+@pytest.mark.parametrize("kind", ["garbage", "truncated", "another message", "nan", "short point"])
+async def test_wrong_message_is_refused_and_the_next_one_served(robot: RobotModel, kind: str) -> None:
+    home = robot.named("home")
+    payload = {
+        "garbage": b"\xc1\xff\x00",
+        "truncated": bad_execute(robot)[:-20],
+        "another message": msgpack.packb({"id": "a", "width": 0.05}),
+        "nan": bad_execute(robot, positions=[float("nan")] * 7),
+        "short point": bad_execute(robot, positions=[0.0] * 6),
+    }[kind]
+    net, clock = LocalNetwork(), Clock(SPEED)
+    async with net.running(trajectory_executor.run, config(), name="trajectory_executor", cell=CELL, clock=clock):
+        replies: asyncio.Queue = asyncio.Queue()
+        loop, session = asyncio.get_running_loop(), net.session()
+        session.get(f"{CELL}/motion/execute", lambda reply: loop.call_soon_threadsafe(replies.put_nowait, reply),
+                    lambda: None, payload=payload, encoding="application/msgpack;ExecuteRequest")
+        async with asyncio.timeout(10):
+            reply = await replies.get()
+        assert reply.sample is None, "refused"
+        person = Person(net, clock)
+        assert (await person.follow("good", move(robot, home, home + 0.1))).state == "succeeded"
+        session.close()
+
+
+async def test_unknown_backend_stops_it_with_the_choices() -> None:
+    with pytest.raises(UnknownName, match="choices: lag, mock"):
+        async with executor("robot.hardware.backend=gazebo"):
+            pass
+
+
+async def test_impossible_layout_stops_it_with_the_place() -> None:
+    with pytest.raises(ConfigError, match=r"world\.balls"):
+        async with executor("world.balls=[[0.55, 0.17]]"):
+            pass
+
+
+async def test_random_layout_follows_the_seed_and_is_within_reach() -> None:
+    async with executor("world.layout=random", "seed=4") as first, executor("world.layout=random", "seed=4") as again:
+        one, two = [await p.see(p.balls, lambda b: True) for p in (first, again)]
+        assert one.poses == two.poses and len(one.ids) == 7
+        assert all(0.18 <= np.hypot(p.position.x, p.position.y) <= 0.82 for p in one.poses)
