@@ -146,7 +146,8 @@ class PickPlace:
         if self.status.state != "DONE":
             self.status.task_seconds = view.now - (self._began or view.now)
         self.status.skipped = self.choice.rejections()
-        self.status.targets = self.status.placed + len(view.targets) + int(view.holding)
+        if self.status.stage not in ("close", "lift", "across", "release"):  # then one is in the hand or in the air
+            self.status.targets = self.status.placed + len(view.targets)
         return [*self._plan_ahead(view), *self._advance(view)]
 
     # --- what runs -------------------------------------------------------------------------------------------
@@ -283,7 +284,7 @@ class PickPlace:
         if not under_way and view.gripper.width < self.gripper.max_width - 0.002:
             self._stages.append(self.rows.open(cycle))
         self._stages += self.rows.pick_and_place(cycle)
-        self._quiet = None
+        self._quiet, self.status.message = None, ""
         return True
 
     def _wait_for_the_end(self, view: View) -> None:
