@@ -103,7 +103,7 @@ async def test_intrinsics_come_from_camera_info():
             Image(header=Header(frame_id=FRAME), width=320, height=240, encoding="bgr8", data=bytes(230400)),
             "image of 320x240, but camera_info says 640x480",
         ),
-        (Image(header=Header(frame_id=FRAME), width=4000, height=1000, encoding="mono8", data=bytes(4_000_000)), "4000"),
+        (Image(header=Header(frame_id=FRAME), width=4000, height=900, encoding="mono8", data=bytes(3_600_000)), "4000"),
         (Image(header=Header(frame_id=FRAME), width=640, height=480, encoding="yuv", data=bytes(9)), "'yuv'"),
         (Image(header=Header(frame_id=FRAME), width=640, height=480, encoding="mono8", data=bytes(307200)), "'mono8'"),
         (Image(header=Header(frame_id=FRAME), width=640, height=480, encoding="bgr8", data=bytes(99)), "too few"),
@@ -194,6 +194,6 @@ async def test_it_reads_no_truth():
     ],
 )
 def test_a_parameter_out_of_bounds_is_named(values, told):
-    with pytest.raises(ConfigError, match="hsv_red|min_contour") as caught:
+    with pytest.raises(ConfigError, match=r"hsv_red|min_contour") as caught:
         check(Config, {"world": around, **values}, "services.vision_detector")
     assert told in str(caught.value)

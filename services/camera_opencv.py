@@ -1,0 +1,81 @@
+"""Sends the pictures of a real camera, a video file or an image folder, rectified."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+from pydantic import Field
+
+from common import topics
+from common.config import Parameters, Surroundings
+from common.messages import CameraInfo
+from common.perception.image import array_to_image
+from common.perception.sources import Intrinsics, Rectifier, Source, open_source
+from common.transport.bus import Bus
+from common.transport.service import main
+
+
+class Config(Parameters):
+    """Where pictures come from. The pose of the camera is that of the world's camera."""
+
+    world: Surroundings
+    source: str | int = Field("/dev/video0", description="device number or path, video file, or folder of images")
+    intrinsics: str = Field(
+        "", description="YAML file with width, height, fx, fy, cx, cy [px] and distortion d; empty: the world's camera"
+    )
+    rate: float = Field(10.0, gt=0, le=250, description="pictures per second of wall time at most [Hz]")
+    loop: bool = Field(True, description="begin a file or folder again at its end")
+    reopen_after: float = Field(
+        0.5, gt=0, le=60, description="wait before a device that is gone is opened again, doubled each time [s]"
+    )
+    reopen_at_most: float = Field(10.0, gt=0, le=600, description="longest of these waits [s]")
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Send pictures; a device that vanishes is opened again. Pictures of another size end the service with one line."""
+    images, infos = bus.writer(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_INFO)
+    frame = config.world.camera.frame
+    i = Intrinsics.load(config.intrinsics, config.world.camera)
+    rectify = Rectifier(i)
+    k = [i.fx, 0.0, i.cx, 0.0, i.fy, i.cy, 0.0, 0.0, 1.0]
+    await bus.ready()
+
+    async def send(source: Source) -> int:
+        """Send what the source gives until it gives no more; the number of pictures."""
+        loop, count = asyncio.get_running_loop(), 0
+        due = loop.time()
+        while (picture := await asyncio.to_thread(source.read)) is not None:
+            header = bus.header(frame)
+            if not count:
+                infos.put(CameraInfo(header=header, height=i.height, width=i.width, d=[0.0] * 5, k=k))
+            late = loop.time() - due
+            if source.live and late < -0.5 / config.rate:
+                continue  # a device is read at its own pace, or its buffer would fill with old pictures
+            straight = await asyncio.to_thread(rectify, picture, str(config.source))
+            images.put(array_to_image(straight, "bgr8", header))
+            count += 1
+            due += max(1, math.ceil(late * config.rate)) / config.rate
+            if not source.live:
+                await asyncio.sleep(due - loop.time())
+        return count
+
+    wait = config.reopen_after
+    while True:
+        source = await asyncio.to_thread(open_source, config.source, i, config.rate, loop=config.loop)
+        if source is not None:
+            # Not closed when this is cancelled: a thread may still be waiting for a picture in there.
+            sent = await send(source)
+            source.close()
+            if not source.live:
+                break
+            wait = config.reopen_after if sent else wait
+        bus.log.error("camera %s gives no picture; it is opened again in %g s", config.source, wait)
+        await asyncio.sleep(wait)
+        wait = min(2 * wait, config.reopen_at_most)
+    bus.log.info("%s has come to its end", config.source)
+    await asyncio.Event().wait()  # other services still look at the last picture
+
+
+if __name__ == "__main__":
+    main(run, Config)
