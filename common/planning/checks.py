@@ -17,6 +17,9 @@ from common.robot.transforms import pose_to_matrix
 Array = NDArray[np.float64]
 
 
+_MEASURED = 1e-4  # [rad] a measured state may stand this far beyond its limit
+
+
 class BadRequest(ZencellError):
     """A request that no planner could serve: code for programs, message for people, the pair where two things touch."""
 
@@ -53,7 +56,7 @@ def check_request(
         raise BadRequest("no_state", "no start is given and the robot's joint states are not known yet")
     else:
         start = _positions(robot, list(current), "current state", "bad_start")
-    _within_limits(robot, start, "start", "start_out_of_limits")
+    start = _within_limits(robot, start, "start", "start_out_of_limits")
     goal = request.goal
     if isinstance(goal, JointGoal):
         return CheckedRequest(start, _joint_goal(robot, goal))
@@ -89,8 +92,7 @@ def _joint_goal(robot: RobotModel, goal: JointGoal) -> Array:
             raise BadRequest("unknown_pose", str(error)) from None
     else:
         raise BadRequest("bad_goal", "joint goal has neither positions nor the name of a pose")
-    _within_limits(robot, positions, "goal", "goal_out_of_limits")
-    return positions
+    return _within_limits(robot, positions, "goal", "goal_out_of_limits")
 
 
 def _positions(robot: RobotModel, values: list[float], what: str, code: str) -> Array:
@@ -99,12 +101,14 @@ def _positions(robot: RobotModel, values: list[float], what: str, code: str) -> 
     return np.array(values, dtype=float)
 
 
-def _within_limits(robot: RobotModel, q: Array, what: str, code: str) -> None:
+def _within_limits(robot: RobotModel, q: Array, what: str, code: str) -> Array:
+    """q, clipped to limits that it may miss by what a measured state does."""
     excess = np.maximum(robot.lower - q, q - robot.upper)
     joint = int(np.argmax(excess))
-    if excess[joint] > 1e-4:  # a measured state may stand this far beyond its limit
+    if excess[joint] > _MEASURED:
         raise BadRequest(
             code,
             f"{what} puts {robot.joint_names[joint]} at {q[joint]:.4f} rad, "
             f"not within {robot.lower[joint]:.4f} to {robot.upper[joint]:.4f}",
         )
+    return np.clip(q, robot.lower, robot.upper)

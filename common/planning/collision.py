@@ -96,8 +96,7 @@ class CollisionWorld:
         self.attached: list[str] = [o.id for o, _, _ in held]
         padded = np.array([0.0] * self._bank.robot_count + [padding if o.role in _PERCEIVED else 0.0 for o in objects])
         margins = padded[self._bank.first] + padded[self._bank.second]
-        excused = {frozenset(pair) for pair in (*scene.allowed_collisions, *allowed)}
-        disabled = frozenset(i for i in range(self._bank.pair_count) if frozenset(self._pair(i)) in excused)
+        disabled = self._pairs_named((*scene.allowed_collisions, *allowed))
         self._far = self._bank.far
         self._far.set(disabled, margins)
         self._near = self._rules_at_start(disabled, margins)
@@ -152,6 +151,19 @@ class CollisionWorld:
             return self._far
         self._bank.near.set(disabled | touching, near_margins)
         return self._bank.near
+
+    def _pairs_named(self, excused: Iterable[Pair]) -> frozenset[int]:
+        """Indices of the pairs with these names, in either order; names that are not there excuse nothing."""
+        indices: dict[str, list[int]] = {}
+        for i, name in enumerate(self._names):
+            indices.setdefault(name, []).append(i)
+        first, second = self._bank.first, self._bank.second
+        found: set[int] = set()
+        for a, b in excused:
+            one, other = indices.get(a, []), indices.get(b, [])
+            either = (np.isin(first, one) & np.isin(second, other)) | (np.isin(first, other) & np.isin(second, one))
+            found.update(np.flatnonzero(either).tolist())
+        return frozenset(found)
 
     def _pair(self, index: int) -> Pair:
         return self._names[self._bank.first[index]], self._names[self._bank.second[index]]

@@ -16,7 +16,7 @@ from common.planning.collision import CollisionWorld, Pair
 from common.planning.obstacles import ObstacleCache
 from common.planning.planners import Plan, load_planner
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result
-from common.planning.retiming import TimedPath, stretch
+from common.planning.retiming import RetimingFailed, TimedPath, stretch
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.timing import retime
 from common.planning.validation import validate
@@ -148,7 +148,7 @@ class PlanningPipeline:
         return Problem(
             robot=robot,
             world=world,
-            start=np.clip(checked.start, robot.lower, robot.upper),
+            start=checked.start,
             goal=checked.goal,
             straight=request.straight,
             velocity=robot.velocity * (request.velocity_scaling or motion.velocity_scaling),
@@ -161,7 +161,10 @@ class PlanningPipeline:
 
     def _finish(self, problem: Problem, result: Result) -> tuple[TimedPath | None, Result]:
         """The timed and validated trajectory and the result, or None and the result with what is wrong."""
-        trajectory = result.trajectory if result.trajectory is not None else retime(problem, result)
+        try:
+            trajectory = result.trajectory if result.trajectory is not None else retime(problem, result)
+        except RetimingFailed as error:
+            return None, replace(result, error="retiming_failed", message=f"retiming: {error}")
         if result.tool_line and self._motion.cartesian_speed_scale < 1:
             trajectory = stretch(trajectory, self._motion.cartesian_speed_scale)
         fault = validate(

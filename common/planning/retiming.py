@@ -123,8 +123,7 @@ def _backward(most: list[float], lengths: Array, A: Array, B: Array) -> list[flo
         following = highest[i + 1]
         x = highest[i]
         for g, o in zip(gains[i], offsets[i], strict=True):
-            reach = g * following + o
-            x = min(x, reach)
+            x = min(x, g * following + o)
         if not x >= 0:
             raise RetimingFailed(f"no feasible speed at grid point {i} of {len(lengths)}")
         highest[i] = x

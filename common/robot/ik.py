@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 POSITION_TOLERANCE = 1e-5  # [m]
 ROTATION_TOLERANCE = 1e-4  # [rad]
-_LARGEST_STEP = 0.5  # [rad] in one joint and iteration: beyond it the linearisation means nothing
+_LARGEST_STEP = 1.0  # [rad] in one joint and iteration: beyond it the linearisation means nothing
 
 
 def converge(robot: RobotModel, target: pin.SE3, seed: Array, iterations: int) -> Array | None:
@@ -68,7 +68,7 @@ def solve_ik(
     *,
     rng: np.random.Generator | None = None,
     restarts: int = 20,
-    iterations: int = 40,
+    iterations: int = 15,
 ) -> Array | None:
     """Joint positions (dof,) [rad] within the limits that put the TCP at a pose; None when none was found.
 
