@@ -1,0 +1,93 @@
+"""Scenes and requests that the planning tests share."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.config import load_cell
+from common.messages import (
+    AttachedObject,
+    CollisionObject,
+    Header,
+    JointGoal,
+    PlanningScene,
+    PlanRequest,
+    Pose,
+    PoseGoal,
+    Vector3,
+)
+from common.planning.obstacles import ObstacleCache
+from common.planning.robot_geometry import RobotGeometry
+from common.robot.ik import solve_ik
+from common.robot.model import RobotModel
+from common.robot.transforms import matrix_to_pose, tool_down
+
+WORLD = Header(frame_id="world")
+CELL = load_cell("panda")
+ROBOT = RobotModel.load(CELL.robot)
+GEOMETRY = RobotGeometry(ROBOT)
+HOME = ROBOT.named("home")
+FINGERS = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
+
+# Seven balls about the table, and a block of five with 65 to 70 mm between the centres.
+SPREAD = [(0.30, -0.28), (0.35, -0.05), (0.42, -0.18), (0.48, 0.02), (0.55, -0.10), (0.60, -0.27), (0.33, 0.20)]
+BLOCK = [(0.50, -0.10), (0.565, -0.10), (0.435, -0.10), (0.50, -0.03), (0.50, -0.17)]
+
+
+def cache() -> ObstacleCache:
+    """A cache of its own: a world made with a shared one would end the worlds before."""
+    return ObstacleCache(GEOMETRY)
+
+
+def solid(name, role, shape, dimensions, position) -> CollisionObject:
+    x, y, z = position
+    pose = Pose(position=Vector3(x=x, y=y, z=z))
+    return CollisionObject(id=name, role=role, shape=shape, dimensions=dimensions, pose=pose)
+
+
+def ball(number, x, y, z=0.03, role="target") -> CollisionObject:
+    return solid(f"ball_{number}", role, "sphere", [0.03], (x, y, z))
+
+
+def scene(balls=(), *, box=True) -> PlanningScene:
+    objects = [solid("table", "fixture", "box", [1.2, 1.6, 0.05], (0.4, 0, -0.025))]
+    if box:
+        objects.append(solid("box_floor", "container", "box", [0.16, 0.16, 0.005], (0.55, 0.25, 0.0025)))
+        for name, dx, dy, sides in (
+            ("box_north", 0.076, 0, [0.008, 0.16, 0.07]), ("box_south", -0.076, 0, [0.008, 0.16, 0.07]),
+            ("box_west", 0, 0.076, [0.16, 0.008, 0.07]), ("box_east", 0, -0.076, [0.16, 0.008, 0.07]),
+        ):
+            objects.append(solid(name, "container", "box", sides, (0.55 + dx, 0.25 + dy, 0.035)))
+    return PlanningScene(header=WORLD, objects=objects + [ball(i, x, y) for i, (x, y) in enumerate(balls)])
+
+
+def held_scene(base: PlanningScene, name: str) -> PlanningScene:
+    """The scene with one of its balls between the fingers."""
+    taken = next(o for o in base.objects if o.id == name)
+    held = taken.model_copy(update={"role": "attached", "pose": Pose()})
+    rest = [o for o in base.objects if o.id != name]
+    return PlanningScene(header=WORLD, objects=rest, attached=[AttachedObject(link="panda_hand_tcp", object=held)])
+
+
+def touching(name: str) -> list[tuple[str, str]]:
+    return [(finger, name) for finger in FINGERS]
+
+
+def above(x, y, z, yaw=0.0) -> np.ndarray:
+    q = solve_ik(ROBOT, tool_down(x, y, z, yaw), HOME)
+    assert q is not None
+    return q
+
+
+def to_pose(T, start, **more) -> PlanRequest:
+    goal = {k: more.pop(k) for k in ("position_tolerance", "tilt_tolerance", "yaw_tolerance") if k in more}
+    return PlanRequest(id="1", start=list(start), goal=PoseGoal(pose=matrix_to_pose(T), **goal), **more)
+
+
+def to_joints(goal, start, **more) -> PlanRequest:
+    return PlanRequest(id="1", start=list(start), goal=JointGoal(positions=list(goal)), **more)
+
+
+def last(response) -> np.ndarray:
+    assert response.ok, response.message
+    return np.array(response.trajectory.points[-1].positions)
