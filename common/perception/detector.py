@@ -16,7 +16,7 @@ from common.perception.outline import Blob, Mask, find_blobs
 from common.perception.pinhole import Pinhole
 from common.perception.resting import Resting
 from common.perception.separation import separate
-from common.perception.sphere import silhouette
+from common.perception.sphere import ray_distances, silhouette
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
@@ -155,7 +155,7 @@ class Detector:
             if not (np.isfinite(pixel).all() and np.isfinite(place).all()):
                 continue
             outline = silhouette(camera, center + camera.position, self.resting.radius, 32)
-            partial = not camera.in_picture(outline).all() or self._cut(blob, fit, center, camera)
+            partial = not camera.in_picture(outline).all() or self._cut(blob, center, camera)
             found.append(
                 Detection(
                     position=(float(place[0]), float(place[1]), self.resting.plane),
@@ -167,10 +167,9 @@ class Detector:
             )
         return found
 
-    def _cut(self, blob: Blob, fit: Fit, center: Array, camera: Pinhole) -> bool:
+    def _cut(self, blob: Blob, center: Array, camera: Pinhole) -> bool:
         """Whether the picture's border cuts through the ball: the blob touches it there."""
         if not len(blob.border):
             return False
-        rays = camera.directions(blob.border)
-        away = center - (rays @ center)[:, None] * rays
-        return bool((np.linalg.norm(away, axis=1) < self.resting.radius).any())
+        distance, _ = ray_distances(camera.directions(blob.border), center[None])
+        return bool((distance < self.resting.radius).any())

@@ -6,6 +6,7 @@ segmented outline lies a little inside or outside of the true one, by as much fo
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,8 @@ from common.perception.outline import Outline
 from common.perception.sphere import ray_distances
 
 Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
+Chosen = npt.NDArray[np.bool_]
 
 _FACING = 0.6  # cosine between the inward normal of the outline and the direction to the centre
 
@@ -27,7 +30,7 @@ class Fit:
         centers: (k, 3) relative to the optical centre [m].
         offset: of the outline from the silhouettes, positive outside [m].
         owner: (n,) index of the sphere that each point of the outline belongs to, -1 for none.
-        residuals: (n,) distance of each point from the offset silhouette of its nearest sphere [m].
+        residuals: (n,) distance of each point outside of the offset silhouette nearest to it [m]; infinite for none.
     """
 
     centers: Array
@@ -35,21 +38,59 @@ class Fit:
     owner: npt.NDArray[np.intp]
     residuals: Array
 
-    def support(self) -> npt.NDArray[np.intp]:
-        """(k,) number of points of the outline that belong to each sphere."""
-        return np.bincount(self.owner[self.owner >= 0], minlength=len(self.centers))
+
+@dataclass(frozen=True)
+class _Misfit:
+    """Points against spheres: (n, k) arrays."""
+
+    beyond: Array  # outside of the silhouette [m]; infinite where the outline faces another way than the sphere would
+    distance: Array  # of the ray from the centre [m]
+    along: Array  # how far along the ray it passes the centre [m]
 
 
-def misfit(outline: Outline, center: Array, radius: float) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-    """How far rays of an outline pass outside of a sphere.
+def _compare(outline: Outline, centers: Array, radius: float) -> _Misfit:
+    distance, along = ray_distances(outline.rays, centers)
+    # The rays are perpendicular to the inward normals, so this is the product with the direction to the centre.
+    facing = outline.inward @ centers.T > _FACING * distance
+    return _Misfit(np.where(facing, distance - radius, np.inf), distance, along)
 
-    Returns:
-        (n,) distance from the silhouette, negative inside [m]; (n, 2) its gradient in the horizontal position of the
-        sphere; (n,) whether the outline there faces the way in which the sphere would.
+
+def _gradients(outline: Outline, misfit: _Misfit, centers: Array, which: Index, owner: Index) -> Array:
+    """(m, 2) change of the distances of points from the silhouettes of their owners with the owners' x and y."""
+    away = centers[owner, :2] - misfit.along[which, owner][:, None] * outline.rays[which, :2]
+    gradients: Array = away / misfit.distance[which, owner][:, None]
+    return gradients
+
+
+def near_points(outline: Outline, center: Array, radius: float, gate: float) -> Chosen:
+    """(n,) which points of an outline lie within the gate [m] of a sphere's silhouette and face as it does."""
+    chosen: Chosen = np.abs(_compare(outline, center[None], radius).beyond[:, 0]) < gate
+    return chosen
+
+
+def fit_one(outline: Outline, center: Array, radius: float, gates: tuple[float, ...]) -> Array:
+    """(3,) the centre of one sphere, by Gauss-Newton from a first guess: one step for each gate [m], height kept.
+
+    Points farther from the silhouette than the gate are left out of a step.
     """
-    distance, gradient = ray_distances(outline.rays, center)
-    facing = np.einsum("ij,ij->i", gradient, outline.inward) > _FACING
-    return distance - radius, gradient[:, :2], facing
+    c = center.astype(float)
+    for gate in gates:
+        misfit = _compare(outline, c[None], radius)
+        residual, along = misfit.beyond[:, 0], misfit.along[:, 0]
+        near = np.abs(residual) < gate
+        weight = near / misfit.distance[:, 0]
+        gx = (c[0] - along * outline.rays[:, 0]) * weight
+        gy = (c[1] - along * outline.rays[:, 1]) * weight
+        residual = np.where(near, residual, 0.0)
+        xx, xy, yy, rx, ry = (float(p @ q) for p, q in ((gx, gx), (gx, gy), (gy, gy), (gx, residual), (gy, residual)))
+        determinant = xx * yy - xy * xy
+        if determinant < 1.0:  # a handful of points, or all on one side
+            break
+        dx, dy = (yy * rx - xy * ry) / determinant, (xx * ry - xy * rx) / determinant
+        shorter = min(1.0, 0.5 * radius / max(math.hypot(dx, dy), 1e-12))
+        c[0] -= dx * shorter
+        c[1] -= dy * shorter
+    return c
 
 
 def fit_spheres(
@@ -57,62 +98,51 @@ def fit_spheres(
     centers: Array,
     radius: float,
     *,
-    offset: float = 0.0,
-    offset_std: float = 1e-3,
+    offset: float,
+    offset_std: float,
     gates: tuple[float, ...] = (6e-3, 4e-3, 2.5e-3, 2.5e-3, 2e-3),
-    point_std: float = 4e-4,
+    point_std: float = 8e-4,
 ) -> Fit:
-    """Gauss-Newton from first centres, one step for each gate.
+    """Gauss-Newton on all spheres and the offset from first centres: one step for each gate.
+
+    In each step every point belongs to the sphere whose silhouette it is nearest to, if it lies within the gate.
 
     Args:
         outline: all edges of a blob.
         centers: (k, 3) first guess relative to the optical centre [m]; heights are kept.
         radius: of all spheres [m].
         offset: expected offset of the outline [m].
-        offset_std: how sure that is [m]; 0 holds it.
-        gates: in each step, points farther than this from every silhouette are left out [m].
-        point_std: how exact a point of the outline is [m]; weighs the outline against the expected offset.
+        offset_std: how sure that is [m].
+        gates: how far off a point may be in each step [m].
+        point_std: how exact a point of the outline is [m]: what the expected offset is weighed against. Neighbouring
+            points err together, so this is twice the scatter that one sees.
     """
     c = centers.astype(float)
     count, delta = len(c), offset
-    owner = np.full(len(outline), -1)
-    residuals = np.full(len(outline), np.inf)
-    for step, gate in enumerate((*gates, gates[-1])):
-        owner, residuals, gradients = _assign(outline, c, radius, delta, gate)
-        if step == len(gates):
-            break
-        used = owner >= 0
-        rows = np.flatnonzero(used)
-        J = np.zeros((len(rows), 2 * count + 1))
-        J[np.arange(len(rows)), 2 * owner[used]] = gradients[used, 0]
-        J[np.arange(len(rows)), 2 * owner[used] + 1] = gradients[used, 1]
+    weight = (point_std / offset_std) ** 2
+    every = np.arange(len(outline))
+    for gate in gates:
+        misfit = _compare(outline, c, radius + delta)
+        nearest = np.argmin(np.abs(misfit.beyond), axis=1)
+        residual = misfit.beyond[every, nearest]
+        used = np.flatnonzero(np.abs(residual) < gate)
+        owner = nearest[used]
+        gradients = _gradients(outline, misfit, c, used, owner)
+        J = np.zeros((len(used), 2 * count + 1))
+        rows = np.arange(len(used))
+        J[rows, 2 * owner] = gradients[:, 0]
+        J[rows, 2 * owner + 1] = gradients[:, 1]
         J[:, -1] = -1.0
         H = J.T @ J + 1e-6 * np.eye(2 * count + 1)
-        g = J.T @ residuals[used]
-        weight = (point_std / offset_std) ** 2 * 4 if offset_std > 0 else 1e9
-        # Neighbouring points of an outline err together: some four of them count as one.
+        g = J.T @ residual[used]
         H[-1, -1] += weight
         g[-1] += weight * (delta - offset)
-        change = np.linalg.solve(H, -g)
-        delta += float(change[-1])
-        moved = change[:-1].reshape(count, 2)
-        length = np.linalg.norm(moved, axis=1, keepdims=True)
+        step = np.linalg.solve(H, -g)
+        delta += float(step[-1])
+        moved = step[:-1].reshape(count, 2)
+        length = np.hypot(moved[:, 0], moved[:, 1])[:, None]
         c[:, :2] += moved * np.minimum(1.0, 0.5 * radius / np.maximum(length, 1e-12))
-    return Fit(c, delta, owner, residuals)
-
-
-def _assign(
-    outline: Outline, centers: Array, radius: float, offset: float, gate: float
-) -> tuple[npt.NDArray[np.intp], Array, Array]:
-    """Give each point of the outline to the sphere whose offset silhouette it is nearest to, facing the right way."""
-    residuals = np.full(len(outline), np.inf)
-    gradients = np.zeros((len(outline), 2))
-    owner = np.full(len(outline), -1)
-    for index, center in enumerate(centers):
-        beyond, gradient, facing = misfit(outline, center, radius + offset)
-        nearer = facing & (np.abs(beyond) < np.abs(residuals))
-        residuals[nearer] = beyond[nearer]
-        gradients[nearer] = gradient[nearer]
-        owner[nearer] = index
-    owner[np.abs(residuals) > gate] = -1
-    return owner, residuals, gradients
+    beyond = _compare(outline, c, radius + delta).beyond
+    nearest = np.argmin(np.abs(beyond), axis=1)
+    residual = beyond[every, nearest]
+    return Fit(c, delta, np.where(np.abs(residual) < gates[-1], nearest, -1), residual)

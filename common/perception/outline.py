@@ -98,22 +98,23 @@ def _outline(parts: Sequence[tuple[npt.NDArray[np.int32], bool]], camera: Pinhol
     pixels, normals = [np.empty((0, 2))], [np.empty((0, 2))]
     for contour, is_hole in parts:
         points = contour.reshape(-1, 2).astype(float)
-        along = np.roll(points, -_REACH, axis=0) - np.roll(points, _REACH, axis=0)
-        turned = np.column_stack([-along[:, 1], along[:, 0]])
+        round_again = np.concatenate([points[-_REACH:], points, points[:_REACH]])
+        along = round_again[2 * _REACH :] - round_again[: -2 * _REACH]
+        turned = along[:, ::-1] * (-1.0, 1.0)
         # Turning a quarter leads into the area that a contour with positive orientation encloses: for the edge of a
         # hole that is the hole.
         if (cv2.contourArea(contour, oriented=True) > 0) == is_hole:
             turned = -turned
-        keep = _off_border(points, camera) & (np.abs(turned).sum(axis=1) > 0)
-        # A direction taken across the border of the picture is not that of the outline.
-        for shift in (-_REACH, _REACH):
-            keep &= _off_border(np.roll(points, shift, axis=0), camera)
+        keep = np.abs(turned).sum(axis=1) > 0
+        clear = _off_border(points, camera)
+        if not clear.all():  # a direction taken across the border of the picture is not that of the outline
+            keep &= clear & np.roll(clear, _REACH) & np.roll(clear, -_REACH)
         pixels.append(points[keep])
         normals.append(turned[keep])
     p, n = np.concatenate(pixels), np.concatenate(normals)
-    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
-    rays = camera.directions(p)
-    inward = camera.directions(p + n) - rays
+    n /= np.maximum(np.hypot(n[:, 0], n[:, 1]), 1e-12)[:, None]
+    both = camera.directions(np.stack([p, p + n]))
+    rays, inward = both[0], both[1] - both[0]
     inward -= np.einsum("ij,ij->i", inward, rays)[:, None] * rays
-    inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
+    inward /= np.sqrt(np.maximum(np.einsum("ij,ij->i", inward, inward), 1e-24))[:, None]
     return Outline(p, rays, inward)

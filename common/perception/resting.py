@@ -67,7 +67,9 @@ class Resting:
         return max(entry, 0.0) <= leave
 
     def heights(self, camera: Pinhole, pixel: npt.ArrayLike) -> list[float]:
-        """z [m] at which the centre of a ball seen at a pixel can be: the table's first."""
-        if self.meets_container(*camera.ray(pixel)):
-            return [self.plane, *self.layers]
-        return [self.plane]
+        """z [m] at which the centre of a ball seen at a pixel can be."""
+        if not self.meets_container(*camera.ray(pixel)):
+            return [self.plane]
+        # Heights that differ by a few millimetres can not be told apart by how large a ball looks.
+        apart = all(abs(z - self.plane) > self.radius / 3 for z in self.layers)
+        return [self.plane, *self.layers] if apart else self.layers

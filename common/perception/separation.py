@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.perception.fit import fit_spheres, misfit
+from common.perception.fit import fit_one, near_points
 from common.perception.outline import Mask, Outline
 from common.perception.pinhole import Pinhole
 from common.perception.resting import Resting
@@ -32,8 +32,8 @@ _MOST_CANDIDATES = 40
 @dataclass(frozen=True)
 class _Candidate:
     center: Array  # (3,) relative to the optical centre [m]
-    on_table: bool
     points: Chosen  # of the outline that belong to it
+    support: int  # how many these are
     whole: float  # points that its whole outline has
 
 
@@ -107,30 +107,26 @@ def _whole_outline(camera: Pinhole, radius: float, distance: float) -> float:
     return 5.66 * radius / max(distance, radius) * (camera.fx + camera.fy) / 2
 
 
-def _refine(
-    outline: Outline, camera: Pinhole, resting: Resting, offset: float, place: Array
-) -> list[_Candidate]:
+def _refine(outline: Outline, camera: Pinhole, resting: Resting, offset: float, place: Array) -> list[_Candidate]:
     """The candidate near a place, at the height that fits best; none when few points support it."""
     best: _Candidate | None = None
+    radius = resting.radius + offset
     start = np.array([place[0], place[1], resting.plane])
     ray = start - camera.position
     for z in resting.heights(camera, camera.project(start)):
         center = ray * ((z - camera.position[2]) / ray[2])
-        beyond, _, facing = misfit(outline, center, resting.radius + offset)
-        near = np.flatnonzero(facing & (np.abs(beyond) < 0.3 * resting.radius))
-        if len(near) < 6:
+        around = np.flatnonzero(near_points(outline, center, radius, 0.35 * resting.radius))
+        if len(around) < 6:
             continue
-        fit = fit_spheres(
-            outline.take(near), center[None], resting.radius, offset=offset, offset_std=0.0, gates=(7e-3, 5e-3, 3e-3)
-        )
-        refined = fit.centers[0]
-        beyond, _, facing = misfit(outline, refined, resting.radius + offset)
-        points = facing & (np.abs(beyond) < _NEAR)
+        local = outline.take(around)
+        refined = fit_one(local, center, radius, (8e-3, 6e-3, 4e-3, 3e-3))
+        points = np.zeros(len(outline), bool)
+        points[around] = near_points(local, refined, radius, _NEAR)
         whole = _whole_outline(camera, resting.radius, float(np.linalg.norm(refined)))
-        candidate = _Candidate(refined, z == resting.plane, points, whole)
-        if best is None or np.count_nonzero(points) > 1.05 * np.count_nonzero(best.points):
+        candidate = _Candidate(refined, points, int(np.count_nonzero(points)), whole)
+        if best is None or candidate.support > 1.05 * best.support:
             best = candidate
-    if best is None or np.count_nonzero(best.points) < _LEAST_SUPPORT * best.whole:
+    if best is None or best.support < _LEAST_SUPPORT * best.whole:
         return []
     return [best]
 
@@ -148,7 +144,9 @@ def _clashes(candidate: _Candidate, chosen: list[_Candidate], radius: float) -> 
 def _is_red(candidate: _Candidate, mask: Mask, camera: Pinhole, radius: float) -> bool:
     """Whether what a ball there would cover of the picture is red."""
     center = candidate.center + camera.position
-    rings = [silhouette(camera, center, part * radius, 16) for part in (0.2, 0.45, 0.65, 0.82)]
-    pixels = np.rint(np.concatenate(rings)).astype(int)
+    outline = silhouette(camera, center, 0.82 * radius, 16)
+    middle = camera.project(center)
+    rings = middle + np.array([0.25, 0.55, 0.8, 1.0])[:, None, None] * (outline - middle)
+    pixels = np.rint(rings.reshape(-1, 2)).astype(int)
     seen = pixels[camera.in_picture(pixels)]
     return len(seen) > 0 and float(np.mean(mask[seen[:, 1], seen[:, 0]] > 0)) >= _COVERED

@@ -38,26 +38,28 @@ def silhouette(camera: Pinhole, center: npt.ArrayLike, radius: float, count: int
     sine = radius / distance
     middle = camera.position + axis * distance * (1 - sine**2)
     around = radius * math.sqrt(1 - sine**2)
-    first = np.cross(axis, (1.0, 0.0, 0.0) if abs(axis[0]) < 0.9 else (0.0, 1.0, 0.0))
-    first /= np.linalg.norm(first)
-    second = np.cross(axis, first)
+    x, y, z = axis
+    first = np.array((0.0, z, -y) if abs(x) < 0.9 else (-z, 0.0, x)) / math.hypot(z, y if abs(x) < 0.9 else x)
+    second = np.array((y * first[2] - z * first[1], z * first[0] - x * first[2], x * first[1] - y * first[0]))
     angle = np.linspace(0.0, 2 * math.pi, count, endpoint=False)[:, None]
     return camera.project(middle + around * (np.cos(angle) * first + np.sin(angle) * second))
 
 
-def ray_distances(directions: Array, center: Array) -> tuple[Array, Array]:
-    """Distance of rays from a point and the direction from each ray to it.
+def ray_distances(directions: Array, centers: Array) -> tuple[Array, Array]:
+    """Distances of rays from the optical centre to points.
 
     Args:
-        directions: (n, 3) unit vectors of rays from the optical centre.
-        center: (3,) relative to the optical centre [m].
+        directions: (n, 3) unit vectors.
+        centers: (k, 3) relative to the optical centre [m].
 
     Returns:
-        (n,) distances [m], and (n, 3) unit vectors: the gradient of the distance in the centre.
+        (n, k) distances [m], and (n, k) how far along each ray it passes each point [m]. The gradient of a distance
+        in its centre is the unit vector (center - along * direction) / distance.
     """
-    away = center - (directions @ center)[:, None] * directions
-    distance = np.sqrt(np.einsum("ij,ij->i", away, away))
-    return distance, away / np.maximum(distance, 1e-12)[:, None]
+    along: Array = directions @ centers.T
+    square = np.einsum("ij,ij->i", centers, centers) - along**2
+    distance: Array = np.sqrt(np.maximum(square, 1e-18))
+    return distance, along
 
 
 def wholly_in_view(camera: Pinhole, center: npt.ArrayLike, radius: float, margin: float = 0.0) -> bool:

@@ -36,7 +36,7 @@ def test_the_box_is_drawn_where_the_camera_sees_its_rim():
 def test_every_pixel_of_a_ball_lies_on_a_ray_that_meets_it():
     center = np.array((0.6, -0.35, 0.03))
     v, u = np.nonzero(red(draw([center], camera, surroundings)))
-    distance, _ = ray_distances(camera.directions(np.column_stack([u, v])), center - camera.position)
+    distance, _ = ray_distances(camera.directions(np.column_stack([u, v])), center[None] - camera.position)
     assert distance.max() < 0.03
     outline = silhouette(camera, center, 0.03, 400)
     area = 0.5 * abs(np.sum(outline[:, 0] * np.roll(outline[:, 1], 1) - outline[:, 1] * np.roll(outline[:, 0], 1)))
