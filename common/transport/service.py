@@ -175,6 +175,8 @@ async def _connected(start: Start[P]) -> ZenohSession:
 
 
 async def _gate(lifeline: Lifeline) -> None:
+    if lifeline.gate_open.is_set():
+        return
     opened = asyncio.Event()
     loop = asyncio.get_running_loop()
     lifeline.on_gate(lambda: call_on_loop(loop, opened.set))

@@ -37,6 +37,13 @@ def find_domain() -> int:
     raise RuntimeError("no domain is free")
 
 
+async def until(condition: Callable[[], bool]) -> None:
+    """Return as soon as something holds that nobody tells us about."""
+    async with asyncio.timeout(PATIENCE):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
+
+
 class Processes:
     """Starts modules of the project as processes and leaves none behind."""
 
@@ -61,9 +68,7 @@ class Processes:
         return self.log_of(self._started.index(process)).read_text()
 
     async def said(self, process: subprocess.Popen[bytes], text: str) -> None:
-        async with asyncio.timeout(PATIENCE):
-            while text not in self.output(process):
-                await asyncio.sleep(0.01)
+        await until(lambda: text in self.output(process))
 
     def end(self) -> None:
         for process in self._started:
@@ -73,10 +78,6 @@ class Processes:
             process.wait()
             if process.stdin:
                 process.stdin.close()
-
-
-async def ended(process: subprocess.Popen[bytes]) -> int:
-    return await asyncio.to_thread(process.wait, PATIENCE)
 
 
 @pytest.fixture
@@ -106,6 +107,12 @@ def shared_router(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 NewBus = Callable[..., Awaitable[Bus]]
+Until = Callable[[Callable[[], bool]], Awaitable[None]]
+
+
+@pytest.fixture(name="until")
+def until_fixture() -> Until:
+    return until
 
 
 @pytest.fixture(params=["local", "zenoh"])

@@ -27,16 +27,8 @@ def event(number: int) -> LogLine:
     return LogLine(service="tester", level="info", message=str(number))
 
 
-async def matched(writer: Writer) -> None:
-    async with asyncio.timeout(PATIENCE):
-        while not writer.matched:
-            await asyncio.sleep(0.005)
-
-
-async def until(condition) -> None:
-    async with asyncio.timeout(PATIENCE):
-        while not condition():
-            await asyncio.sleep(0.005)
+async def matched(writer: Writer, until) -> None:
+    await until(lambda: writer.matched)
 
 
 async def next_of(reader: Reader):
@@ -47,11 +39,11 @@ def put_raw(bus: Bus, topic, payload: bytes, attachment: bytes = b"") -> None:
     bus._session.publisher(f"{bus.cell}/{topic.key}", "", reliable=True).put(payload, attachment)
 
 
-async def test_stream_reader_gets_the_newest_and_counts_what_it_replaced(new_bus) -> None:
+async def test_stream_reader_gets_the_newest_and_counts_what_it_replaced(new_bus, until) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
     reader = receiver.reader(topics.CAMERA_IMAGE)
     writer = sender.writer(topics.CAMERA_IMAGE)
-    await matched(writer)
+    await matched(writer, until)
     for number in range(10):
         writer.put(image(number))
     await until(lambda: reader.received == 10)
@@ -60,21 +52,21 @@ async def test_stream_reader_gets_the_newest_and_counts_what_it_replaced(new_bus
     assert (reader.invalid, reader.overflow) == (0, 0)
 
 
-async def test_latest_does_not_consume(new_bus) -> None:
+async def test_latest_does_not_consume(new_bus, until) -> None:
     bus = await new_bus()
     reader, writer = bus.reader(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_IMAGE)
     assert reader.latest is None
-    await matched(writer)
+    await matched(writer, until)
     writer.put(image(1))
     await until(lambda: reader.latest is not None)
     assert (await next_of(reader)) is reader.latest
     assert reader.dropped == 0
 
 
-async def test_stream_message_is_returned_once(new_bus) -> None:
+async def test_stream_message_is_returned_once(new_bus, until) -> None:
     bus = await new_bus()
     reader, writer = bus.reader(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_IMAGE)
-    await matched(writer)
+    await matched(writer, until)
     writer.put(image(1))
     await next_of(reader)
     waiting = asyncio.create_task(reader.next())
@@ -82,10 +74,10 @@ async def test_stream_message_is_returned_once(new_bus) -> None:
     assert (await asyncio.wait_for(waiting, PATIENCE)).header.stamp == 2
 
 
-async def test_events_come_all_and_in_order(new_bus) -> None:
+async def test_events_come_all_and_in_order(new_bus, until) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
     reader, writer = receiver.reader(topics.LOG), sender.writer(topics.LOG)
-    await matched(writer)
+    await matched(writer, until)
     for number in range(500):
         writer.put(event(number))
     got = [int((await next_of(reader)).message) for _ in range(500)]
@@ -94,10 +86,10 @@ async def test_events_come_all_and_in_order(new_bus) -> None:
     assert reader.latest.message == "499"
 
 
-async def test_events_that_overflow_are_counted_and_reported(new_bus, caplog) -> None:
+async def test_events_that_overflow_are_counted_and_reported(new_bus, until, caplog) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
     reader, writer = receiver.reader(topics.LOG, size=10), sender.writer(topics.LOG)
-    await matched(writer)
+    await matched(writer, until)
     for number in range(25):
         writer.put(event(number))
     await until(lambda: reader.received == 25)
@@ -148,7 +140,7 @@ async def test_plain_late_subscriber_sees_the_state_repeated_and_readers_do_not(
     assert reader.dropped == 0
 
 
-async def test_restarted_writer_is_heard_though_it_counts_from_the_start(new_bus) -> None:
+async def test_restarted_writer_is_heard_though_it_counts_from_the_start(new_bus, until) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
     reader = receiver.reader(topics.PICK_PLACE_STATUS)
     first = sender.writer(topics.PICK_PLACE_STATUS)
@@ -159,10 +151,10 @@ async def test_restarted_writer_is_heard_though_it_counts_from_the_start(new_bus
     await until(lambda: reader.latest.placed == 9)
 
 
-async def test_message_that_is_not_newer_is_dropped(new_bus) -> None:
+async def test_message_that_is_not_newer_is_dropped(new_bus, until) -> None:
     bus = await new_bus()
     reader = bus.reader(topics.LOG)
-    await matched(bus.writer(topics.LOG))
+    await matched(bus.writer(topics.LOG), until)
     for sequence, number in ((5, 1), (5, 2), (4, 3), (6, 4)):
         put_raw(bus, topics.LOG, encode(event(number)), encode_attachment(Attachment("w", sequence)))
     assert (await next_of(reader)).message == "1"
@@ -170,10 +162,10 @@ async def test_message_that_is_not_newer_is_dropped(new_bus) -> None:
     assert reader.received == 2
 
 
-async def test_plain_put_without_attachment_is_accepted_every_time(new_bus) -> None:
+async def test_plain_put_without_attachment_is_accepted_every_time(new_bus, until) -> None:
     bus = await new_bus()
     reader = bus.reader(topics.LOG)
-    await matched(bus.writer(topics.LOG))
+    await matched(bus.writer(topics.LOG), until)
     put_raw(bus, topics.LOG, encode(event(1)))
     put_raw(bus, topics.LOG, encode(event(1)))
     assert (await next_of(reader)) == (await next_of(reader)) == event(1)
@@ -182,10 +174,10 @@ async def test_plain_put_without_attachment_is_accepted_every_time(new_bus) -> N
 BAD = [b"garbage", b"", encode(event(1))[:-3], encode(status(1)), msgpack.packb({"data": float("nan")})]
 
 
-async def test_bad_payloads_are_dropped_counted_and_reported_once(new_bus, caplog) -> None:
+async def test_bad_payloads_are_dropped_counted_and_reported_once(new_bus, until, caplog) -> None:
     bus = await new_bus()
     reader, writer = bus.reader(topics.LOG), bus.writer(topics.LOG)
-    await matched(writer)
+    await matched(writer, until)
     for payload in BAD:
         put_raw(bus, topics.LOG, payload)
     put_raw(bus, topics.LOG, encode(event(1)), b"no attachment of ours")
@@ -199,10 +191,10 @@ async def test_bad_payloads_are_dropped_counted_and_reported_once(new_bus, caplo
     assert bus.counters().invalid == {"log": len(BAD) + 3}
 
 
-async def test_rubbish_does_not_displace_a_state_that_was_not_read_yet(new_bus) -> None:
+async def test_rubbish_does_not_displace_a_state_that_was_not_read_yet(new_bus, until) -> None:
     bus = await new_bus()
     reader, writer = bus.reader(topics.PICK_PLACE_STATUS), bus.writer(topics.PICK_PLACE_STATUS)
-    await matched(writer)
+    await matched(writer, until)
     writer.put(status(3))
     put_raw(bus, topics.PICK_PLACE_STATUS, b"garbage")
     put_raw(bus, topics.PICK_PLACE_STATUS, b"garbage", encode_attachment(Attachment("somebody", 1)))
@@ -216,7 +208,7 @@ async def test_put_of_another_message_is_a_bug_that_shows(new_bus) -> None:
         bus.writer(topics.CAMERA_IMAGE).put(event(1))
 
 
-async def test_trace_rides_from_what_was_read_to_what_is_put(new_bus) -> None:
+async def test_trace_rides_from_what_was_read_to_what_is_put(new_bus, until) -> None:
     sender, middle, end = await new_bus("sender"), await new_bus("middle"), await new_bus("end")
     images, log = sender.writer(topics.CAMERA_IMAGE), middle.writer(topics.LOG)
     reader = middle.reader(topics.CAMERA_IMAGE)
@@ -231,8 +223,8 @@ async def test_trace_rides_from_what_was_read_to_what_is_put(new_bus) -> None:
 
     watching = asyncio.create_task(watch())
     forwarding = asyncio.create_task(forward())
-    await matched(images)
-    await matched(log)
+    await matched(images, until)
+    await matched(log, until)
     images.put(image(1))
     await until(lambda: len(seen) == 2)
     assert seen["log"] == seen["image_raw"] != ""
@@ -240,10 +232,10 @@ async def test_trace_rides_from_what_was_read_to_what_is_put(new_bus) -> None:
     await forwarding
 
 
-async def test_counters_are_published_while_somebody_reads_them(new_bus) -> None:
+async def test_counters_are_published_while_somebody_reads_them(new_bus, until) -> None:
     service, tool = await new_bus("service"), await new_bus("tool")
     reader, writer = service.reader(topics.REJECTED_TARGETS), service.writer(topics.REJECTED_TARGETS)
-    await matched(writer)
+    await matched(writer, until)
     writer.put(Rejections(header={}, rejected=[]))
     await next_of(reader)
     await service.ready()
@@ -253,11 +245,11 @@ async def test_counters_are_published_while_somebody_reads_them(new_bus) -> None
     assert counted.received == {"rejected_targets": 1}
 
 
-async def test_log_lines_are_put_on_the_log_topic(new_bus) -> None:
+async def test_log_lines_are_put_on_the_log_topic(new_bus, until) -> None:
     service, tool = await new_bus("talker"), await new_bus("tool")
     reader = tool.reader(topics.LOG)
     handler = BusLog(service)
-    await matched(handler._writer)
+    await matched(handler._writer, until)
     service.log.addHandler(handler)
     service.log.setLevel(logging.INFO)
     try:

@@ -4,8 +4,8 @@ import asyncio
 from typing import Literal
 
 from common import topics
-from common.config import ConfigError, Parameters
-from common.errors import Refused
+from common.config import Parameters
+from common.errors import ConfigError, Refused
 from common.messages import PickPlaceStatus, TaskCommand
 from common.transport.bus import Bus
 from common.transport.service import main

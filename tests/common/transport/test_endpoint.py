@@ -1,0 +1,53 @@
+import json
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from common.errors import ConfigError
+from common.transport.endpoint import endpoint_of
+
+
+@pytest.mark.parametrize(
+    ("domain", "connect", "environ", "endpoint"),
+    [
+        (None, None, {}, "tcp/127.0.0.1:7489"),
+        (0, None, {}, "tcp/127.0.0.1:7447"),
+        ("232", None, {}, "tcp/127.0.0.1:7679"),
+        (None, None, {"ZENCELL_DOMAIN": "7"}, "tcp/127.0.0.1:7454"),
+        (5, None, {"ZENCELL_DOMAIN": "7"}, "tcp/127.0.0.1:7452"),
+        (None, None, {"ZENCELL_DOMAIN": "7", "ZENCELL_CONNECT": "tcp/router:7447"}, "tcp/router:7447"),
+        (5, None, {"ZENCELL_CONNECT": "tcp/router:7447"}, "tcp/127.0.0.1:7452"),
+        (5, "tls/[::1]:7447", {}, "tls/[::1]:7447"),
+    ],
+)
+def test_endpoint_follows_options_before_environment(
+    domain: int | str | None, connect: str | None, environ: dict[str, str], endpoint: str
+) -> None:
+    assert endpoint_of(domain, connect, environ) == endpoint
+
+
+@pytest.mark.parametrize("domain", [-1, 233, "x", "4.5", ""])
+def test_domain_out_of_bounds_is_refused_with_the_bounds(domain: int | str) -> None:
+    with pytest.raises(ConfigError, match=r"--domain: .* must be a whole number from 0 to 232"):
+        endpoint_of(domain)
+
+
+def test_error_names_the_variable_that_the_value_came_from() -> None:
+    with pytest.raises(ConfigError, match="ZENCELL_DOMAIN: '999'"):
+        endpoint_of(environ={"ZENCELL_DOMAIN": "999"})
+    with pytest.raises(ConfigError, match="ZENCELL_CONNECT: 'here'"):
+        endpoint_of(environ={"ZENCELL_CONNECT": "here"})
+
+
+@pytest.mark.parametrize("connect", ["router", "tcp/router", "router:7447", "tcp/:7447", "tcp/router:99999", "x/y:1"])
+def test_what_is_no_endpoint_is_refused(connect: str) -> None:
+    with pytest.raises(ConfigError, match="--connect"):
+        endpoint_of(None, connect)
+
+
+def test_client_file_points_at_the_default_router_and_searches_for_nothing() -> None:
+    config = zenoh.Config.from_file(Path(__file__).parents[3] / "config" / "zenoh-client.json5")
+    assert json.loads(config.get_json("mode")) == "client"
+    assert json.loads(config.get_json("connect/endpoints")) == [endpoint_of(environ={})]
+    assert json.loads(config.get_json("scouting/multicast/enabled")) is False

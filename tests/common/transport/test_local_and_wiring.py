@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from common import topics
+from common.errors import NoResponder
+from common.messages import Image, LogLine, PickPlaceStatus, TaskCommand
+from common.transport.bus import Bus
+from common.transport.local import LocalNetwork
+from common.transport.wiring import wiring
+
+PATIENCE = 20.0
+
+
+class Config:
+    fail = False
+
+
+async def service(bus: Bus, config: Config) -> None:
+    images = bus.reader(topics.CAMERA_IMAGE)
+    status = bus.writer(topics.PICK_PLACE_STATUS)
+    bus.client(topics.MOTION_PLAN)
+
+    async def handle(request: TaskCommand) -> PickPlaceStatus:
+        if request.command == "stop":
+            raise RuntimeError("the handler has a bug")
+        return PickPlaceStatus()
+
+    bus.serve(topics.TASK_COMMAND, handle)
+    if config.fail:
+        raise RuntimeError("the start has a bug")
+    await bus.ready()
+    async for image in images:
+        bus.log.info("saw %d", image.header.stamp)
+        status.put(PickPlaceStatus(placed=image.header.stamp))
+
+
+def image(stamp: int) -> Image:
+    return Image(header={"stamp": stamp}, height=1, width=1, encoding="mono8", data=b"x")
+
+
+async def test_service_runs_in_process_from_its_ready_to_the_end_of_the_block() -> None:
+    net = LocalNetwork()
+    tester = net.bus("tester")
+    status, log = tester.reader(topics.PICK_PLACE_STATUS), tester.reader(topics.LOG)
+    async with net.running(service, Config(), name="toy"):
+        assert await tester.alive.known() == {"toy"}
+        tester.writer(topics.CAMERA_IMAGE).put(image(4))
+        assert (await asyncio.wait_for(status.next(), PATIENCE)).placed == 4
+        assert await asyncio.wait_for(log.next(), PATIENCE) == LogLine(
+            header=log.latest.header, service="toy", level="info", message="saw 4"
+        )
+    await tester.alive.wait("toy", PATIENCE, there=False)
+    with pytest.raises(NoResponder):
+        await tester.client(topics.TASK_COMMAND).call(TaskCommand(command="start"))
+
+
+async def test_crash_at_the_start_is_raised() -> None:
+    config = Config()
+    config.fail = True
+    with pytest.raises(RuntimeError, match="the start has a bug"):
+        async with LocalNetwork().running(service, config):
+            raise AssertionError("the block must not be entered")
+
+
+async def test_crash_in_the_middle_ends_the_block_and_is_raised() -> None:
+    net = LocalNetwork()
+    client = net.bus("tester").client(topics.TASK_COMMAND)
+
+    async def block() -> None:
+        async with net.running(service, Config()):
+            asking = asyncio.create_task(client.call(TaskCommand(command="stop")))
+            asking.add_done_callback(lambda task: task.exception())
+            await asyncio.Event().wait()
+
+    with pytest.raises(RuntimeError, match="the handler has a bug"):
+        await asyncio.wait_for(block(), PATIENCE)
+
+
+async def test_failure_of_the_block_is_raised_as_it_is() -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with LocalNetwork().running(service, Config()):
+            _ = 1 // 0
+
+
+async def test_block_that_is_cancelled_is_cancelled() -> None:
+    async def block() -> None:
+        async with LocalNetwork().running(service, Config()):
+            await asyncio.Event().wait()
+
+    task = asyncio.create_task(block())
+    await asyncio.sleep(0)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+
+
+async def test_service_that_ends_before_it_is_ready_is_reported() -> None:
+    async def short(bus: Bus, config: Config) -> None:
+        bus.log.debug("nothing to do")
+
+    with pytest.raises(RuntimeError, match="ended before it was ready"):
+        async with LocalNetwork().running(short, Config(), name="short"):
+            raise AssertionError("the block must not be entered")
+    with pytest.raises(RuntimeError, match="before ready"):
+        await wiring(short, Config())
+
+
+async def test_wiring_lists_what_a_service_has_to_do_with() -> None:
+    found = await wiring(service, Config())
+    assert found.reads == {topics.CAMERA_IMAGE}
+    assert found.writes == {topics.PICK_PLACE_STATUS}
+    assert found.serves == {topics.TASK_COMMAND}
+    assert found.calls == {topics.MOTION_PLAN}
+
+
+async def test_wiring_raises_what_the_service_raises() -> None:
+    config = Config()
+    config.fail = True
+    with pytest.raises(RuntimeError, match="the start has a bug"):
+        await wiring(service, config)
+
+
+async def test_buses_of_two_networks_or_cells_do_not_meet() -> None:
+    net = LocalNetwork()
+    net.bus("sender", cell="a").writer(topics.PICK_PLACE_STATUS).put(PickPlaceStatus())
+    assert net.bus("other", cell="b").reader(topics.PICK_PLACE_STATUS).latest is None
+    assert LocalNetwork().bus("other", cell="a").reader(topics.PICK_PLACE_STATUS).latest is None
+    assert net.bus("same", cell="a").reader(topics.PICK_PLACE_STATUS).latest == PickPlaceStatus()

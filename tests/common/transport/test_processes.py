@@ -1,0 +1,319 @@
+"""What only real processes show: every way to end, and what the others see of it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from common import topics
+from common.errors import NoResponder, NoRouter, RemoteError, RequestLost, RequestTimeout
+from common.messages import TaskCommand
+from common.transport.bus import Bus, Client
+from common.transport.connect import connect
+from common.transport.endpoint import endpoint_of, port_of
+from common.transport.zenoh_session import wait_router
+
+PATIENCE = 20.0  # only ever waited for by a test that fails
+CELL = str(Path(__file__).with_name("toy_cell.yaml"))
+START, HOLD = TaskCommand(command="start"), TaskCommand(command="pause")
+
+
+class Stage:
+    """A router and toys on a domain of their own."""
+
+    def __init__(self, processes, domain: int, until) -> None:
+        self.until = until
+        self.processes = processes
+        self.domain = domain
+        self.endpoint = endpoint_of(domain)
+
+    async def router(self) -> subprocess.Popen[bytes]:
+        process = self.processes.start("services.router", "--domain", str(self.domain))
+        await wait_router(self.endpoint, PATIENCE)
+        return process
+
+    def toy(self, *arguments: str, mode: str = "serve") -> subprocess.Popen[bytes]:
+        return self.processes.start(
+            "tests.common.transport.toy", "--cell", CELL, "--domain", str(self.domain),
+            "--set", f"services.toy.mode={mode}", *arguments,
+        )
+
+    async def ended(self, process: subprocess.Popen[bytes]) -> int:
+        return await asyncio.to_thread(process.wait, PATIENCE)
+
+    def output(self, process: subprocess.Popen[bytes]) -> str:
+        return self.processes.output(process)
+
+    async def said(self, process: subprocess.Popen[bytes], text: str) -> None:
+        await self.processes.said(process, text)
+
+    async def connected(self, process: subprocess.Popen[bytes]) -> None:
+        """Return when a process has a link to the router, though it has not said anything."""
+
+        def linked() -> bool:
+            links = psutil.Process(process.pid).net_connections("tcp")
+            ports = [link.raddr.port for link in links if link.status == psutil.CONN_ESTABLISHED]
+            return port_of(self.domain) in ports
+
+        await self.until(linked)
+
+    def bus(self):
+        return connect(cell="toy_cell", service="tester", endpoint=self.endpoint, timeout=PATIENCE)
+
+
+@pytest.fixture
+def stage(processes, domain: int, until) -> Stage:
+    return Stage(processes, domain, until)
+
+
+@pytest.fixture
+async def bus(stage: Stage) -> AsyncIterator[Bus]:
+    stage.the_router = await stage.router()
+    async with stage.bus() as bus:
+        yield bus
+
+
+async def available(bus: Bus) -> Client:
+    client = bus.client(topics.TASK_COMMAND)
+    await client.wait_available(PATIENCE)
+    return client
+
+
+# --- the ends of a request ----------------------------------------------------------------------------------------
+
+
+async def test_request_to_another_process_is_answered_or_refused(stage: Stage, bus: Bus) -> None:
+    stage.toy("--set", "services.toy.placed=5")
+    client = await available(bus)
+    assert (await client.call(START)).placed == 5
+    with pytest.raises(RemoteError, match="not now"):
+        await client.call(TaskCommand(command="stop"))
+
+
+async def test_killed_responder_is_no_responder(stage: Stage, bus: Bus) -> None:
+    toy = stage.toy()
+    client = await available(bus)
+    toy.kill()
+    await stage.until(lambda: not client.available)
+    with pytest.raises(NoResponder):
+        await client.call(START)
+
+
+async def test_responder_killed_in_the_middle_loses_the_request(stage: Stage, bus: Bus) -> None:
+    toy = stage.toy()
+    waiting = asyncio.create_task((await available(bus)).call(HOLD, timeout=PATIENCE))
+    await stage.said(toy, "holding")
+    toy.kill()
+    with pytest.raises(RequestLost):
+        await waiting
+
+
+async def test_frozen_responder_is_a_time_out_then_lost_then_gone_and_serves_again_when_it_thaws(
+    stage: Stage, bus: Bus
+) -> None:
+    toy = stage.toy()
+    client = await available(bus)
+    toy.send_signal(signal.SIGSTOP)
+    with pytest.raises(RequestTimeout):
+        await client.call(START, timeout=0.2)
+    with pytest.raises(RequestLost):  # its lease runs out while we wait
+        await client.call(START, timeout=PATIENCE)
+    await stage.until(lambda: not client.available)
+    with pytest.raises(NoResponder):
+        await client.call(START, timeout=PATIENCE)
+    toy.send_signal(signal.SIGCONT)
+    await client.wait_available(PATIENCE)
+    assert (await client.call(START)).placed == 7
+
+
+async def test_router_killed_in_the_middle_loses_the_request_and_then_nobody_is_there(stage: Stage, bus: Bus) -> None:
+    toy = stage.toy()
+    client = await available(bus)
+    waiting = asyncio.create_task(client.call(HOLD, timeout=PATIENCE))
+    await stage.said(toy, "holding")
+    stage.the_router.kill()
+    with pytest.raises(RequestLost):
+        await waiting
+    await stage.until(lambda: not client.available)
+    with pytest.raises(NoResponder):
+        await client.call(START)
+
+
+async def test_router_frozen_in_the_middle_loses_the_request(stage: Stage, bus: Bus) -> None:
+    toy = stage.toy()
+    client = await available(bus)
+    waiting = asyncio.create_task(client.call(HOLD, timeout=PATIENCE))
+    await stage.said(toy, "holding")
+    stage.the_router.send_signal(signal.SIGSTOP)
+    with pytest.raises(RequestTimeout):
+        await client.call(START, timeout=0.1)
+    with pytest.raises(RequestLost):
+        await waiting
+
+
+async def test_handler_with_a_bug_ends_the_process_with_its_traceback(stage: Stage, bus: Bus) -> None:
+    toy = stage.toy()
+    client = await available(bus)
+    with pytest.raises(RemoteError, match="the handler has a bug") as caught:
+        await client.call(TaskCommand(command="resume"))
+    assert caught.value.code == "internal"
+    assert await stage.ended(toy) == 1
+    assert "Traceback" in stage.output(toy)
+
+
+async def test_all_heals_when_the_router_is_restarted(stage: Stage, bus: Bus) -> None:
+    toy = stage.toy()
+    client = await available(bus)
+    reader = bus.reader(topics.PICK_PLACE_STATUS)
+    await asyncio.wait_for(reader.next(), PATIENCE)
+    await bus.alive.wait("toy", PATIENCE)
+    stage.the_router.kill()
+    await stage.ended(stage.the_router)
+    await bus.alive.wait("toy", PATIENCE, there=False)
+    await stage.said(toy, "the router is lost")
+    await stage.router()
+    await bus.alive.wait("toy", PATIENCE)
+    await client.wait_available(PATIENCE)
+    async with asyncio.timeout(PATIENCE):
+        async for sample in bus.raw_reader("toy_cell/pick_place_status"):  # it is put again by itself
+            assert sample.payload
+            break
+    assert reader.received == 1
+    assert [s.key for s in await bus.raw_get("toy_cell/pick_place_status", PATIENCE)] == ["toy_cell/pick_place_status"]
+    assert (await client.call(START)).placed == 7
+    toy.send_signal(signal.SIGTERM)
+    assert await stage.ended(toy) == 0
+
+
+# --- gone after a signal, whatever goes on ------------------------------------------------------------------------
+
+
+async def reach(stage: Stage, state: str) -> list[subprocess.Popen[bytes]]:
+    """Two toys in a state: one for each signal."""
+    if state == "connecting":
+        toys = [stage.toy() for _ in range(2)]
+        for toy in toys:
+            await stage.said(toy, "no router at")
+        return toys
+    router = await stage.router()
+    if state == "gated":
+        toys = [stage.toy("--gate") for _ in range(2)]
+        for toy in toys:
+            await stage.connected(toy)
+        return toys
+    mode = state if state in ("busy", "stubborn") else "serve"
+    toys = [stage.toy(mode=mode) for _ in range(2)]
+    for toy in toys:
+        await stage.said(toy, "is ready")
+    if state == "router dead":
+        router.kill()
+        for toy in toys:
+            await stage.said(toy, "the router is lost")
+    if state == "router frozen":
+        router.send_signal(signal.SIGSTOP)
+    return toys
+
+
+STATES = ["connecting", "gated", "running", "busy", "stubborn", "router dead", "router frozen"]
+
+
+@pytest.mark.parametrize("state", STATES)
+async def test_gone_with_exit_code_0_after_sigint_or_sigterm(stage: Stage, state: str) -> None:
+    interrupted, terminated = await reach(stage, state)
+    interrupted.send_signal(signal.SIGINT)
+    interrupted.send_signal(signal.SIGINT)  # an impatient second one changes nothing
+    terminated.send_signal(signal.SIGTERM)
+    assert [await stage.ended(interrupted), await stage.ended(terminated)] == [0, 0]
+    for toy in (interrupted, terminated):
+        assert "Traceback" not in stage.output(toy)
+
+
+async def test_gate_lets_run_begin_and_its_end_ends_the_process(stage: Stage, bus: Bus) -> None:
+    toy = stage.toy("--gate")
+    await stage.connected(toy)
+    assert "toy" not in await bus.alive.known()
+    toy.stdin.write(b"go\n")
+    toy.stdin.flush()
+    await bus.alive.wait("toy", PATIENCE)
+    toy.stdin.close()
+    assert await stage.ended(toy) == 0
+    await bus.alive.wait("toy", PATIENCE, there=False)
+    assert "the supervisor is gone" in stage.output(toy)
+
+
+async def test_token_vanishes_at_once_when_a_service_is_terminated(stage: Stage, bus: Bus) -> None:
+    toy = stage.toy()
+    await bus.alive.wait("toy", PATIENCE)
+    os.kill(toy.pid, signal.SIGTERM)
+    await bus.alive.wait("toy", PATIENCE, there=False)
+    assert await stage.ended(toy) == 0
+    assert "stopped: SIGTERM" in stage.output(toy)
+
+
+async def test_router_ends_on_signals_and_with_its_supervisor(processes, domain: int) -> None:
+    for end in (signal.SIGINT, signal.SIGTERM, None):
+        router = processes.start("services.router", "--domain", str(domain), "--gate")
+        router.stdin.write(b"\n")
+        router.stdin.flush()
+        await processes.said(router, "listening at")
+        if end is None:
+            router.stdin.close()
+        else:
+            router.send_signal(end)
+        assert await asyncio.to_thread(router.wait, PATIENCE) == 0
+
+
+# --- bad starts ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--domain", "233"], "--domain: '233' must be a whole number from 0 to 232"),
+        (["--cell", "pandaa"], "unknown cell 'pandaa' (did you mean 'panda'?)"),
+        (["--set", "services.toy.mood=1"], "services.toy.mood"),
+        (["--set", "services.toy.mode=idle"], "services.toy.mode: 'idle' must be"),
+        (["--speed", "50"], "50 is not within 0.1 to 10"),
+        (["--connect", "nowhere"], "--connect: 'nowhere' must be an endpoint"),
+        (["--sped", "5"], "unrecognized arguments: --sped 5"),
+    ],
+)
+async def test_bad_start_is_one_line_and_exit_code_2(stage: Stage, arguments: list[str], reason: str) -> None:
+    toy = stage.toy(*arguments)
+    assert await stage.ended(toy) == 2
+    output = stage.output(toy)
+    assert reason in output
+    assert len(output.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("mode", "code"), [("crash", 1), ("bad_config", 2), ("end", 0)])
+async def test_exit_code_tells_how_run_ended(stage: Stage, bus: Bus, mode: str, code: int) -> None:
+    toy = stage.toy("--log-json", mode=mode)
+    assert await stage.ended(toy) == code
+    lines = [json.loads(line) for line in stage.output(toy).splitlines()]
+    assert {line["service"] for line in lines} == {"toy"}
+    crashes = [line["message"] for line in lines if "RuntimeError: the service has a bug" in line.get("traceback", "")]
+    assert crashes == (["crashed"] if mode == "crash" else [])
+    assert ("services.toy.mode: 'bad_config' can not be used" in stage.output(toy)) == (mode == "bad_config")
+
+
+async def test_second_router_names_the_process_that_holds_the_port(stage: Stage) -> None:
+    router = await stage.router()
+    second = stage.processes.start("services.router", "--domain", str(stage.domain))
+    assert await stage.ended(second) == 2
+    [line] = stage.output(second).splitlines()
+    assert f"port {port_of(stage.domain)} (domain {stage.domain}) is in use by process {router.pid}" in line
+
+
+async def test_tool_without_a_router_is_told_so(domain: int) -> None:
+    with pytest.raises(NoRouter, match=f"no router at {endpoint_of(domain)}"):
+        async with connect(cell="toy_cell", service="tester", endpoint=endpoint_of(domain), timeout=0.1):
+            pass
