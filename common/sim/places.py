@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.config import Fixture, World
+from common.scene.slots import slot_positions
 
 Array = NDArray[np.float64]
 Slot = tuple[int, int]  # layer, index within the layer
@@ -88,18 +88,16 @@ class Slots:
 
     def __init__(self, world: World) -> None:
         """Lay out the slots."""
-        c = world.container
-        self._container = c
-        self.centres = [(c.x + sx * c.slot_offset, c.y + sy * c.slot_offset) for sx, sy in product((-1, 1), (-1, 1))]
-        self.layers = c.layers
-        self._lowest = world.table_height + c.floor_thickness + world.ball_radius
-        self._radius = world.ball_radius
-        self.count = 4 * c.layers
+        self._container = world.container
+        self._positions = slot_positions(world.container, world.ball_radius, world.table_height)
+        self.centres = [(float(x), float(y)) for x, y, _ in self._positions[0]]
+        self.layers = world.container.layers
+        self.count = 4 * self.layers
 
     def position(self, slot: Slot) -> Array:
         """Centre of a ball in the slot (3,) [m]."""
-        layer, index = slot
-        return np.array([*self.centres[index], self._lowest + layer * 2 * self._radius])
+        position: Array = self._positions[slot].copy()
+        return position
 
     def over(self, x: float, y: float) -> bool:
         """Whether (x, y) is above the container, its walls included."""
