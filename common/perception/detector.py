@@ -38,7 +38,9 @@ class DetectorOptions(Parameters):
     outline_offset_px: float = Field(
         -1.0, ge=-10, le=10, description="where the outline is expected, outside of the silhouette [px]"
     )
-    max_offset_px: float = Field(3.5, gt=0, le=20, description="an outline further off is not that of a ball [px]")
+    max_offset_px: float = Field(
+        2.0, gt=0, le=20, description="an outline that is further from where it is expected is not that of a ball [px]"
+    )
 
     @model_validator(mode="after")
     def _windows_are_not_empty(self) -> DetectorOptions:
@@ -103,12 +105,12 @@ class Detector:
         crowded: list[Blob] = []
         offsets: list[float] = []
         for blob in blobs:
-            fit = self._single(blob, camera, offset, pixel_size)
-            if fit is None:
+            fit, is_round = self._single(blob, camera, offset, pixel_size)
+            if fit is not None:
+                offsets.append(fit.offset)
+                detections += self._detections(blob, fit, camera)
+            elif not is_round:
                 crowded.append(blob)
-                continue
-            offsets.append(fit.offset)
-            detections += self._detections(blob, fit, camera)
         # All outlines of a picture are off by as much: balls that stand alone say by how much.
         spread = 1.0 * pixel_size
         if offsets:
@@ -121,22 +123,32 @@ class Detector:
         """Size of a pixel at the plane of the balls, below the camera [m]."""
         return abs(float(camera.position[2]) - self.resting.plane) / camera.fx
 
-    def _single(self, blob: Blob, camera: Pinhole, offset: float, pixel_size: float) -> Fit | None:
-        """The one ball that a blob is, whole and in view; None when it is something else."""
+    def _single(self, blob: Blob, camera: Pinhole, offset: float, pixel_size: float) -> tuple[Fit | None, bool]:
+        """The fit of a blob that is one round thing wholly in view, and whether it is round at all.
+
+        The fit is None when it is not, and when it is round but as large as no ball looks where it can lie: that is
+        something else, or a ball that is falling.
+        """
         if len(blob.border) or len(blob.outline) < 12:
-            return None
-        start = np.append(camera.on_plane(blob.centroid, self.resting.plane), self.resting.plane) - camera.position
-        if not np.isfinite(start).all():
-            return None
-        limit = self.options.max_offset_px * pixel_size
-        fit = fit_spheres(
-            blob.outline, start[None], self.resting.radius, offset=offset, offset_std=limit,
-            gates=(limit * 2, limit, limit),
-        )
-        away = np.abs(fit.residuals)
-        if np.count_nonzero(away < 1.3 * pixel_size) < 0.96 * len(away) or abs(fit.offset) > limit:
-            return None
-        return fit
+            return None, False
+        center = camera.on_plane(blob.centroid, self.resting.plane)
+        if not np.isfinite(center).all():
+            return None, False
+        ray = np.append(center, self.resting.plane) - camera.position
+        best: Fit | None = None
+        for z in self.resting.heights(camera, blob.centroid):
+            start = ray * ((z - camera.position[2]) / ray[2])
+            fit = fit_spheres(
+                blob.outline, start[None], self.resting.radius, offset=offset, offset_std=1.0,
+                gates=(self.resting.radius, 4 * pixel_size, 3 * pixel_size),
+            )
+            if np.count_nonzero(np.abs(fit.residuals) < 1.3 * pixel_size) < 0.96 * len(fit.residuals):
+                return None, False
+            if best is None or abs(fit.offset - offset) < abs(best.offset - offset):
+                best = fit
+        if best is None or abs(best.offset - offset) > self.options.max_offset_px * pixel_size:
+            return None, True
+        return best, True
 
     def _separated(self, blob: Blob, closed: Mask, camera: Pinhole, offset: float, spread: float) -> list[Detection]:
         """The balls of a blob that touch, hide each other or reach over the border."""

@@ -16,7 +16,7 @@ from common.perception.fit import fit_one, near_points
 from common.perception.outline import Mask, Outline
 from common.perception.pinhole import Pinhole
 from common.perception.resting import Resting
-from common.perception.sphere import silhouette
+from common.perception.sphere import ray_distances, silhouette
 
 Array = npt.NDArray[np.float64]
 Chosen = npt.NDArray[np.bool_]
@@ -26,6 +26,7 @@ _LEAST_VOTES = 0.06  # at a peak, as part of the votes of a whole outline
 _LEAST_SUPPORT = 0.14  # part of a whole outline that a ball must show
 _NEAR = 2.0e-3  # a point this near to a silhouette belongs to it [m]
 _COVERED = 0.85  # part of a ball's silhouette that must be red
+_MOST_GOING_ON = 0.5  # part of the surroundings of a ball that may be red for no known reason
 _MOST_CANDIDATES = 40
 
 
@@ -64,7 +65,10 @@ def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: Resting, of
             continue
         chosen.append(candidate)
         free &= ~candidate.points
-    return np.array([c.center for c in chosen]).reshape(-1, 3)
+    centers = np.array([c.center for c in chosen]).reshape(-1, 3)
+    whole = [_ends(index, centers, mask, camera, resting.radius) for index in range(len(centers))]
+    kept: Array = centers[np.array(whole, bool)]
+    return kept
 
 
 def _votes(outline: Outline, camera: Pinhole, resting: Resting, offset: float) -> Array:
@@ -150,3 +154,16 @@ def _is_red(candidate: _Candidate, mask: Mask, camera: Pinhole, radius: float) -
     pixels = np.rint(rings.reshape(-1, 2)).astype(int)
     seen = pixels[camera.in_picture(pixels)]
     return len(seen) > 0 and float(np.mean(mask[seen[:, 1], seen[:, 0]] > 0)) >= _COVERED
+
+
+def _ends(index: int, centers: Array, mask: Mask, camera: Pinhole, radius: float) -> bool:
+    """Whether a ball ends where it should: what is red around it is other balls. Larger things go on and on."""
+    ring = silhouette(camera, centers[index] + camera.position, 1.15 * radius, 32)
+    pixels = np.rint(ring).astype(int)
+    inside = camera.in_picture(pixels)
+    seen = pixels[inside]
+    others = np.delete(centers, index, axis=0)
+    distance, _ = ray_distances(camera.directions(ring[inside]), others)
+    explained = (distance < 1.05 * radius).any(axis=1)
+    going_on = (mask[seen[:, 1], seen[:, 0]] > 0) & ~explained
+    return int(np.count_nonzero(going_on)) <= _MOST_GOING_ON * len(ring)
