@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import os
 import signal
+import subprocess
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -38,53 +40,63 @@ class Child:
         self.tail: deque[str] = deque(maxlen=TAIL_LINES)
         self.started_at = 0.0  # [s, monotonic]
         self._on_line = on_line
-        self._process: asyncio.subprocess.Process | None = None
-        self._reading: asyncio.Task[None] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._exited: asyncio.Future[int] | None = None
+        self._output = 0  # file descriptor
+        self._rest = b""  # of a line that has not ended yet
+        self._silent = asyncio.Event()  # nothing more can be written
         self._released = False
 
     @property
     def pid(self) -> int | None:
         """Process id while the process runs."""
-        return self._process.pid if self._process is not None and self._process.returncode is None else None
+        running = self._process is not None and self._exited is not None and not self._exited.done()
+        return self._process.pid if running and self._process else None
 
     @property
     def alive_seconds(self) -> float:
         """Time [s] since the process was started."""
         return time.monotonic() - self.started_at
 
-    async def start(self) -> None:
-        """Start the process, behind its gate."""
+    def start(self) -> None:
+        """Start the process, behind its gate; on the running loop."""
+        # Not asyncio's own subprocesses: before Python 3.12 they wait until nobody holds the output open any more,
+        # and a process that ours left behind may do so for ever.
         self.tail.clear()
         self._released = False
+        self._rest = b""
+        self._silent.clear()
         self.started_at = time.monotonic()
-        self._process = await asyncio.create_subprocess_exec(
-            *self.command,
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.STDOUT,
-            env=self.environment,
-            start_new_session=True,
+        process = self._process = subprocess.Popen(
+            self.command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, bufsize=0,
+            env=self.environment, start_new_session=True,
         )
-        self._reading = asyncio.create_task(self._read_lines(self._process))
+        assert process.stdout is not None
+        self._output = process.stdout.fileno()
+        os.set_blocking(self._output, False)
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._output, self._read)
+        self._exited = loop.create_future()
+        threading.Thread(
+            target=_await_exit, args=(process, loop, self._exited), name=f"wait for {self.name}", daemon=True
+        ).start()
 
     def release(self) -> None:
         """Let the process through its gate; without effect the second time."""
         if self._released or self._process is None or self._process.stdin is None:
             return
         self._released = True
-        with contextlib.suppress(OSError, RuntimeError):  # it died meanwhile: wait() tells
+        with contextlib.suppress(OSError, ValueError):  # it died meanwhile: wait() tells
             self._process.stdin.write(b"go\n")
 
     async def wait(self) -> int:
         """Exit code of the process (minus the signal that killed it), once its last lines were read."""
-        assert self._process is not None and self._reading is not None, "not started"
-        code = await self._process.wait()
-        self._kill_group()  # whatever it started and left behind
+        assert self._process is not None and self._exited is not None, "not started"
+        code = await asyncio.shield(self._exited)
         with contextlib.suppress(TimeoutError):  # a stray that moved to another session may hold the pipe open
-            await asyncio.wait_for(asyncio.shield(self._reading), 1.0)
-        self._reading.cancel()
-        if self._process.stdin is not None:
-            self._process.stdin.close()
+            async with asyncio.timeout(1.0):
+                await self._silent.wait()
+        self._close()
         return code
 
     def terminate(self) -> None:
@@ -96,29 +108,66 @@ class Child:
     def kill(self) -> None:
         """End the process and everything that it started, at once (SIGKILL)."""
         if self.pid is not None:
-            self._kill_group()
+            _kill_group(self.pid)
 
-    def _kill_group(self) -> None:
+    def _close(self) -> None:
         assert self._process is not None
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
+        if not self._silent.is_set():
+            self._fall_silent()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
 
-    async def _read_lines(self, process: asyncio.subprocess.Process) -> None:
-        assert process.stdout is not None
-        rest = b""
-        while chunk := await process.stdout.read(65536):
-            *lines, rest = (rest + chunk).split(b"\n")
-            for line in lines:
-                self._emit(line)
-            rest = rest[: 4 * LONGEST_LINE]
-        if rest:
-            self._emit(rest)
+    def _read(self) -> None:
+        try:
+            chunk = os.read(self._output, 65536)
+        except BlockingIOError:
+            return
+        except OSError:
+            chunk = b""
+        if not chunk:
+            self._fall_silent()
+            return
+        *lines, rest = (self._rest + chunk).split(b"\n")
+        self._rest = rest[: 4 * LONGEST_LINE]
+        for line in lines:
+            self._emit(line)
+
+    def _fall_silent(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._output)
+        self._emit(self._rest)
+        self._rest = b""
+        self._silent.set()
 
     def _emit(self, raw: bytes) -> None:
         line = raw.decode("utf-8", "replace").rstrip()[:LONGEST_LINE]
         if line:
             self.tail.append(line)
             self._on_line(self.name, line)
+
+
+def _await_exit(process: subprocess.Popen[bytes], loop: asyncio.AbstractEventLoop, exited: asyncio.Future[int]) -> None:
+    """Wait for the end of a process, on a thread, and take whatever it left behind with it."""
+    if hasattr(os, "waitid"):  # not everywhere; until it is reaped, nobody else can have its number
+        with contextlib.suppress(ChildProcessError):
+            os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+    else:
+        process.wait()
+    _kill_group(process.pid)
+    code = process.wait()
+
+    def tell() -> None:
+        if not exited.done():
+            exited.set_result(code)
+
+    with contextlib.suppress(RuntimeError):  # the loop has ended
+        loop.call_soon_threadsafe(tell)
+
+
+def _kill_group(pid: int) -> None:
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(pid, signal.SIGKILL)
 
 
 def describe_exit(code: int) -> str:

@@ -66,10 +66,13 @@ async def operate(
     working = asyncio.create_task(_work(cell, launch, endpoint, supervisor, work, prepare))
     stopped = asyncio.create_task(interrupts.stop.wait())
     try:
-        await asyncio.wait({working, stopped}, return_when=asyncio.FIRST_COMPLETED)
+        anything: set[asyncio.Future[Any]] = {working, stopped, supervisor.failure}
+        await asyncio.wait(anything, return_when=asyncio.FIRST_COMPLETED)
         if not working.done():
             working.cancel()
             await asyncio.wait({working})
+        if supervisor.failure.done():
+            supervisor.failure.result()
         if working.cancelled():
             raise Interrupted
         return working.result()
@@ -126,7 +129,8 @@ async def _publish(bus: Bus, supervisor: Supervisor) -> None:
             supervisor.changed.clear()
             out.put(SupervisorStatus(header=bus.header(), cell=bus.cell, services=supervisor.statuses))
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(supervisor.changed.wait(), STATUS_PERIOD)
+            async with asyncio.timeout(STATUS_PERIOD):  # wait_for can swallow a cancellation before Python 3.12
+                await supervisor.changed.wait()
 
 
 async def beside(background: Coroutine[Any, Any, None], main: Coroutine[Any, Any, T]) -> T:

@@ -60,7 +60,7 @@ class Supervisor:
     """
 
     def __init__(self, cell: Cell, launch: Launch, on_line: Callable[[str, str], None]) -> None:
-        """Prepare the processes without starting any.
+        """Prepare the processes without starting any; on the running loop.
 
         Args:
             cell: the resolved cell; its services are started in their order.
@@ -76,7 +76,7 @@ class Supervisor:
         self._all = [self._router, *self._services] if self._router else list(self._services)
         self._by_name = {watched.child.name: watched for watched in self._all}
         self._tasks: set[asyncio.Task[None]] = set()
-        self._failure: asyncio.Future[None] | None = None
+        self.failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()  # only ever an exception
         self._up = False
         self._stopping = asyncio.Event()
         self.changed = asyncio.Event()  # set whenever `statuses` differs from before
@@ -93,7 +93,6 @@ class Supervisor:
 
     def begin(self) -> None:
         """Start all processes at once, the services behind their gates, so that their imports overlap."""
-        self._failure = asyncio.get_running_loop().create_future()
         for watched in self._all:
             watched.admitted = watched is self._router
             task = asyncio.create_task(self._keep(watched), name=f"keep {watched.child.name}")
@@ -165,7 +164,7 @@ class Supervisor:
         child = watched.child
         try:
             while not self._stopping.is_set():
-                await child.start()
+                child.start()
                 if watched.admitted:
                     child.release()
                 if self._stopping.is_set():  # it was asked to end before there was anything to ask
@@ -183,17 +182,18 @@ class Supervisor:
                 log.warning("%s ended (%s); starting it again in %.1f s", child.name, message, delay)
                 self._set(watched, state="restarting", restarts=watched.status.restarts + 1, message=message)
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(self._stopping.wait(), delay)
+                    async with asyncio.timeout(delay):
+                        await self._stopping.wait()
         finally:
             self._set(watched, state="failed" if watched.status.state == "failed" else "stopped")
             watched.gone.set()
 
     def _kept(self, task: asyncio.Task[None]) -> None:
-        if task.cancelled() or self._failure is None or self._failure.done():
+        if task.cancelled() or self.failure.done():
             return
         if error := task.exception():
-            self._failure.set_exception(error)
-            self._failure.exception()  # it may be that nobody waits for it any more
+            self.failure.set_exception(error)
+            self.failure.exception()  # it may be that nobody waits for it any more
 
     async def _end(self, watched: Watched, deadline: float, hurry: asyncio.Event) -> None:
         """End one process by the deadline [s, monotonic], or as soon as there is a hurry."""
@@ -209,18 +209,18 @@ class Supervisor:
                 log.warning("%s does not end; killed", watched.child.name)
             watched.child.kill()
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(gone, 1.0)
+                async with asyncio.timeout(1.0):
+                    await gone
         hurried.cancel()
 
     async def _unless_failed(self, reaching: Awaitable[T], watched: Watched | None, name: str) -> T:
         """The result of something that a process has to reach in time, while no process has failed."""
-        assert self._failure is not None, "begin() comes first"
         waited = asyncio.ensure_future(reaching)
         try:
-            either: set[asyncio.Future[Any]] = {waited, self._failure}
+            either: set[asyncio.Future[Any]] = {waited, self.failure}
             await asyncio.wait(either, timeout=START_TIMEOUT, return_when=asyncio.FIRST_COMPLETED)
-            if self._failure.done():
-                self._failure.result()
+            if self.failure.done():
+                self.failure.result()
             if waited.done():
                 return waited.result()
             tail = list(watched.child.tail)[-SHOWN_LINES:] if watched else []

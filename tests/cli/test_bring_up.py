@@ -48,18 +48,6 @@ def test_a_service_that_crashes_at_its_start_is_given_another_chance(zencell: St
     assert command.end() == 0
 
 
-def test_time_out_at_the_start_names_the_service_and_its_last_lines(
-    zencell: Start, folder: Path
-) -> None:
-    command = zencell("run", "tiny.yaml", "--set", "services.middle.behave=never ready", "--summary", "out.json")
-    command.until("waiting for the moon")
-    command.until("zencell: middle was not ready within")
-    command.until("waiting for the moon")
-    assert command.end() == 1
-    assert not command.children()
-    assert json.loads((folder / "out.json").read_text())["state"] == "ERROR"
-
-
 def test_wrong_configuration_of_one_service_ends_everything_with_one_line(zencell: Start) -> None:
     command = zencell("up", "tiny.yaml", "--set", "services.middle.plcaed=3")
     assert command.end() == 2
