@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _SAME = 1e-9  # [rad] waypoints closer than this are one
+_SHORTEST = 1e-5  # [rad] a shorter blend is a stop
 _TURN_BACK = -0.985  # cosine of the angle at a corner that is too sharp to blend
 
 
@@ -82,7 +83,7 @@ def blended_path(waypoints: Array, blends: Array) -> list[SmoothPath]:
 
     Args:
         waypoints: (N, dof) [rad], each other than the one before.
-        blends: (N,) length [rad] taken from both edges at each waypoint; 0 means to stop there. Half the shorter edge
+        blends: (N,) length [rad] taken from both edges at each waypoint; next to 0 means to stop there. Half the shorter edge
             at most is used.
     """
     edges = np.diff(waypoints, axis=0)
@@ -90,8 +91,9 @@ def blended_path(waypoints: Array, blends: Array) -> list[SmoothPath]:
     directions = edges / lengths[:, None]
     cut = np.zeros(len(waypoints))
     for i in range(1, len(waypoints) - 1):
-        if directions[i - 1] @ directions[i] > _TURN_BACK:
-            cut[i] = min(blends[i], 0.5 * lengths[i - 1], 0.5 * lengths[i])
+        longest = min(blends[i], 0.5 * lengths[i - 1], 0.5 * lengths[i])
+        if longest > _SHORTEST and directions[i - 1] @ directions[i] > _TURN_BACK:
+            cut[i] = longest
     paths = []
     pieces: list[tuple[Array, Array, Array, float]] = []
     for i, (direction, length) in enumerate(zip(directions, lengths, strict=True)):

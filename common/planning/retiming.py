@@ -21,6 +21,8 @@ from common.planning.path import SmoothPath
 Array = NDArray[np.float64]
 
 _TINY = 1e-12
+_REFINEMENTS = 5
+_OVERSHOOT = 1.01  # of the acceleration limits, by the cubics between the states
 _LEAST_INTERVALS = 20  # also on a short path: speed changes at grid points only
 
 
@@ -56,7 +58,16 @@ def parametrise(path: SmoothPath, velocity: ArrayLike, acceleration: ArrayLike, 
     """
     limit_v, limit_a = np.asarray(velocity, dtype=float), np.asarray(acceleration, dtype=float)
     move = float((np.maximum(np.abs(path.d0), np.abs(path.d1)).max(axis=1) * path.lengths).sum())
-    grid = path.divided(min(step, move / _LEAST_INTERVALS))
+    step = min(step, move / _LEAST_INTERVALS)
+    for _ in range(_REFINEMENTS):
+        trajectory = _timed(path.divided(step), limit_v, limit_a)
+        if _overshoot(trajectory, limit_a) <= _OVERSHOOT:
+            return trajectory
+        step /= 3
+    raise RetimingFailed("the path bends too sharply to be followed by cubics")
+
+
+def _timed(grid: SmoothPath, limit_v: Array, limit_a: Array) -> TimedPath:
     x, u = _profile(grid, limit_v, limit_a)
     root = np.sqrt(x)
     durations = 2 * grid.lengths / (root[:-1] + root[1:])
@@ -73,6 +84,19 @@ def parametrise(path: SmoothPath, velocity: ArrayLike, acceleration: ArrayLike, 
     )
 
 
+def end_accelerations(trajectory: TimedPath) -> tuple[Array, Array]:
+    """(N - 1, dof) accelerations at the beginning and the end of the cubics between the states."""
+    h = np.diff(trajectory.times)[:, None]
+    ahead = np.diff(trajectory.positions, axis=0) / h
+    v0, v1 = trajectory.velocities[:-1], trajectory.velocities[1:]
+    return (6 * ahead - 4 * v0 - 2 * v1) / h, (-6 * ahead + 2 * v0 + 4 * v1) / h
+
+
+def _overshoot(trajectory: TimedPath, limit_a: Array) -> float:
+    """Largest acceleration of the cubics as a share of the limits; they meet a bend exactly only where it is flat."""
+    return max(float((np.abs(values) / limit_a).max()) for values in end_accelerations(trajectory))
+
+
 def _profile(grid: SmoothPath, limit_v: Array, limit_a: Array) -> tuple[Array, Array]:
     """x (N + 1,) at the grid points and u (N,) between them."""
     d0, d1, lengths = grid.d0, grid.d1, grid.lengths
@@ -86,23 +110,22 @@ def _profile(grid: SmoothPath, limit_v: Array, limit_a: Array) -> tuple[Array, A
     safe = np.where(flat, 1.0, np.abs(D))
     A = np.where(flat, np.inf, limits / safe)  # -A - B x <= u <= A - B x
     B = np.where(flat, 0.0, sign * C / safe)
-    most = _highest_x(grid, limit_v, limits, A, B, C, flat)
+    most = _highest_x(grid, limit_v, limit_a, bends)
     highest = _backward(most, lengths, A, B)
     return _forward(highest, lengths, A, B)
 
 
-def _highest_x(
-    grid: SmoothPath, limit_v: Array, limits: Array, A: Array, B: Array, C: Array, flat: Array
-) -> list[float]:
-    """(N + 1,) x at which velocities and, whatever u is, accelerations are within limits."""
+def _highest_x(grid: SmoothPath, limit_v: Array, limit_a: Array, bends: Array) -> list[float]:
+    """(N + 1,) x at which velocities are within limits, and accelerations at constant speed.
+
+    A path may be followed somewhat faster into a bend if the speed changes just right in it; leaving that out makes
+    sure that each point which is reached can be left, also on a coarse grid.
+    """
     slopes = np.abs(np.concatenate([grid.d0, grid.d1[-1:]]))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        most = ((limit_v / np.maximum(slopes, _TINY)) ** 2).min(axis=1)
-        bound = np.where(flat & (np.abs(C) > _TINY), limits / np.maximum(np.abs(C), _TINY), np.inf).min(axis=1)
-        difference = B[:, :, None] - B[:, None, :]  # of the upper line l and the lower line k: u_low <= u_high
-        room = A[:, :, None] + A[:, None, :]
-        pairs = np.where(difference > _TINY, room / np.maximum(difference, _TINY), np.inf).min(axis=(1, 2))
-    most[:-1] = np.minimum(most[:-1], np.minimum(bound, pairs))
+    most = ((limit_v / np.maximum(slopes, _TINY)) ** 2).min(axis=1)
+    bound = (limit_a / np.maximum(np.abs(bends), _TINY)).min(axis=1)
+    most[:-1] = np.minimum(most[:-1], bound)
+    most[1:] = np.minimum(most[1:], bound)
     most[0] = most[-1] = 0.0
     return [float(v) for v in most]
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.messages import JointTrajectory
 from common.planning.collision import CollisionWorld, Pair
-from common.planning.retiming import TimedPath, sample
+from common.planning.retiming import TimedPath, end_accelerations, sample
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -98,8 +98,7 @@ def check_numbers(
     h = spans[:, None]
     ahead = np.diff(q, axis=0) / h
     peak = 1.5 * ahead - 0.25 * (dq[:-1] + dq[1:])  # velocity in the middle of the cubic
-    begin = (6 * ahead - 4 * dq[:-1] - 2 * dq[1:]) / h  # accelerations at the ends of the cubic
-    finish = (-6 * ahead + 2 * dq[:-1] + 4 * dq[1:]) / h
+    begin, finish = end_accelerations(trajectory)
     checks: list[tuple[str, Array, Callable[[int], str]]] = [
         ("position_limit", np.maximum(robot.lower - 1e-6 - q, q - robot.upper - 1e-6), lambda j: "its position limit"),
         ("velocity_limit", np.abs(dq) - (1 + TOLERANCE) * limit_v, lambda j: f"{limit_v[j]:.3f} rad/s"),

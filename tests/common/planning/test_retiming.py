@@ -1,0 +1,135 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from common.planning.path import blended_path, dense_path, distinct
+from common.planning.retiming import TimedPath, join, parametrise, sample, stretch
+
+V = np.array([2.175, 2.175, 2.61])
+A = np.array([15.0, 7.5, 20.0])
+
+waypoints = st.integers(2, 8).flatmap(
+    lambda n: arrays(np.float64, (n, 3), elements=st.floats(-2.5, 2.5, allow_subnormal=False).map(lambda x: round(x, 4)))
+).filter(lambda w: len(distinct(w)) > 1)
+
+
+def hermite_peaks(trajectory: TimedPath) -> tuple[float, float]:
+    """Largest velocity and acceleration of the cubics between the states, as shares of the limits."""
+    t = np.linspace(0, trajectory.duration, 4000)
+    q = sample(trajectory, t)
+    h = np.diff(trajectory.times)[:, None]
+    ahead = np.diff(trajectory.positions, axis=0) / h
+    v0, v1 = trajectory.velocities[:-1], trajectory.velocities[1:]
+    ends = np.abs([(6 * ahead - 4 * v0 - 2 * v1) / h, (-6 * ahead + 2 * v0 + 4 * v1) / h])
+    speed = np.abs(np.diff(q, axis=0) / np.diff(t)[:, None])
+    return float((speed / V).max()), float((ends / A).max())
+
+
+def assert_sound(trajectory: TimedPath, first, last) -> None:
+    assert (np.diff(trajectory.times) > 0).all()
+    assert trajectory.times[0] == 0
+    assert np.allclose(trajectory.positions[0], first)
+    assert np.allclose(trajectory.positions[-1], last, atol=1e-9)
+    assert np.array_equal(trajectory.velocities[[0, -1]], np.zeros((2, 3)))
+    assert (np.abs(trajectory.velocities) <= V * (1 + 1e-9)).all()
+    assert (np.abs(trajectory.accelerations) <= A * (1 + 1e-6)).all()
+    speed, acceleration = hermite_peaks(trajectory)
+    assert speed <= 1.02
+    assert acceleration <= 1.02
+
+
+@settings(max_examples=60, deadline=None)
+@given(waypoints, st.floats(0, 0.5))
+def test_blended_paths_are_timed_within_limits_from_rest_to_rest(points, blend):
+    points = distinct(points)
+    paths = blended_path(points, np.full(len(points), blend))
+    trajectory = join([parametrise(path, V, A) for path in paths])
+    assert_sound(trajectory, points[0], points[-1])
+
+
+@settings(max_examples=40, deadline=None)
+@given(arrays(np.float64, (4, 3), elements=st.floats(-1, 1).map(lambda x: round(x, 3))), st.integers(2, 40))
+def test_dense_paths_are_timed_within_limits_from_rest_to_rest(c, count):
+    s = np.linspace(0, 1, count + 1)[:, None]
+    points = distinct(c[0] + c[1] * s + 0.3 * c[2] * s**2 + 0.1 * c[3] * np.sin(4 * s))
+    if len(points) > 1:
+        assert_sound(parametrise(dense_path(points), V, A), points[0], points[-1])
+
+
+@settings(max_examples=40, deadline=None)
+@given(waypoints, st.floats(0.01, 0.3))
+def test_trajectory_stays_on_the_path(points, blend):
+    points = distinct(points)
+    paths = blended_path(points, np.full(len(points), blend))
+    trajectory = join([parametrise(path, V, A) for path in paths])
+    fine = np.concatenate([path.positions(0.002) for path in paths])
+    states = sample(trajectory, np.linspace(0, trajectory.duration, 60))
+    away = np.linalg.norm(states[:, None, :] - fine[None, :, :], axis=2).min(axis=1)
+    assert away.max() < 0.004
+
+
+@settings(max_examples=40, deadline=None)
+@given(waypoints, st.floats(0.01, 0.3))
+def test_blends_cut_corners_by_less_than_half_their_length(points, blend):
+    points = distinct(points)
+    for path in blended_path(points, np.full(len(points), blend)):
+        for q in path.positions(0.05):
+            distances = []
+            for a, b in zip(points[:-1], points[1:], strict=True):
+                share = np.clip((q - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+                distances.append(np.linalg.norm(q - a - share * (b - a)))
+            assert min(distances) <= blend / 2 + 1e-9
+
+
+def test_corner_without_a_blend_is_a_stop():
+    points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0.0]])
+    paths = blended_path(points, np.zeros(3))
+    assert len(paths) == 2
+    trajectory = join([parametrise(path, V, A) for path in paths])
+    corner = int(np.argmin(np.linalg.norm(trajectory.positions - points[1], axis=1)))
+    assert np.allclose(trajectory.velocities[corner], 0)
+
+
+def test_turning_back_is_a_stop_even_where_a_blend_is_allowed():
+    points = np.array([[0, 0, 0], [1, 0, 0], [0.2, 0.01, 0.0]])
+    assert len(blended_path(points, np.full(3, 0.2))) == 2
+
+
+def test_straight_line_takes_the_time_of_the_trapezoidal_profile():
+    # 1 rad at 2.175 rad/s and 15 rad/s^2: ramps of v/a, the rest at v.
+    path = dense_path(np.array([[0, 0, 0], [1.0, 0, 0]]))
+    best = 1 / V[0] + V[0] / A[0]
+    assert parametrise(path, V, A).duration == pytest.approx(best, rel=0.02)
+    assert parametrise(path, V, A).duration >= best - 1e-9
+
+
+def test_lower_limits_take_longer():
+    path = dense_path(np.array([[0, 0, 0], [0.5, 0.2, 0], [1.0, 0, 0.3]]))
+    fast, slow = parametrise(path, V, A), parametrise(path, 0.2 * V, 0.2 * A)
+    assert slow.duration > 2 * fast.duration
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.05, 1))
+def test_stretched_trajectory_is_the_same_way_slower(scale):
+    fast = parametrise(dense_path(np.array([[0, 0, 0], [0.5, 0.2, 0], [1.0, 0, 0.3]])), V, A)
+    slow = stretch(fast, scale)
+    assert slow.duration == pytest.approx(fast.duration / scale)
+    assert np.array_equal(slow.positions, fast.positions)
+    assert np.allclose(slow.velocities, fast.velocities * scale)
+    assert np.allclose(slow.accelerations, fast.accelerations * scale**2)
+    t = np.linspace(0, fast.duration, 50)
+    assert np.allclose(sample(slow, t / scale), sample(fast, t), atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, 1.5, float("nan")])
+def test_stretching_to_something_faster_or_nothing_is_refused(scale):
+    with pytest.raises(ValueError, match="scale"):
+        stretch(parametrise(dense_path(np.array([[0, 0, 0], [1.0, 0, 0]])), V, A), scale)
+
+
+def test_repeated_waypoints_are_one():
+    points = np.array([[0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0.0]])
+    assert np.array_equal(distinct(points), [[0, 0, 0], [1, 0, 0]])

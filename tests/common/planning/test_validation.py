@@ -1,0 +1,82 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planning_scenes import HOME, ROBOT, WORLD, above, ball, cache, scene
+
+from common.messages import PlanningScene
+from common.planning.collision import CollisionWorld
+from common.planning.path import blended_path
+from common.planning.retiming import TimedPath, parametrise
+from common.planning.validation import check_numbers, fine_samples, validate
+
+GOAL = HOME + np.array([0.5, 0.1, -0.2, 0.1, 0, 0.2, 0.3])
+V, A = 0.2 * ROBOT.velocity, 0.2 * ROBOT.acceleration
+GOOD = parametrise(blended_path(np.array([HOME, GOAL]), np.zeros(2))[0], V, A)
+
+
+def numbers(trajectory: TimedPath, start=HOME, v=V, a=A) -> str:
+    fault = check_numbers(trajectory, ROBOT, start=start, velocity=v, acceleration=a)
+    return fault.code if fault else ""
+
+
+def changed(field: str, index, value) -> TimedPath:
+    array = getattr(GOOD, field).copy()
+    array[index] = value
+    return replace(GOOD, **{field: array})
+
+
+def test_sound_trajectory_has_no_fault():
+    world = CollisionWorld(ROBOT, scene(), start=HOME, cache=cache())
+    assert validate(GOOD, ROBOT, world, start=HOME, velocity=V, acceleration=A, step=0.01) is None
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "code"),
+    [
+        (changed("times", 3, GOOD.times[2]), "bad_times"),
+        (changed("times", 0, 0.001), "bad_times"),
+        (changed("positions", (4, 2), np.nan), "not_finite"),
+        (changed("velocities", (4, 2), np.inf), "not_finite"),
+        (changed("velocities", (-1, 0), 0.1), "not_at_rest"),
+        (changed("velocities", (5, 0), V[0] * 1.1), "velocity_limit"),
+        (changed("accelerations", (5, 1), -A[1] * 1.1), "acceleration_limit"),
+        (changed("positions", (5, 0), GOOD.positions[5, 0] + 0.2), "velocity_limit"),
+        (changed("velocities", (5, 6), GOOD.velocities[5, 6] + 0.09), "inconsistent"),
+        (TimedPath(GOOD.times[:1], GOOD.positions[:1], GOOD.velocities[:1], GOOD.accelerations[:1]), "bad_trajectory"),
+        (replace(GOOD, positions=GOOD.positions + np.array([0, 0, 0, 3.0, 0, 0, 0])), "start_mismatch"),
+    ],
+)
+def test_what_a_controller_would_refuse_is_found(trajectory, code):
+    assert numbers(trajectory) == code
+
+
+def test_start_elsewhere_is_found_and_the_joint_named():
+    fault = check_numbers(GOOD, ROBOT, start=HOME + 0.01 * np.eye(7)[2], velocity=V, acceleration=A)
+    assert fault.code == "start_mismatch"
+    assert "panda_joint3" in fault.message
+
+
+def test_position_beyond_a_limit_is_found():
+    away = np.array([0, 0, 0, 0, 0, 0, 3.0])
+    assert numbers(replace(GOOD, positions=GOOD.positions + away), start=HOME + away) == "position_limit"
+
+
+def test_collision_between_states_is_found_with_waypoint_and_pair():
+    start, goal = above(0.48, -0.2, 0.2), above(0.48, 0.2, 0.2)
+    path = blended_path(np.array([start, goal]), np.zeros(2))[0]
+    trajectory = parametrise(path, V, A, step=0.5)
+    x, y, z = ROBOT.fk((start + goal) / 2)[:3, 3]
+    between = PlanningScene(header=WORLD, objects=[ball(0, x, y, z)])
+    world = CollisionWorld(ROBOT, between, start=start, cache=cache())
+    fault = validate(trajectory, ROBOT, world, start=start, velocity=V, acceleration=A, step=0.01)
+    assert fault.code == "collision"
+    assert fault.colliding[1] == "ball_0"
+    assert f"waypoint {fault.waypoint} of" in fault.message
+
+
+def test_samples_are_no_farther_apart_than_the_step():
+    path, owners = fine_samples(GOOD, 0.01)
+    assert np.abs(np.diff(path, axis=0)).max() <= 0.01 + 1e-9
+    assert np.array_equal(path[[0, -1]], GOOD.positions[[0, -1]])
+    assert (np.diff(owners) >= 0).all()
