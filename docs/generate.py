@@ -1,0 +1,170 @@
+"""Writes docs/parameters.md and the generated tables of README.md; with --check, tells whether they are current.
+
+Run as `python -m docs.generate [--check]` from the project's folder.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from common import config as c
+from common import topics
+from common.planning.planners import load_planner
+from common.transport.wiring import wiring
+from docs.seed_parameters import CAMERA, CONTROLLER, VALIDATOR, SeedParameter
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def first_line(text: str | None) -> str:
+    """The first line of a docstring."""
+    return (text or "").strip().splitlines()[0] if text else ""
+
+
+def bounds_of(info: FieldInfo) -> str:
+    """Bounds of a field as people write them."""
+    low = next((f">= {m.ge:g}" if hasattr(m, "ge") else f"> {m.gt:g}" for m in info.metadata
+                if hasattr(m, "ge") or hasattr(m, "gt")), "")
+    high = next((f"<= {m.le:g}" if hasattr(m, "le") else f"< {m.lt:g}" for m in info.metadata
+                 if hasattr(m, "le") or hasattr(m, "lt")), "")
+    return ", ".join(part for part in (low, high) if part)
+
+
+def shown(value: object) -> str:
+    """A value, short enough for a table."""
+    text = f"{value:g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def rows_of(model: type[BaseModel], prefix: str, values: BaseModel | None = None) -> list[str]:
+    """A table row for each parameter of a model, nested ones with a dotted path; sections are left out."""
+    rows = []
+    for name, info in model.model_fields.items():
+        annotation = info.annotation
+        value = getattr(values, name, None) if values is not None else info.get_default(call_default_factory=True)
+        if isinstance(annotation, type) and issubclass(annotation, c.Section) and issubclass(model, c.Parameters):
+            continue
+        if isinstance(value, BaseModel):
+            rows += rows_of(type(value), f"{prefix}.{name}", value)
+            continue
+        rows.append(f"| `{prefix}.{name}` | {shown(value)} | {bounds_of(info)} | {info.description or ''} |")
+    return rows
+
+
+def lookup(cell: c.Cell, path: str) -> object:
+    """The value that a dotted path of the seed tables has in the cell."""
+    head, *rest = path.split(".")
+    if head == "services":
+        config: Any = importlib.import_module(f"services.{rest[0]}").Config
+        return c.service_config(cell, rest[0], config).model_dump()[rest[1]]
+    if head == "pipeline":
+        entry = next(p for p in cell.pipeline.planners if p.name == rest[0])
+        return load_planner(entry.name, entry.options)[1].model_dump()[rest[1]]
+    value: Any = getattr(cell, head)
+    for part in rest:
+        value = getattr(value, part)
+    return value
+
+
+def seed_table(cell: c.Cell, rows: list[SeedParameter]) -> list[str]:
+    """The table of one of the seed's files."""
+    lines = ["| seed parameter | seed value | frame | ours | became | what changes when you touch it |",
+             "|---|---|---|---|---|---|"]
+    for row in rows:
+        ours = "<br>".join(f"`{path}` = {shown(lookup(cell, path))}" for path in row.ours)
+        frame = f"{row.frame} to panda_hand_tcp" if row.became == "re-framed" else row.frame
+        lines.append(f"| {row.name} | {row.value} | {frame} | {ours} | {row.became} | {row.effect} |")
+    return lines
+
+
+def parameters() -> str:
+    """The text of docs/parameters.md."""
+    cell = c.load_cell("panda")
+    head = ["| parameter | default | bounds | meaning |", "|---|---|---|---|"]
+    lines = [
+        "# Parameters", "",
+        "Made by `python -m docs.generate`; a test keeps it current. Every value can be set in the cell file or with",
+        "`--set PATH=VALUE`, for example `--set world.count=5 --set services.camera_simulator.noise_std=8`.", "",
+        "## The seed's numbers and ours", "",
+        "The seed's controller declares 28 parameters; its document names 25 (some in pairs), and gives three more numbers",
+        "in its text, marked so. *Kept*: same number, same meaning. *Re-framed*: same meaning, for the tool centre point",
+        "between the finger tips instead of panda_link8, which lies 0.1034 m above it. *Replaced*: as the last column says.",
+        "", "### Controller", "", *seed_table(cell, CONTROLLER), "", "### Workspace validator", "",
+        *seed_table(cell, VALIDATOR), "", "### Camera and detector", "", *seed_table(cell, CAMERA), "", "## The cell", "",
+        *head, *rows_of(c.Motion, "motion", cell.motion), *rows_of(c.Grasp, "grasp", cell.grasp),
+        *rows_of(c.World, "world", cell.world), *rows_of(c.RobotConfig, "robot", cell.robot),
+        f"| `pipeline.validation_step` | {cell.pipeline.validation_step:g} | > 0, <= 0.2 | "
+        f"{c.Pipeline.model_fields['validation_step'].description} |", "",
+        "## Planners", "", "Set in the pipeline file, under `options` of the planner.", "", *head,
+    ]
+    for entry in cell.pipeline.planners:
+        options = load_planner(entry.name, entry.options)[1]
+        lines += rows_of(type(options), entry.name, options)
+    lines += ["", "## Services", "", *head]
+    for name in c.service_names():
+        config = getattr(importlib.import_module(f"services.{name}"), "Config", None)
+        if config is not None:
+            lines += rows_of(config, f"services.{name}")
+    return "\n".join(lines) + "\n"
+
+
+def topic_table() -> str:
+    """All topics of a cell."""
+    lines = ["| key, after `panda/` | message | kind | written or served by | |", "|---|---|---|---|---|"]
+    for topic in topics.all_topics().values():
+        message = topic.message.__name__
+        if isinstance(topic, topics.Request):
+            message = f"{message} → {topic.answer.__name__}"
+        lines.append(f"| `{topic.key}` | {message} | {topic.kind} | {topic.writer} | {topic.doc} |")
+    return "\n".join(lines)
+
+
+def service_table() -> str:
+    """The services of the panda cell in start order, with what each reads, writes, serves and asks."""
+    cell = c.load_cell("panda")
+    lines = ["| | service | what it does | reads | writes | serves | asks |", "|---|---|---|---|---|---|---|"]
+    for number, name in enumerate(cell.services, 1):
+        module = importlib.import_module(f"services.{name}")
+        wired = asyncio.run(wiring(module.run, c.service_config(cell, name, module.Config)))
+        keys = [", ".join(sorted(f"`{t.key}`" for t in side if t.key not in ("log", "counters")))
+                for side in (wired.reads, wired.writes, wired.serves, wired.calls)]
+        lines.append(f"| {number} | {name} | {first_line(module.__doc__)} | {' | '.join(keys)} |")
+    return "\n".join(lines)
+
+
+def readme(text: str) -> str:
+    """The README with its generated tables made anew, between their markers."""
+    for name, table in (("services", service_table()), ("topics", topic_table())):
+        pattern = re.compile(rf"(<!-- {name}: made by docs/generate.py -->\n).*?(\n<!-- end of {name} -->)", re.DOTALL)
+        if not pattern.search(text):
+            raise SystemExit(f"README.md has no place for the table of {name}")
+        text = pattern.sub(lambda match, made=table: f"{match[1]}{made}{match[2]}", text)
+    return text
+
+
+def main() -> int:
+    """Write what is not current, or say that it is not."""
+    files = {
+        ROOT / "docs" / "parameters.md": parameters(),
+        ROOT / "README.md": readme((ROOT / "README.md").read_text(encoding="utf-8")),
+    }
+    old = [path for path, text in files.items() if not path.exists() or path.read_text(encoding="utf-8") != text]
+    if "--check" in sys.argv:
+        for path in old:
+            sys.stderr.write(f"{path.name} is not current: run `make docs`\n")
+        return 1 if old else 0
+    for path in old:
+        path.write_text(files[path], encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
