@@ -73,3 +73,11 @@ class Resting:
         # Heights that differ by a few millimetres can not be told apart by how large a ball looks.
         apart = all(abs(z - self.plane) > self.radius / 3 for z in self.layers)
         return [self.plane, *self.layers] if apart else self.layers
+
+    def can_lie(self, center: npt.ArrayLike) -> bool:
+        """Whether a ball can lie with its centre at (x, y, z) [m] in world: above the table only between the walls."""
+        x, y, z = np.asarray(center, dtype=float)
+        if z < self.plane + self.radius:
+            return True
+        room = self.container.half_side - self.container.wall_thickness - 0.7 * self.radius
+        return bool(abs(x - self.container.x) <= room and abs(y - self.container.y) <= room)

@@ -26,7 +26,7 @@ _LEAST_VOTES = 0.06  # at a peak, as part of the votes of a whole outline
 _LEAST_SUPPORT = 0.14  # part of a whole outline that a ball must show
 _NEAR = 2.0e-3  # a point this near to a silhouette belongs to it [m]
 _COVERED = 0.85  # part of a ball's silhouette that must be red
-_MOST_GOING_ON = 0.5  # part of the surroundings of a ball that may be red for no known reason
+_MOST_GOING_ON = 0.45  # part of the surroundings of a ball that may be red for no known reason
 _MOST_CANDIDATES = 40
 
 
@@ -124,6 +124,8 @@ def _refine(outline: Outline, camera: Pinhole, resting: Resting, offset: float, 
             continue
         local = outline.take(around)
         refined = fit_one(local, center, radius, (8e-3, 6e-3, 4e-3, 3e-3))
+        if not resting.can_lie(refined + camera.position):
+            continue
         points = np.zeros(len(outline), bool)
         points[around] = near_points(local, refined, radius, _NEAR)
         whole = _whole_outline(camera, resting.radius, float(np.linalg.norm(refined)))
