@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 VIEWER = "viewer"
 START_REQUEST_TIMEOUT = 5.0  # [s]
 
-Speed = Annotated[float, typer.Option("--speed", metavar="X", help="cell time per wall time, 0.1 to 10")]
+Speed = Annotated[str, typer.Option("--speed", metavar="X", help="cell time per wall time, 0.1 to 10")]
 NoViewer = Annotated[bool, typer.Option("--no-viewer", help="without the operator's page")]
 SummaryFile = Annotated[str | None, typer.Option("--summary", metavar="FILE.json", help="write the figures there")]
 LogJson = Annotated[bool, typer.Option("--log-json", help="log lines as JSON objects")]
@@ -36,7 +36,7 @@ def run(
     overrides: options.Overrides = None,
     world: options.WorldName = None,
     seed: options.Seed = None,
-    speed: Speed = 1.0,
+    speed: Speed = "1",
     domain: options.Domain = None,
     connect: options.Connect = None,
     no_viewer: NoViewer = False,
@@ -53,7 +53,7 @@ def up(
     overrides: options.Overrides = None,
     world: options.WorldName = None,
     seed: options.Seed = None,
-    speed: Speed = 1.0,
+    speed: Speed = "1",
     domain: options.Domain = None,
     connect: options.Connect = None,
     no_viewer: NoViewer = False,
@@ -69,7 +69,7 @@ class Operation:
     """One bring-up, as a person asked for it."""
 
     def __init__(
-        self, cell: str, overrides: list[str] | None, world: str | None, seed: int | None, speed: float,
+        self, cell: str, overrides: list[str] | None, world: str | None, seed: str | None, speed: str,
         domain: str | None, connect: str | None, no_viewer: bool, summary: str | None, log_json: bool,
     ) -> None:
         """Check everything that was asked for; nothing is started yet.
@@ -96,15 +96,15 @@ class Operation:
             raise ConfigError("--summary", summary, "is in a folder that does not exist")
         number, endpoint = place_of(domain, connect)
         self.launch = Launch(
-            cell=cell, overrides=tuple(overrides or ()), world=world, seed=seed, domain=number, connect=endpoint,
-            log_json=log_json, clock=clock_of(speed),
+            cell=cell, overrides=tuple(overrides or ()), world=world, seed=options.whole("--seed", seed, 0),
+            domain=number, connect=endpoint, log_json=log_json, clock=clock_of(options.number("--speed", speed)),
         )
-        loaded = load_cell(cell, self.launch.overrides, world=world, seed=seed)
+        loaded = load_cell(cell, self.launch.overrides, world=world, seed=self.launch.seed)
         if no_viewer:
             kept = {name: entry for name, entry in loaded.services.items() if entry.name != VIEWER}
             loaded = loaded.model_copy(update={"services": kept})
         self.cell: Cell = loaded
-        self.summary = Summary(loaded.name, loaded.run.seed, speed)
+        self.summary = Summary(loaded.name, loaded.run.seed, self.launch.clock.speed)
         require_modules(loaded)
         if endpoint is None:
             require_free_port(endpoint_of(number))

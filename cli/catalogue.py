@@ -52,12 +52,12 @@ def service(
     from common.supervision.launch import ROUTER, ROUTER_MODULE, Launch, place_of, python_module, python_path
 
     number, endpoint = place_of(domain, connect)
-    launch = Launch(cell, tuple(overrides or ()), world, seed, number, endpoint)
+    launch = Launch(cell, tuple(overrides or ()), world, options.whole("--seed", seed, 0), number, endpoint)
     if name == ROUTER:
         command = [*python_module(ROUTER_MODULE), "--domain", str(number)]
     else:
         entries = {known: ServiceEntry(name=known, module=f"services.{known}") for known in service_names()}
-        for key, entry in load_cell(cell, launch.overrides, world=world, seed=seed).services.items():
+        for key, entry in load_cell(cell, launch.overrides, world=world, seed=launch.seed).services.items():
             entries[key] = entries[entry.name] = entry
         if name not in entries:
             raise UnknownName("service", name, entries)

@@ -19,8 +19,8 @@ task = typer.Typer(help="Tell the task what to do.", no_args_is_help=True)
 world = typer.Typer(help="Change the simulated world.", no_args_is_help=True)
 
 TIMEOUT = 5.0  # [s]
-X = Annotated[float, typer.Argument(metavar="X", help="[m] in world")]
-Y = Annotated[float, typer.Argument(metavar="Y", help="[m] in world")]
+X = Annotated[str, typer.Argument(metavar="X", help="[m] in world")]
+Y = Annotated[str, typer.Argument(metavar="Y", help="[m] in world")]
 Id = Annotated[str, typer.Argument(metavar="ID", help="as in `zencell topic echo scene_balls`")]
 NEGATIVE_NUMBERS = {"ignore_unknown_options": True}  # -0.2 is a coordinate, not an option
 
@@ -29,7 +29,7 @@ def call(
     key: Annotated[str, typer.Argument(metavar="KEY", help="of a request, as in `zencell topic list`")],
     body: Annotated[str, typer.Argument(metavar="JSON", help="its fields; `zencell topic info KEY` has an example")],
     cell: options.CellName = None,
-    timeout: Annotated[float, typer.Option("--timeout", min=0.01, metavar="S", help="[s]")] = TIMEOUT,
+    timeout: Annotated[str, typer.Option("--timeout", metavar="S", help="[s]")] = f"{TIMEOUT:g}",
     domain: options.Domain = None,
     connect: options.Connect = None,
 ) -> None:
@@ -42,7 +42,10 @@ def call(
         raise UnknownName("request", key, requests)
     request = requests[key]
     message = check(request.message, _parse(key, body), key)
-    _send(request, message, timeout, cell, domain, connect)
+    seconds = options.number("--timeout", timeout)
+    if seconds <= 0:
+        raise ConfigError("--timeout", timeout, "must be more than 0")
+    _send(request, message, seconds, cell, domain, connect)
 
 
 def _parse(key: str, body: str) -> dict[str, Any]:
@@ -110,6 +113,10 @@ def stop(cell: options.CellName = None, domain: options.Domain = None, connect: 
 # --- world ------------------------------------------------------------------------------------------------------
 
 
+def _position(x: str, y: str) -> dict[str, float]:
+    return {"x": options.number("X", x), "y": options.number("Y", y)}
+
+
 def _edit(values: dict[str, Any], cell: str | None, domain: str | None, connect: str | None) -> None:
     from common import topics
     from common.config import check
@@ -126,7 +133,7 @@ def add(
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Put one more ball on the table."""
-    _edit({"op": "add", "id": name, "position": {"x": x, "y": y}}, cell, domain, connect)
+    _edit({"op": "add", "id": name, "position": _position(x, y)}, cell, domain, connect)
 
 
 @world.command(context_settings=NEGATIVE_NUMBERS)
@@ -135,7 +142,7 @@ def move(
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Put a ball elsewhere."""
-    _edit({"op": "move", "id": name, "position": {"x": x, "y": y}}, cell, domain, connect)
+    _edit({"op": "move", "id": name, "position": _position(x, y)}, cell, domain, connect)
 
 
 @world.command()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import typer
+
+from common.errors import ConfigError
 
 CellArgument = Annotated[
     str, typer.Argument(metavar="CELL", help="a name of `zencell cells`, or the path of a YAML file")
@@ -21,10 +24,45 @@ Connect = Annotated[
     typer.Option("--connect", metavar="ENDPOINT", help="use the router there, start none [ZENCELL_CONNECT]"),
 ]
 Json = Annotated[bool, typer.Option("--json", help="one JSON object a line")]
-Count = Annotated[int | None, typer.Option("--count", "-n", min=1, metavar="N", help="stop after N")]
+Count = Annotated[str | None, typer.Option("--count", "-n", metavar="N", help="stop after N")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="PATH=VALUE", help="any value of the cell, as world.count=5; repeatable"),
 ]
 WorldName = Annotated[str | None, typer.Option("--world", metavar="NAME", help="another world, by name or path")]
-Seed = Annotated[int | None, typer.Option("--seed", metavar="N", help="of everything random")]
+Seed = Annotated[str | None, typer.Option("--seed", metavar="N", help="of everything random")]
+
+
+# Numbers are read here and not by typer, whose errors do not show what was given.
+
+
+def number(option: str, text: str) -> float:
+    """The number that a text says.
+
+    Raises:
+        ConfigError: it is none, or not finite.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ConfigError(option, text, "must be a number")
+    return value
+
+
+def whole(option: str, text: str | None, least: int) -> int | None:
+    """The whole number that a text says; None when nothing was said.
+
+    Raises:
+        ConfigError: it is none, or less than `least`.
+    """
+    if text is None:
+        return None
+    try:
+        value = int(text)
+    except ValueError:
+        value = least - 1
+    if value < least:
+        raise ConfigError(option, text, f"must be a whole number, {least} or more")
+    return value

@@ -76,13 +76,14 @@ def echo(
     from cli.inspection import inspect
 
     topic = published(key)
+    most = options.whole("--count", count, 1)
 
     async def visit(bus: Bus) -> None:
         shown = 0
         async for message in bus.reader(topic):
             typer.echo(_shown(message.model_dump(), as_json))
             shown += 1
-            if shown == count:
+            if shown == most:
                 return
 
     inspect(visit, cell=cell, domain=domain, connect=connect)
@@ -121,18 +122,20 @@ def bw(
 
 
 def _measure(
-    topic: Topic[Any], cell: str | None, count: int | None, as_json: bool, domain: str | None, connect: str | None,
+    topic: Topic[Any], cell: str | None, count: str | None, as_json: bool, domain: str | None, connect: str | None,
     *, in_bytes: bool,
 ) -> None:
     from cli.inspection import inspect
     from cli.measuring import describe, windows
+
+    most = options.whole("--count", count, 1)
 
     async def visit(bus: Bus) -> None:
         shown = 0
         async for figures in windows(bus, f"{bus.cell}/{topic.key}"):
             typer.echo(json.dumps({"key": topic.key, **figures}) if as_json else describe(figures, in_bytes=in_bytes))
             shown += 1
-            if shown == count:
+            if shown == most:
                 return
 
     inspect(visit, cell=cell, domain=domain, connect=connect)

@@ -52,6 +52,35 @@ if __name__ == "__main__":
     main(run, Config)
 '''
 
+TALKER = '''"""Sends pictures and answers what the task is told."""
+import asyncio
+from common import topics
+from common.config import Parameters
+from common.errors import Refused
+from common.messages import Image, PickPlaceStatus
+from common.transport.service import main
+
+class Config(Parameters):
+    """Nothing."""
+
+async def run(bus, config):
+    async def answer(request):
+        if request.command == "stop":
+            raise Refused("busy", "not now")
+        if request.command == "resume":
+            await asyncio.Event().wait()
+        return PickPlaceStatus(header=bus.header(), paused=request.command == "pause")
+    images = bus.writer(topics.CAMERA_IMAGE)
+    bus.serve(topics.TASK_COMMAND, answer)
+    await bus.ready()
+    while True:
+        images.put(Image(header=bus.header("camera"), height=3, width=4, encoding="bgr8", data=bytes(36)))
+        await asyncio.sleep(0.05)
+
+if __name__ == "__main__":
+    main(run, Config)
+'''
+
 CELL = """# Three tiny services.
 cell: tiny
 robot: panda
@@ -65,20 +94,25 @@ services:
 """
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def make_folder(path: Path) -> Path:
     """Where a person stands: a package of services and a cell file."""
-    package = tmp_path / "fakes"
+    package = path / "fakes"
     package.mkdir()
     (package / "__init__.py").touch()
     for name in ("first", "middle", "last"):
         (package / f"{name}.py").write_text(SERVICE)
-    (tmp_path / "tiny.yaml").write_text(CELL)
-    return tmp_path
+    (package / "talker.py").write_text(TALKER)
+    (path / "tiny.yaml").write_text(CELL)
+    return path
 
 
 @pytest.fixture
-def domain() -> int:
+def folder(tmp_path: Path) -> Path:
+    """A folder of its own for each test."""
+    return make_folder(tmp_path)
+
+
+def free_domain() -> int:
     """A domain whose port is free."""
     for number in random.sample(range(60, 233), 100):
         with socket.socket() as probe:
@@ -89,6 +123,12 @@ def domain() -> int:
                 continue
             return number
     pytest.skip("no domain is free")
+
+
+@pytest.fixture
+def domain() -> int:
+    """A domain of its own for each test."""
+    return free_domain()
 
 
 def command_line(*arguments: str) -> list[str]:

@@ -1,0 +1,98 @@
+"""Bad input gets one line that names the thing, the value and the choices; exit code 2 and no traceback."""
+
+from pathlib import Path
+
+import pytest
+from conftest import ask
+
+CASES: dict[str, tuple[list[str], list[str]]] = {
+    "unknown cell": (["run", "pnada"], ["unknown cell 'pnada'", "did you mean 'panda'?", "choices:"]),
+    "cell file that is not there": (["up", "nowhere.yaml"], ["nowhere.yaml", "is not a file"]),
+    "unknown world": (["run", "panda", "--world", "moon"], ["unknown world 'moon'", "balls"]),
+    "unknown parameter": (["run", "panda", "--set", "world.cuont=3"], ["world.cuont", "3", "choices:", "count"]),
+    "unknown section": (["run", "panda", "--set", "wrold.count=3"], ["wrold", "choices:"]),
+    "unknown service": (["run", "panda", "--set", "services.viewre.port=1"], ["unknown service 'viewre'", "choices:"]),
+    "out of bounds": (["run", "panda", "--set", "world.count=9"], ["world.count", "9", "less than or equal to 8"]),
+    "not a number": (["run", "panda", "--set", "motion.velocity_scaling=fast"], ["motion.velocity_scaling", "'fast'"]),
+    "not a number that is finite": (
+        ["run", "panda", "--set", "motion.object_padding=.nan"], ["motion.object_padding", "nan"]
+    ),
+    "override without a value": (["run", "panda", "--set", "world.count"], ["--set", "'world.count'", "PATH=VALUE"]),
+    "override that is no YAML": (
+        ["run", "panda", "--set", "world.count=[1"], ["world.count", "'[1'", "not a YAML value"]
+    ),
+    "balls that overlap": (["run", "panda", "--set", "world.balls=[[0.4, 0], [0.41, 0]]"], ["world", "overlap"]),
+    "cell that does not parse": (["run", "broken.yaml"], ["broken.yaml", "does not parse at line 2"]),
+    "cell that is a list": (["run", "list.yaml"], ["list.yaml", "must hold a mapping"]),
+    "cell that is empty": (["run", "empty.yaml"], ["empty.yaml", "must hold a mapping"]),
+    "cell without a task": (["run", "taskless.yaml"], ["task: is missing"]),
+    "service of nobody": (
+        ["run", "tiny.yaml", "--set", "services.first.x=1"], ["services.fakes.first", "not a module"]
+    ),
+    "speed out of bounds": (["run", "panda", "--speed", "11"], ["--speed", "11", "0.1 to 10"]),
+    "speed that is no number": (["run", "panda", "--speed", "fast"], ["--speed", "fast"]),
+    "domain out of bounds": (["up", "panda", "--domain", "233"], ["--domain", "233", "0 to 232"]),
+    "domain that is no number": (["topic", "echo", "tf", "--domain", "x"], ["--domain", "'x'", "0 to 232"]),
+    "endpoint that is none": (["node", "list", "--connect", "here"], ["--connect", "'here'", "tcp/"]),
+    "seed out of bounds": (["run", "panda", "--seed", "-1"], ["seed", "-1", "0 or more"]),
+    "summary in no folder": (["run", "panda", "--summary", "no/where/s.json"], ["--summary", "does not exist"]),
+    "unknown option": (["run", "panda", "--sped", "2"], ["--sped", "--speed"]),
+    "unknown verb": (["rnu", "panda"], ["rnu", "run"]),
+    "no cell": (["run"], ["CELL"]),
+    "unknown topic": (["topic", "info", "joint_state"], ["unknown key", "did you mean 'joint_states'?"]),
+    "service of no name": (["service", "nobody"], ["unknown service 'nobody'", "motion_planner"]),
+    "call without fields": (["call", "motion/plan", "{}"], ["motion/plan.id", "is missing"]),
+    "count that counts nothing": (["topic", "echo", "tf", "-n", "0"], ["--count", "0"]),
+}
+
+
+@pytest.fixture(scope="module")
+def wrong_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bad")
+    base = "robot: panda\nworld: balls\npipeline: cartesian_ompl\n"
+    (folder / "broken.yaml").write_text("cell: [1,\nrobot: }\n")
+    (folder / "list.yaml").write_text("- 1\n")
+    (folder / "empty.yaml").write_text("")
+    (folder / "taskless.yaml").write_text(base + "services: {motion_planner: {}}\n")
+    (folder / "tiny.yaml").write_text(base + "task: first\nservices: {fakes.first: {}}\n")
+    return folder
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_is_one_line_and_exit_code_2(case: str, wrong_files: Path) -> None:
+    arguments, wanted = CASES[case]
+    done = ask(wrong_files, *arguments)
+    (line,) = done.stderr.splitlines() or ["nothing"]
+    assert line.startswith("zencell: ")
+    for part in wanted:
+        assert part in line
+    assert done.returncode == 2
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("override", "wanted"),
+    [
+        ("robot.urdf=package://example-robot-data/robots/nobody/nobody.urdf", "nobody.urdf"),
+        ("services.vision_detector.min_aera=3", "services.vision_detector.min_aera"),
+    ],
+)
+def test_what_only_a_service_can_tell_is_one_line_too(
+    zencell, wrong_files: Path, override: str, wanted: str  # type: ignore[no-untyped-def]  # noqa: ANN001
+) -> None:
+    command = zencell("run", "panda", "--set", override)
+    assert command.end() == 2
+    errors = [line for line in command.lines if line.startswith("zencell: ")]
+    assert len(errors) == 1
+    assert wanted in errors[0]
+    assert not any("Traceback" in line for line in command.lines)
+    assert not command.children()
+
+
+@pytest.mark.parametrize("verb", [["node", "list"], ["topic", "echo", "tf"], ["task", "start"], ["topic", "hz", "tf"]])
+def test_where_no_cell_is_up_the_hint_says_how_to_start_one(verb: list[str], tmp_path: Path, domain: int) -> None:
+    done = ask(tmp_path, *verb, "--domain", str(domain))
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert "zencell up panda" in line
+    assert str(7447 + domain) in line
