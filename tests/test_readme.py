@@ -1,0 +1,96 @@
+"""The commands of the README, word for word but for the port, so that tests beside each other do not meet."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+BIN = Path(sys.executable).parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+LINES = [
+    line.partition("#")[0].strip()
+    for block in re.findall(r"^```\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
+    for line in block.splitlines()
+    if line.startswith((".venv/bin/", "make "))
+]
+RUNS = [line for line in LINES if line.startswith(".venv/bin/zencell run")]
+BESIDE = [line for line in LINES if line.startswith(".venv/bin/") and line not in RUNS and " up " not in line]
+PATIENCE = 60  # [s]
+
+
+def free_domain() -> int:
+    """A domain whose port nobody listens on."""
+    for domain in range(100 + os.getpid() % 60, 232):
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", 7447 + domain)):
+                return domain
+    raise AssertionError("no free domain")
+
+
+def command(line: str, *more: str) -> list[str]:
+    return [part.replace(".venv/bin/", f"{BIN}/") for part in shlex.split(line)] + list(more)
+
+
+@pytest.fixture(scope="module")
+def cell() -> Iterator[dict[str, str]]:
+    """What `up` of the README brings up, and the environment in which it is found."""
+    domain = free_domain()
+    env = {**os.environ, "ZENCELL_DOMAIN": str(domain)}
+    line = next(line for line in LINES if " up " in line)
+    with subprocess.Popen(command(line), cwd=ROOT, env=env, text=True, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        while "is up at" not in (said := process.stdout.readline()):
+            assert said, "the cell did not come up"
+        env["PASTE"] = process.stdout.readline().strip()
+        yield env
+        process.send_signal(signal.SIGINT)
+        process.stdout.read()
+        process.wait(PATIENCE)
+
+
+def test_readme_names_the_two_commands_first() -> None:
+    assert [line.split("#")[0].strip() for line in LINES[:2]] == ["make run", "make test"]
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in ("run", "test", "setup", "check", "bench"))
+
+
+@pytest.mark.cell
+@pytest.mark.parametrize("line", RUNS)
+def test_run_of_the_readme_ends_with_every_ball_in_the_box(line: str) -> None:
+    faster = () if "--speed" in line else ("--speed", "8")
+    ran = subprocess.run(command(line, *faster, "--domain", str(free_domain())), cwd=ROOT, text=True,
+                         capture_output=True, timeout=2 * PATIENCE, check=False)
+    count = "8" if "count=8" in line else "7"
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert f"DONE, {count} of {count} placed (truth: {count} in the box, 0 on the table)" in ran.stdout
+
+
+@pytest.mark.cell
+@pytest.mark.parametrize("line", BESIDE)
+def test_command_of_the_readme_answers_beside_a_running_cell(line: str, cell: dict[str, str]) -> None:
+    line = line.replace("7489", str(7447 + int(cell["ZENCELL_DOMAIN"])))
+    with subprocess.Popen(command(line), cwd=ROOT, env=cell, text=True, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        process.stdout.read()
+        process.wait(PATIENCE)
+    wanted = {"hz": "Hz", "status": '"state"', "targets": '"poses"', "list": "panda/", "zenoh": "panda/", "add": '"ids"',
+              "pause": '"paused": true'}
+    assert next(text for word, text in wanted.items() if word in line) in first
+
+
+@pytest.mark.cell
+def test_up_prints_the_line_of_the_readme(cell: dict[str, str]) -> None:
+    line = next(line for line in LINES if "/zenoh " in line).removeprefix(".venv/bin/")
+    assert cell["PASTE"] == line.replace("7489", str(7447 + int(cell["ZENCELL_DOMAIN"])))
