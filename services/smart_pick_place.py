@@ -128,8 +128,8 @@ async def run(bus: Bus, config: Config) -> None:
                 group.create_task(work(command))
             now = task.status
             if now.model_copy(update={"task_seconds": before.task_seconds, "header": before.header}) != before:
-                if (now.state, now.message) != (before.state, before.message):
-                    bus.log.info("%s %s", now.state, now.message)
+                if now.state != before.state or now.message not in ("", before.message):
+                    bus.log.info("%s", f"{now.state} {now.message}".rstrip())
                 now.header = bus.header()
                 status.put(now)
                 before = now.model_copy(deep=True)

@@ -21,6 +21,8 @@ from common.tasks.grasp import HandShape
 from common.tasks.row import Rows, Tolerances
 from common.tasks.stages import Command, Cycle, Grip, Move, Stage, Target, View, appeared
 
+MOST_FIGURES = 200  # plans that the status tells of: a cell may run for days
+
 
 class PickPlaceParameters(Parameters):
     """How the task behaves; times are cell time unless they say wall."""
@@ -107,6 +109,7 @@ class PickPlace:
             planner=response.planner, seconds=response.seconds, fraction=response.fraction,
             attempts=max(1, len(response.attempts)),
         ))
+        del self.status.plans[:-MOST_FIGURES]
 
     def on_goal(self, answer: m.MotionStatus | m.GripperState, view: View) -> None:
         """Take in the answer to execute or to a gripper command: accepted, or refused with a reason."""
