@@ -298,7 +298,7 @@ class PickPlace:
         if not view.fresh(self.p.frame_timeout) or self._quiet is None or self._quiet[1] != bool(left):
             self._quiet = (view.now, bool(left)) if view.fresh(self.p.frame_timeout) else None
             self.status.message = "no fresh picture" if self._quiet is None else (
-                f"{left} objects are left that can not be taken" if left else "the table is empty")
+                f"{left} objects are left that can not be taken" if left else "the table looks empty")
         done = self._quiet is not None and view.now - self._quiet[0] >= (self.p.grace if left else self.p.empty)
         self.status.state, self.status.stage, self.status.target = "DONE" if done else "IDLE", "", ""
 
