@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 from typing import Any, NoReturn
 
@@ -23,6 +24,7 @@ class CommandLine(typer.Typer):
 
     def __call__(self, *args: Any, **kwargs: Any) -> None:
         """Run the verb that the arguments name and exit with its code."""
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
             code = typer.main.get_command(self)(*args, standalone_mode=False, prog_name="zencell", **kwargs)
         except typer.TyperException as error:
