@@ -30,6 +30,7 @@ A = TypeVar("A", bound=Message)
 
 REPEAT_SECONDS = 1.0  # wall time between repetitions of a state, and between counters
 _MOST_RAW = 1000
+_SETTLE_SECONDS = 0.05  # after which a session knows about what it has just reported
 _END_SECONDS = 1.0  # for a cancelled service to end
 
 
@@ -67,7 +68,8 @@ class Bus:
         self._beat: asyncio.TimerHandle | None = None
         self._closed = False
         self._running = False
-        session.watch_connection(lambda there: call_on_loop(self._loop, lambda: self._on_connection(there)))
+        self._was_connected = session.connected
+        session.watch_connection(lambda: call_on_loop(self._loop, self._look_at_connection_soon))
         self._tick()
 
     # --- declarations ---------------------------------------------------------------------------------------------
@@ -211,7 +213,8 @@ class Bus:
             key, tokens.append, lambda: call_on_loop(self._loop, done.set), timeout=timeout
         )
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(done.wait(), timeout)
+            async with asyncio.timeout(timeout):
+                await done.wait()
         return sorted(tokens)
 
     # --- life -----------------------------------------------------------------------------------------------------
@@ -225,9 +228,14 @@ class Bus:
         if self._counters is not None and self._counters.matched:
             self._counters.put(self.counters())
 
-    def _on_connection(self, there: bool) -> None:
-        if not self._closed:
-            (self.log.info if there else self.log.warning)("the router %s", "is back" if there else "is lost")
+    def _look_at_connection_soon(self) -> None:
+        self._loop.call_later(_SETTLE_SECONDS, self._look_at_connection)
+
+    def _look_at_connection(self) -> None:
+        now = self._session.connected
+        if now != self._was_connected and not self._closed:
+            (self.log.info if now else self.log.warning)("the router %s", "is back" if now else "is lost")
+        self._was_connected = now
 
     def _on_crash(self, error: BaseException) -> None:
         if not self._running:  # a bus without a service has nothing to end
