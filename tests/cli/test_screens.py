@@ -1,0 +1,52 @@
+import io
+import json
+import logging
+
+import pytest
+from rich.console import Console
+
+from cli.live import render
+from cli.screens import Content, JsonScreen, PlainScreen, ScreenHandler, open_screen
+from common.messages import PickPlaceStatus, ServiceStatus
+
+CONTENT = Content(
+    [ServiceStatus(name="router", state="ready", pid=12), ServiceStatus(name="vision", state="restarting", restarts=2)],
+    {"vision": ("detected_objects", 9.96)},
+    PickPlaceStatus(placed=3, targets=7, state="GRASPING", target="ball_4", started=True),
+)
+
+
+def test_table_shows_state_restarts_rates_and_progress() -> None:
+    console = Console(file=io.StringIO(), width=100)
+    console.print(render(CONTENT))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    (row,) = [line.split() for line in text.splitlines() if line.startswith("vision")]
+    assert row == ["vision", "restarting", "2", "detected_objects", "10.0"]
+    assert "3 of 7 placed - GRASPING ball_4" in text
+
+
+def test_lines_elsewhere_have_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
+    screen = open_screen(lambda: CONTENT, log_json=False)  # stderr is no terminal here
+    assert isinstance(screen, PlainScreen)
+    screen.line("router", "INFO router: listening")
+    screen.line("router", "bare")
+    screen.progress("3 of 7 placed")
+    screen.note("it is up")
+    screen.close()
+    shown = capsys.readouterr()
+    assert shown.err == "INFO router: listening\nrouter: bare\ntask: 3 of 7 placed\n"
+    assert shown.out == "it is up\n"
+
+
+def test_json_lines_are_passed_on_and_others_wrapped(capsys: pytest.CaptureFixture[str]) -> None:
+    screen = JsonScreen()
+    screen.line("a", '{"level": "error", "message": "x", "service": "b", "time": 1.0}')
+    screen.line("a", '{"half": ')
+    screen.line("a", "plain")
+    record = logging.LogRecord("supervisor", logging.WARNING, "", 0, "%s", ("y",), None)
+    ScreenHandler(screen, log_json=True).emit(record)
+    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert [(line["service"], line["message"]) for line in lines] == [
+        ("b", "x"), ("a", '{"half": '), ("a", "plain"), ("supervisor", "y")
+    ]
+    assert lines[3]["level"] == "warning"
