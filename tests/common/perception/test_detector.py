@@ -106,11 +106,12 @@ def test_every_ball_of_random_layouts_is_found_within_a_millimetre(noise, bright
         check(balls, picture, within=0.001)
 
 
-@pytest.mark.parametrize("name", CLUSTERS)
-@pytest.mark.parametrize(("noise", "brightness", "rim"), PICTURES)
+@pytest.mark.parametrize(
+    ("name", "noise", "brightness", "rim"),
+    # Without rims nothing in the picture shows the ball in the middle of seven.
+    [(name, *p) for name in CLUSTERS for p in PICTURES if p[2] or name != "seven close together"],
+)
 def test_balls_that_touch_are_told_apart(name, noise, brightness, rim):
-    if name == "seven close together" and rim == 0:
-        pytest.skip("without a rim nothing in the picture shows the one in the middle")
     rng = np.random.default_rng(2)
     for _ in range(5):
         balls = moved_into_view(CLUSTERS[name](rng), rng)
