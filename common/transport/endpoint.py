@@ -18,6 +18,7 @@ MAX_DOMAIN = 232
 DOMAIN_VARIABLE = "ZENCELL_DOMAIN"
 CONNECT_VARIABLE = "ZENCELL_CONNECT"
 LEASE_MS = 2000  # a frozen process or cut link is noticed after this
+STUCK_MS = 1000  # so is a link that takes nothing
 
 
 def parse_domain(value: object, field: str = "--domain") -> int:
@@ -95,6 +96,9 @@ def _config(**values: Any) -> zenoh.Config:
         "scouting__gossip__enabled": False,
         "timestamping__enabled": True,
         "transport__link__tx__lease": LEASE_MS,
+        # A message that must arrive and that a link does not take for so long ends the link. By default it is 5 s, and
+        # Zenoh does not see meanwhile that the lease of a frozen router has run out, nor that it is back.
+        "transport__link__tx__queue__congestion_control__block__wait_before_close": STUCK_MS * 1000,
         # Shared memory goes round the size limits of a link, and queries over it were lost when a receiver stalled.
         "transport__shared_memory__enabled": False,
     }

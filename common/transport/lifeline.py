@@ -14,7 +14,7 @@ from typing import NoReturn
 
 log = logging.getLogger(__name__)
 
-GRACE_SECONDS = 0.8  # from the signal to the end; the rest of the second is the system's
+GRACE_SECONDS = 0.7  # from the signal to the end; the rest of the second is the system's
 
 
 class Lifeline:

@@ -136,7 +136,7 @@ class LocalSession:
         """Always: there is no router to lose."""
         return True
 
-    def watch_connection(self, on_change: Callable[[bool], None]) -> None:
+    def watch_connection(self, on_change: Callable[[], None]) -> None:
         """Never calls back: the connection does not change."""
 
     def _keep(self, entry: _Entry) -> _Entry:

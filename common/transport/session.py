@@ -116,8 +116,8 @@ class Session(Protocol):
     ) -> None:
         """Call back for each matching token that is there now, then once `on_done`; before any watch that covers it."""
 
-    def watch_connection(self, on_change: Callable[[bool], None]) -> None:
-        """Call back when the router is lost or reached again."""
+    def watch_connection(self, on_change: Callable[[], None]) -> None:
+        """Call back when the router may have been lost or reached; `connected` tells a moment later."""
 
     def close(self) -> None:
         """Take back everything in reverse order and leave; may block, so call it in a thread with a time bound."""

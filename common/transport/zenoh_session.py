@@ -153,29 +153,16 @@ class ZenohSession:
         self._lock = threading.Lock()
         self._own_tokens: set[str] = set()
         self._token_watchers: list[tuple[zenoh.KeyExpr, OnToken]] = []
-        self._connection_watchers: list[Callable[[bool], None]] = []
-        self._transports = 0
-        session.info.declare_transport_events_listener(_direct(self._on_transport), history=True)
 
     @property
     def connected(self) -> bool:
         """Whether the link to the router stands."""
-        return self._transports > 0
+        return not self._session.is_closed() and bool(self._session.info.routers_zid())
 
-    def _on_transport(self, event: Any) -> None:
-        with self._lock:
-            before = self._transports > 0
-            self._transports += 1 if event.kind == zenoh.SampleKind.PUT else -1
-            now = self._transports > 0
-            watchers = list(self._connection_watchers)
-        if now != before:
-            for watcher in watchers:
-                watcher(now)
-
-    def watch_connection(self, on_change: Callable[[bool], None]) -> None:
-        """Call back when the router is lost or reached again."""
-        with self._lock:
-            self._connection_watchers.append(on_change)
+    def watch_connection(self, on_change: Callable[[], None]) -> None:
+        """Call back when the router may have been lost or reached."""
+        # The events themselves do not add up: after a frozen router some come twice and some out of order.
+        self._session.info.declare_transport_events_listener(_direct(lambda _event: on_change()))
 
     def _keep(self, declared: Declared) -> Declared:
         self._declared.append(declared)
