@@ -77,7 +77,7 @@ async def run(bus: Bus, config: Config) -> None:
         if verdict.rejections:
             rejected.put(Rejections(header=header, rejected=verdict.rejections))
         for one in verdict.rejections:
-            bus.log.info("rejected (%.3f, %.3f): %s", one.position.x, one.position.y, one.reason)
+            bus.log.info("rejected (%s, %s): %s", f"{one.position.x:z.3f}", f"{one.position.y:z.3f}", one.reason)
 
     async def watch() -> None:
         async for frame in detected:

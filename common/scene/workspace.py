@@ -180,20 +180,20 @@ def _chain(
     home = robot.named("home")
     q = solve_ik(robot, tool_down(x, y, above, yaw), home, restarts=0, iterations=_FROM_HOME)
     if q is None:
-        return 0, f"pre-grasp at ({x:.3f}, {y:.3f}, {above:.3f}) has no inverse kinematics {turned}"
+        return 0, f"pre-grasp at ({x:z.3f}, {y:z.3f}, {above:.3f}) has no inverse kinematics {turned}"
     for height in _line(above, low, bounds.line_step):
         q = _next(robot, (x, y, height), yaw, q, bounds) if q is not None else None
         if q is None:
-            return 1, f"straight line down to ({x:.3f}, {y:.3f}, {low:.3f}) ends at height {height:.3f} m {turned}"
+            return 1, f"straight line down to ({x:z.3f}, {y:z.3f}, {low:.3f}) ends at height {height:.3f} m {turned}"
     at_grasp = solve_ik(robot, tool_down(x, y, low, yaw), home, restarts=0, iterations=_FROM_HOME)
     if at_grasp is None:
-        return 2, f"grasp at ({x:.3f}, {y:.3f}, {low:.3f}) has no inverse kinematics {turned}"
+        return 2, f"grasp at ({x:z.3f}, {y:z.3f}, {low:.3f}) has no inverse kinematics {turned}"
     for start in (q, at_grasp):
         q = start
         for height in _line(low, top, bounds.line_step):
             q = _next(robot, (x, y, height), yaw, q, bounds) if q is not None else None
             if q is None:
-                return 3, f"lift to ({x:.3f}, {y:.3f}, {top:.3f}) ends at height {height:.3f} m {turned}"
+                return 3, f"lift to ({x:z.3f}, {y:z.3f}, {top:.3f}) ends at height {height:.3f} m {turned}"
     return 4, ""
 
 
