@@ -35,7 +35,7 @@ class PickPlaceParameters(Parameters):
     goal_timeout: float = Field(60.0, gt=0, le=3600, description="a motion that takes longer is stopped [s]")
     grace: float = Field(8.0, ge=0, le=600, description="wait while only objects are left that can not be taken [s]")
     empty: float = Field(1.0, ge=0.1, le=600, description="wait with an empty table before the task is done [s]")
-    frame_timeout: float = Field(1.0, ge=0.1, le=60, description="an older picture starts no motion [s]")
+    frame_timeout: float = Field(1.0, ge=0.1, le=60, description="an older picture starts no motion [s, wall time]")
     max_retries: int = Field(3, ge=0, le=100, description="grasps of one place that may close on nothing")
     max_failures: int = Field(10, ge=1, le=1000, description="failures in a row after which the task gives up")
     moved: float = Field(0.005, gt=0, le=0.05, description="an object that is further from where it was has moved [m]")

@@ -19,9 +19,9 @@ def ball(name: str, x: float, y: float) -> m.CollisionObject:
                              pose=m.Pose(position=m.Vector3(x=x, y=y, z=0.03)))
 
 
-def show(bus: Bus, targets: list[tuple[float, float]]) -> None:
-    """What the other services would say of an arm at home and balls on the table."""
-    header = bus.header("world")
+def show(bus: Bus, targets: list[tuple[float, float]], age: float = 0.0) -> None:
+    """What the other services would say of an arm at home and balls on the table, `age` [s, cell time] ago."""
+    header = m.Header(stamp=bus.clock.now_ns() - int(age * 1e9), frame_id="world")
     bus.writer(topics.GRIPPER_STATE).put(m.GripperState(header=header, width=0.08))
     bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(header=header))
     bus.writer(topics.JOINT_STATES).put(
@@ -50,6 +50,24 @@ async def test_validated_target_makes_it_ask_for_a_plan_to_above_that_ball() -> 
         assert isinstance(request.goal, m.PoseGoal)
         assert (request.goal.pose.position.x, request.goal.pose.position.y) == (0.40, -0.17)
         assert abs(request.goal.pose.position.z - 0.13) < 1e-9
+
+
+async def test_picture_that_is_late_by_the_fast_clock_of_the_cell_only_is_fresh() -> None:
+    net = LocalNetwork()
+    clock = Clock(speed=10.0)
+    bus = net.bus("tester", cell="test", clock=clock)
+    asked: asyncio.Queue[m.PlanRequest] = asyncio.Queue()
+
+    async def plan(request: m.PlanRequest) -> m.PlanResponse:
+        asked.put_nowait(request)
+        return m.PlanResponse(id=request.id, ok=False, error="no_ik", message="not today")
+
+    bus.serve(topics.MOTION_PLAN, plan)
+    await bus.ready()
+    patient = CONFIG.model_copy(update={"frame_timeout": 10.0})  # [s, wall]
+    async with net.running(smart_pick_place.run, patient, name="smart_pick_place", clock=clock):
+        show(bus, [(0.40, -0.17)], age=30.0)
+        assert (await asyncio.wait_for(asked.get(), 5)).stage == "pre-grasp"
 
 
 async def test_status_is_a_state_that_a_late_reader_gets() -> None:
