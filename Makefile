@@ -27,13 +27,12 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-bench: setup  ## every published figure, one script each
-	@for script in benchmarks/[a-z]*.py; do [ -e "$$script" ] || continue; echo "== $$script"; \
-	  $(BIN)/python "$$script" || exit 1; done
+bench: setup  ## every published figure, one module each
+	@for script in $$(grep -l __main__ benchmarks/*.py); do module=benchmarks.$$(basename $$script .py); \
+	  echo "== $$module"; $(BIN)/python -m $$module || exit 1; done
 
 docs: setup  ## write the generated tables and pages again
-	@for script in docs/generate*.py; do [ -e "$$script" ] || continue; echo "== $$script"; \
-	  $(BIN)/python "$$script" || exit 1; done
+	$(BIN)/python -m docs.generate
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
