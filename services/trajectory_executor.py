@@ -6,6 +6,7 @@ With simulated hardware the true world lives here too, because whether a grasp s
 from __future__ import annotations
 
 import asyncio
+import math
 
 from pydantic import Field
 
@@ -32,6 +33,7 @@ from common.transport.bus import Bus
 from common.transport.service import main
 
 MOST_CYCLES = 250.0  # per second of wall time
+REACH_MARGIN = 0.008  # [m] random places keep from the ends of the reach: what is seen is a few millimetres off
 
 
 class Config(Parameters):
@@ -53,13 +55,19 @@ def make_cycle(config: Config, simulated: bool) -> ControlCycle:
     home = robot.named("home")
     world = None
     if simulated:
-        z = config.world.table_height + config.world.ball_radius
-        places = layout(config.world, config.run.seed, lambda x, y: not reach_reason(robot, (x, y, z), config.grasp))
+        places = layout(config.world, config.run.seed, lambda x, y: within_reach(robot, x, y, config))
         world = SimulatedWorld(config.world, places, config.grasp_tolerances)
     return ControlCycle(
         load_hardware(config.robot, limits, home), limits, home,
         tolerances=config.tolerances, gripper=config.robot.gripper, kinematics=robot, world=world,
     )
+
+
+def within_reach(robot: RobotModel, x: float, y: float, config: Config) -> bool:
+    """Whether the arm can take a ball from (x, y) [m], and from a little nearer and farther as well."""
+    z, radius = config.world.table_height + config.world.ball_radius, max(math.hypot(x, y), REACH_MARGIN)
+    scales = (1 + off / radius for off in (REACH_MARGIN, -REACH_MARGIN, 0.0))
+    return all(not reach_reason(robot, (s * x, s * y, z), config.grasp) for s in scales)
 
 
 async def run(bus: Bus, config: Config) -> None:

@@ -23,6 +23,7 @@ from common.messages import (
 from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
+from common.scene.workspace import reach_reason
 from common.transport.local import LocalNetwork
 from common.transport.wiring import wiring
 from services import trajectory_executor
@@ -244,3 +245,14 @@ async def test_random_layout_follows_the_seed_and_is_within_reach() -> None:
         one, two = [await p.see(p.balls, lambda b: True) for p in (first, again)]
         assert one.poses == two.poses and len(one.ids) == 7
         assert all(0.18 <= np.hypot(p.position.x, p.position.y) <= 0.82 for p in one.poses)
+
+
+@pytest.mark.parametrize("off", [-0.005, 0.005])
+async def test_random_layout_is_within_reach_also_when_seen_a_few_millimetres_off(off: float) -> None:
+    cell = load_cell("panda")
+    robot = RobotModel.load(cell.robot)
+    async with executor("world.layout=random", "seed=20", "world.count=8") as person:
+        seen = await person.see(person.balls, lambda b: True)
+    for p in (pose.position for pose in seen.poses):
+        radius = float(np.hypot(p.x, p.y))
+        assert not reach_reason(robot, (p.x * (1 + off / radius), p.y * (1 + off / radius), p.z), cell.grasp)
