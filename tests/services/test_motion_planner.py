@@ -1,0 +1,165 @@
+import asyncio
+
+import pytest
+
+from common import topics
+from common.clock import Clock
+from common.config import load_cell, service_config
+from common.errors import RemoteError
+from common.messages import (
+    CollisionObject,
+    Header,
+    JointGoal,
+    JointState,
+    PlanningScene,
+    PlanRequest,
+    Pose,
+    PoseGoal,
+    Vector3,
+)
+from common.robot.model import RobotModel
+from common.robot.transforms import matrix_to_pose, tool_down
+from common.transport.local import LocalNetwork
+from common.transport.wiring import wiring
+from services import motion_planner
+
+CELL = load_cell("panda")
+CONFIG = service_config(CELL, "motion_planner", motion_planner.Config)
+ROBOT = RobotModel.load(CELL.robot)
+HOME = ROBOT.named("home")
+
+
+def scene(*objects: CollisionObject) -> PlanningScene:
+    table = CollisionObject(
+        id="table", role="fixture", shape="box", dimensions=[1.0, 1.0, 0.05],
+        pose=Pose(position=Vector3(x=0.5, z=-0.025)),
+    )
+    return PlanningScene(header=Header(frame_id="world"), objects=[table, *objects])
+
+
+class Planner:
+    """A motion planner on a network of its own, and what its users hold."""
+
+    def __init__(self, bus):
+        self.bus = bus
+        self.plan = bus.client(topics.MOTION_PLAN)
+        self.scenes = bus.writer(topics.PLANNING_SCENE)
+        self.states = bus.writer(topics.JOINT_STATES)
+        self.display = bus.reader(topics.DISPLAY_TRAJECTORY)
+
+    def stand_at(self, q, names=None):
+        fingers = ["panda_finger_joint1", "panda_finger_joint2"]
+        names = [*ROBOT.joint_names, *fingers] if names is None else names
+        self.states.put(JointState(header=self.bus.header(), name=names, position=[*q, *[0.04] * (len(names) - len(q))]))
+
+    async def refusal(self, request) -> RemoteError:
+        with pytest.raises(RemoteError) as caught:
+            await self.plan.call(request, timeout=10)
+        return caught.value
+
+
+@pytest.fixture
+async def planner():
+    network = LocalNetwork()
+    bus = network.bus("tester", cell="test", clock=Clock())
+    user = Planner(bus)
+    async with network.running(motion_planner.run, CONFIG, name="motion_planner"):
+        await user.plan.wait_available(10)
+        yield user
+
+
+def to_home(**more) -> PlanRequest:
+    return PlanRequest(id="1", goal=JointGoal(named="home"), **more)
+
+
+async def test_request_is_answered_with_a_trajectory_that_is_also_displayed(planner):
+    planner.scenes.put(scene())
+    start = HOME + 0.2
+    planner.stand_at(start)
+    response = await planner.plan.call(to_home(), timeout=10)
+    assert response.ok, response.message
+    assert response.id == "1"
+    assert response.header.stamp > 0
+    assert response.trajectory.joint_names == ROBOT.joint_names
+    assert response.trajectory.points[0].positions == pytest.approx(start, abs=1e-6)
+    assert response.trajectory.points[-1].positions == pytest.approx(HOME, abs=1e-6)
+    async with asyncio.timeout(5):
+        assert (await planner.display.next()).points == response.trajectory.points
+
+
+async def test_request_without_a_scene_is_refused(planner):
+    planner.stand_at(HOME)
+    refusal = await planner.refusal(to_home(stage="homing", start=list(HOME)))
+    assert refusal.code == "no_scene"
+    assert "homing" in refusal.message
+
+
+async def test_request_without_a_start_is_refused_until_joint_states_are_known(planner):
+    planner.scenes.put(scene())
+    assert (await planner.refusal(to_home())).code == "no_state"
+    planner.stand_at(HOME[:3], names=ROBOT.joint_names[:3])
+    assert (await planner.refusal(to_home())).code == "no_state"
+    assert (await planner.plan.call(to_home(start=list(HOME + 0.1)), timeout=10)).ok
+    planner.stand_at(HOME + 0.1)
+    assert (await planner.plan.call(to_home(), timeout=10)).ok
+
+
+async def test_start_in_collision_is_answered_with_the_pair_and_the_next_request_is_served(planner):
+    where = ROBOT.fk(HOME)[:3, 3]
+    in_hand = CollisionObject(
+        id="ball_1", role="target", shape="sphere", dimensions=[0.03],
+        pose=Pose(position=Vector3(x=where[0], y=where[1], z=where[2] + 0.06)),
+    )
+    planner.scenes.put(scene(in_hand))
+    planner.stand_at(HOME)
+    goal = PoseGoal(pose=matrix_to_pose(tool_down(0.4, 0.1, 0.3)))
+    response = await planner.plan.call(PlanRequest(id="2", stage="lift", goal=goal), timeout=10)
+    assert not response.ok
+    assert response.error == "start_in_collision"
+    assert response.colliding[1] == "ball_1"
+    planner.scenes.put(scene())
+    assert (await planner.plan.call(PlanRequest(id="3", goal=goal), timeout=10)).ok
+
+
+async def test_requests_at_the_same_time_are_all_answered(planner):
+    planner.scenes.put(scene())
+    planner.stand_at(HOME + 0.1)
+    requests = [to_home(start=list(HOME + 0.01 * i)) for i in range(5)]
+    answers = await asyncio.gather(*(planner.plan.call(request, timeout=20) for request in requests))
+    assert all(answer.ok for answer in answers)
+    starts = [answer.trajectory.points[0].positions[0] for answer in answers]
+    assert starts == pytest.approx([HOME[0] + 0.01 * i for i in range(5)], abs=1e-6)
+
+
+async def test_service_that_is_stopped_ends_a_running_plan():
+    network = LocalNetwork()
+    bus = network.bus("tester", cell="test", clock=Clock())
+    user = Planner(bus)
+    options = {"planners": [{"name": "ompl", "options": {"algorithm": "AORRTC", "improving_time": 60}}]}
+    config = motion_planner.Config.model_validate(CONFIG.model_dump() | {"pipeline": options})
+    wall = CollisionObject(
+        id="wall", role="fixture", shape="box", dimensions=[0.3, 0.02, 0.4],
+        pose=Pose(position=Vector3(x=0.55, z=0.2)),
+    )
+    left = [0.6, *HOME[1:]]
+    right = [-0.6, *HOME[1:]]
+    down = [0.0, 0.5, 0, 0.1, 0, 0, 0]
+    start, goal = ([a + b for a, b in zip(q, down, strict=True)] for q in (left, right))
+    async with asyncio.timeout(30):
+        async with network.running(motion_planner.run, config, name="motion_planner"):
+            await user.plan.wait_available(10)
+            user.scenes.put(scene(wall))
+            request = PlanRequest(id="1", start=start, goal=JointGoal(positions=goal), planning_time=300)
+            asked = asyncio.create_task(user.plan.call(request, timeout=300))
+            await asyncio.sleep(0.2)
+            assert not asked.done()
+        asked.cancel()
+        await asyncio.wait({asked})
+
+
+async def test_wiring_reads_no_truth():
+    found = await wiring(motion_planner.run, CONFIG)
+    assert topics.SCENE_BALLS not in found.reads
+    assert found.reads == {topics.PLANNING_SCENE, topics.JOINT_STATES}
+    assert found.serves == {topics.MOTION_PLAN}
+    assert found.writes == {topics.DISPLAY_TRAJECTORY}
