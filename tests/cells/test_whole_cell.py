@@ -1,0 +1,159 @@
+"""The Panda cell as a person starts it: all processes, the closed loop, figures, what one reads from outside, the end."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shlex
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from benchmarks.runs import RunningCell, until
+from common import topics
+from common.config import load_cell
+from common.messages import SupervisorStatus
+
+pytestmark = pytest.mark.cell
+
+SERVICES = list(load_cell("panda").services)
+GONE = 8.0  # [s] after Ctrl-C
+TOPICS = ("joint_states", "camera/image_raw", "camera/camera_info", "gripper/state", "tf", "planning_scene",
+          "detected_objects", "validated_targets", "pick_place_status", "scene_balls", "supervisor/status")
+
+
+def all_ready(status: SupervisorStatus) -> bool:
+    return len(status.services) == 1 + len(SERVICES) and all(service.state == "ready" for service in status.services)
+
+
+@pytest.fixture(scope="module")
+def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCell]:
+    """A cell at speed 1 whose task waits."""
+    with RunningCell(tmp_path_factory.mktemp("up"), "up", "panda", "--set", "autostart=false") as cell:
+
+        async def ready() -> None:
+            async with cell.listen() as bus:
+                await until(bus.reader(topics.SUPERVISOR_STATUS), all_ready)
+
+        asyncio.run(ready())
+        yield cell
+
+
+def test_every_process_is_there_once(up: RunningCell) -> None:
+    assert sorted(up.processes()) == sorted(["router", *SERVICES])
+
+
+def test_zenoh_cli_decodes_the_topics_with_the_line_that_is_printed(up: RunningCell) -> None:
+    printed = next(line for line in up.text.splitlines() if line.startswith("zenoh --mode client"))
+    program, *arguments = shlex.split(printed)
+    assert arguments == ["--mode", "client", "--connect", up.endpoint, "subscribe", "-k", "panda/**", "--decoder",
+                         "msgpack", "--line", "{key} {value}"]
+    tool = Path(sys.executable).with_name(program)
+    reading = subprocess.Popen(
+        [str(tool), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+    too_late = threading.Timer(30.0, reading.kill)
+    too_late.start()
+    wanted, seen, lines = {f"panda/{key}" for key in TOPICS}, {}, []
+    assert reading.stdout is not None
+    for line in reading.stdout:
+        key, _, value = line.rstrip("\n").partition(" ")
+        lines.append(line)
+        seen[key] = value
+        if wanted <= seen.keys():
+            break
+    too_late.cancel()
+    reading.kill()
+    reading.stdout.close()
+    reading.wait()
+    assert not wanted - seen.keys(), "".join(lines[-20:])
+    for key in wanted - {"panda/camera/image_raw"}:
+        assert isinstance(json.loads(seen[key]), dict), seen[key]
+    assert "640" in seen["panda/camera/image_raw"] and "bgr8" in seen["panda/camera/image_raw"]
+    assert len(seen["panda/camera/image_raw"]) < 400
+
+
+def test_the_camera_sends_about_ten_pictures_each_second(up: RunningCell) -> None:
+    answer = up.tell("topic", "hz", "camera/image_raw", "--count", "3", "--json")
+    assert answer.returncode == 0, answer.stderr
+    last = json.loads(answer.stdout.splitlines()[-1])
+    assert 5 < last["hz"] < 13
+
+
+def test_interrupted_while_waiting_it_is_gone_and_says_so(up: RunningCell) -> None:
+    up.interrupt()
+    assert asyncio.run(up.ended(GONE)) == 0
+    assert not up.processes()
+    assert up.summary["state"] == "IDLE"
+
+
+def test_the_default_layout_ends_in_the_box_with_all_figures(tmp_path: Path) -> None:
+    with RunningCell(tmp_path, "run", "panda", "--speed", "10", "--seed", "5") as cell:
+        assert asyncio.run(cell.ended(90)) == 0, cell.tail()
+        assert not cell.processes()
+        assert not descendants(cell)
+        summary = cell.summary
+    assert summary["truth"] == {"in_box": 7, "on_table": 0, "elsewhere": 0}
+    assert {k: summary[k] for k in ("cell", "state", "placed", "targets", "rejected", "seed", "speed")} == {
+        "cell": "panda", "state": "DONE", "placed": 7, "targets": 7, "rejected": [], "seed": 5, "speed": 10.0,
+    }
+    assert set(summary) == {
+        "cell", "state", "placed", "targets", "rejected", "failures", "retries", "seconds", "plans",
+        "frame_to_target_ms", "restarts", "seed", "speed", "truth",
+    }
+    seconds = summary["seconds"]
+    assert set(seconds) == {"ready", "first_motion", "task", "moving", "planning"}
+    assert 0 < seconds["ready"] < seconds["first_motion"]
+    assert 0 < seconds["moving"] <= seconds["task"]
+    assert seconds["planning"] > 0
+    assert len(summary["plans"]) >= 4 * 7
+    for plan in summary["plans"]:
+        assert set(plan) == {"planner", "seconds", "fraction", "attempts"}
+        assert 0 < plan["fraction"] <= 1
+    assert 0 < summary["frame_to_target_ms"]["p50"] <= summary["frame_to_target_ms"]["p99"]
+    assert summary["restarts"] == dict.fromkeys(["router", *SERVICES], 0)
+
+
+def descendants(cell: RunningCell) -> list[str]:
+    """Processes that carry the summary's path or the domain in their command line, whatever they are."""
+    marks = {str(cell.folder), f"--domain {cell.domain}"}
+    found = []
+    for process in psutil.process_iter(["cmdline"]):
+        command = " ".join(process.info["cmdline"] or [])
+        if process.pid != os.getpid() and "cli.main" not in command and any(mark in command for mark in marks):
+            found.append(command)
+    return found
+
+
+def test_interrupted_with_a_ball_in_the_hand_it_is_gone_and_has_written_the_summary(tmp_path: Path) -> None:
+    with RunningCell(tmp_path, "run", "panda", "--speed", "5") as cell:
+
+        async def hold() -> None:
+            async with cell.listen() as bus:
+                await until(bus.reader(topics.GRIPPER_STATE), lambda state: state.holding)
+
+        asyncio.run(hold())
+        started = time.monotonic()
+        cell.interrupt()
+        assert asyncio.run(cell.ended(GONE)) == 130, cell.tail()
+        assert not cell.processes(), f"{time.monotonic() - started:.1f} s after Ctrl-C"
+        assert cell.summary["state"] in ("GRASPING", "PLACING")
+        assert "Traceback" not in cell.text
+
+
+def test_a_value_that_only_a_service_can_judge_exits_2_with_one_line(tmp_path: Path) -> None:
+    with RunningCell(tmp_path, "run", "panda", "--set", "services.camera_simulator.rate=-1") as cell:
+        assert asyncio.run(cell.ended(30)) == 2
+        said = [line for line in cell.text.splitlines() if line.startswith("zencell: ")]
+        assert len(said) == 1
+        assert "services.camera_simulator.rate" in said[0] and "-1" in said[0] and "greater than 0" in said[0]
+        assert "Traceback" not in cell.text
+        assert not cell.processes()
