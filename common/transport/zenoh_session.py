@@ -148,6 +148,7 @@ class ZenohSession:
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
+        self._closed = False
         self._outbox = Outbox()
         self._declared: list[Declared] = []
         self._lock = threading.Lock()
@@ -157,7 +158,8 @@ class ZenohSession:
     @property
     def connected(self) -> bool:
         """Whether the link to the router stands."""
-        return not self._session.is_closed() and bool(self._session.info.routers_zid())
+        # Not session.is_closed(): it keeps the interpreter's lock while it waits for one that a callback may hold.
+        return not self._closed and bool(self._session.info.routers_zid())
 
     def watch_connection(self, on_change: Callable[[], None]) -> None:
         """Call back when the router may have been lost or reached."""
@@ -290,6 +292,7 @@ class ZenohSession:
 
     def close(self) -> None:
         """Take back everything in reverse order and leave; may block."""
+        self._closed = True
         self._outbox.close(_FLUSH_SECONDS)
         while self._declared:
             try:
