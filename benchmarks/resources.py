@@ -8,13 +8,15 @@ from __future__ import annotations
 import argparse
 import asyncio
 import os
-import sysconfig
 import tempfile
 from collections import defaultdict
+from importlib.metadata import distribution
 from pathlib import Path
 from statistics import median
 
 import psutil
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from benchmarks.runs import RunningCell, folder_for, until
 from common import topics
@@ -60,8 +62,8 @@ async def whole_run(folder: Path) -> list[str]:
     together = max(map(sum, zip(*memory.values(), strict=True)))
     lines.append(f"| together | {together:.0f} | {sum(share.values()):.1%} |")
     delay = summary["frame_to_target_ms"]
-    lines += ["", f"run at speed 1: exit code {code}, {summary['state']}, {summary['truth']['in_box']} balls in the box, "
-              f"task {summary['seconds']['task']:.1f} s",
+    lines += ["", f"run at speed 1: exit code {code}, {summary['state']}, {summary['truth']['in_box']} balls in the "
+              f"box, task {summary['seconds']['task']:.1f} s",
               f"frame to validated target: p50 {delay['p50']:.1f} ms, p99 {delay['p99']:.1f} ms"]
     return lines
 
@@ -73,21 +75,37 @@ def _cpu(process: psutil.Process) -> float:
 
 
 def environment() -> list[str]:
-    """Size of the installed packages, and the largest of them, as lines."""
-    root = Path(sysconfig.get_path("purelib"))
-    parts = {entry.name: _size(entry) for entry in root.iterdir()}
-    lines = ["", f"environment: {sum(parts.values()) / 1e9:.2f} GB in {root.name}; the largest parts [MB]:"]
-    for name, size in sorted(parts.items(), key=lambda item: -item[1])[:SHOWN]:
+    """Size of everything that zencell needs besides Python, and its largest parts, as lines."""
+    sizes = {name: _size(name) for name in sorted(needed("zencell"))}
+    lines = ["", f"environment: {sum(sizes.values()) / 1e9:.2f} GB in {len(sizes)} packages; the largest [MB]:"]
+    for name, size in sorted(sizes.items(), key=lambda item: -item[1])[:SHOWN]:
         lines.append(f"  {size / 1e6:6.0f}  {name}")
     return lines
 
 
-def _size(path: Path) -> int:
-    """What a file or folder takes on the disk [bytes], as du says."""
-    total = path.lstat().st_blocks * 512
-    for folder, _, files in os.walk(path):
-        total += sum(Path(folder, name).lstat().st_blocks * 512 for name in files)
-    return total
+def needed(name: str) -> set[str]:
+    """Names of the distributions that one needs, and those that they need, without extras that nobody asks for."""
+    found: set[str] = set()
+    open_ends: list[tuple[str, frozenset[str]]] = [(name, frozenset())]
+    seen = set()
+    while open_ends:
+        current = open_ends.pop()
+        if current in seen:
+            continue
+        seen.add(current)
+        for text in distribution(current[0]).requires or []:
+            requirement = Requirement(text)
+            asked = [{"extra": extra} for extra in ("", *current[1])]
+            if requirement.marker is None or any(requirement.marker.evaluate(extra) for extra in asked):
+                found.add(canonicalize_name(requirement.name))
+                open_ends.append((canonicalize_name(requirement.name), frozenset(requirement.extras)))
+    return found
+
+
+def _size(name: str) -> int:
+    """What the files of a distribution take on the disk [bytes], compiled ones included."""
+    paths = (Path(str(file.locate())) for file in distribution(name).files or [])
+    return sum(path.lstat().st_blocks * 512 for path in paths if path.exists())
 
 
 async def measure(folder: Path) -> None:
