@@ -11,15 +11,17 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from common.config import Parameters, Surroundings
-from common.perception.fit import Fit, fit_spheres
+from common.perception.fit import fit_each, fit_spheres
 from common.perception.outline import Blob, Mask, find_blobs
 from common.perception.pinhole import Pinhole
 from common.perception.resting import Resting
 from common.perception.separation import separate
-from common.perception.sphere import ray_distances, silhouette
+from common.perception.sphere import ray_distances, silhouettes
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
+
+_ROUND = 0.96  # part of an outline that must fit for a blob to be one ball
 
 Hue = Annotated[int, Field(ge=0, le=180)]
 Byte = Annotated[int, Field(ge=0, le=255)]
@@ -70,6 +72,13 @@ class Detection:
     outline: Array
 
 
+@dataclass(frozen=True)
+class _Seen:
+    center: Array  # (3,) relative to the optical centre [m]
+    area: float  # [px^2]
+    border: Array  # (m, 2) pixels of its blob at the border of the picture
+
+
 class Detector:
     """Finds balls: the same picture always gives the same detections."""
 
@@ -82,15 +91,17 @@ class Detector:
         """
         self.options = options or DetectorOptions()
         self.resting = Resting.of(surroundings)
-        size = self.options.morph_kernel_px
+        o, size = self.options, self.options.morph_kernel_px
+        self._windows = [
+            (np.array(o.hsv_red_lo1), np.array(o.hsv_red_hi1)), (np.array(o.hsv_red_lo2), np.array(o.hsv_red_hi2))
+        ]
         self._kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
 
     def masks(self, picture: Picture) -> tuple[Mask, Mask]:
         """What is red in a bgr8 picture: opened, and then closed; 255 where it is."""
-        o = self.options
         hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
-        low = cv2.inRange(hsv, np.array(o.hsv_red_lo1), np.array(o.hsv_red_hi1))
-        high = cv2.inRange(hsv, np.array(o.hsv_red_lo2), np.array(o.hsv_red_hi2))
+        low = cv2.inRange(hsv, *self._windows[0])
+        high = cv2.inRange(hsv, *self._windows[1])
         opened = cv2.morphologyEx(cv2.bitwise_or(low, high), cv2.MORPH_OPEN, self._kernel)
         closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, self._kernel)
         return np.asarray(opened, np.uint8), np.asarray(closed, np.uint8)
@@ -99,89 +110,80 @@ class Detector:
         """Balls in a bgr8 picture (height, width, 3), nearest to the upper left corner first."""
         fine, closed = self.masks(picture)
         blobs = find_blobs(closed, fine, camera, self.options.min_contour_area_px)
-        pixel_size = self._pixel_size(camera)
+        pixel_size = abs(float(camera.position[2]) - self.resting.plane) / camera.fx  # at the plane of the balls
         offset = self.options.outline_offset_px * pixel_size
-        detections: list[Detection] = []
-        crowded: list[Blob] = []
-        offsets: list[float] = []
-        for blob in blobs:
-            fit, is_round = self._single(blob, camera, offset, pixel_size)
-            if fit is not None:
-                offsets.append(fit.offset)
-                detections += self._detections(blob, fit, camera)
-            elif not is_round:
-                crowded.append(blob)
+        seen: list[_Seen] = []
+        alone, crowded, offsets = self._alone(blobs, camera, offset, pixel_size)
+        seen += alone
         # All outlines of a picture are off by as much: balls that stand alone say by how much.
         spread = 1.0 * pixel_size
         if offsets:
             offset, spread = float(np.median(offsets)), 0.2 * pixel_size
-        for blob in crowded:
-            detections += self._separated(blob, closed, camera, offset, spread)
-        return sorted(detections, key=lambda d: (d.pixel[1], d.pixel[0]))
+        for blob in crowded:  # balls that touch, hide each other or reach over the border
+            centers = separate(blob.outline, closed, camera, self.resting, offset)
+            if len(centers):
+                fit = fit_spheres(blob.outline, centers, self.resting.radius, offset=offset, offset_std=spread)
+                seen += [_Seen(center, blob.area / len(centers), blob.border) for center in fit.centers]
+        return sorted(self._detections(seen, camera), key=lambda d: (d.pixel[1], d.pixel[0]))
 
-    def _pixel_size(self, camera: Pinhole) -> float:
-        """Size of a pixel at the plane of the balls, below the camera [m]."""
-        return abs(float(camera.position[2]) - self.resting.plane) / camera.fx
+    def _alone(
+        self, blobs: list[Blob], camera: Pinhole, offset: float, pixel_size: float
+    ) -> tuple[list[_Seen], list[Blob], list[float]]:
+        """Blobs that are one ball wholly in view, blobs that are not round, and the offsets of the former [m].
 
-    def _single(self, blob: Blob, camera: Pinhole, offset: float, pixel_size: float) -> tuple[Fit | None, bool]:
-        """The fit of a blob that is one round thing wholly in view, and whether it is round at all.
-
-        The fit is None when it is not, and when it is round but as large as no ball looks where it can lie: that is
-        something else, or a ball that is falling.
+        What is round but as large as no ball looks where it can lie is left out: it is something else, or falling.
         """
-        if len(blob.border) or len(blob.outline) < 12:
-            return None, False
-        center = camera.on_plane(blob.centroid, self.resting.plane)
-        if not np.isfinite(center).all():
-            return None, False
-        ray = np.append(center, self.resting.plane) - camera.position
-        best: Fit | None = None
-        for z in self.resting.heights(camera, blob.centroid):
-            start = ray * ((z - camera.position[2]) / ray[2])
-            fit = fit_spheres(
-                blob.outline, start[None], self.resting.radius, offset=offset, offset_std=1.0,
-                gates=(self.resting.radius, 4 * pixel_size, 3 * pixel_size),
-            )
-            if np.count_nonzero(np.abs(fit.residuals) < 1.3 * pixel_size) < 0.96 * len(fit.residuals):
-                return None, False
-            if best is None or abs(fit.offset - offset) < abs(best.offset - offset):
-                best = fit
-        if best is None or abs(best.offset - offset) > self.options.max_offset_px * pixel_size:
-            return None, True
-        return best, True
-
-    def _separated(self, blob: Blob, closed: Mask, camera: Pinhole, offset: float, spread: float) -> list[Detection]:
-        """The balls of a blob that touch, hide each other or reach over the border."""
-        outline = blob.outline
-        centers = separate(outline, closed, camera, self.resting, offset)
-        if not len(centers):
-            return []
-        fit = fit_spheres(outline, centers, self.resting.radius, offset=offset, offset_std=spread)
-        return self._detections(blob, fit, camera)
-
-    def _detections(self, blob: Blob, fit: Fit, camera: Pinhole) -> list[Detection]:
-        found = []
-        for center in fit.centers:
-            pixel = camera.project(center + camera.position)
-            place = camera.on_plane(pixel, self.resting.plane)
-            if not (np.isfinite(pixel).all() and np.isfinite(place).all()):
+        crowded, tried, starts = [], [], []
+        for index, blob in enumerate(blobs):
+            center = camera.on_plane(blob.centroid, self.resting.plane)
+            if len(blob.border) or len(blob.outline) < 12 or not np.isfinite(center).all():
+                crowded.append(blob)
                 continue
-            outline = silhouette(camera, center + camera.position, self.resting.radius, 32)
-            partial = not camera.in_picture(outline).all() or self._cut(blob, center, camera)
-            found.append(
-                Detection(
-                    position=(float(place[0]), float(place[1]), self.resting.plane),
-                    pixel=(float(pixel[0]), float(pixel[1])),
-                    area=blob.area / len(fit.centers),
-                    partial=bool(partial),
-                    outline=outline,
-                )
-            )
-        return found
+            ray = np.append(center, self.resting.plane) - camera.position
+            for z in self.resting.heights(camera, blob.centroid):
+                tried.append(index)
+                starts.append(ray * ((z - camera.position[2]) / ray[2]))
+        if not tried:
+            return [], crowded, []
+        centers, offsets, close = fit_each(
+            [blobs[index].outline for index in tried], np.array(starts), self.resting.radius, offset=offset,
+            gates=(self.resting.radius, 4 * pixel_size, 3 * pixel_size), close=1.3 * pixel_size,
+        )
+        alone, found = [], []
+        for index in dict.fromkeys(tried):
+            mine = [k for k, other in enumerate(tried) if other == index]
+            if min(close[mine]) < _ROUND:
+                crowded.append(blobs[index])
+                continue
+            best = min(mine, key=lambda k: abs(offsets[k] - offset))
+            if abs(offsets[best] - offset) <= self.options.max_offset_px * pixel_size:
+                alone.append(_Seen(centers[best], blobs[index].area, blobs[index].border))
+                found.append(float(offsets[best]))
+        return alone, crowded, found
 
-    def _cut(self, blob: Blob, center: Array, camera: Pinhole) -> bool:
-        """Whether the picture's border cuts through the ball: the blob touches it there."""
-        if not len(blob.border):
+    def _detections(self, seen: list[_Seen], camera: Pinhole) -> list[Detection]:
+        if not seen:
+            return []
+        centers = np.array([one.center for one in seen]) + camera.position
+        pixels = camera.project(centers)
+        places = camera.on_plane(pixels, self.resting.plane)
+        outlines = silhouettes(camera, centers, self.resting.radius, 32)
+        inside = np.asarray(camera.in_picture(outlines).all(axis=1))
+        return [
+            Detection(
+                position=(float(places[k, 0]), float(places[k, 1]), self.resting.plane),
+                pixel=(float(pixels[k, 0]), float(pixels[k, 1])),
+                area=one.area,
+                partial=not inside[k] or self._cut(one, camera),
+                outline=outlines[k],
+            )
+            for k, one in enumerate(seen)
+            if np.isfinite(places[k]).all() and np.isfinite(outlines[k]).all()
+        ]
+
+    def _cut(self, seen: _Seen, camera: Pinhole) -> bool:
+        """Whether the picture's border cuts through the ball: its blob touches it there."""
+        if not len(seen.border):
             return False
-        distance, _ = ray_distances(camera.directions(blob.border), center[None])
+        distance, _ = ray_distances(camera.directions(seen.border), seen.center[None])
         return bool((distance < self.resting.radius).any())

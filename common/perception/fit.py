@@ -7,6 +7,7 @@ segmented outline lies a little inside or outside of the true one, by as much fo
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -146,3 +147,45 @@ def fit_spheres(
     nearest = np.argmin(np.abs(beyond), axis=1)
     residual = beyond[every, nearest]
     return Fit(c, delta, np.where(np.abs(residual) < gates[-1], nearest, -1), residual)
+
+
+def fit_each(
+    outlines: Sequence[Outline], centers: Array, radius: float, *, offset: float, gates: tuple[float, ...], close: float
+) -> tuple[Array, Array, Array]:
+    """As many spheres, each to an outline and with an offset of its own, in one go: most balls lie alone.
+
+    Args:
+        outlines: one or more points each.
+        centers: (k, 3) first guesses relative to the optical centre [m]; heights are kept.
+        radius: of all spheres [m].
+        offset: of the outlines, to start from [m].
+        gates: how far off a point may be in each step [m].
+        close: how far off a point may be in the end [m].
+
+    Returns:
+        (k, 3) centres [m], (k,) offsets [m], (k,) the part of each outline that is close.
+    """
+    rays, inward = (np.concatenate([getattr(o, name) for o in outlines]) for name in ("rays", "inward"))
+    sizes = np.array([len(o) for o in outlines])
+    starts, owner = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
+    c, delta = centers.astype(float), np.full(len(sizes), offset)
+
+    def compare() -> tuple[Array, Array]:
+        mine = c[owner]
+        along = np.einsum("ij,ij->i", rays, mine)
+        distance = np.sqrt(np.maximum(np.einsum("ij,ij->i", mine, mine) - along**2, 1e-18))
+        facing = np.einsum("ij,ij->i", inward, mine) > _FACING * distance
+        away: Array = (mine[:, :2] - along[:, None] * rays[:, :2]) / distance[:, None]
+        return np.where(facing, distance - radius - delta[owner], np.inf), away
+
+    for gate in gates:
+        beyond, away = compare()
+        near = np.abs(beyond) < gate
+        J = np.column_stack([away, np.full(len(away), -1.0), np.where(near, beyond, 0.0)]) * near[:, None]
+        products = np.add.reduceat(J[:, :, None] * J[:, None, :], starts)
+        step = np.linalg.solve(products[:, :3, :3] + 1e-6 * np.eye(3), -products[:, :3, 3:])[..., 0]
+        length = np.hypot(step[:, 0], step[:, 1])
+        c[:, :2] += step[:, :2] * np.minimum(1.0, 0.5 * radius / np.maximum(length, 1e-12))[:, None]
+        delta += step[:, 2]
+    beyond, _ = compare()
+    return c, delta, np.add.reduceat((np.abs(beyond) < close).astype(float), starts) / sizes

@@ -13,6 +13,8 @@ from common.perception.pinhole import Pinhole
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.uint8]
+Contour = npt.NDArray[np.int32]
+Part = tuple[Contour, bool]  # a contour, and whether it is that of a hole
 
 _REACH = 3  # contour points to either side from which the direction of the outline is taken
 _LEAST_POINTS = 16  # shorter contours are specks or pin holes
@@ -52,7 +54,7 @@ class Blob:
         border: (m, 2) its pixels at the border of the picture [px].
     """
 
-    contour: npt.NDArray[np.int32]
+    contour: Contour
     area: float
     centroid: Array
     outline: Outline
@@ -69,7 +71,7 @@ def find_blobs(closed: Mask, fine: Mask, camera: Pinhole, min_area: float) -> li
     if not large:
         return []
     contours, hierarchy = cv2.findContours(fine, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    within: list[list[tuple[npt.NDArray[np.int32], bool]]] = [[] for _ in large]
+    within: list[list[Part]] = [[] for _ in large]
     for contour, links in zip(contours, hierarchy[0] if hierarchy is not None else (), strict=True):
         if len(contour) < _LEAST_POINTS:
             continue
@@ -79,12 +81,12 @@ def find_blobs(closed: Mask, fine: Mask, camera: Pinhole, min_area: float) -> li
                 within[index].append((np.asarray(contour, np.int32), bool(links[3] >= 0)))
                 break
     blobs = []
-    for (contour, area), parts in zip(large, within, strict=True):
+    for (contour, area), outline in zip(large, _outlines(within, camera), strict=True):
         moments = cv2.moments(contour)
         centroid = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
         flat = contour.reshape(-1, 2).astype(float)
         border = flat[~_off_border(flat, camera)]
-        blobs.append(Blob(contour, area, centroid, _outline(parts, camera), border))
+        blobs.append(Blob(contour, area, centroid, outline, border))
     return blobs
 
 
@@ -94,27 +96,39 @@ def _off_border(pixels: Array, camera: Pinhole) -> npt.NDArray[np.bool_]:
     return clear
 
 
-def _outline(parts: Sequence[tuple[npt.NDArray[np.int32], bool]], camera: Pinhole) -> Outline:
-    pixels, normals = [np.empty((0, 2))], [np.empty((0, 2))]
-    for contour, is_hole in parts:
-        points = contour.reshape(-1, 2).astype(float)
-        round_again = np.concatenate([points[-_REACH:], points, points[:_REACH]])
-        along = round_again[2 * _REACH :] - round_again[: -2 * _REACH]
-        turned = along[:, ::-1] * (-1.0, 1.0)
-        # Turning a quarter leads into the area that a contour with positive orientation encloses: for the edge of a
-        # hole that is the hole.
-        if (cv2.contourArea(contour, oriented=True) > 0) == is_hole:
-            turned = -turned
-        keep = np.abs(turned).sum(axis=1) > 0
-        clear = _off_border(points, camera)
-        if not clear.all():  # a direction taken across the border of the picture is not that of the outline
-            keep &= clear & np.roll(clear, _REACH) & np.roll(clear, -_REACH)
-        pixels.append(points[keep])
-        normals.append(turned[keep])
+def _outlines(blobs: Sequence[Sequence[Part]], camera: Pinhole) -> list[Outline]:
+    """One outline for each blob, of all its parts; the rays are computed for all of them at once."""
+    pixels, normals, sizes = [np.empty((0, 2))], [np.empty((0, 2))], []
+    for parts in blobs:
+        sizes.append(0)
+        for contour, is_hole in parts:
+            points, inward_px = _inward(contour, camera, is_hole=is_hole)
+            pixels.append(points)
+            normals.append(inward_px)
+            sizes[-1] += len(points)
     p, n = np.concatenate(pixels), np.concatenate(normals)
     n /= np.maximum(np.hypot(n[:, 0], n[:, 1]), 1e-12)[:, None]
     both = camera.directions(np.stack([p, p + n]))
     rays, inward = both[0], both[1] - both[0]
     inward -= np.einsum("ij,ij->i", inward, rays)[:, None] * rays
     inward /= np.sqrt(np.maximum(np.einsum("ij,ij->i", inward, inward), 1e-24))[:, None]
-    return Outline(p, rays, inward)
+    ends = np.cumsum(sizes)
+    cuts = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    return [Outline(p[cut], rays[cut], inward[cut]) for cut in cuts]
+
+
+def _inward(contour: Contour, camera: Pinhole, *, is_hole: bool) -> tuple[Array, Array]:
+    """Points (n, 2) of a contour that are not at the border of the picture, and directions (n, 2) into the red [px]."""
+    points = contour.reshape(-1, 2).astype(float)
+    round_again = np.concatenate([points[-_REACH:], points, points[:_REACH]])
+    along = round_again[2 * _REACH :] - round_again[: -2 * _REACH]
+    turned = along[:, ::-1] * (-1.0, 1.0)
+    # Turning a quarter leads into the area that a contour with positive orientation encloses: for the edge of a hole
+    # that is the hole.
+    if (cv2.contourArea(contour, oriented=True) > 0) == is_hole:
+        turned = -turned
+    keep = np.abs(turned).sum(axis=1) > 0
+    clear = _off_border(points, camera)
+    if not clear.all():  # a direction taken across the border of the picture is not that of the outline
+        keep &= clear & np.roll(clear, _REACH) & np.roll(clear, -_REACH)
+    return points[keep], turned[keep]

@@ -16,7 +16,7 @@ from common.perception.fit import fit_one, near_points
 from common.perception.outline import Mask, Outline
 from common.perception.pinhole import Pinhole
 from common.perception.resting import Resting
-from common.perception.sphere import ray_distances, silhouette
+from common.perception.sphere import ray_distances, silhouettes
 
 Array = npt.NDArray[np.float64]
 Chosen = npt.NDArray[np.bool_]
@@ -53,6 +53,10 @@ def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: Resting, of
     candidates = []
     for place in _peaks(_votes(outline, camera, resting, offset), camera, resting):
         candidates += _refine(outline, camera, resting, offset, place)
+    if not candidates:
+        return np.empty((0, 3))
+    red = _are_red(np.array([c.center for c in candidates]), mask, camera, resting.radius)
+    candidates = [candidate for candidate, good in zip(candidates, red, strict=True) if good]
     chosen: list[_Candidate] = []
     free = np.ones(len(outline), bool)
     while candidates:
@@ -61,13 +65,11 @@ def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: Resting, of
         if gains[best] < _LEAST_SUPPORT:
             break
         candidate = candidates.pop(best)
-        if _clashes(candidate, chosen, resting.radius) or not _is_red(candidate, mask, camera, resting.radius):
-            continue
-        chosen.append(candidate)
-        free &= ~candidate.points
+        if not _clashes(candidate, chosen, resting.radius):
+            chosen.append(candidate)
+            free &= ~candidate.points
     centers = np.array([c.center for c in chosen]).reshape(-1, 3)
-    whole = [_ends(index, centers, mask, camera, resting.radius) for index in range(len(centers))]
-    kept: Array = centers[np.array(whole, bool)]
+    kept: Array = centers[_end(centers, mask, camera, resting.radius)]
     return kept
 
 
@@ -147,25 +149,32 @@ def _clashes(candidate: _Candidate, chosen: list[_Candidate], radius: float) -> 
     return False
 
 
-def _is_red(candidate: _Candidate, mask: Mask, camera: Pinhole, radius: float) -> bool:
-    """Whether what a ball there would cover of the picture is red."""
-    center = candidate.center + camera.position
-    outline = silhouette(camera, center, 0.82 * radius, 16)
-    middle = camera.project(center)
-    rings = middle + np.array([0.25, 0.55, 0.8, 1.0])[:, None, None] * (outline - middle)
-    pixels = np.rint(rings.reshape(-1, 2)).astype(int)
-    seen = pixels[camera.in_picture(pixels)]
-    return len(seen) > 0 and float(np.mean(mask[seen[:, 1], seen[:, 0]] > 0)) >= _COVERED
+def _red_at(pixels: Array, mask: Mask, camera: Pinhole) -> tuple[Chosen, Chosen]:
+    """Which pixels are in the picture, and which of all are red in it; in the shape of the pixels, without (u, v)."""
+    nearest = np.rint(np.where(np.isfinite(pixels), pixels, -1.0)).astype(int)
+    seen = np.asarray(camera.in_picture(nearest))
+    u, v = (np.where(seen, nearest[..., axis], 0) for axis in (0, 1))
+    return seen, seen & (mask[v, u] > 0)
 
 
-def _ends(index: int, centers: Array, mask: Mask, camera: Pinhole, radius: float) -> bool:
-    """Whether a ball ends where it should: what is red around it is other balls. Larger things go on and on."""
-    ring = silhouette(camera, centers[index] + camera.position, 1.15 * radius, 32)
-    pixels = np.rint(ring).astype(int)
-    inside = camera.in_picture(pixels)
-    seen = pixels[inside]
-    others = np.delete(centers, index, axis=0)
-    distance, _ = ray_distances(camera.directions(ring[inside]), others)
-    explained = (distance < 1.05 * radius).any(axis=1)
-    going_on = (mask[seen[:, 1], seen[:, 0]] > 0) & ~explained
-    return int(np.count_nonzero(going_on)) <= _MOST_GOING_ON * len(ring)
+def _are_red(centers: Array, mask: Mask, camera: Pinhole, radius: float) -> Chosen:
+    """(k,) whether what balls there would cover of the picture is red."""
+    places = centers + camera.position
+    outlines, middles = silhouettes(camera, places, 0.82 * radius, 16), camera.project(places)[:, None]
+    rings = [middles + part * (outlines - middles) for part in (0.25, 0.55, 0.8, 1.0)]
+    seen, red = _red_at(np.concatenate(rings, axis=1), mask, camera)
+    visible = np.count_nonzero(seen, axis=1)
+    good: Chosen = (visible > 0) & (np.count_nonzero(red, axis=1) >= _COVERED * visible)
+    return good
+
+
+def _end(centers: Array, mask: Mask, camera: Pinhole, radius: float) -> Chosen:
+    """(k,) whether balls end where they should: what is red around them is other balls. Larger things go on and on."""
+    rings = silhouettes(camera, centers + camera.position, 1.15 * radius, 32)
+    _, red = _red_at(rings, mask, camera)
+    distance, _ = ray_distances(camera.directions(rings.reshape(-1, 2)), centers)
+    inside = (distance < 1.05 * radius).reshape(*rings.shape[:2], len(centers))
+    inside[np.arange(len(centers)), :, np.arange(len(centers))] = False  # itself explains nothing
+    going_on = red & ~inside.any(axis=2)
+    good: Chosen = np.count_nonzero(going_on, axis=1) <= _MOST_GOING_ON * rings.shape[1]
+    return good

@@ -17,32 +17,43 @@ from common.perception.pinhole import Pinhole
 Array = npt.NDArray[np.float64]
 
 
-def silhouette(camera: Pinhole, center: npt.ArrayLike, radius: float, count: int = 64) -> Array:
-    """Pixels (count, 2) on the outline of a sphere, all the way round.
+def silhouettes(camera: Pinhole, centers: npt.ArrayLike, radius: float, count: int = 64) -> Array:
+    """Pixels (k, count, 2) on the outlines of spheres, all the way round [px].
 
     Args:
         camera: the camera.
-        center: (3,) in world [m].
+        centers: (k, 3) in world [m].
         radius: [m].
-        count: number of points.
+        count: number of points of each.
 
     Returns:
-        (count, 2) [px]; empty (0, 2) when the sphere is not wholly in front of the optical centre.
+        nan for spheres that are not wholly in front of the optical centre.
     """
-    c = np.asarray(center, dtype=float) - camera.position
-    distance = float(np.linalg.norm(c))
-    if distance <= radius or float(camera.to_camera(center)[2]) <= radius:
-        return np.empty((0, 2))
-    axis = c / distance
+    places = np.asarray(centers, dtype=float).reshape(-1, 3)
+    c = places - camera.position
+    distance = np.sqrt(np.einsum("ij,ij->i", c, c))[:, None]
+    sine = np.clip(radius / np.maximum(distance, 1e-12), 0, 1)
+    axis = c / np.maximum(distance, 1e-12)
     # All tangent points lie on a circle in front of the centre.
-    sine = radius / distance
-    middle = camera.position + axis * distance * (1 - sine**2)
-    around = radius * math.sqrt(1 - sine**2)
-    x, y, z = axis
-    first = np.array((0.0, z, -y) if abs(x) < 0.9 else (-z, 0.0, x)) / math.hypot(z, y if abs(x) < 0.9 else x)
-    second = np.array((y * first[2] - z * first[1], z * first[0] - x * first[2], x * first[1] - y * first[0]))
-    angle = np.linspace(0.0, 2 * math.pi, count, endpoint=False)[:, None]
-    return camera.project(middle + around * (np.cos(angle) * first + np.sin(angle) * second))
+    middle = axis * distance * (1 - sine**2)
+    around = radius * np.sqrt(1 - sine**2)
+    x, y, z = axis.T
+    o = np.zeros_like(x)
+    first = np.where(np.abs(x)[:, None] < 0.9, np.column_stack([o, z, -y]), np.column_stack([-z, o, x]))
+    first /= np.maximum(np.sqrt(np.einsum("ij,ij->i", first, first)), 1e-12)[:, None]
+    fx, fy, fz = first.T
+    second = np.column_stack([y * fz - z * fy, z * fx - x * fz, x * fy - y * fx])
+    angle = np.linspace(0.0, 2 * math.pi, count, endpoint=False)[None, :, None]
+    ring = middle[:, None] + around[:, None] * (np.cos(angle) * first[:, None] + np.sin(angle) * second[:, None])
+    pixels = camera.project(camera.position + ring)
+    pixels[camera.to_camera(places)[:, 2] <= radius] = np.nan
+    return pixels
+
+
+def silhouette(camera: Pinhole, center: npt.ArrayLike, radius: float, count: int = 64) -> Array:
+    """Pixels (count, 2) on the outline of one sphere; empty (0, 2) when it is not wholly in front of the camera."""
+    pixels: Array = silhouettes(camera, center, radius, count)[0]
+    return np.empty((0, 2)) if np.isnan(pixels).any() else pixels
 
 
 def ray_distances(directions: Array, centers: Array) -> tuple[Array, Array]:
