@@ -83,8 +83,8 @@ def blended_path(waypoints: Array, blends: Array) -> list[SmoothPath]:
 
     Args:
         waypoints: (N, dof) [rad], each other than the one before.
-        blends: (N,) length [rad] taken from both edges at each waypoint; next to 0 means to stop there. Half the shorter edge
-            at most is used.
+        blends: (N,) length [rad] taken from both edges at each waypoint; next to 0 means to stop there. Half the
+            shorter edge at most is used.
     """
     edges = np.diff(waypoints, axis=0)
     lengths = np.linalg.norm(edges, axis=1)

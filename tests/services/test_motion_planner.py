@@ -50,7 +50,8 @@ class Planner:
     def stand_at(self, q, names=None):
         fingers = ["panda_finger_joint1", "panda_finger_joint2"]
         names = [*ROBOT.joint_names, *fingers] if names is None else names
-        self.states.put(JointState(header=self.bus.header(), name=names, position=[*q, *[0.04] * (len(names) - len(q))]))
+        position = [*q, *[0.04] * (len(names) - len(q))]
+        self.states.put(JointState(header=self.bus.header(), name=names, position=position))
 
     async def refusal(self, request) -> RemoteError:
         with pytest.raises(RemoteError) as caught:

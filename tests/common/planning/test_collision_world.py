@@ -129,7 +129,9 @@ def test_attached_object_moves_with_the_tool():
 def test_contact_at_the_start_ends_after_the_contact_distance():
     grasp = above(0.50, -0.10, 0.03)
     close = scene([(0.50, -0.10), (0.561, -0.10)])
-    lifted = world(close, start=grasp, attach="ball_0", padding=0.003, contact_distance=0.02, allowed=touching("ball_1"))
+    lifted = world(
+        close, start=grasp, attach="ball_0", padding=0.003, contact_distance=0.02, allowed=touching("ball_1")
+    )
     assert not lifted.collides(grasp)
     assert not lifted.collides(above(0.50, -0.10, 0.045))
     assert lifted.collides(above(0.50, -0.10, 0.0505))  # 64.4 mm between the centres, padded radii 66 mm

@@ -107,8 +107,8 @@ def test_start_in_collision_is_refused_with_the_pair_and_the_next_request_is_ser
     [
         (to_joints([0.0] * 6, START), "bad_goal", "6 positions for 7 joints"),
         (to_joints(HOME, [0.0] * 8), "bad_start", "8 positions for 7 joints"),
-        (to_joints(HOME + [0, 0, 0, 0, 0, 0, 9], START), "goal_out_of_limits", "panda_joint7"),
-        (to_joints(HOME, HOME + [0, 0, 0, 4, 0, 0, 0]), "start_out_of_limits", "panda_joint4"),
+        (to_joints(HOME + 9 * np.eye(7)[6], START), "goal_out_of_limits", "panda_joint7"),
+        (to_joints(HOME, HOME + 4 * np.eye(7)[3]), "start_out_of_limits", "panda_joint4"),
         (to_joints(above(0.68, 0.0, -0.02), START), "goal_in_collision", "table"),
         (PlanRequest(id="1", start=list(START), goal=JointGoal(named="hom")), "unknown_pose", "did you mean 'home'"),
         (PlanRequest(id="1", start=list(START), goal=JointGoal()), "bad_goal", "neither"),
@@ -145,7 +145,8 @@ def test_current_state_is_the_start_when_none_is_given():
 
 def test_scaling_of_the_request_makes_it_slower():
     def duration(scaling) -> float:
-        response = PIPELINE.plan(to_joints(HOME, START, velocity_scaling=scaling, acceleration_scaling=scaling), scene())
+        request = to_joints(HOME, START, velocity_scaling=scaling, acceleration_scaling=scaling)
+        response = PIPELINE.plan(request, scene())
         return response.trajectory.points[-1].time_from_start
 
     assert duration(0.1) > duration(None) > duration(0.8)

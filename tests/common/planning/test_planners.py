@@ -1,4 +1,4 @@
-"""All planners share the same checks: ends at the goal, within limits, free of collision at a finer step, times increase."""
+"""All planners share the same checks: end at the goal, limits, free of collision at a finer step, times increase."""
 
 import math
 import threading
