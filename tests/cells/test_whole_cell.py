@@ -1,4 +1,4 @@
-"""The Panda cell as a person starts it: all processes, the closed loop, figures, what one reads from outside, the end."""
+"""The Panda cell as a person starts it: processes, the closed loop, figures, what is read from outside, the end."""
 
 from __future__ import annotations
 
