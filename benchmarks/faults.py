@@ -80,7 +80,8 @@ class Assassin:
             self.notes.append(f"{stage or 'between stages'} ({'holding' if held else 'empty'})")
 
     def _is_ready(self, status: SupervisorStatus) -> bool:
-        return any(service.name == self.victim and service.state == "ready" for service in status.services)
+        said = any(service.name == self.victim and service.state == "ready" for service in status.services)
+        return said and self.victim in self.cell.processes()  # its end may not be known yet
 
 
 @dataclass(frozen=True)
