@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -18,8 +19,8 @@ from common.planning.planners import Plan, load_planner
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result
 from common.planning.retiming import RetimingFailed, TimedPath, stretch
 from common.planning.robot_geometry import RobotGeometry
-from common.planning.timing import retime
-from common.planning.validation import validate
+from common.planning.timing import BLENDS, retime
+from common.planning.validation import Fault, validate
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -161,13 +162,31 @@ class PlanningPipeline:
 
     def _finish(self, problem: Problem, result: Result) -> tuple[TimedPath | None, Result]:
         """The timed and validated trajectory and the result, or None and the result with what is wrong."""
+        wrong = result
         try:
-            trajectory = result.trajectory if result.trajectory is not None else retime(problem, result)
+            for trajectory in self._timings(problem, result):
+                fault = self._fault(problem, trajectory)
+                if fault is None:
+                    return trajectory, result
+                message = f"validation: {fault.message}"
+                wrong = replace(
+                    result, error=fault.code, message=message, waypoint=fault.waypoint, colliding=fault.colliding
+                )
         except RetimingFailed as error:
-            return None, replace(result, error="retiming_failed", message=f"retiming: {error}")
-        if result.tool_line and self._motion.cartesian_speed_scale < 1:
-            trajectory = stretch(trajectory, self._motion.cartesian_speed_scale)
-        fault = validate(
+            wrong = replace(result, error="retiming_failed", message=f"retiming: {error}")
+        return None, wrong
+
+    def _timings(self, problem: Problem, result: Result) -> Iterator[TimedPath]:
+        """The planner's own trajectory, or its path timed with smaller and smaller blends."""
+        if result.trajectory is not None:
+            yield result.trajectory
+            return
+        for blend in BLENDS[:1] if result.dense else BLENDS:
+            trajectory = retime(problem, result, blend)
+            yield stretch(trajectory, self._motion.cartesian_speed_scale) if result.tool_line else trajectory
+
+    def _fault(self, problem: Problem, trajectory: TimedPath) -> Fault | None:
+        return validate(
             trajectory,
             problem.robot,
             problem.world,
@@ -175,15 +194,6 @@ class PlanningPipeline:
             velocity=problem.velocity,
             acceleration=problem.acceleration,
             step=self._step,
-        )
-        if fault is None:
-            return trajectory, result
-        return None, replace(
-            result,
-            error=fault.code,
-            message=f"validation: {fault.message}",
-            waypoint=fault.waypoint,
-            colliding=fault.colliding,
         )
 
 

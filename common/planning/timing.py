@@ -13,29 +13,40 @@ from common.planning.retiming import TimedPath, join, parametrise
 Array = NDArray[np.float64]
 
 LIMIT_SHARE = 0.98  # of the limits: between two states the controller's cubic may exceed them a little
-BLEND = 0.25  # [rad] taken from both edges at a corner, where that is free
+# [rad] taken from both edges at a corner, where that is free. A blend that passes within a hair of something may be
+# found free here and not by validation, which looks at other positions: then smaller ones are tried, in the end none.
+BLENDS = (0.25, 0.06, 0.0)
 _SMALLEST_BLEND = 0.02  # [rad] below it the robot stops at the corner
 
 
-def retime(problem: Problem, result: Result) -> TimedPath:
-    """The time-optimal trajectory of a planner's path, at rest at both ends."""
+def retime(problem: Problem, result: Result, blend: float = BLENDS[0]) -> TimedPath:
+    """The time-optimal trajectory of a planner's path, at rest at both ends.
+
+    Args:
+        problem: limits and the collision world.
+        result: a planner's waypoints.
+        blend: length [rad] taken at most from both edges at a corner of a path that is not dense.
+
+    Raises:
+        RetimingFailed: the path can not be followed.
+    """
     assert result.waypoints is not None
     waypoints = distinct(result.waypoints)
     if len(waypoints) == 1:  # the robot is there already
         still = np.zeros((2, problem.robot.dof))
         return TimedPath(np.array([0.0, 0.01]), np.array([waypoints[0], waypoints[0]]), still, still)
-    paths = [dense_path(waypoints)] if result.dense else free_blends(waypoints, problem.world)
+    paths = [dense_path(waypoints)] if result.dense else free_blends(waypoints, problem.world, blend)
     velocity, acceleration = LIMIT_SHARE * problem.velocity, LIMIT_SHARE * problem.acceleration
     return join([parametrise(path, velocity, acceleration) for path in paths])
 
 
-def free_blends(waypoints: Array, world: CollisionWorld, step: float = 0.01) -> list[SmoothPath]:
+def free_blends(waypoints: Array, world: CollisionWorld, blend: float, step: float = 0.003) -> list[SmoothPath]:
     """Blended paths whose corners are free of collision: a blend that is not is halved, in the end to a stop."""
-    blends = np.full(len(waypoints), BLEND)
+    blends = np.full(len(waypoints), blend)
     for i in range(1, len(waypoints) - 1):
         a, b, c = waypoints[i - 1 : i + 2]
         half = 0.5 * min(float(np.linalg.norm(b - a)), float(np.linalg.norm(c - b)))
-        blends[i] = min(BLEND, half)
+        blends[i] = min(blend, half)
         while blends[i] > 0:
             corner = blended_path(np.array([a, b, c]), np.array([0.0, blends[i], 0.0]))
             if len(corner) > 1 or world.first_collision(corner[0].positions(step)) is None:

@@ -12,6 +12,7 @@ from planning_scenes import (
     held_scene,
     last,
     scene,
+    solid,
     to_joints,
     to_pose,
     touching,
@@ -21,7 +22,7 @@ from common.config import Motion, Pipeline
 from common.messages import Header, JointGoal, PlanRequest, Vector3
 from common.planning.collision import CollisionWorld
 from common.planning.pipeline import PlanningPipeline
-from common.planning.validation import fine_samples, timed_path
+from common.planning.validation import Fault, fine_samples, timed_path
 from common.robot.transforms import tool_down
 
 PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
@@ -190,3 +191,22 @@ def test_validation_has_the_same_rule_for_contact_as_planning():
     path, _ = fine_samples(timed_path(response.trajectory), 0.005)
     assert strict.first_collision(path) is not None
     assert free_again(request, close, response)
+
+
+def test_path_whose_corners_turn_out_to_collide_is_stopped_at(monkeypatch):
+    wall = [*scene(box=False).objects, solid("wall", "fixture", "box", [0.5, 0.02, 0.4], (0.55, 0.0, 0.2))]
+    blocked = scene().model_copy(update={"objects": wall})
+    left, right = above(0.5, 0.3, 0.2), above(0.5, -0.3, 0.2)
+
+    def strict(trajectory, robot, world, **given):
+        resting = np.abs(trajectory.velocities[1:-1]).max(axis=1) < 1e-9
+        return None if resting.any() else Fault("collision", "waypoint 5 of 9: a collides with b", 5, ("a", "b"))
+
+    monkeypatch.setattr("common.planning.pipeline.validate", strict)
+    response = PIPELINE.plan(to_joints(left, right, planner="ompl"), blocked)
+    assert response.ok
+    assert free_again(to_joints(left, right), blocked, response)
+    direct = PIPELINE.plan(to_joints(HOME, right, planner="ompl"), blocked)
+    assert direct.error == "collision"
+    assert direct.message == "ompl: validation: waypoint 5 of 9: a collides with b"
+    assert [a.error for a in direct.attempts] == ["", "collision"]
