@@ -6,7 +6,6 @@ segmented outline lies a little inside or outside of the true one, by as much fo
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -63,35 +62,10 @@ def _gradients(outline: Outline, misfit: _Misfit, centers: Array, which: Index, 
     return gradients
 
 
-def near_points(outline: Outline, center: Array, radius: float, gate: float) -> Chosen:
-    """(n,) which points of an outline lie within the gate [m] of a sphere's silhouette and face as it does."""
-    chosen: Chosen = np.abs(_compare(outline, center[None], radius).beyond[:, 0]) < gate
+def near_points(outline: Outline, centers: Array, radius: float, gate: float) -> Chosen:
+    """(n, k) which points of an outline lie within the gate [m] of the silhouettes of spheres and face as these do."""
+    chosen: Chosen = np.abs(_compare(outline, centers, radius).beyond) < gate
     return chosen
-
-
-def fit_one(outline: Outline, center: Array, radius: float, gates: tuple[float, ...]) -> Array:
-    """(3,) the centre of one sphere, by Gauss-Newton from a first guess: one step for each gate [m], height kept.
-
-    Points farther from the silhouette than the gate are left out of a step.
-    """
-    c = center.astype(float)
-    for gate in gates:
-        misfit = _compare(outline, c[None], radius)
-        residual, along = misfit.beyond[:, 0], misfit.along[:, 0]
-        near = np.abs(residual) < gate
-        weight = near / misfit.distance[:, 0]
-        gx = (c[0] - along * outline.rays[:, 0]) * weight
-        gy = (c[1] - along * outline.rays[:, 1]) * weight
-        residual = np.where(near, residual, 0.0)
-        xx, xy, yy, rx, ry = (float(p @ q) for p, q in ((gx, gx), (gx, gy), (gy, gy), (gx, residual), (gy, residual)))
-        determinant = xx * yy - xy * xy
-        if determinant < 1.0:  # a handful of points, or all on one side
-            break
-        dx, dy = (yy * rx - xy * ry) / determinant, (xx * ry - xy * rx) / determinant
-        shorter = min(1.0, 0.5 * radius / max(math.hypot(dx, dy), 1e-12))
-        c[0] -= dx * shorter
-        c[1] -= dy * shorter
-    return c
 
 
 def fit_spheres(
@@ -150,15 +124,23 @@ def fit_spheres(
 
 
 def fit_each(
-    outlines: Sequence[Outline], centers: Array, radius: float, *, offset: float, gates: tuple[float, ...], close: float
+    outlines: Sequence[Outline],
+    centers: Array,
+    radius: float,
+    *,
+    offset: float,
+    gates: tuple[float, ...],
+    close: float,
+    hold_offset: bool = False,
 ) -> tuple[Array, Array, Array]:
-    """As many spheres, each to an outline and with an offset of its own, in one go: most balls lie alone.
+    """Fit many spheres in one go, each to an outline of its own and with an offset of its own.
 
     Args:
         outlines: one or more points each.
         centers: (k, 3) first guesses relative to the optical centre [m]; heights are kept.
         radius: of all spheres [m].
         offset: of the outlines, to start from [m].
+        hold_offset: find the places only.
         gates: how far off a point may be in each step [m].
         close: how far off a point may be in the end [m].
 
@@ -169,6 +151,7 @@ def fit_each(
     sizes = np.array([len(o) for o in outlines])
     starts, owner = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
     c, delta = centers.astype(float), np.full(len(sizes), offset)
+    free = 2 if hold_offset else 3
 
     def compare() -> tuple[Array, Array]:
         mine = c[owner]
@@ -183,9 +166,10 @@ def fit_each(
         near = np.abs(beyond) < gate
         J = np.column_stack([away, np.full(len(away), -1.0), np.where(near, beyond, 0.0)]) * near[:, None]
         products = np.add.reduceat(J[:, :, None] * J[:, None, :], starts)
-        step = np.linalg.solve(products[:, :3, :3] + 1e-6 * np.eye(3), -products[:, :3, 3:])[..., 0]
+        step = np.linalg.solve(products[:, :free, :free] + 1e-3 * np.eye(free), -products[:, :free, 3:])[..., 0]
         length = np.hypot(step[:, 0], step[:, 1])
         c[:, :2] += step[:, :2] * np.minimum(1.0, 0.5 * radius / np.maximum(length, 1e-12))[:, None]
-        delta += step[:, 2]
+        if not hold_offset:
+            delta += step[:, 2]
     beyond, _ = compare()
     return c, delta, np.add.reduceat((np.abs(beyond) < close).astype(float), starts) / sizes

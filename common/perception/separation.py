@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.perception.fit import fit_one, near_points
+from common.perception.fit import fit_each, near_points
 from common.perception.outline import Mask, Outline
 from common.perception.pinhole import Pinhole
 from common.perception.resting import Resting
@@ -50,9 +50,8 @@ def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: Resting, of
     """
     if len(outline) < 8:
         return np.empty((0, 3))
-    candidates = []
-    for place in _peaks(_votes(outline, camera, resting, offset), camera, resting):
-        candidates += _refine(outline, camera, resting, offset, place)
+    places = _peaks(_votes(outline, camera, resting, offset), camera, resting)
+    candidates = _refined(places, outline, camera, resting, offset)
     if not candidates:
         return np.empty((0, 3))
     red = _are_red(np.array([c.center for c in candidates]), mask, camera, resting.radius)
@@ -113,30 +112,39 @@ def _whole_outline(camera: Pinhole, radius: float, distance: float) -> float:
     return 5.66 * radius / max(distance, radius) * (camera.fx + camera.fy) / 2
 
 
-def _refine(outline: Outline, camera: Pinhole, resting: Resting, offset: float, place: Array) -> list[_Candidate]:
-    """The candidate near a place, at the height that fits best; none when few points support it."""
-    best: _Candidate | None = None
+def _refined(
+    places: Array, outline: Outline, camera: Pinhole, resting: Resting, offset: float
+) -> list[_Candidate]:
+    """Candidates near places (k, 2), each at the height that fits best; places that few points support give none."""
     radius = resting.radius + offset
-    start = np.array([place[0], place[1], resting.plane])
-    ray = start - camera.position
-    for z in resting.heights(camera, camera.project(start)):
-        center = ray * ((z - camera.position[2]) / ray[2])
-        around = np.flatnonzero(near_points(outline, center, radius, 0.35 * resting.radius))
-        if len(around) < 6:
-            continue
-        local = outline.take(around)
-        refined = fit_one(local, center, radius, (8e-3, 6e-3, 4e-3, 3e-3))
-        if not resting.can_lie(refined + camera.position):
-            continue
-        points = np.zeros(len(outline), bool)
-        points[around] = near_points(local, refined, radius, _NEAR)
-        whole = _whole_outline(camera, resting.radius, float(np.linalg.norm(refined)))
-        candidate = _Candidate(refined, points, int(np.count_nonzero(points)), whole)
-        if best is None or candidate.support > 1.05 * best.support:
-            best = candidate
-    if best is None or best.support < _LEAST_SUPPORT * best.whole:
+    starts, place_of = [], []
+    for index, place in enumerate(places):
+        ray = np.array([place[0], place[1], resting.plane]) - camera.position
+        for z in resting.heights(camera, camera.project(ray + camera.position)):
+            starts.append(ray * ((z - camera.position[2]) / ray[2]))
+            place_of.append(index)
+    if not starts:
         return []
-    return [best]
+    first = np.array(starts)
+    near = near_points(outline, first, radius, 0.35 * resting.radius)
+    enough = np.flatnonzero(np.count_nonzero(near, axis=0) >= 6)
+    if not len(enough):
+        return []
+    centers, _, _ = fit_each(
+        [outline.take(near[:, k]) for k in enough], first[enough], resting.radius, offset=offset,
+        gates=(8e-3, 6e-3, 4e-3, 3e-3), close=_NEAR, hold_offset=True,
+    )
+    points = near_points(outline, centers, radius, _NEAR)
+    support = np.count_nonzero(points, axis=0)
+    best: dict[int, _Candidate] = {}
+    for k, center in enumerate(centers):
+        place = place_of[enough[k]]
+        whole = _whole_outline(camera, resting.radius, float(np.linalg.norm(center)))
+        if support[k] < _LEAST_SUPPORT * whole or not resting.can_lie(center + camera.position):
+            continue
+        if place not in best or support[k] > 1.05 * best[place].support:
+            best[place] = _Candidate(center, points[:, k], int(support[k]), whole)
+    return list(best.values())
 
 
 def _clashes(candidate: _Candidate, chosen: list[_Candidate], radius: float) -> bool:
