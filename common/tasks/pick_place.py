@@ -73,7 +73,7 @@ class PickPlace:
         self._planning: tuple[Move, str] | None = None
         self._minted = 0
         self._look_after = 0.0  # only a later picture decides
-        self._quiet: tuple[float, bool] | None = None  # since when, and whether something is left
+        self._quiet: tuple[float, bool] | None = None  # since which picture, and whether something is left
         self._began: float | None = None
         self._looked = False
         self._failures_in_a_row = 0
@@ -294,12 +294,14 @@ class PickPlace:
         """DONE after a moment with an empty table, or after the grace period when something can not be taken."""
         if self.status.state == "DONE":
             return
-        left = len(view.balls())
-        if not view.fresh(self.p.frame_timeout) or self._quiet is None or self._quiet[1] != bool(left):
-            self._quiet = (view.now, bool(left)) if view.fresh(self.p.frame_timeout) else None
-            self.status.message = "no fresh picture" if self._quiet is None else (
-                f"{left} objects are left that can not be taken" if left else "the table looks empty")
-        done = self._quiet is not None and view.now - self._quiet[0] >= (self.p.grace if left else self.p.empty)
+        left = max(len(view.balls()), len(view.targets))  # one of the two may have just begun to look
+        # Time of pictures, not of the clock: a table that nobody looks at stays as it was seen last for ever.
+        seen = max(self._look_after, min(view.targets_stamp, view.scene_stamp))
+        if self._quiet is None or self._quiet[1] != bool(left):
+            self._quiet = (seen, bool(left))
+        self.status.message = "no fresh picture" if not view.fresh(self.p.frame_timeout) else (
+            f"{left} objects are left that can not be taken" if left else "the table looks empty")
+        done = seen - self._quiet[0] >= (self.p.grace if left else self.p.empty)
         self.status.state, self.status.stage, self.status.target = "DONE" if done else "IDLE", "", ""
 
     # --- planning and doing ----------------------------------------------------------------------------------

@@ -107,6 +107,31 @@ def test_no_picture_never_ends_the_task_nor_starts_a_motion() -> None:
     assert cell.contained == 1
 
 
+def test_pictures_that_stop_coming_do_not_end_the_task_however_fresh_the_last_one_counts() -> None:
+    cell = CellDouble([], frame_timeout=30.0)
+    cell.step()
+    cell.camera_on = False
+    for _ in range(100):
+        cell.step()
+    assert cell.task.status.state == "IDLE"
+    cell.camera_on = True
+    cell.until("DONE")
+
+
+def test_scene_that_shows_nothing_yet_does_not_end_the_task_while_targets_are_seen() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    known, cell.balls = cell.balls, {}
+    for _ in range(50):
+        cell.now += 0.1
+        view = cell.view()
+        view.targets = [(0.40, -0.30, 0.03)]  # a scene manager that was started again has to see it twice
+        assert cell.task.step(view) == []
+        assert cell.task.status.state == "IDLE"
+    cell.balls = known
+    cell.until("DONE")
+    assert cell.contained == 1
+
+
 def test_target_that_can_not_be_planned_is_tried_at_every_yaw_then_skipped_until_the_scene_changes() -> None:
     cell = CellDouble([(0.40, -0.09), (0.40, 0.30)])
     cell.unplannable = lambda r: "collision" if (
