@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import asyncio
 
-from common import messages as m
 from common import topics
 from common.config import RobotConfig, Surroundings
-from common.perception.pinhole import Pinhole
+from common.perception.intake import Unusable, camera_of
 from common.robot.model import RobotModel
-from common.robot.transforms import pose_to_matrix
 from common.scene.perceived import PerceivedScene, SceneParameters
 from common.transport.bus import Bus
 from common.transport.service import main
@@ -34,6 +32,7 @@ async def run(bus: Bus, config: Config) -> None:
     if config.robot.gripper is None:
         raise ValueError("the scene manager needs a robot with a gripper")
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
+    unusable: set[str] = set()
     out.put(scene.scene())
     await bus.ready()
 
@@ -54,8 +53,12 @@ async def run(bus: Bus, config: Config) -> None:
 
     async def watch_table() -> None:
         async for markers in detected:
-            camera = _camera(infos.latest, statics.latest, config.world.camera.frame)
-            if camera is None:
+            try:
+                camera = camera_of(infos.latest, statics.latest, config.world.camera.frame)
+            except Unusable as error:
+                if error.kind not in unusable and error.kind != "unknown_camera":  # usual in the first moments
+                    bus.log.warning("detections left out: %s (told once)", error)
+                unusable.add(error.kind)
                 continue
             hand()
             measured = joints.latest
@@ -66,12 +69,6 @@ async def run(bus: Bus, config: Config) -> None:
     async with asyncio.TaskGroup() as group:
         group.create_task(watch_hand())
         group.create_task(watch_table())
-
-
-def _camera(info: m.CameraInfo | None, statics: m.TFMessage | None, frame: str) -> Pinhole | None:
-    """The camera as camera_info and tf describe it, once both are known."""
-    pose = next((t.transform for t in statics.transforms if t.child_frame_id == frame), None) if statics else None
-    return Pinhole.from_info(info, pose_to_matrix(pose)) if info and pose else None
 
 
 if __name__ == "__main__":
