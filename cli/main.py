@@ -9,6 +9,7 @@ import contextlib
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import typer
@@ -23,10 +24,14 @@ class CommandLine(typer.Typer):
     """Verbs whose errors come out as one line: exit code 1 for what failed, 2 for bad input, 130 for Ctrl-C."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> None:
-        """Run the verb that the arguments name and exit with its code."""
+        """Run the verb that the process's arguments name and end the process with its code."""
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        _leave(self.execute(sys.argv[1:]))
+
+    def execute(self, arguments: Sequence[str]) -> int:
+        """Exit code of a verb, which is run; an error is shown."""
         try:
-            code = typer.main.get_command(self)(*args, standalone_mode=False, prog_name="zencell", **kwargs)
+            code = typer.main.get_command(self)(list(arguments), standalone_mode=False, prog_name="zencell")
         except typer.TyperException as error:
             code = _fail(error.format_message(), error.exit_code)
         except RequestFailed as error:
@@ -37,7 +42,7 @@ class CommandLine(typer.Typer):
             code = EXIT_INTERRUPTED
         except BrokenPipeError:  # as in `zencell topic echo ... | head`
             code = EXIT_FAILED
-        _leave(code if isinstance(code, int) else 0)
+        return code if isinstance(code, int) else 0
 
 
 def _fail(message: str, code: int) -> int:

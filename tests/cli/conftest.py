@@ -199,7 +199,7 @@ class Zencell:
                 found[command[command.index("-m") + 1].rpartition(".")[2]] = process
         return found
 
-    def until_childless(self, timeout: float) -> None:
+    def until_childless(self, timeout: float = PATIENCE) -> None:
         """Return when no process is left."""
         deadline = time.monotonic() + timeout
         while left := self.children():

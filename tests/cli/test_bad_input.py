@@ -1,9 +1,12 @@
 """Bad input gets one line that names the thing, the value and the choices; exit code 2 and no traceback."""
 
+import sys
 from pathlib import Path
 
 import pytest
 from conftest import ask
+
+from cli.main import app
 
 CASES: dict[str, tuple[list[str], list[str]]] = {
     "unknown cell": (["run", "pnada"], ["unknown cell 'pnada'", "did you mean 'panda'?", "choices:"]),
@@ -59,15 +62,27 @@ def wrong_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_bad_input_is_one_line_and_exit_code_2(case: str, wrong_files: Path) -> None:
+def test_bad_input_is_one_line_and_exit_code_2(
+    case: str, wrong_files: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     arguments, wanted = CASES[case]
-    done = ask(wrong_files, *arguments)
-    (line,) = done.stderr.splitlines() or ["nothing"]
+    monkeypatch.chdir(wrong_files)
+    monkeypatch.setattr(sys, "path", list(sys.path))  # services of one's own are looked for
+    code = app.execute(arguments)
+    shown = capsys.readouterr()
+    (line,) = shown.err.splitlines() or ["nothing"]
     assert line.startswith("zencell: ")
     for part in wanted:
         assert part in line
-    assert done.returncode == 2
-    assert done.stdout == ""
+    assert code == 2
+    assert shown.out == ""
+
+
+def test_the_process_ends_with_the_exit_code_and_without_a_traceback(tmp_path: Path) -> None:
+    done = ask(tmp_path, "run", "pnada")
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("zencell: unknown cell 'pnada' (did you mean 'panda'?); choices: ")
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def test_interrupted_at_any_time_no_process_is_left(zencell: Start, phase: str) 
     command = zencell("up", "tiny.yaml")
     command.until(phase)
     command.interrupt()
-    code = command.end(timeout=8)
+    code = command.end()
     assert code == 0 if phase == UP else code in (0, 130)
     assert not command.children()
     assert not any("Traceback" in line for line in command.lines)
@@ -79,7 +79,7 @@ def test_interrupted_before_anything_is_up_no_process_is_left(zencell: Start) ->
     command = zencell("run", "tiny.yaml", "--set", "services.first.behave=never ready", "--summary", "out.json")
     command.until("waiting for the moon")
     command.interrupt()
-    assert command.end(timeout=8) == 130
+    assert command.end() == 130
     assert not command.children()
 
 
@@ -91,7 +91,7 @@ def test_a_frozen_service_is_killed_and_a_second_interrupt_does_so_at_once(zence
     command.until("stopped")  # the last one; the middle can not
     command.interrupt()
     command.until("middle does not end; killed")
-    assert command.end(timeout=8) == 0
+    assert command.end() == 0
     assert not command.children()
 
 
@@ -100,7 +100,7 @@ def test_a_killed_supervisor_leaves_no_process(zencell: Start) -> None:
     command.until(UP)
     assert command.children()
     command.process.kill()
-    command.until_childless(timeout=3)
+    command.until_childless()
 
 
 def test_run_ends_with_the_task_and_writes_the_summary(zencell: Start, folder: Path) -> None:
@@ -127,7 +127,7 @@ def test_interrupted_run_writes_the_summary(zencell: Start, folder: Path) -> Non
     command = zencell("run", "tiny.yaml", "--summary", "out.json")
     command.until("0 of 2 placed - IDLE")
     command.interrupt()
-    assert command.end(timeout=8) == 130
+    assert command.end() == 130
     assert json.loads((folder / "out.json").read_text())["state"] == "IDLE"
     assert not command.children()
 

@@ -1,5 +1,6 @@
 import os
 import socket
+import sys
 from pathlib import Path
 
 import pytest
@@ -77,7 +78,8 @@ def test_a_port_in_use_is_named_with_who_holds_it() -> None:
     require_free_port(f"tcp/127.0.0.1:{port}")
 
 
-def test_a_module_that_is_not_there_is_named() -> None:
+def test_a_module_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
     cell = load_cell("panda")
     require_modules(cell)
     wrong = cell.model_copy(update={"services": {"nobodys.it": ServiceEntry(name="it", module="nobodys.it")}})
