@@ -295,13 +295,14 @@ class PickPlace:
         if self.status.state == "DONE":
             return
         left = max(len(view.balls()), len(view.targets))  # one of the two may have just begun to look
-        # Time of pictures, not of the clock: a table that nobody looks at stays as it was seen last for ever.
+        # Time of pictures, not of the clock: that nobody looks any more is no sign of an empty table.
         seen = max(self._look_after, min(view.targets_stamp, view.scene_stamp))
-        if self._quiet is None or self._quiet[1] != bool(left):
+        if not view.fresh(self.p.frame_timeout):
+            self._quiet, self.status.message = None, "no fresh picture"
+        elif self._quiet is None or self._quiet[1] != bool(left):
             self._quiet = (seen, bool(left))
-        self.status.message = "no fresh picture" if not view.fresh(self.p.frame_timeout) else (
-            f"{left} objects are left that can not be taken" if left else "the table looks empty")
-        done = seen - self._quiet[0] >= (self.p.grace if left else self.p.empty)
+            self.status.message = f"{left} objects are left that can not be taken" if left else "the table looks empty"
+        done = self._quiet is not None and seen - self._quiet[0] >= (self.p.grace if left else self.p.empty)
         self.status.state, self.status.stage, self.status.target = "DONE" if done else "IDLE", "", ""
 
     # --- planning and doing ----------------------------------------------------------------------------------

@@ -118,6 +118,16 @@ def test_pictures_that_stop_coming_do_not_end_the_task_however_fresh_the_last_on
     cell.until("DONE")
 
 
+def test_first_picture_after_a_long_time_without_any_does_not_end_the_task() -> None:
+    cell = CellDouble([])
+    cell.camera_on, cell._stamp = False, 0.0  # as a scene manager that has seen nothing yet says
+    cell.step()
+    cell.camera_on = True
+    start = cell.now
+    cell.until("DONE")
+    assert cell.now - start >= 1.0
+
+
 def test_scene_that_shows_nothing_yet_does_not_end_the_task_while_targets_are_seen() -> None:
     cell = CellDouble([(0.40, -0.30)])
     known, cell.balls = cell.balls, {}
