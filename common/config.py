@@ -139,6 +139,35 @@ class CameraConfig(Section):
     )
 
 
+class ObjectConfig(Section):
+    """A solid that stands upright somewhere: its cross-section about (x, y), turned by yaw, and its height."""
+
+    id: str
+    shape: Literal["box", "cylinder", "prism", "ring"]
+    x: Coordinate = Field(description="of the origin of the cross-section [m], world")
+    y: Coordinate = Field(description="of the origin of the cross-section [m], world")
+    z: Coordinate = Field(0.0, description="of what it stands on [m]")
+    yaw: Number = Field(0.0, description="[rad]")
+    height: Length = Field(description="[m]")
+    size: tuple[Length, Length] | None = Field(None, description="of a box, along its x and y [m]")
+    radius: Length | None = Field(None, description="of a cylinder, outer of a ring [m]")
+    inner_radius: Length | None = Field(None, description="of a ring [m]")
+    polygon: list[tuple[Coordinate, Coordinate]] = Field([], description="cross-section of a prism, anticlockwise [m]")
+    color: Rgb = (1.0, 1.0, 0.0)
+
+    @model_validator(mode="after")
+    def _has_what_its_shape_needs(self) -> ObjectConfig:
+        needs = {"box": ["size"], "cylinder": ["radius"], "ring": ["radius", "inner_radius"], "prism": ["polygon"]}
+        missing = [field for field in needs[self.shape] if not getattr(self, field)]
+        if missing:
+            raise ValueError(f"{self.id}: a {self.shape} needs {' and '.join(missing)}")
+        if self.radius and self.inner_radius and self.inner_radius >= self.radius:
+            raise ValueError(f"{self.id}: inner_radius {self.inner_radius:g} is not below radius {self.radius:g}")
+        if self.shape == "prism" and len(self.polygon) < 3:
+            raise ValueError(f"{self.id}: a polygon has at least 3 corners, not {len(self.polygon)}")
+        return self
+
+
 class Surroundings(Section):
     """What everybody in the cell knows: what is fixed, where the camera is, how large the balls are."""
 
@@ -159,7 +188,7 @@ class World(Surroundings):
     balls: list[tuple[Coordinate, Coordinate]] = Field([], description="centres [m]; replaces layout and count")
     min_separation: Length = Field(0.07, description="random: least distance of centres [m]")
     container_clearance: Length = Field(0.04, description="random: least distance of a ball from the container [m]")
-    objects: list[dict[str, Any]] = Field([], description="objects other than balls")
+    objects: list[ObjectConfig] = Field([], description="objects other than balls")
 
     @model_validator(mode="after")
     def _balls_do_not_overlap(self) -> World:

@@ -179,19 +179,23 @@ class Rejections(Message):
 class CollisionObject(Message):
     """A solid in the planning scene.
 
-    `dimensions` [m]: box (x, y, z), sphere (radius,), cylinder (radius, length along z).
+    `dimensions` [m]: box (x, y, z), sphere (radius,), cylinder (radius, length along z), prism (length along z). A
+    prism has the convex hull of `outline` [m] as its cross-section and, as all shapes, its pose at half its length.
     """
 
     id: Name
     role: Literal["fixture", "container", "target", "contained", "attached"]
-    shape: Literal["box", "sphere", "cylinder"]
+    shape: Literal["box", "sphere", "cylinder", "prism"]
     dimensions: list[Positive] = Field(min_length=1, max_length=3)
+    outline: list[tuple[Finite, Finite]] = Field([], description="cross-section of a prism [m], in its own frame")
     pose: Pose
     color: Color = Color()
 
     @model_validator(mode="after")
     def _dimensions_fit_shape(self) -> CollisionObject:
-        wanted = {"box": 3, "sphere": 1, "cylinder": 2}[self.shape]
+        wanted = {"box": 3, "sphere": 1, "cylinder": 2, "prism": 1}[self.shape]
+        if (self.shape == "prism") != (len(self.outline) >= 3):
+            raise ValueError(f"a {self.shape} has {len(self.outline)} points of an outline")
         if len(self.dimensions) != wanted:
             raise ValueError(f"a {self.shape} has {wanted} dimensions, not {len(self.dimensions)}")
         return self
@@ -460,6 +464,108 @@ class WorldEditReply(Message):
 
     id: str
     ids: list[str]
+
+
+# --- outlines ---------------------------------------------------------------------------------------------------
+
+
+class PointCloud2(Message):
+    """Points as rows of little-endian float32 x, y, z and one packed colour, as sensor_msgs/PointCloud2."""
+
+    header: Header
+    height: int = Field(ge=1, le=16384)
+    width: int = Field(ge=1, le=16384)
+    fields: list[str] = ["x", "y", "z", "rgb"]
+    point_step: int = Field(16, ge=4, le=256, description="bytes of one point")
+    row_step: int = Field(ge=4, description="bytes of one row")
+    data: bytes
+
+
+class Contour(Message):
+    """One closed contour in a picture. `pixels` are (u, v) [px], every one along the edge."""
+
+    index: int = Field(ge=0)
+    label: Name
+    pixels: list[tuple[Finite, Finite]] = Field(min_length=1)
+    area: Finite = Field(0.0, description="[px^2]")
+    parent: int = Field(-1, description="index of the contour around this one, or -1")
+    touches_border: bool = False
+    color: Color = Color()
+
+
+class Contours(Message):
+    """All contours of one picture, and the one that was chosen."""
+
+    header: Header
+    width: int = Field(ge=1)
+    height: int = Field(ge=1)
+    contours: list[Contour] = []
+    selected: int = Field(-1, description="index of the chosen contour, or -1")
+    message: str = ""
+
+
+class OutlineSelect(Message):
+    """Choose an object: the largest that does not touch the border, one of a colour, or one by its index."""
+
+    rule: Literal["auto", "colour", "index"] = "auto"
+    index: int | None = Field(None, ge=0)
+    colour: str = Field("", description="red, green, blue, yellow, ... of the object's inside")
+
+
+class OutlineSelection(Message):
+    """What was chosen."""
+
+    index: int
+    label: str
+
+
+OutlineState = Literal[
+    "IDLE", "SELECTING", "PLANNING", "APPROACHING", "TRACING", "RETREATING", "HOMING", "DONE", "ERROR"
+]
+
+
+class OutlineStatus(Message):
+    """State and figures of the outline task."""
+
+    header: Header = Header()
+    state: OutlineState = "IDLE"
+    paused: bool = False
+    started: bool = False
+    stage: str = ""
+    object: str = ""
+    points: int = 0
+    fraction: Finite = 0.0
+    length_m: Finite = 0.0
+    closed: bool = False
+    invalid_depth: int = Field(0, description="pixels of the contour whose depth was filled from neighbours")
+    failures: int = 0
+    plans: list[PlanFigure] = []
+    moving_seconds: Finite = 0.0
+    planning_seconds: Finite = 0.0
+    task_seconds: Finite = 0.0
+    message: str = ""
+
+
+class WorldObject(Message):
+    """A solid of the simulated world, standing upright: its outline [m] in world and its height.
+
+    `outline` is the outer edge of its top face, anticlockwise; `hole` an inner edge, if it has one.
+    """
+
+    id: Name
+    shape: Literal["box", "cylinder", "prism", "ring"]
+    outline: list[tuple[Finite, Finite]] = Field(min_length=3)
+    hole: list[tuple[Finite, Finite]] = []
+    base: Finite = Field(description="z on which it stands [m]")
+    height: Positive
+    color: Color = Color()
+
+
+class WorldObjects(Message):
+    """All solids of the simulated world: the truth."""
+
+    header: Header = Header()
+    objects: list[WorldObject] = []
 
 
 # --- processes --------------------------------------------------------------------------------------------------

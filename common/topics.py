@@ -70,6 +70,19 @@ MOTION_STATUS = Topic("motion/status", m.MotionStatus, "state", "trajectory_exec
 DISPLAY_TRAJECTORY = Topic("display_trajectory", m.JointTrajectory, "state", "motion_planner", "newest plan")
 PICK_PLACE_STATUS = Topic("pick_place_status", m.PickPlaceStatus, "state", "smart_pick_place",
                           "IDLE, GRASPING, PLACING, HOMING, DONE or ERROR, and counters")
+SCENE_OBJECTS = Topic("scene_objects", m.WorldObjects, "state", "trajectory_executor",
+                      "the truth: where every object is; simulated hardware only")
+DEPTH_CAMERA_IMAGE = Topic("depth_camera/image_raw", m.Image, "stream", "depth_camera", "colour picture")
+DEPTH_CAMERA_DEPTH = Topic("depth_camera/depth/image_raw", m.Image, "stream", "depth_camera",
+                           "depth along the optical axis [m], 32FC1, NaN where there is none")
+DEPTH_CAMERA_POINTS = Topic("depth_camera/points", m.PointCloud2, "stream", "depth_camera",
+                            "coloured points, only while somebody listens")
+DEPTH_CAMERA_INFO = Topic("depth_camera/camera_info", m.CameraInfo, "state", "depth_camera", "intrinsics")
+CONTOURS = Topic("contours", m.Contours, "state", "contour_detector", "contours of the picture and the chosen one")
+CONTOUR_IMAGE = Topic("contour_image", m.Image, "state", "contour_detector", "the picture with labelled contours")
+CONTOUR_POINTS = Topic("contour_points", m.PoseArray, "state", "pixel_to_world", "the chosen contour in world")
+CONTOUR_PATH = Topic("contour_path", m.PoseArray, "state", "duplicate_remover", "the same, cleared of duplicates")
+OUTLINE_STATUS = Topic("outline_status", m.OutlineStatus, "state", "contour_tracer", "state and figures")
 SUPERVISOR_STATUS = Topic("supervisor/status", m.SupervisorStatus, "state", "supervisor", "all processes")
 LOG = Topic("log", m.LogLine, "event", "everyone", "log lines")
 COUNTERS = Topic("counters", m.ServiceCounters, "event", "everyone",
@@ -83,6 +96,8 @@ GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState, "
                           "move the fingers; the result appears on gripper/state")
 WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "trajectory_executor",
                      "add, move, remove, reset; simulated hardware only")
+OUTLINE_SELECT = Request("outline/select", m.OutlineSelect, m.OutlineSelection, "contour_detector",
+                         "choose the object to outline")
 TASK_COMMAND = Request("task/command", m.TaskCommand, m.PickPlaceStatus, "smart_pick_place",
                        "start, pause, resume or stop the task")
 

@@ -24,10 +24,12 @@ from common.messages import (
     StopRequest,
     WorldEdit,
     WorldEditReply,
+    WorldObjects,
 )
 from common.robot.model import RobotModel
 from common.scene.workspace import reach_reason
 from common.sim.layout import layout
+from common.sim.objects import world_object
 from common.sim.world import GraspTolerances, SimulatedWorld
 from common.transport.bus import Bus
 from common.transport.service import main
@@ -77,6 +79,9 @@ async def run(bus: Bus, config: Config) -> None:
     gripper = bus.writer(topics.GRIPPER_STATE) if config.robot.gripper else None
     balls = bus.writer(topics.SCENE_BALLS) if simulated else None
     updates = bus.writer(topics.SCENE_OBJECT_UPDATES) if simulated else None
+    if simulated:
+        objects = [world_object(thing) for thing in config.world.objects]
+        bus.writer(topics.SCENE_OBJECTS).put(WorldObjects(header=bus.header("world"), objects=objects))
 
     async def execute(request: ExecuteRequest) -> MotionStatus:
         status = cycle.execute(request, bus.clock.now())

@@ -103,7 +103,7 @@ async def test_it_reads_nothing_and_serves_motion_gripper_and_world() -> None:
     found = await wiring(trajectory_executor.run, config())
     assert found.reads == set() and found.calls == set()
     assert found.writes == {topics.JOINT_STATES, topics.MOTION_STATUS, topics.GRIPPER_STATE, topics.SCENE_BALLS,
-                            topics.SCENE_OBJECT_UPDATES}
+                            topics.SCENE_OBJECTS, topics.SCENE_OBJECT_UPDATES}
     assert found.serves == {topics.MOTION_EXECUTE, topics.MOTION_STOP, topics.GRIPPER_COMMAND, topics.WORLD_EDIT}
 
 
