@@ -124,7 +124,8 @@ async def run(bus: Bus, config: Config) -> None:
         before = m.PickPlaceStatus()
         while True:
             with contextlib.suppress(TimeoutError):  # time passes too: a grace period may have ended
-                await asyncio.wait_for(woken.wait(), 0.05)
+                async with asyncio.timeout(0.05):  # wait_for of Python 3.11 can lose a cancellation
+                    await woken.wait()
             woken.clear()
             for command in task.step(look()):
                 group.create_task(work(command))

@@ -93,7 +93,8 @@ async def run(bus: Bus, config: Config) -> None:
                 idle.clear()
                 work.set()
                 with suppress(TimeoutError):  # what is not known by then goes out with a later frame
-                    await asyncio.wait_for(idle.wait(), PATIENCE)
+                    async with asyncio.timeout(PATIENCE):  # wait_for of Python 3.11 can lose a cancellation
+                        await idle.wait()
             send(frame, camera)
 
     async def work_out() -> None:

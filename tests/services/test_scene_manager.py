@@ -3,7 +3,7 @@ from __future__ import annotations
 from common import messages as m
 from common import topics
 from common.clock import Clock
-from common.config import Surroundings, load_cell, service_config
+from common.config import load_cell, service_config
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import matrix_to_pose
 from common.transport.local import LocalNetwork
