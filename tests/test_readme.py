@@ -61,7 +61,8 @@ def cell() -> Iterator[dict[str, str]]:
 def test_readme_names_the_two_commands_first() -> None:
     assert [line.split("#")[0].strip() for line in LINES[:2]] == ["make run", "make test"]
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in ("run", "test", "setup", "check", "bench"))
+    for target in ("run", "test", "setup", "check", "bench"):
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
 
 
 @pytest.mark.cell
@@ -85,8 +86,8 @@ def test_command_of_the_readme_answers_beside_a_running_cell(line: str, cell: di
         process.send_signal(signal.SIGINT)
         process.stdout.read()
         process.wait(PATIENCE)
-    wanted = {"hz": "Hz", "status": '"state"', "targets": '"poses"', "list": "panda/", "zenoh": "panda/", "add": '"ids"',
-              "pause": '"paused": true'}
+    wanted = {"hz": "Hz", "status": '"state"', "targets": '"poses"', "list": "panda/", "zenoh": "panda/",
+              "add": '"ids"', "pause": '"paused": true'}
     assert next(text for word, text in wanted.items() if word in line) in first
 
 

@@ -218,7 +218,8 @@ class Client(Generic[Q, A]):
         )
         self._waiting.add(future)
         try:
-            return await asyncio.wait_for(future, seconds)
+            async with asyncio.timeout(seconds):  # wait_for of Python 3.11 can lose a cancellation
+                return await future
         except TimeoutError:
             raise RequestTimeout(self.topic.key, timeout) from None
         finally:

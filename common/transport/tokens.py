@@ -50,7 +50,8 @@ class TokenWatch:
     async def known(self, timeout: float) -> None:
         """Return when the tokens that were there from the start are known, or after `timeout` seconds."""
         try:
-            await asyncio.wait_for(self._known.wait(), timeout)
+            async with asyncio.timeout(timeout):  # wait_for of Python 3.11 can lose a cancellation
+                await self._known.wait()
         except TimeoutError:
             return  # no router answers: nobody is there
 

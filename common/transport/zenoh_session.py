@@ -310,7 +310,8 @@ async def close_bounded(session: Any, seconds: float) -> bool:
 
     threading.Thread(target=work, name="close", daemon=True).start()
     try:
-        await asyncio.wait_for(closed.wait(), seconds)
+        async with asyncio.timeout(seconds):
+            await closed.wait()
     except TimeoutError:
         return False
     return True
