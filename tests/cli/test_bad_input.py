@@ -4,9 +4,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import ask
 
 from cli.main import app
+from tests.cli.conftest import ask
 
 CASES: dict[str, tuple[list[str], list[str]]] = {
     "unknown cell": (["run", "pnada"], ["unknown cell 'pnada'", "did you mean 'panda'?", "choices:"]),

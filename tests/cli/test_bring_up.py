@@ -6,7 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import Zencell
+
+from tests.cli.conftest import Zencell
 
 Start = Callable[..., Zencell]
 UP = "zenoh --mode client"  # the last line that `up` writes when all is ready

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from conftest import CELL, PATIENCE, Zencell, ask, environment, free_domain, make_folder
+
+from tests.cli.conftest import CELL, PATIENCE, Zencell, ask, environment, free_domain, make_folder
 
 ZENOH = Path(sys.executable).parent / "zenoh"
 needs_zenoh_cli = pytest.mark.skipif(not ZENOH.exists(), reason="zenoh-cli is not installed beside this Python")

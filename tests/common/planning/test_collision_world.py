@@ -2,7 +2,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from planning_scenes import (
+
+from common.errors import UnknownName
+from common.messages import PlanningScene
+from common.planning.collision import CollisionWorld, interpolate
+from common.planning.obstacles import ObstacleCache
+from tests.common.planning.planning_scenes import (
     BLOCK,
     GEOMETRY,
     HOME,
@@ -17,11 +22,6 @@ from planning_scenes import (
     solid,
     touching,
 )
-
-from common.errors import UnknownName
-from common.messages import PlanningScene
-from common.planning.collision import CollisionWorld, interpolate
-from common.planning.obstacles import ObstacleCache
 
 AROUND = CollisionWorld(ROBOT, scene(SPREAD), start=HOME, cache=cache())
 

@@ -1,6 +1,13 @@
 import numpy as np
 import pytest
-from planning_scenes import (
+
+from common.config import Motion, Pipeline
+from common.messages import Header, JointGoal, PlanRequest, Vector3
+from common.planning.collision import CollisionWorld
+from common.planning.pipeline import PlanningPipeline
+from common.planning.validation import Fault, fine_samples, timed_path
+from common.robot.transforms import tool_down
+from tests.common.planning.planning_scenes import (
     BLOCK,
     CELL,
     HOME,
@@ -17,13 +24,6 @@ from planning_scenes import (
     to_pose,
     touching,
 )
-
-from common.config import Motion, Pipeline
-from common.messages import Header, JointGoal, PlanRequest, Vector3
-from common.planning.collision import CollisionWorld
-from common.planning.pipeline import PlanningPipeline
-from common.planning.validation import Fault, fine_samples, timed_path
-from common.robot.transforms import tool_down
 
 PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
 START = above(0.45, -0.25, 0.2)

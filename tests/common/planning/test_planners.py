@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 import pytest
-from planning_scenes import CELL, HOME, ROBOT, SPREAD, above, last, scene, solid, to_joints, to_pose
 
 from common.config import Pipeline
 from common.errors import ConfigError, UnknownName
@@ -17,6 +16,18 @@ from common.planning.planners import load_planner, planner_names
 from common.planning.problem import Cancel, Region
 from common.planning.validation import fine_samples, timed_path
 from common.robot.transforms import tool_down
+from tests.common.planning.planning_scenes import (
+    CELL,
+    HOME,
+    ROBOT,
+    SPREAD,
+    above,
+    last,
+    scene,
+    solid,
+    to_joints,
+    to_pose,
+)
 
 PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
 AROUND = scene(SPREAD)

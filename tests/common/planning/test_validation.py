@@ -2,13 +2,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planning_scenes import HOME, ROBOT, WORLD, above, ball, cache, scene
 
 from common.messages import PlanningScene
 from common.planning.collision import CollisionWorld
 from common.planning.path import blended_path
 from common.planning.retiming import TimedPath, parametrise
 from common.planning.validation import check_numbers, fine_samples, validate
+from tests.common.planning.planning_scenes import HOME, ROBOT, WORLD, above, ball, cache, scene
 
 GOAL = HOME + np.array([0.5, 0.1, -0.2, 0.1, 0, 0.2, 0.3])
 V, A = 0.2 * ROBOT.velocity, 0.2 * ROBOT.acceleration
