@@ -103,13 +103,13 @@ def test_each_algorithm_of_ompl_finds_a_way_around_a_wall(algorithm):
 def test_algorithm_that_is_not_known_is_refused_with_the_choices():
     with pytest.raises(ConfigError, match=r"pipeline.planners.ompl.algorithm.*RRTConnect"):
         with_planner("ompl", algorithm="Dijkstra")
-    with pytest.raises(UnknownName, match="cartesian, joint_move, ompl"):
-        load_planner("chomp", {})
+    with pytest.raises(UnknownName, match=r"cartesian, .*joint_move, .*ompl"):
+        load_planner("dijkstra", {})
     with pytest.raises(ConfigError, match="can not be imported"):
         load_planner("nobody.planner", {})
     with pytest.raises(ConfigError, match=r"plan\(\) and Options"):
         load_planner("common.planning.path", {})
-    assert planner_names() == ["cartesian", "joint_move", "ompl"]
+    assert {"cartesian", "joint_move", "lerp", "ompl"} <= set(planner_names())
 
 
 def test_same_seed_gives_the_same_path_and_another_seed_another():
