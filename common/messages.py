@@ -294,6 +294,21 @@ class PoseGoal(Message):
     yaw_tolerance: Annotated[float, Field(ge=0, le=math.pi, allow_inf_nan=False)] = 0.0
 
 
+class PathGoal(Message):
+    """Poses for the tool centre point to pass in straight lines, in order, from the first, which is where it starts.
+
+    `tool_speed` is kept wherever joint limits and corners allow; without one the path is as fast as limits allow.
+    """
+
+    kind: Literal["path"] = "path"
+    waypoints: list[Pose] = Field(min_length=1, max_length=20000)
+    step: Annotated[float, Field(gt=0, le=0.1, allow_inf_nan=False)] | None = Field(
+        None, description="way between poses for which joint positions are solved [m]; None: the planner's"
+    )
+    min_fraction: Fraction | None = Field(None, description="less of the path is refused; None: the planner's")
+    tool_speed: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] | None = Field(None, description="[m/s]")
+
+
 class PlanRequest(Message):
     """Ask for a trajectory. Poses are in the robot's base frame, `world`.
 
@@ -306,7 +321,7 @@ class PlanRequest(Message):
     id: Name
     stage: str = Field("", description="what the motion is for: appears in every error")
     start: list[Finite] = Field([], description="joint positions [rad]; empty: where the robot is now")
-    goal: Annotated[JointGoal | PoseGoal, Field(discriminator="kind")]
+    goal: Annotated[JointGoal | PoseGoal | PathGoal, Field(discriminator="kind")]
     straight: bool = Field(False, description="only a straight line of the tool will do")
     allowed_collisions: list[tuple[str, str]] = Field([], description="in addition to the planning scene's")
     attach: str = ""

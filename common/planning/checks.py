@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import UnknownName, ZencellError
-from common.messages import JointGoal, PlanningScene, PlanRequest
+from common.messages import JointGoal, PathGoal, PlanningScene, PlanRequest
 from common.planning.collision import CollisionWorld, Pair
-from common.planning.problem import Region
+from common.planning.problem import Region, ToolPath
 from common.robot.model import RobotModel
-from common.robot.transforms import pose_to_matrix
+from common.robot.transforms import invert, pose_to_matrix
 
 Array = NDArray[np.float64]
 
 
 _MEASURED = 1e-4  # [rad] a measured state may stand this far beyond its limit
+_AT_FIRST = (0.002, 0.02)  # [m], [rad] a path begins this close to where the robot is
 
 
 class BadRequest(ZencellError):
@@ -31,10 +32,10 @@ class BadRequest(ZencellError):
 
 @dataclass(frozen=True)
 class CheckedRequest:
-    """Start (dof,) [rad] and goal, joint positions or a region, of a request whose numbers fit the robot."""
+    """Start (dof,) [rad] and goal, joint positions, a region or a path, of a request whose numbers fit the robot."""
 
     start: Array
-    goal: Array | Region
+    goal: Array | Region | ToolPath
 
 
 def check_request(
@@ -60,6 +61,8 @@ def check_request(
     goal = request.goal
     if isinstance(goal, JointGoal):
         return CheckedRequest(start, _joint_goal(robot, goal))
+    if isinstance(goal, PathGoal):
+        return CheckedRequest(start, _tool_path(robot, start, goal))
     tolerance = goal.position_tolerance
     sides = np.array([tolerance.x, tolerance.y, tolerance.z])
     if (sides < 0).any():
@@ -93,6 +96,18 @@ def _joint_goal(robot: RobotModel, goal: JointGoal) -> Array:
     else:
         raise BadRequest("bad_goal", "joint goal has neither positions nor the name of a pose")
     return _within_limits(robot, positions, "goal", "goal_out_of_limits")
+
+
+def _tool_path(robot: RobotModel, start: Array, goal: PathGoal) -> ToolPath:
+    poses = np.array([pose_to_matrix(pose) for pose in goal.waypoints])
+    T_tcp_first = invert(robot.fk(start)) @ poses[0]
+    away = float(np.linalg.norm(T_tcp_first[:3, 3]))
+    turned = float(np.arccos(np.clip((np.trace(T_tcp_first[:3, :3]) - 1) / 2, -1, 1)))
+    if away > _AT_FIRST[0] or turned > _AT_FIRST[1]:
+        raise BadRequest(
+            "start_mismatch", f"start is {1e3 * away:.1f} mm and {turned:.3f} rad away from the path's first pose"
+        )
+    return ToolPath(poses, goal.step, goal.min_fraction, goal.tool_speed)
 
 
 def _positions(robot: RobotModel, values: list[float], what: str, code: str) -> Array:

@@ -85,10 +85,8 @@ class CollisionWorld:
         self.contact_distance = contact_distance
         environment, held = self._sort(scene, attach, attach_pose, release)
         objects = [*environment, *(item for item, _, _ in held)]
-        solids = [Solid(o.shape, tuple(o.dimensions)) for o in environment]
-        solids += [
-            Solid(o.shape, tuple(o.dimensions), robot.model.frames[frame].parentJoint, frame) for o, frame, _ in held
-        ]
+        solids = [Solid.of(o) for o in environment]
+        solids += [Solid.of(o, robot.model.frames[frame].parentJoint, frame) for o, frame, _ in held]
         self._bank = self.cache.bank(tuple(solids))
         self._bank.place([pose_to_matrix(o.pose) for o in environment] + [pose for _, _, pose in held])
         self._names = [*self.cache.robot.links, *(o.id for o in objects)]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _SAME = 1e-9  # [rad] waypoints closer than this are one
-_SHORTEST = 1e-5  # [rad] a shorter blend is a stop
+_SHORTEST = 1e-5  # [rad], [m] a shorter blend is a stop
 _TURN_BACK = -0.985  # cosine of the angle at a corner that is too sharp to blend
 
 
@@ -78,22 +78,24 @@ def dense_path(waypoints: Array) -> SmoothPath:
     return SmoothPath(starts, d0, d1, lengths)
 
 
-def blended_path(waypoints: Array, blends: Array) -> list[SmoothPath]:
+def blended_path(waypoints: Array, blends: Array, lengths: Array | None = None) -> list[SmoothPath]:
     """Straight edges with a parabola about each corner; one path for each stretch between corners without a blend.
 
     Args:
         waypoints: (N, dof) [rad], each other than the one before.
-        blends: (N,) length [rad] taken from both edges at each waypoint; next to 0 means to stop there. Half the
+        blends: (N,) length taken from both edges at each waypoint; next to 0 means to stop there. Half the
             shorter edge at most is used.
+        lengths: (N - 1,) of the edges, by which the path is then measured; their lengths in joint space [rad] when
+            not given.
     """
     edges = np.diff(waypoints, axis=0)
-    lengths = np.linalg.norm(edges, axis=1)
+    spans = np.linalg.norm(edges, axis=1)
+    lengths = spans if lengths is None else lengths
     directions = edges / lengths[:, None]
+    cosines = (edges[:-1] * edges[1:]).sum(axis=1) / (spans[:-1] * spans[1:])
     cut = np.zeros(len(waypoints))
-    for i in range(1, len(waypoints) - 1):
-        longest = min(blends[i], 0.5 * lengths[i - 1], 0.5 * lengths[i])
-        if longest > _SHORTEST and directions[i - 1] @ directions[i] > _TURN_BACK:
-            cut[i] = longest
+    longest = np.minimum(blends[1:-1], 0.5 * np.minimum(lengths[:-1], lengths[1:]))
+    cut[1:-1] = np.where((longest > _SHORTEST) & (cosines > _TURN_BACK), longest, 0.0)
     paths = []
     pieces: list[tuple[Array, Array, Array, float]] = []
     for i, (direction, length) in enumerate(zip(directions, lengths, strict=True)):

@@ -14,9 +14,9 @@ from common.errors import UnknownName
 from common.messages import JointTrajectory, JointTrajectoryPoint, PlanAttempt, PlanningScene, PlanRequest, PlanResponse
 from common.planning.checks import BadRequest, CheckedRequest, check_collisions, check_request
 from common.planning.collision import CollisionWorld, Pair
-from common.planning.obstacles import ObstacleCache
+from common.planning.obstacles import BadShape, ObstacleCache
 from common.planning.planners import Plan, load_planner
-from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result
+from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result, ToolPath
 from common.planning.retiming import RetimingFailed, TimedPath, stretch
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.timing import BLENDS, retime
@@ -124,6 +124,8 @@ class PlanningPipeline:
             return self._make_world(request, scene, checked.start, self._cache)
         except UnknownName as error:
             raise BadRequest(f"unknown_{error.what}", str(error)) from None
+        except BadShape as error:
+            raise BadRequest("bad_scene", str(error)) from None
 
     def _make_world(
         self, request: PlanRequest, scene: PlanningScene, start: Array, cache: ObstacleCache
@@ -151,7 +153,7 @@ class PlanningPipeline:
             world=world,
             start=checked.start,
             goal=checked.goal,
-            straight=request.straight,
+            straight=request.straight or isinstance(checked.goal, ToolPath),
             velocity=robot.velocity * (request.velocity_scaling or motion.velocity_scaling),
             acceleration=robot.acceleration * acceleration,
             jerk=robot.jerk * acceleration,
@@ -181,7 +183,7 @@ class PlanningPipeline:
         if result.trajectory is not None:
             yield result.trajectory
             return
-        for blend in BLENDS[:1] if result.dense else BLENDS:
+        for blend in BLENDS[:1] if result.dense or result.way else BLENDS:
             trajectory = retime(problem, result, blend)
             yield stretch(trajectory, self._motion.cartesian_speed_scale) if result.tool_line else trajectory
 

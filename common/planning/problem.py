@@ -28,12 +28,28 @@ class Region:
 
 
 @dataclass(frozen=True)
+class ToolPath:
+    """Poses that the TCP passes in straight lines, from the first, at which it is at the start.
+
+    Attributes:
+        poses: (N, 4, 4) T_world_tcp.
+        step: way between IK solutions [m]; min_fraction: of the way that must be possible; None: the planner's.
+        speed: of the TCP where limits and corners allow it [m/s]; None: as fast as they allow.
+    """
+
+    poses: Array
+    step: float | None = None
+    min_fraction: float | None = None
+    speed: float | None = None
+
+
+@dataclass(frozen=True)
 class Problem:
     """One checked request: the start is free and within limits.
 
     Attributes:
         start: (dof,) [rad].
-        goal: (dof,) [rad] for a joint goal, else a region for the TCP.
+        goal: (dof,) [rad] for a joint goal, else a region for the TCP or a path that it follows.
         straight: only a straight line of the TCP will do.
         velocity, acceleration, jerk: scaled limits (dof,).
         attempts: how many tries a sampling planner has.
@@ -43,7 +59,7 @@ class Problem:
     robot: RobotModel
     world: CollisionWorld
     start: Array
-    goal: Array | Region
+    goal: Array | Region | ToolPath
     straight: bool
     velocity: Array
     acceleration: Array
@@ -81,6 +97,21 @@ class Cancel:
 
 
 @dataclass(frozen=True)
+class ToolWay:
+    """How the TCP moves between waypoints that lie close together.
+
+    Attributes:
+        lengths: (N - 1,) its way between them [m].
+        cuts: (N,) how much of the way before and after each may be rounded off [m].
+        speed: wanted along the way [m/s], or None.
+    """
+
+    lengths: Array
+    cuts: Array
+    speed: float | None = None
+
+
+@dataclass(frozen=True)
 class Result:
     """A path or a trajectory, or the error of a planner; what it tried is in `attempts`.
 
@@ -90,6 +121,7 @@ class Result:
         waypoints: (N, dof) [rad], to be retimed.
         dense: the waypoints lie close together: smooth through all of them; else blend at the corners.
         tool_line: the TCP follows a straight line (its speed scale applies).
+        way: the TCP follows a path with corners, at a speed of its own: rounds them and times its way.
         trajectory: already timed; then there are no waypoints.
         fraction: how much of the way is covered.
         waypoint, colliding: where and between what a failure was found.
@@ -98,6 +130,7 @@ class Result:
     waypoints: Array | None = None
     dense: bool = False
     tool_line: bool = False
+    way: ToolWay | None = None
     trajectory: TimedPath | None = None
     fraction: float = 0.0
     error: str = ""

@@ -45,13 +45,20 @@ class RetimingFailed(Exception):
     """A path that can not be followed within the limits, which only a broken path or limit brings about."""
 
 
-def parametrise(path: SmoothPath, velocity: ArrayLike, acceleration: ArrayLike, step: float = 0.02) -> TimedPath:
+def parametrise(
+    path: SmoothPath,
+    velocity: ArrayLike,
+    acceleration: ArrayLike,
+    step: float = 0.02,
+    speed: float = math.inf,
+) -> TimedPath:
     """The time-optimal trajectory along a path, at rest at both ends.
 
     Args:
         path: pieces (P, dof).
         velocity, acceleration: limits (dof,) [rad/s], [rad/s^2].
         step: largest joint movement between grid points [rad].
+        speed: highest ds/dt: that of the tool along a path that is measured by the tool's way [m/s].
 
     Raises:
         RetimingFailed: no speed is feasible somewhere.
@@ -60,15 +67,15 @@ def parametrise(path: SmoothPath, velocity: ArrayLike, acceleration: ArrayLike, 
     move = float((np.maximum(np.abs(path.d0), np.abs(path.d1)).max(axis=1) * path.lengths).sum())
     step = min(step, move / _LEAST_INTERVALS)
     for _ in range(_REFINEMENTS):
-        trajectory = _timed(path.divided(step), limit_v, limit_a)
+        trajectory = _timed(path.divided(step), limit_v, limit_a, speed)
         if _overshoot(trajectory, limit_a) <= _OVERSHOOT:
             return trajectory
         step /= 3
     raise RetimingFailed("the path bends too sharply to be followed by cubics")
 
 
-def _timed(grid: SmoothPath, limit_v: Array, limit_a: Array) -> TimedPath:
-    x, u = _profile(grid, limit_v, limit_a)
+def _timed(grid: SmoothPath, limit_v: Array, limit_a: Array, speed: float) -> TimedPath:
+    x, u = _profile(grid, limit_v, limit_a, speed)
     root = np.sqrt(x)
     durations = 2 * grid.lengths / (root[:-1] + root[1:])
     times = np.concatenate([[0.0], np.cumsum(durations)])
@@ -97,7 +104,7 @@ def _overshoot(trajectory: TimedPath, limit_a: Array) -> float:
     return max(float((np.abs(values) / limit_a).max()) for values in end_accelerations(trajectory))
 
 
-def _profile(grid: SmoothPath, limit_v: Array, limit_a: Array) -> tuple[Array, Array]:
+def _profile(grid: SmoothPath, limit_v: Array, limit_a: Array, speed: float) -> tuple[Array, Array]:
     """x (N + 1,) at the grid points and u (N,) between them."""
     d0, d1, lengths = grid.d0, grid.d1, grid.lengths
     bends = (d1 - d0) / lengths[:, None]
@@ -110,19 +117,19 @@ def _profile(grid: SmoothPath, limit_v: Array, limit_a: Array) -> tuple[Array, A
     safe = np.where(flat, 1.0, np.abs(D))
     A = np.where(flat, np.inf, limits / safe)  # -A - B x <= u <= A - B x
     B = np.where(flat, 0.0, sign * C / safe)
-    most = _highest_x(grid, limit_v, limit_a, bends)
+    most = _highest_x(grid, limit_v, limit_a, bends, speed)
     highest = _backward(most, lengths, A, B)
     return _forward(highest, lengths, A, B)
 
 
-def _highest_x(grid: SmoothPath, limit_v: Array, limit_a: Array, bends: Array) -> list[float]:
-    """(N + 1,) x at which velocities are within limits, and accelerations at constant speed.
+def _highest_x(grid: SmoothPath, limit_v: Array, limit_a: Array, bends: Array, speed: float) -> list[float]:
+    """(N + 1,) x at which speed and velocities are within limits, and accelerations at constant speed.
 
     A path may be followed somewhat faster into a bend if the speed changes just right in it; leaving that out makes
     sure that each point which is reached can be left, also on a coarse grid.
     """
     slopes = np.abs(np.concatenate([grid.d0, grid.d1[-1:]]))
-    most = ((limit_v / np.maximum(slopes, _TINY)) ** 2).min(axis=1)
+    most = np.minimum(((limit_v / np.maximum(slopes, _TINY)) ** 2).min(axis=1), speed**2)
     bound = (limit_a / np.maximum(np.abs(bends), _TINY)).min(axis=1)
     most[:-1] = np.minimum(most[:-1], bound)
     most[1:] = np.minimum(most[1:], bound)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,8 +37,11 @@ def retime(problem: Problem, result: Result, blend: float = BLENDS[0]) -> TimedP
     if len(waypoints) == 1:  # the robot is there already
         still = np.zeros((2, problem.robot.dof))
         return TimedPath(np.array([0.0, 0.01]), np.array([waypoints[0], waypoints[0]]), still, still)
-    paths = [dense_path(waypoints)] if result.dense else free_blends(waypoints, problem.world, blend)
     velocity, acceleration = LIMIT_SHARE * problem.velocity, LIMIT_SHARE * problem.acceleration
+    if result.way is not None:
+        paths = blended_path(result.waypoints, result.way.cuts, result.way.lengths)
+        return join([parametrise(path, velocity, acceleration, speed=result.way.speed or math.inf) for path in paths])
+    paths = [dense_path(waypoints)] if result.dense else free_blends(waypoints, problem.world, blend)
     return join([parametrise(path, velocity, acceleration) for path in paths])
 
 

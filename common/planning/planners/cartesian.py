@@ -1,9 +1,9 @@
-"""A straight line of the TCP: IK at every centimetre from the step before, each step checked for collision."""
+"""Straight lines of the TCP: IK in small steps, each from the step before and checked for collision."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -11,60 +11,158 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common.config import Parameters
-from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result
+from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result, ToolPath, ToolWay
 from common.robot.ik import converge
+from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
 
 _SAME = 1e-5  # [m], [rad] a goal this close to the start needs no motion
+_REACH_OF_TURN = 0.1  # [m] a turn by a radian counts as this much way
+_SINGULAR = 0.03  # smallest singular value of the Jacobian [m, rad per rad] near a singularity
 
 
 class Options(Parameters):
-    """How finely the line is followed and how much of it must be possible."""
+    """How finely lines are followed and how much of them must be possible."""
 
     step: float = Field(0.01, gt=0, le=0.2, description="way of the TCP between IK solutions [m]")
     rotation_step: float = Field(0.1, gt=0, le=1, description="turn of the TCP between IK solutions [rad]")
     min_fraction: float = Field(0.95, gt=0, le=1, description="of the line that must be possible")
     goal_tolerance: float = Field(0.002, gt=0, le=0.1, description="a shortened line ends this close to its goal [m]")
     jump_threshold: float = Field(0.35, gt=0, le=3.2, description="a joint that moves more in a step has jumped [rad]")
+    path_tolerance: float = Field(
+        8e-5, gt=2e-5, le=0.05, description="how far corners of a path with several lines are rounded off [m]"
+    )
+
+
+@dataclass(frozen=True)
+class _Target:
+    """A pose for the TCP on its way: `length` [m] of the way there from the target before."""
+
+    pose: pin.SE3
+    length: float
+    point: int  # of the path to which it leads
 
 
 def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
-    """The joint path of a straight line to a pose goal, or how far the line goes and what ends it.
+    """The joint path of straight lines through the poses of the goal, or how far they go and what ends them.
 
-    Position moves linearly and orientation along the shortest turn, together.
+    Position moves linearly and orientation along the shortest turn, together. A path of several lines stays within
+    `path_tolerance` of them.
     """
-    if not isinstance(problem.goal, Region):
-        return Result(error=NOT_APPLICABLE, message="a straight line needs a pose goal")
-    robot = problem.robot
-    T_start, T_goal = pin.SE3(robot.fk(problem.start)), pin.SE3(problem.goal.T_world_tcp)
-    way = T_goal.translation - T_start.translation
-    turn = pin.log3(T_start.rotation.T @ T_goal.rotation)
-    distance, angle = float(np.linalg.norm(way)), float(np.linalg.norm(turn))
-    if distance < _SAME and angle < _SAME:
+    goal = problem.goal
+    if isinstance(goal, Region):
+        return _line(problem, goal, options, cancel)
+    if isinstance(goal, ToolPath):
+        return _path(problem, goal, options, cancel)
+    return Result(error=NOT_APPLICABLE, message="a straight line needs a pose goal")
+
+
+def _line(problem: Problem, goal: Region, options: Options, cancel: Cancel) -> Result:
+    """One line to the pose of a goal region."""
+    T_start = pin.SE3(problem.robot.fk(problem.start))
+    targets = _between(T_start, pin.SE3(goal.T_world_tcp), options.step, options.rotation_step, 1)
+    if not targets:
         return Result(waypoints=np.array([problem.start, problem.start]), dense=True, tool_line=True, fraction=1.0)
-    count = max(1, math.ceil(distance / options.step - 1e-6), math.ceil(angle / options.rotation_step - 1e-6))
-    path, motion = [problem.start], np.zeros(robot.dof)
-    failure: Result | None = None
-    for i in range(1, count + 1):
-        share = i / count
-        target = pin.SE3(T_start.rotation @ pin.exp3(share * turn), T_start.translation + share * way)
-        following = _step(problem, options, cancel, path[-1], motion, target, i)
-        if isinstance(following, Result):
-            failure = following
-            break
-        motion = following - path[-1]
-        path.append(following)
-    fraction = (len(path) - 1) / count
+    waypoints, failure = _follow(problem, options, cancel, targets, None)
+    count = len(targets)
+    fraction = (len(waypoints) - 1) / count
+    distance, angle = _distance(T_start, pin.SE3(goal.T_world_tcp))
     left = (1 - fraction) * max(distance, angle * options.goal_tolerance)
     if failure and (fraction < options.min_fraction or left > options.goal_tolerance):
         message = f"waypoint {failure.waypoint} of {count}: {failure.message} (fraction {fraction:.2f})"
         return replace(failure, fraction=fraction, message=message)
-    return Result(waypoints=np.array(path), dense=True, tool_line=True, fraction=fraction)
+    return Result(waypoints=waypoints, dense=True, tool_line=True, fraction=fraction)
+
+
+def _path(problem: Problem, goal: ToolPath, options: Options, cancel: Cancel) -> Result:
+    """All lines of a path."""
+    step = goal.step or options.step
+    poses = [pin.SE3(T) for T in goal.poses]
+    targets: list[_Target] = []
+    last = poses[0]
+    for point, pose in enumerate(poses[1:], 1):
+        between = _between(last, pose, step, options.rotation_step, point)
+        targets += between
+        last = pose if between else last
+    if not targets:
+        return Result(waypoints=np.array([problem.start, problem.start]), dense=True, fraction=1.0)
+    waypoints, failure = _follow(problem, options, cancel, targets, options.path_tolerance)
+    lengths = np.array([target.length for target in targets])
+    done = len(waypoints) - 1
+    fraction = float(lengths[:done].sum() / lengths.sum()) if failure else 1.0
+    if failure and (done == 0 or fraction < (goal.min_fraction or options.min_fraction)):
+        target = targets[done]
+        x, y, z = target.pose.translation
+        message = (
+            f"point {target.point + 1} of {len(poses)}, at ({x:.3f}, {y:.3f}, {z:.3f}): {failure.message}"
+            f" (fraction {fraction:.2f})"
+        )
+        return replace(failure, fraction=fraction, message=message, waypoint=target.point)
+    cuts = _cuts(poses[0], targets[:done], options.path_tolerance)
+    way = ToolWay(lengths[:done], cuts, goal.speed)
+    return Result(waypoints=waypoints, way=way, tool_line=goal.speed is None, fraction=fraction)
+
+
+def _distance(a: pin.SE3, b: pin.SE3) -> tuple[float, float]:
+    """Way [m] and turn [rad] between two poses."""
+    turn = pin.log3(a.rotation.T @ b.rotation)
+    return float(np.linalg.norm(b.translation - a.translation)), float(np.linalg.norm(turn))
+
+
+def _between(a: pin.SE3, b: pin.SE3, step: float, rotation_step: float, point: int) -> list[_Target]:
+    """Targets on the line from a to b, without a and with b; none where the two are the same."""
+    distance, angle = _distance(a, b)
+    if distance < _SAME and angle < _SAME:
+        return []
+    way, turn = b.translation - a.translation, pin.log3(a.rotation.T @ b.rotation)
+    count = max(1, math.ceil(distance / step - 1e-6), math.ceil(angle / rotation_step - 1e-6))
+    length = max(distance, _REACH_OF_TURN * angle) / count
+    return [
+        _Target(pin.SE3(a.rotation @ pin.exp3(share * turn), a.translation + share * way), length, point)
+        for share in (i / count for i in range(1, count + 1))
+    ]
+
+
+def _cuts(first: pin.SE3, targets: list[_Target], tolerance: float) -> Array:
+    """(N,) how much of the way at each waypoint is rounded off [m] so that the path passes within the tolerance.
+
+    A parabola that takes c from both sides of a corner passes it at c sin(turn / 2) / 2.
+    """
+    places = np.array([first.translation, *(target.pose.translation for target in targets)])
+    edges = np.diff(places, axis=0)
+    directions = edges / np.maximum(np.linalg.norm(edges, axis=1), 1e-12)[:, None]
+    halves = np.linalg.norm(np.diff(directions, axis=0), axis=1) / 2  # sin(turn / 2)
+    return np.concatenate([[0.0], 2 * tolerance / np.maximum(halves, 1e-6), [0.0]])
+
+
+def _follow(
+    problem: Problem, options: Options, cancel: Cancel, targets: list[_Target], tolerance: float | None
+) -> tuple[Array, Result | None]:
+    """Waypoints (N, dof) [rad] as far as the targets can be followed, and what ends them."""
+    path, motion, length = [problem.start], np.zeros(problem.robot.dof), 1.0
+    for i, target in enumerate(targets, 1):
+        guess = path[-1] + motion * (target.length / length)
+        following = _step(problem, options, cancel, path[-1], guess, target.pose, i)
+        if isinstance(following, Result):
+            return np.array(path), following
+        if tolerance is not None and _bows(problem.robot, path[-1], following) > tolerance:
+            joint = int(np.argmax(np.abs(following - path[-1])))
+            message = f"{problem.robot.joint_names[joint]} turns too fast for a straight line: near a singularity"
+            return np.array(path), Result(error="joint_jump", message=message, waypoint=i)
+        motion, length = following - path[-1], target.length
+        path.append(following)
+    return np.array(path), None
+
+
+def _bows(robot: RobotModel, a: Array, b: Array) -> float:
+    """How far [m] the TCP leaves the line between two positions (dof,) [rad], half way."""
+    ends = robot.fk(a)[:3, 3] + robot.fk(b)[:3, 3]
+    return float(np.linalg.norm(robot.fk((a + b) / 2)[:3, 3] - ends / 2))
 
 
 def _step(
-    problem: Problem, options: Options, cancel: Cancel, q: Array, motion: Array, target: pin.SE3, i: int
+    problem: Problem, options: Options, cancel: Cancel, q: Array, guess: Array, target: pin.SE3, i: int
 ) -> Array | Result:
     """The next position (dof,) [rad], or why there is none."""
     stop = cancel.reason(problem)
@@ -72,11 +170,11 @@ def _step(
         return Result(error=stop, message="planning was ended", waypoint=i)
     robot = problem.robot
     # The step before, once more, is the best guess: one iteration less on a line.
-    following = converge(robot, target, q + motion, 10)
+    following = converge(robot, target, guess, 10)
     if following is None:
         following = converge(robot, target, q, 30)
     if following is None:
-        return Result(error="no_ik", message="the arm does not reach it without leaving its joint limits", waypoint=i)
+        return Result(error="no_ik", message=_why_not(robot, q, target), waypoint=i)
     jump = np.abs(following - q)
     if float(jump.max()) > options.jump_threshold:
         joint = int(np.argmax(jump))
@@ -86,3 +184,18 @@ def _step(
         pair = hit.pair if hit else ("robot", "scene")
         return Result(error="collision", message=f"{pair[0]} collides with {pair[1]}", waypoint=i, colliding=pair)
     return following
+
+
+def _why_not(robot: RobotModel, q: Array, target: pin.SE3) -> str:
+    """What keeps the arm at q (dof,) [rad] from a pose next to it."""
+    jacobian = pin.computeFrameJacobian(robot.model, robot.data, q, robot.tcp_frame, pin.ReferenceFrame.LOCAL)
+    if np.linalg.svd(jacobian, compute_uv=False)[-1] < _SINGULAR:
+        return "the arm does not reach it: it is at a singularity, such as stretched out"
+    here = pin.SE3(robot.fk(q))
+    wanted = q + np.linalg.lstsq(jacobian, pin.log6(here.actInv(target)).vector, rcond=None)[0]
+    beyond = np.maximum(robot.lower - wanted, wanted - robot.upper)
+    joint = int(np.argmax(beyond))
+    if beyond[joint] > 0:
+        low, high = robot.lower[joint], robot.upper[joint]
+        return f"{robot.joint_names[joint]} would leave its limits {low:.3f} to {high:.3f} rad"
+    return "the arm does not reach it without leaving its joint limits"
