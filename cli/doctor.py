@@ -85,13 +85,14 @@ def _packages() -> Iterator[Finding]:
 
 
 def _robots() -> Iterator[Finding]:
-    from common.config import RobotConfig, check, config_root, names_of, read_yaml
+    from common.config import RobotConfig, check, config_root, names_of, read_robot
     from common.errors import ZencellError
 
     for name in names_of("robots"):
         try:
-            robot = check(RobotConfig, read_yaml(config_root() / "robots" / f"{name}.yaml"))
-            missing = [text for text in (robot.urdf, robot.srdf) if text and not _described(text, robot.package_dirs)]
+            robot = check(RobotConfig, read_robot(config_root() / "robots" / f"{name}.yaml"))
+            needed = [robot.urdf, robot.srdf, *(attachment.urdf for attachment in robot.attachments)]
+            missing = [text for text in needed if text and not _described(text, robot.package_dirs)]
         except ZencellError as error:
             yield Finding("fail", f"robot {name}: {error}", "correct the file")
             continue

@@ -9,7 +9,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from common.errors import ConfigError
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -30,13 +29,7 @@ class RobotGeometry:
             ConfigError: a mesh is not there, or the SRDF does not parse.
         """
         self.robot = robot
-        folders = [str(folder) for folder in robot.package_folders]
-        try:
-            full = pin.buildGeomFromUrdf(
-                robot.full_model, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=folders
-            )
-        except ValueError as error:
-            raise ConfigError("robot.urdf", str(robot.urdf), f"has a mesh that can not be loaded: {error}") from None
+        full = robot.full_geometry(pin.GeometryType.COLLISION)
         _, geometry = pin.buildReducedModel(robot.full_model, full, robot.locked_ids, robot.full_reference)
         for item in geometry.geometryObjects:
             if isinstance(item.geometry, coal.BVHModelBase):

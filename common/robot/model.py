@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from common.config import RobotConfig
 from common.errors import ConfigError, UnknownName
 from common.robot.description import find_description, package_folders
+from common.robot.merging import WORLD, merged_urdf
 
 Array = NDArray[np.float64]
 
@@ -19,21 +20,22 @@ Array = NDArray[np.float64]
 class RobotModel:
     """Kinematics of the planning group; joints outside it are held where the robot file says.
 
-    Poses are in the base frame, which is `world`. Not thread-safe: pinocchio's working data belong to the model, so
-    each thread loads its own.
+    Poses are in `world`, where the robot file puts the base. Not thread-safe: pinocchio's working data belong to the
+    model, so each thread loads its own.
 
     Attributes:
         config: the robot file.
+        urdf: text of the URDF with everything that is attached, rooted in a link `world`; srdf: path, or None.
         joint_names: joints of the group, in the order of every (dof,) array.
         lower, upper: position limits (dof,) [rad], from the URDF.
-        velocity: limits (dof,) [rad/s], from the URDF.
+        velocity: limits (dof,) [rad/s], from the robot file, else the URDF.
         acceleration, jerk: limits (dof,) [rad/s^2], [rad/s^3], from the robot file.
         link_parents: link -> the link it hangs on, for every link but the root.
         full_model, model: pinocchio models with all joints and with those of the group.
         tcp_frame: index of the TCP's frame in `model`.
     """
 
-    def __init__(self, config: RobotConfig, full_model: pin.Model, urdf: Path, srdf: Path | None) -> None:
+    def __init__(self, config: RobotConfig, full_model: pin.Model, urdf: str, srdf: Path | None) -> None:
         """Reduce the full model to the group. Use `load`."""
         self.config = config
         self.urdf = urdf
@@ -51,14 +53,14 @@ class RobotModel:
         self.dof: int = self.model.nq
         self.lower: Array = np.array(self.model.lowerPositionLimit)
         self.upper: Array = np.array(self.model.upperPositionLimit)
-        self.velocity: Array = np.array(self.model.velocityLimit)
+        self.velocity: Array = np.array(config.velocity_limits or self.model.velocityLimit, dtype=float)
         self.acceleration: Array = np.array(config.acceleration_limits, dtype=float)
         self.jerk: Array = np.array(config.jerk_limits, dtype=float)
         for name, low, high, speed in zip(self.joint_names, self.lower, self.upper, self.velocity, strict=True):
             if not (np.isfinite(low) and np.isfinite(high) and low < high and 0 < speed < np.inf):
                 raise ConfigError("robot.urdf", config.urdf, f"has no usable limits for joint {name}")
-        self._links = {f.name: i for i, f in enumerate(self.model.frames) if f.type == pin.FrameType.BODY}
-        self._full_links = {f.name: i for i, f in enumerate(full_model.frames) if f.type == pin.FrameType.BODY}
+        self._links = _link_frames(self.model)
+        self._full_links = _link_frames(full_model)
         for field, link in (("tcp_link", config.tcp_link), ("base_link", config.base_link)):
             if link not in self._links:
                 raise ConfigError(f"robot.{field}", link, f"is not a link; choices: {', '.join(self._links)}")
@@ -77,18 +79,30 @@ class RobotModel:
         Raises:
             ConfigError: a description is not there or does not fit the robot file: names the field and what would do.
         """
-        urdf = find_description("robot.urdf", config.urdf, config.package_dirs)
+        urdf = merged_urdf(config)
         srdf = find_description("robot.srdf", config.srdf, config.package_dirs) if config.srdf else None
         try:
-            full_model = pin.buildModelFromUrdf(str(urdf))
+            full_model = pin.buildModelFromXML(urdf)
         except ValueError as error:
-            raise ConfigError("robot.urdf", str(urdf), f"does not parse: {error}") from None
+            raise ConfigError("robot.urdf", config.urdf, f"does not parse: {error}") from None
         return cls(config, full_model, urdf, srdf)
 
     @property
     def package_folders(self) -> list[Path]:
         """Folders in which the URDF's package:// meshes are looked up."""
         return package_folders(self.config.package_dirs)
+
+    def full_geometry(self, kind: pin.GeometryType) -> pin.GeometryModel:
+        """Collision or visual shapes of all links, placed on the joints of `full_model`.
+
+        Raises:
+            ConfigError: a mesh is not there or can not be read.
+        """
+        folders = [str(folder) for folder in self.package_folders]
+        try:
+            return pin.buildGeomFromUrdfString(self.full_model, self.urdf, kind, package_dirs=folders)
+        except ValueError as error:
+            raise ConfigError("robot.urdf", self.config.urdf, f"has a mesh that can not be loaded: {error}") from None
 
     @property
     def groups(self) -> list[str]:
@@ -172,6 +186,11 @@ def _locked(config: RobotConfig, model: pin.Model) -> tuple[list[int], Array]:
     return locked, reference
 
 
+def _link_frames(model: pin.Model) -> dict[str, int]:
+    """Index of the frame of each link; `world` is none of the robot's."""
+    return {f.name: i for i, f in enumerate(model.frames) if f.type == pin.FrameType.BODY and f.name != WORLD}
+
+
 def _link_parents(model: pin.Model) -> dict[str, str]:
     parents: dict[str, str] = {}
     for frame in model.frames:
@@ -180,6 +199,6 @@ def _link_parents(model: pin.Model) -> dict[str, str]:
         index = frame.parentFrame
         while index and model.frames[index].type != pin.FrameType.BODY:
             index = model.frames[index].parentFrame
-        if model.frames[index].type == pin.FrameType.BODY:
+        if model.frames[index].type == pin.FrameType.BODY and model.frames[index].name != WORLD:
             parents[frame.name] = model.frames[index].name
     return parents

@@ -56,6 +56,8 @@ def random_layout(world: World, rng: np.random.Generator, accepts: Accepts) -> l
             and accepts(*place)
         )
 
+    if world.count == 0:
+        return []
     for _ in range(ATTEMPTS):
         places: list[Place] = []
         for _ in range(TRIES * world.count):
