@@ -51,6 +51,7 @@ def parametrise(
     acceleration: ArrayLike,
     step: float = 0.02,
     speed: float = math.inf,
+    braking: ArrayLike | None = None,
 ) -> TimedPath:
     """The time-optimal trajectory along a path, at rest at both ends.
 
@@ -59,23 +60,25 @@ def parametrise(
         velocity, acceleration: limits (dof,) [rad/s], [rad/s^2].
         step: largest joint movement between grid points [rad].
         speed: highest ds/dt: that of the tool along a path that is measured by the tool's way [m/s].
+        braking: limits (dof,) that hold instead of `acceleration` where speed along the path is lost.
 
     Raises:
         RetimingFailed: no speed is feasible somewhere.
     """
     limit_v, limit_a = np.asarray(velocity, dtype=float), np.asarray(acceleration, dtype=float)
+    limit_b = limit_a if braking is None else np.asarray(braking, dtype=float)
     move = float((np.maximum(np.abs(path.d0), np.abs(path.d1)).max(axis=1) * path.lengths).sum())
     step = min(step, move / _LEAST_INTERVALS)
     for _ in range(_REFINEMENTS):
-        trajectory = _timed(path.divided(step), limit_v, limit_a, speed)
-        if _overshoot(trajectory, limit_a) <= _OVERSHOOT:
+        trajectory = _timed(path.divided(step), limit_v, limit_a, limit_b, speed)
+        if _overshoot(trajectory, np.maximum(limit_a, limit_b)) <= _OVERSHOOT:
             return trajectory
         step /= 3
     raise RetimingFailed("the path bends too sharply to be followed by cubics")
 
 
-def _timed(grid: SmoothPath, limit_v: Array, limit_a: Array, speed: float) -> TimedPath:
-    x, u = _profile(grid, limit_v, limit_a, speed)
+def _timed(grid: SmoothPath, limit_v: Array, limit_a: Array, limit_b: Array, speed: float) -> TimedPath:
+    x, u = _profile(grid, limit_v, limit_a, limit_b, speed)
     root = np.sqrt(x)
     durations = 2 * grid.lengths / (root[:-1] + root[1:])
     times = np.concatenate([[0.0], np.cumsum(durations)])
@@ -104,22 +107,23 @@ def _overshoot(trajectory: TimedPath, limit_a: Array) -> float:
     return max(float((np.abs(values) / limit_a).max()) for values in end_accelerations(trajectory))
 
 
-def _profile(grid: SmoothPath, limit_v: Array, limit_a: Array, speed: float) -> tuple[Array, Array]:
+def _profile(
+    grid: SmoothPath, limit_v: Array, limit_a: Array, limit_b: Array, speed: float
+) -> tuple[Array, Array]:
     """x (N + 1,) at the grid points and u (N,) between them."""
     d0, d1, lengths = grid.d0, grid.d1, grid.lengths
     bends = (d1 - d0) / lengths[:, None]
     # Joint accelerations at both ends of an interval, as D u + C x with the x of its beginning.
     D = np.concatenate([d0, d1 + 2 * lengths[:, None] * bends], axis=1)
     C = np.concatenate([bends, bends], axis=1)
-    limits = np.concatenate([limit_a, limit_a])
     flat = np.abs(D) < _TINY
     sign = np.where(D < 0, -1.0, 1.0)
     safe = np.where(flat, 1.0, np.abs(D))
-    A = np.where(flat, np.inf, limits / safe)  # -A - B x <= u <= A - B x
-    B = np.where(flat, 0.0, sign * C / safe)
-    most = _highest_x(grid, limit_v, limit_a, bends, speed)
-    highest = _backward(most, lengths, A, B)
-    return _forward(highest, lengths, A, B)
+    up, down = (np.where(flat, np.inf, np.concatenate([limit, limit]) / safe) for limit in (limit_a, limit_b))
+    B = np.where(flat, 0.0, sign * C / safe)  # -down - B x <= u <= up - B x
+    most = _highest_x(grid, limit_v, np.minimum(limit_a, limit_b), bends, speed)
+    highest = _backward(most, lengths, down, B)
+    return _forward(highest, lengths, up, B)
 
 
 def _highest_x(grid: SmoothPath, limit_v: Array, limit_a: Array, bends: Array, speed: float) -> list[float]:

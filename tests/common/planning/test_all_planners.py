@@ -11,7 +11,7 @@ from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sou
 from tests.common.planning.planning_scenes import ROBOT, above, last, scene, solid, to_joints, to_pose
 
 JOINT_GOALS = ["joint_move", "lerp", "ompl", "ptp"]
-POSE_GOALS = ["cartesian", "lerp", "ompl", "ptp"]
+POSE_GOALS = ["cartesian", "lerp", "lin", "ompl", "ptp"]
 ALL = sorted({*JOINT_GOALS, *POSE_GOALS})
 PIPELINES = {name: with_planner(name) for name in ALL}
 NEVER_FOUND = [name for name in ALL if name != "ompl"]

@@ -1,10 +1,15 @@
 """Point to point, straight lines and arcs with trapezoidal profiles."""
 
-import numpy as np
+from itertools import pairwise
 
-from common.planning.retiming import end_accelerations
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from common.planning.retiming import TimedPath, end_accelerations, sample
+from common.robot.transforms import tool_down
 from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sound, wall, with_planner
-from tests.common.planning.planning_scenes import CELL, ROBOT, to_joints
+from tests.common.planning.planning_scenes import CELL, ROBOT, last, scene, solid, to_joints, to_pose
 
 
 def test_point_to_point_has_three_phases_and_all_joints_share_them():
@@ -23,3 +28,69 @@ def test_point_to_point_has_three_phases_and_all_joints_share_them():
 def test_point_to_point_names_the_waypoint_of_a_collision():
     response = with_planner("ptp", steps=20).plan(to_joints(LEFT, RIGHT), wall())
     assert f"waypoint {response.attempts[-1].waypoint} of 20" in response.message
+
+
+def tool_along(timed: TimedPath, count: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times [s], (N, 4, 4) poses of the tool, and (N - 1,) its speed [m/s] between them."""
+    times = np.linspace(0, timed.duration, count)
+    poses = np.array([ROBOT.fk(q) for q in sample(timed, times)])
+    speeds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / np.diff(times)
+    return times, poses, speeds
+
+
+def test_line_has_a_trapezoidal_profile_of_the_tool():
+    pipeline = with_planner("lin", speed=0.5, acceleration=1.0, deceleration=2.0)
+    request = to_pose(tool_down(0.5, 0.3, 0.2), RIGHT)  # scaled to 0.1 m/s, 0.2 m/s^2 and 0.4 m/s^2
+    timed = assert_sound(pipeline, request, scene(box=False), pipeline.plan(request, scene(box=False)))
+    times, poses, speeds = tool_along(timed)
+    assert speeds.max() == pytest.approx(0.1, rel=0.01)
+    assert timed.duration == pytest.approx(0.6 / 0.1 + 0.05 / 0.2 + 0.05 / 0.4, rel=0.01)
+    changes = np.diff(speeds) / times[1]
+    assert np.median(changes[:20]) == pytest.approx(0.2, rel=0.03)
+    assert np.median(changes[-10:]) == pytest.approx(-0.4, rel=0.03)
+    T_start, T_goal = ROBOT.fk(RIGHT), tool_down(0.5, 0.3, 0.2)
+    way = (T_goal - T_start)[:3, 3]
+    shares = (poses[:, :3, 3] - T_start[:3, 3]) @ way / (way @ way)
+    assert np.linalg.norm(poses[:, :3, 3] - T_start[:3, 3] - shares[:, None] * way, axis=1).max() < 2e-4
+
+
+def test_turn_on_the_spot_keeps_the_rotation_speed_of_the_tool():
+    pipeline = with_planner("lin")
+    request = to_pose(ROBOT.fk(RIGHT) @ _turned(1.2), RIGHT)
+    timed = assert_sound(pipeline, request, AROUND, pipeline.plan(request, AROUND))
+    times, poses, speeds = tool_along(timed)
+    R = poses[:, :3, :3]
+    turns = [np.linalg.norm(pin.log3(a.T @ b)) for a, b in pairwise(R)]
+    assert max(turns) / times[1] == pytest.approx(0.2 * 1.57, rel=0.02)
+    assert speeds.max() < 0.01
+
+
+def _turned(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+def test_line_is_slowed_down_where_a_joint_is_at_its_limit():
+    pipeline = with_planner("lin", speed=3.0, acceleration=50, deceleration=50)
+    request = to_pose(tool_down(0.5, 0.3, 0.2), RIGHT)
+    timed = assert_sound(pipeline, request, scene(box=False), pipeline.plan(request, scene(box=False)))
+    limit = CELL.motion.velocity_scaling * ROBOT.velocity
+    assert (np.abs(timed.velocities) / limit).max() > 0.97
+    assert tool_along(timed)[2].max() < 0.6
+
+
+def test_line_says_at_which_waypoint_it_ends_and_why():
+    beam = solid("beam", "fixture", "box", [0.3, 0.02, 0.6], (0.5, 0.0, 0.3))
+    blocked = scene(box=False)
+    blocked.objects.append(beam)
+    response = with_planner("lin").plan(to_pose(tool_down(0.5, 0.3, 0.2), RIGHT), blocked)
+    assert response.error == "collision"
+    assert f"waypoint {response.attempts[-1].waypoint} of 120: " in response.message
+    assert "collides with beam" in response.message
+    assert 0.1 < response.fraction < 0.5
+
+
+def test_line_ends_at_the_very_pose():
+    T = tool_down(0.45, 0.1, 0.35, 0.7)
+    response = with_planner("lin").plan(to_pose(T, RIGHT), AROUND)
+    assert np.allclose(ROBOT.fk(last(response)), T, atol=1e-4)

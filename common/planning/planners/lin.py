@@ -1,0 +1,45 @@
+"""A straight line of the tool as an industrial controller moves it: with a trapezoidal profile of the tool's speed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from pydantic import Field
+
+from common.planning.planners import cartesian
+from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result
+from common.planning.tool_timing import ToolLimits, follow_in_time
+
+Array = NDArray[np.float64]
+
+
+class Options(ToolLimits):
+    """Limits of the tool, and how finely the line is followed."""
+
+    step: float = Field(0.005, gt=0, le=0.2, description="way of the tool between IK solutions [m]")
+    rotation_step: float = Field(0.05, gt=0, le=1, description="turn of the tool between IK solutions [rad]")
+    jump_threshold: float = Field(0.35, gt=0, le=3.2, description="a joint that moves more in a step has jumped [rad]")
+
+
+def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
+    """A trajectory along the whole line to a pose goal, or what ends the line."""
+    if not isinstance(problem.goal, Region):
+        return Result(error=NOT_APPLICABLE, message="a straight line of the tool needs a pose goal")
+    given = cartesian.Options(
+        step=options.step, rotation_step=options.rotation_step, jump_threshold=options.jump_threshold, min_fraction=1.0
+    )
+    result = cartesian.plan(problem, given, cancel)
+    if result.waypoints is None:
+        return result
+    shares = np.linspace(0, 1, len(result.waypoints))[:, None]
+    ways = shares * line_ways(problem.robot.fk(problem.start), problem.goal.T_world_tcp)
+    return Result(trajectory=follow_in_time(problem, result.waypoints, ways, options), fraction=1.0)
+
+
+def line_ways(T_from: Array, T_to: Array) -> Array:
+    """(2,) way [m] and turn [rad] between two poses (4, 4)."""
+    turn = pin.log3(T_from[:3, :3].T @ T_to[:3, :3])
+    return np.array([math.dist(T_from[:3, 3], T_to[:3, 3]), float(np.linalg.norm(turn))])
