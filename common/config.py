@@ -71,7 +71,7 @@ class GripperConfig(Section):
     acceleration: Length = Field(2.0, description="of the width [m/s^2]")
     jerk: float = Field(50.0, gt=0, le=1e4, description="of the width [m/s^3]")
     max_effort: float = Field(70.0, gt=0, le=1e4, description="grip force [N]")
-    controller: str = Field("gripper_controller", description="name of its controller")
+    controller: str = Field("gripper_controller", description="name of its controller, the source of its state")
     named_widths: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field({}, description="such as open, closed [m]")
 
     @model_validator(mode="after")
@@ -139,7 +139,7 @@ class RobotConfig(Section):
     velocity_limits: list[Annotated[float, Field(gt=0, le=100)]] = Field([], description="[rad/s]; else the URDF's")
     acceleration_limits: list[Annotated[float, Field(gt=0, le=1000)]] = Field(description="[rad/s^2]")
     jerk_limits: list[Annotated[float, Field(gt=0, le=1e6)]] = Field(description="[rad/s^3]")
-    controller: str = Field("arm_controller", description="name of the trajectory controller")
+    controller: str = Field("controller", description="name of the arm's controller, the source of its status")
     gripper: GripperConfig | None = None
     hardware: HardwareConfig = HardwareConfig()
 

@@ -309,6 +309,49 @@ class PathGoal(Message):
     tool_speed: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] | None = Field(None, description="[m/s]")
 
 
+class ArcGoal(Message):
+    """A pose that the tool centre point reaches on a circular arc from where it starts.
+
+    The circle is told by a point `via` which the arc passes, or by its `center`; then the shorter arc is taken. The
+    orientation turns evenly along it.
+    """
+
+    kind: Literal["arc"] = "arc"
+    pose: Pose
+    via: Vector3 | None = Field(None, description="a point that the arc passes [m]")
+    center: Vector3 | None = Field(None, description="of the circle [m]")
+
+    @model_validator(mode="after")
+    def _tells_one_circle(self) -> ArcGoal:
+        if (self.via is None) == (self.center is None):
+            raise ValueError("an arc has either via or center")
+        return self
+
+
+class SequenceItem(Message):
+    """One motion of a sequence: point to point, a straight line where `straight`, an arc for an arc goal.
+
+    The tool rounds the corner to the next item off within `blend_radius` of this goal; with none it stops there.
+    """
+
+    goal: Annotated[JointGoal | PoseGoal | ArcGoal, Field(discriminator="kind")]
+    straight: bool = False
+    blend_radius: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = Field(0.0, description="[m]")
+
+
+class SequenceGoal(Message):
+    """Goals to reach one after the other, in one trajectory."""
+
+    kind: Literal["sequence"] = "sequence"
+    items: list[SequenceItem] = Field(min_length=1, max_length=200)
+
+    @model_validator(mode="after")
+    def _stops_at_the_end(self) -> SequenceGoal:
+        if self.items[-1].blend_radius:
+            raise ValueError(f"the last item has blend_radius {self.items[-1].blend_radius:g}, but nothing follows it")
+        return self
+
+
 class PlanRequest(Message):
     """Ask for a trajectory. Poses are in the robot's base frame, `world`.
 
@@ -321,7 +364,7 @@ class PlanRequest(Message):
     id: Name
     stage: str = Field("", description="what the motion is for: appears in every error")
     start: list[Finite] = Field([], description="joint positions [rad]; empty: where the robot is now")
-    goal: Annotated[JointGoal | PoseGoal | PathGoal, Field(discriminator="kind")]
+    goal: Annotated[JointGoal | PoseGoal | PathGoal | ArcGoal | SequenceGoal, Field(discriminator="kind")]
     straight: bool = Field(False, description="only a straight line of the tool will do")
     allowed_collisions: list[tuple[str, str]] = Field([], description="in addition to the planning scene's")
     attach: str = ""
@@ -392,7 +435,7 @@ class MotionStatus(Message):
     progress: Fraction = 0.0
     error: str = Field("", description="code, such as start_mismatch, limit, path_tolerance, cancelled")
     message: str = ""
-    source: str = Field("", description="who said so: controller or hardware")
+    source: str = Field("", description="who said so: the controller by its name, or hardware")
 
 
 class GripperCommand(Message):
@@ -400,6 +443,7 @@ class GripperCommand(Message):
 
     id: Name
     width: Annotated[float, Field(ge=0, le=0.2, allow_inf_nan=False)]
+    effort: Annotated[float, Field(ge=0, le=1e4, description="grip force [N]; 0: as much as the gripper has")] = 0.0
 
 
 class GripperState(Message):
@@ -407,11 +451,14 @@ class GripperState(Message):
 
     header: Header = Header()
     width: Finite = 0.0
+    position: Finite = Field(0.0, description="driven joint [rad or m]")
+    effort: Finite = Field(0.0, description="what the fingers press with [N]")
     holding: bool = False
     moving: bool = False
     id: str = ""
     state: GoalState = "none"
     message: str = ""
+    source: str = Field("", description="name of the gripper's controller")
 
 
 # --- task -------------------------------------------------------------------------------------------------------

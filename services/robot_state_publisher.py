@@ -41,6 +41,7 @@ class LinkFrames:
         model = robot.full_model
         joint = {frame.name: frame.parentJoint for frame in model.frames if frame.name in robot.link_names}
         self.root = next(link for link in robot.link_names if link not in robot.link_parents)
+        self.T_world_root = robot.link_poses(robot.named("home"))[self.root]
         self._fixed = [link for link, parent in robot.link_parents.items() if joint[link] == joint[parent]]
         self._moving = [link for link in robot.link_parents if link not in self._fixed]
 
@@ -72,7 +73,7 @@ async def run(bus: Bus, config: Config) -> None:
     frames = LinkFrames(RobotModel.load(config.robot))
     camera, stamp = config.surroundings.camera, bus.header().stamp
     T_world_camera = transform(rpy_to_matrix(*camera.rpy), camera.position)
-    base = stamped(WORLD, frames.root, np.eye(4), stamp)
+    base = stamped(WORLD, frames.root, frames.T_world_root, stamp)
     fixed = [base, stamped(WORLD, camera.frame, T_world_camera, stamp), *frames.fixed(stamp)]
     tf_static.put(TFMessage(transforms=fixed))
     await bus.ready()

@@ -61,7 +61,8 @@ def make_cycle(config: Config, simulated: bool) -> ControlCycle:
         world = SimulatedWorld(config.world, places, config.grasp_tolerances)
     return ControlCycle(
         load_hardware(config.robot, limits, home), limits, home,
-        tolerances=config.tolerances, gripper=config.robot.gripper, kinematics=robot, world=world,
+        tolerances=config.tolerances, gripper=config.robot.gripper, controller=config.robot.controller,
+        kinematics=robot, world=world,
     )
 
 

@@ -48,9 +48,11 @@ class TrajectoryController:
     """Follows one trajectory at a time, and holds still between them."""
 
     def __init__(
-        self, limits: Limits, start: Vector, tolerances: Tolerances | None = None, remember: int = 1000
+        self, limits: Limits, start: Vector, tolerances: Tolerances | None = None, remember: int = 1000,
+        name: str = "controller",
     ) -> None:
-        """Hold at `start` (dof,) [rad]; `remember` so many goals by their ids."""
+        """Hold at `start` (dof,) [rad]; `remember` so many goals by their ids; sign reports with the name."""
+        self._name = name
         self._limits = limits
         self._tolerances = tolerances or Tolerances()
         self._hold = start.copy()
@@ -79,7 +81,7 @@ class TrajectoryController:
             checked = checked_trajectory(trajectory, self._limits, measured, self._tolerances)
         except Refused as refusal:
             rejected = MotionStatus(
-                id=goal, state="rejected", error=refusal.code, message=str(refusal), source="controller"
+                id=goal, state="rejected", error=refusal.code, message=str(refusal), source=self._name
             )
             return self._memory.put(goal, rejected)
         # Go on from the set-point, unless the arm was moved from outside since.
@@ -100,7 +102,7 @@ class TrajectoryController:
                 return self.status
             unknown = f"no goal {goal!r} is known"
             return self._memory.get(goal) or MotionStatus(
-                id=goal, error="unknown_goal", message=unknown, source="controller"
+                id=goal, error="unknown_goal", message=unknown, source=self._name
             )
         if running.stop is None:
             running.stop = plan_stop(running.trajectory, running.time, self._limits)
@@ -134,7 +136,7 @@ class TrajectoryController:
             self._report("active")
         return self._hold, velocity
 
-    def abort(self, error: str, message: str, measured: Vector | None = None, source: str = "controller") -> None:
+    def abort(self, error: str, message: str, measured: Vector | None = None, source: str = "") -> None:
         """End the running goal and hold where the robot is."""
         if measured is not None:
             self._hold = measured.copy()
@@ -169,14 +171,14 @@ class TrajectoryController:
             self.abort("goal_tolerance", f"{name} is {what} {allowed.goal_time:g} s after the end", measured)
         return None
 
-    def _report(self, state: GoalState, error: str = "", message: str = "", source: str = "controller") -> MotionStatus:
+    def _report(self, state: GoalState, error: str = "", message: str = "", source: str = "") -> MotionStatus:
         assert self._goal is not None
         progress = 1.0 if state == "succeeded" else min(self._goal.time / self._goal.trajectory.duration, 1.0)
         self.status = MotionStatus(
-            id=self._goal.id, state=state, progress=progress, error=error, message=message, source=source
+            id=self._goal.id, state=state, progress=progress, error=error, message=message, source=source or self._name
         )
         return self._memory.put(self._goal.id, self.status)
 
-    def _finish(self, state: GoalState, error: str = "", message: str = "", source: str = "controller") -> None:
+    def _finish(self, state: GoalState, error: str = "", message: str = "", source: str = "") -> None:
         self._report(state, error, message, source)
         self._goal = None

@@ -27,6 +27,7 @@ from common.messages import (
     WorldEdit,
     WorldEditReply,
 )
+from common.robot.finger_joints import finger_positions, finger_velocities
 
 PROGRESS_PERIOD = 0.1  # cell time between reports of progress [s]
 WORLD_PERIOD = 0.05  # cell time between reports of a ball that moves [s]
@@ -86,6 +87,7 @@ class ControlCycle:
         *,
         tolerances: Tolerances | None = None,
         gripper: GripperConfig | None = None,
+        controller: str = "controller",
         kinematics: Kinematics | None = None,
         world: Truth | None = None,
     ) -> None:
@@ -96,9 +98,9 @@ class ControlCycle:
         """
         self._hardware, self._limits = hardware, limits
         self._kinematics, self._world = kinematics, world
-        self._arm = TrajectoryController(limits, start, tolerances)
+        self._arm = TrajectoryController(limits, start, tolerances, name=controller)
         self._gripper: GripperController | None = None
-        self._fingers: list[str] = []
+        self._fingers = gripper
         self._obstructible: SimulatedGripper | None = None
         if gripper is not None:
             backend = type(hardware).__name__
@@ -109,9 +111,8 @@ class ControlCycle:
                     raise ConfigError("robot.hardware.backend", backend, "is simulated: its gripper needs obstruct()")
                 self._obstructible = hardware.gripper
             self._gripper = GripperController(hardware.gripper, gripper)
-            self._fingers = list(gripper.joints)
         self._q = start.copy()
-        self._finger_speed = 0.0
+        self._width_rate = 0.0
         self._told_motion: MotionStatus | None = None
         self._told_motion_at = self._told_gripper_at = self._told_world_at = -np.inf
         self._told_gripper: GripperState | None = None
@@ -182,17 +183,17 @@ class ControlCycle:
             self._obstructible.obstruct(self._world.obstruction(T_world_tcp, self._gripper.state.width))
             reading = gripper.read(now)
             self._world.tick(now, T_world_tcp, reading.width, reading.holding)
-        self._finger_speed = reading.velocity / 2
+        self._width_rate = reading.velocity
         self._gripper.update(reading)
 
     def _joint_state(self, header: Header, dq: Vector) -> JointState:
-        width = self._gripper.state.width / 2 if self._gripper else 0.0
-        return JointState(
-            header=header,
-            name=[*self._limits.names, *self._fingers],
-            position=[*self._q.tolist(), *(width for _ in self._fingers)],
-            velocity=[*dq.tolist(), *(self._finger_speed for _ in self._fingers)],
-        )
+        names, positions, velocities = list(self._limits.names), self._q.tolist(), dq.tolist()
+        if self._gripper is not None and self._fingers is not None:
+            width = self._gripper.state.width
+            names += self._fingers.joints
+            positions += finger_positions(self._fingers, width)
+            velocities += finger_velocities(self._fingers, width, self._width_rate)
+        return JointState(header=header, name=names, position=positions, velocity=velocities)
 
     def _news_of_motion(self, header: Header, now: float) -> MotionStatus | None:
         status, told = self._arm.status, self._told_motion
@@ -206,7 +207,7 @@ class ControlCycle:
         if self._gripper is None:
             return None
         state, told = self._gripper.state, self._told_gripper
-        same = told is not None and told.model_copy(update={"width": state.width}) == state
+        same = told is not None and told.model_copy(update={"width": state.width, "position": state.position}) == state
         if same and (told == state or now - self._told_gripper_at < PROGRESS_PERIOD):
             return None
         self._told_gripper, self._told_gripper_at = state, now

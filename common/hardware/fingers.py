@@ -21,15 +21,20 @@ class Fingers:
         self._config = config
         self._width, self._velocity, self._acceleration = width, 0.0, 0.0
         self._target = width
+        self._effort = config.max_effort
         self._obstruction = 0.0
         self._blocked = False
         self._since = 0.0
         self._motion: ruckig.Trajectory | None = None
         self._now = 0.0
 
-    def command(self, width: float, now: float) -> None:
-        """Start to move from the present width, velocity and acceleration to rest at a width [m]."""
+    def command(self, width: float, now: float, effort: float | None = None) -> None:
+        """Start to move from the present width, velocity and acceleration to rest at a width [m].
+
+        On something in the way the fingers press with an effort [N], all that they have when none is given.
+        """
         self._advance(now)
+        self._effort = self._config.max_effort if effort is None else effort
         self._target = min(max(width, 0.0), self._config.max_width)
         self._start(now)
 
@@ -42,9 +47,10 @@ class Fingers:
             self._start(self._now)
 
     def read(self, now: float) -> GripperReading:
-        """Width [m], its rate [m/s], whether the fingers move, and whether they press on something."""
+        """Width [m], its rate [m/s], whether the fingers move, whether they press on something, and how hard."""
         self._advance(now)
-        return GripperReading(self._width, self._velocity, self._motion is not None, self._blocked)
+        effort = self._effort if self._blocked else 0.0
+        return GripperReading(self._width, self._velocity, self._motion is not None, self._blocked, effort)
 
     def _start(self, now: float) -> None:
         self._blocked = False

@@ -6,6 +6,7 @@ from common.config import GripperConfig
 from common.hardware.goals import GoalMemory
 from common.hardware.interface import Gripper, GripperReading
 from common.messages import GripperCommand, GripperState
+from common.robot.finger_joints import driven_position
 
 SETTLED = 1e-3  # fingers that stop this near to the width they were told are there [m]
 
@@ -19,30 +20,37 @@ class GripperController:
         self._config = config
         self._memory: GoalMemory[GripperState] = GoalMemory(remember)
         self._target = 0.0
-        self.state = GripperState()
+        self.state = GripperState(source=config.controller)
 
     def command(self, request: GripperCommand, now: float) -> GripperState:
         """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
         known = self._memory.get(request.id)
         if known is not None:
             return known
-        reading = {"width": self.state.width, "holding": self.state.holding, "moving": self.state.moving}
+        reading = self.state.model_dump(include={"width", "position", "effort", "holding", "moving", "source"})
+        message = ""
         if request.width > self._config.max_width:
             message = f"width {request.width:g} m is more than the fingers open ({self._config.max_width:g} m)"
+        elif request.effort > self._config.max_effort:
+            message = f"effort {request.effort:g} N is more than the fingers have ({self._config.max_effort:g} N)"
+        if message:
             rejected = GripperState.model_validate(
                 {**reading, "id": request.id, "state": "rejected", "message": message})
             return self._memory.put(request.id, rejected)
         if self.state.state == "active":
             replaced = {"state": "cancelled", "message": f"replaced by {request.id!r}"}
             self._memory.put(self.state.id, self.state.model_copy(update=replaced))
-        self._gripper.command(request.width, now)
+        self._gripper.command(request.width, now, request.effort or self._config.max_effort)
         self._target = request.width
         self.state = GripperState.model_validate({**reading, "moving": True, "id": request.id, "state": "active"})
         return self._memory.put(request.id, self.state)
 
     def update(self, reading: GripperReading) -> GripperState:
         """The state with the newest reading: a goal is over when the fingers have stopped."""
-        changes: dict[str, object] = {"width": reading.width, "holding": reading.holding, "moving": reading.moving}
+        changes: dict[str, object] = {
+            "width": reading.width, "position": driven_position(self._config, reading.width),
+            "effort": reading.effort, "holding": reading.holding, "moving": reading.moving,
+        }
         if self.state.state == "active" and not reading.moving:
             changes["state"] = "succeeded"
             if abs(reading.width - self._target) > SETTLED and not reading.holding:

@@ -40,19 +40,20 @@ class Limits:
 
 @dataclass(frozen=True)
 class GripperReading:
-    """State of the fingers: `width` between their inner faces [m], its rate [m/s]."""
+    """State of the fingers: `width` between their inner faces [m], its rate [m/s], `effort` they press with [N]."""
 
     width: float
     velocity: float
     moving: bool
     holding: bool
+    effort: float = 0.0
 
 
 class Gripper(Protocol):
     """Two fingers that open and close."""
 
-    def command(self, width: float, now: float) -> None:
-        """Start to move the fingers to a width [m]; replaces a motion under way."""
+    def command(self, width: float, now: float, effort: float) -> None:
+        """Start to move the fingers to a width [m], pressing with an effort [N]; replaces a motion under way."""
 
     def read(self, now: float) -> GripperReading:
         """State of the fingers at a time that does not go back."""

@@ -200,7 +200,7 @@ def test_arm_without_gripper_refuses_gripper_commands(limits):
 class Numb:
     """Fingers of a simulated arm that feel nothing."""
 
-    def command(self, width, now):
+    def command(self, width, now, effort):
         pass
 
     def read(self, now):

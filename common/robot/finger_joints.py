@@ -1,0 +1,46 @@
+"""Where the joints of a gripper are when its fingers are some width apart."""
+
+from __future__ import annotations
+
+import math
+
+from common.config import GripperConfig
+
+
+def driven_position(gripper: GripperConfig, width: float) -> float:
+    """Position of the driven joint [rad or m] at a width [m]: half of it, or the angle of the linkage.
+
+    The pads move as the ends of the linkage's bars do, sideways by length * sin(open_angle - a).
+    """
+    bars = gripper.linkage
+    if bars is None:
+        return width / 2
+    sine = math.sin(bars.open_angle - bars.closed) + width / (2 * bars.length)
+    return bars.open_angle - math.asin(min(max(sine, -1.0), 1.0))
+
+
+def width_at(gripper: GripperConfig, position: float) -> float:
+    """Width [m] at a position of the driven joint [rad or m]: the inverse of `driven_position`."""
+    bars = gripper.linkage
+    if bars is None:
+        return 2 * position
+    return 2 * bars.length * (math.sin(bars.open_angle - position) - math.sin(bars.open_angle - bars.closed))
+
+
+def finger_positions(gripper: GripperConfig, width: float) -> list[float]:
+    """Positions [rad or m] of the gripper's joints, in their order, at a width [m]."""
+    driven = driven_position(gripper, width)
+    return [factor * driven for factor in _factors(gripper)]
+
+
+def finger_velocities(gripper: GripperConfig, width: float, rate: float) -> list[float]:
+    """Velocities [rad/s or m/s] of the gripper's joints at a width [m] that changes at a rate [m/s]."""
+    driven = rate / 2
+    if gripper.linkage is not None:
+        bars = gripper.linkage
+        driven = -rate / (2 * bars.length * math.cos(bars.open_angle - driven_position(gripper, width)))
+    return [factor * driven for factor in _factors(gripper)]
+
+
+def _factors(gripper: GripperConfig) -> list[float]:
+    return list(gripper.mimic) or [1.0] * len(gripper.joints)
