@@ -17,11 +17,10 @@ from pydantic import Field
 from common import messages as m
 from common.config import Grasp, GripperConfig, Parameters, Surroundings
 from common.tasks.choice import Choice
+from common.tasks.execution import Execution, Report, note_plan
 from common.tasks.grasp import HandShape
 from common.tasks.row import Rows, Tolerances
 from common.tasks.stages import Command, Cycle, Grip, Move, Stage, Target, View, appeared
-
-MOST_FIGURES = 200  # plans that the status tells of: a cell may run for days
 
 
 class PickPlaceParameters(Parameters):
@@ -67,8 +66,7 @@ class PickPlace:
                              parameters.max_retries)
         self.status = m.PickPlaceStatus(started=started)
         self._stages: deque[Stage] = deque()
-        self._running: tuple[Stage, str, float] | None = None  # stage, goal id, when it was asked for
-        self._accepted: int | None = None  # stamp of the answer that accepted what runs
+        self._running: Execution[Stage] | None = None
         self._stopping = False
         self._planning: tuple[Move, str] | None = None
         self._minted = 0
@@ -100,25 +98,17 @@ class PickPlace:
             return  # of a row of stages that was thrown away meanwhile
         move, _ = self._planning
         self._planning = None
-        self.status.planning_seconds += response.seconds
+        note_plan(self.status, response)
         if not response.ok or response.trajectory is None:
             self._plan_failed(move, response, view)
             return
         move.trajectory = response.trajectory
-        self.status.plans.append(m.PlanFigure(
-            planner=response.planner, seconds=response.seconds, fraction=response.fraction,
-            attempts=max(1, len(response.attempts)),
-        ))
-        del self.status.plans[:-MOST_FIGURES]
 
     def on_goal(self, answer: m.MotionStatus | m.GripperState, view: View) -> None:
         """Take in the answer to execute or to a gripper command: accepted, or refused with a reason."""
-        if self._running is None or self._running[1] != answer.id:
+        if self._running is None or self._running.command.id != answer.id or self._running.accept(answer):
             return
-        if answer.state != "rejected":
-            self._accepted = answer.header.stamp
-            return
-        stage, self._running = self._running[0], None
+        stage, self._running = self._running.stage, None
         # A robot that is not where the plan began only needs a new plan.
         stale = isinstance(answer, m.MotionStatus) and answer.error == "start_mismatch"
         self._fail(f"{stage.name} was refused: {answer.message}", view, go_home=not stale)
@@ -144,7 +134,7 @@ class PickPlace:
             if view.motion.state == "active" or view.gripper.moving:
                 return []  # what a task before this one began is let finish
             self._decide(view)
-        elif self._running is not None and self._running[0].name == "across" and not self._waiting_cycle():
+        elif self._running is not None and self._running.stage.name == "across" and not self._waiting_cycle():
             self._queue_next(view)
         if self.status.state != "DONE":
             self.status.task_seconds = view.now - (self._began or view.now)
@@ -159,27 +149,27 @@ class PickPlace:
         """Follow the stage that runs: its end, its failure, and a ball that falls out of the hand."""
         if self._running is None:
             return []
-        stage, goal, since = self._running
-        reported = view.gripper if isinstance(stage, Grip) else view.motion
-        assert reported is not None
-        if reported.id == goal and reported.state in ("succeeded", "aborted", "cancelled"):
+        assert view.motion is not None and view.gripper is not None
+        running, stage = self._running, self._running.stage
+        outcome = running.outcome(view.motion, view.gripper)
+        if outcome == "ended":
             self._running = None
-            self.status.moving_seconds += max(0.0, view.now - since)
-            self._ended(stage, reported, view)
-        elif reported.id != goal and self._accepted is not None and reported.header.stamp > self._accepted:
+            self.status.moving_seconds += max(0.0, view.now - running.since)
+            self._ended(stage, running.report(view.motion, view.gripper), view)
+        elif outcome == "forgotten":
             self._running = None
             self._fail(f"{stage.name} was forgotten by the controller", view)
         elif isinstance(stage, Move) and stage.carries and not view.holding:
             stop = self._stop(view, "the ball fell")
             self._fail(f"the ball fell during {stage.name}", view, go_home=False)
             return stop
-        elif view.now - since > self.p.goal_timeout:
+        elif view.now - running.since > self.p.goal_timeout:
             stop = self._stop(view, "it takes too long")
             self._fail(f"{stage.name} took longer than {self.p.goal_timeout:g} s", view)
             return stop
         return []
 
-    def _ended(self, stage: Stage, reported: m.MotionStatus | m.GripperState, view: View) -> None:
+    def _ended(self, stage: Stage, reported: Report, view: View) -> None:
         if reported.state == "cancelled" and isinstance(stage, Move):
             self._clear()
             self.status.paused = True
@@ -252,12 +242,11 @@ class PickPlace:
         """Forget the row of stages and bring the arm to rest; fingers finish what they began."""
         self._clear()
         self._look_after = view.now
-        if self._running is None or isinstance(self._running[0], Grip):
+        if self._running is None or not self._running.moves_arm:
             return []
-        _, goal, since = self._running
-        self._running, self._stopping = None, True
-        self.status.moving_seconds += max(0.0, view.now - since)
-        return [m.StopRequest(id=goal, reason=reason)]
+        running, self._running, self._stopping = self._running, None, True
+        self.status.moving_seconds += max(0.0, view.now - running.since)
+        return [m.StopRequest(id=running.command.id, reason=reason)]
 
     # --- what to do next -------------------------------------------------------------------------------------
 
@@ -279,7 +268,7 @@ class PickPlace:
         assert view.tcp is not None and view.gripper is not None
         if min(view.targets_stamp, view.scene_stamp) <= self._look_after or not view.fresh(self.p.frame_timeout):
             return False
-        under_way = [self._running[0].cycle] if self._running and self._running[0].cycle else []
+        under_way = [self._running.stage.cycle] if self._running and self._running.stage.cycle else []
         box = self.around.container
         cycle = self.choice.next(view, (box.x, box.y) if under_way else view.tcp, under_way)
         if cycle is None:
@@ -311,7 +300,7 @@ class PickPlace:
         """Ask for the first motion that has no trajectory, from where the one before it ends."""
         if self._planning is not None:
             return
-        running = self._running[0] if self._running else None
+        running = self._running.stage if self._running else None
         end = running.end() if isinstance(running, Move) else []
         for move in self._stages:
             if not isinstance(move, Move):
@@ -381,15 +370,16 @@ class PickPlace:
         self._stages.popleft()
         if stage.cycle is not None and stage.name != "open":
             stage.cycle.begun = True
-        goal = self._mint()
-        self._running, self._accepted = (stage, goal, view.now), None
-        self.status.state, self.status.stage = stage.state, stage.name
-        self.status.target = stage.cycle.target.id if stage.cycle else ""
+        command: m.ExecuteRequest | m.GripperCommand
         if isinstance(stage, Grip):
-            yield m.GripperCommand(id=goal, width=stage.width)
+            command = m.GripperCommand(id=self._mint(), width=stage.width)
         else:
             assert stage.trajectory is not None
-            yield m.ExecuteRequest(id=goal, trajectory=stage.trajectory)
+            command = m.ExecuteRequest(id=self._mint(), trajectory=stage.trajectory)
+        self._running = Execution(stage, command, view.now)
+        self.status.state, self.status.stage = stage.state, stage.name
+        self.status.target = stage.cycle.target.id if stage.cycle else ""
+        yield command
 
     def _is_planned(self, move: Move) -> bool:
         """Whether it can begin: a pre-grasp only together with the whole way to the container."""
