@@ -581,6 +581,18 @@ class OutlineSelection(Message):
     label: str
 
 
+class OutlinePoints(PoseArray):
+    """The outline of the top face of the chosen object, closed: the last point is followed by the first.
+
+    The stamp is that of the picture. Without a chosen object, or when its outline can not be told, there are no poses
+    and `message` says why.
+    """
+
+    object: str = Field("", description="label of the chosen contour")
+    invalid_depth: int = Field(0, ge=0, description="pixels whose depth was filled from neighbours")
+    message: str = ""
+
+
 OutlineState = Literal[
     "IDLE", "SELECTING", "PLANNING", "APPROACHING", "TRACING", "RETREATING", "HOMING", "DONE", "ERROR"
 ]

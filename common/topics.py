@@ -80,8 +80,10 @@ DEPTH_CAMERA_POINTS = Topic("depth_camera/points", m.PointCloud2, "stream", "dep
 DEPTH_CAMERA_INFO = Topic("depth_camera/camera_info", m.CameraInfo, "state", "depth_camera", "intrinsics")
 CONTOURS = Topic("contours", m.Contours, "state", "contour_detector", "contours of the picture and the chosen one")
 CONTOUR_IMAGE = Topic("contour_image", m.Image, "state", "contour_detector", "the picture with labelled contours")
-CONTOUR_POINTS = Topic("contour_points", m.PoseArray, "state", "pixel_to_world", "the chosen contour in world")
-CONTOUR_PATH = Topic("contour_path", m.PoseArray, "state", "duplicate_remover", "the same, cleared of duplicates")
+CONTOUR_POINTS = Topic("contour_points", m.OutlinePoints, "state", "pixel_to_world",
+                       "outline of the chosen object's top face in world")
+CONTOUR_PATH = Topic("contour_path", m.OutlinePoints, "state", "duplicate_remover",
+                     "the same, cleared of duplicates")
 OUTLINE_STATUS = Topic("outline_status", m.OutlineStatus, "state", "contour_tracer", "state and figures")
 SUPERVISOR_STATUS = Topic("supervisor/status", m.SupervisorStatus, "state", "supervisor", "all processes")
 LOG = Topic("log", m.LogLine, "event", "everyone", "log lines")

@@ -1,0 +1,126 @@
+"""Solids of the world as triangles, for a camera to see: upright objects, fixtures, the links of a robot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.config import Fixture
+from common.messages import WorldObject
+from common.perception.ray_caster import Mesh
+from common.robot.transforms import rpy_to_matrix, transform
+from common.sim.objects import circle
+
+Array = NDArray[np.float64]
+
+RINGS = 24  # of a sphere, from pole to pole
+
+
+def object_mesh(thing: WorldObject) -> Mesh:
+    """Top, bottom and walls of an upright object."""
+    outline, hole = np.array(thing.outline), np.array(thing.hole).reshape(-1, 2)
+    color = (thing.color.r, thing.color.g, thing.color.b)
+    return Mesh(upright(outline, hole, thing.base, thing.base + thing.height), color)
+
+
+def upright(outline: Array, hole: Array, low: float, high: float) -> Array:
+    """Triangles (n, 3, 3) of the solid between two heights [m] with this outline (k, 2) and this hole, if any."""
+    face = between(outline, hole) if len(hole) else triangulate(outline)
+    parts = [_lift(face, low), _lift(face, high), _walls(outline, low, high)]
+    if len(hole):
+        parts.append(_walls(hole, low, high))
+    return np.concatenate(parts)
+
+
+def _lift(face: Array, z: float) -> Array:
+    return np.concatenate([face, np.full((len(face), 3, 1), z)], axis=2)
+
+
+def _walls(outline: Array, low: float, high: float) -> Array:
+    a, b = outline, np.roll(outline, -1, axis=0)
+    bottom, top = np.full((len(a), 1), low), np.full((len(a), 1), high)
+    corners = [np.hstack(pair) for pair in ((a, bottom), (b, bottom), (b, top), (a, top))]
+    return np.concatenate([np.stack([corners[0], corners[i], corners[i + 1]], axis=1) for i in (1, 2)])
+
+
+def between(outline: Array, hole: Array) -> Array:
+    """Triangles (n, 3, 2) of the band between two closed curves of the same sense that begin at the same angle."""
+    count = max(len(outline), len(hole))
+    steps = np.arange(count + 1)
+    a, b = outline[steps * len(outline) // count % len(outline)], hole[steps * len(hole) // count % len(hole)]
+    first, second = np.stack([a[:-1], a[1:], b[:-1]], axis=1), np.stack([a[1:], b[1:], b[:-1]], axis=1)
+    return np.concatenate([first, second])
+
+
+def triangulate(outline: Array) -> Array:
+    """Triangles (n, 3, 2) of a simple polygon (k, 2), either way round: ears are cut off until three corners are left.
+
+    Meisters, "Polygons have ears" (1975): there is always an ear. A convex polygon gets a fan about its middle, whose
+    triangles are less thin.
+    """
+    following = np.roll(outline, -1, axis=0)
+    twice_area = float(np.sum(_cross(outline, following)))
+    corners = outline if twice_area > 0 else outline[::-1]
+    side = np.roll(corners, -1, axis=0) - corners
+    if (_cross(side, np.roll(side, -1, axis=0)) >= 0).all():
+        middle = np.broadcast_to(corners.mean(axis=0), corners.shape)
+        return np.stack([middle, corners, np.roll(corners, -1, axis=0)], axis=1)
+    left = list(range(len(corners)))
+    ears = []
+    while len(left) > 3:
+        ear = next((i for i in range(len(left)) if _is_ear(corners, left, i)), 0)  # 0: the polygon crosses itself
+        ears.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
+        del left[ear]
+    return np.asarray(corners[np.array([*ears, left])])
+
+
+def _is_ear(corners: Array, left: Sequence[int], i: int) -> bool:
+    a, b, c = corners[left[i - 1]], corners[left[i]], corners[left[(i + 1) % len(left)]]
+    if _cross(b - a, c - b) <= 0:
+        return False
+    others = corners[[k for k in left if k not in (left[i - 1], left[i], left[(i + 1) % len(left)])]]
+    within = (_cross(b - a, others - a) > 0) & (_cross(c - b, others - b) > 0) & (_cross(a - c, others - c) > 0)
+    return not bool(within.any())
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def fixture_mesh(fixture: Fixture) -> Mesh:
+    """A box, cylinder or sphere in its place."""
+    size = fixture.dimensions
+    T = transform(rpy_to_matrix(*fixture.rpy), fixture.position)
+    return Mesh(placed(primitive(fixture.shape, size), T), fixture.color)
+
+
+def primitive(shape: str, dimensions: Sequence[float]) -> Array:
+    """Triangles (n, 3, 3) [m] about the origin: box (x, y, z), cylinder (radius, length along z), sphere (radius,)."""
+    if shape == "box":
+        x, y, z = (value / 2 for value in dimensions)
+        return upright(np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), np.empty((0, 2)), -z, z)
+    if shape == "cylinder":
+        return upright(circle(dimensions[0])[::4], np.empty((0, 2)), -dimensions[1] / 2, dimensions[1] / 2)
+    if shape == "sphere":
+        around, along = np.meshgrid(np.linspace(0, 2 * math.pi, 2 * RINGS + 1), np.linspace(0, math.pi, RINGS + 1))
+        grid = dimensions[0] * np.stack(
+            [np.sin(along) * np.cos(around), np.sin(along) * np.sin(around), np.cos(along)], axis=-1
+        )
+        a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
+        return np.concatenate([np.stack(three, axis=-2).reshape(-1, 3, 3) for three in ((a, b, c), (a, c, d))])
+    raise ValueError(f"no triangles for a {shape}; choices: box, cylinder, sphere")
+
+
+def placed(corners: Array, T: Array) -> Array:
+    """Triangles (n, 3, 3) after a rigid (4, 4) transform."""
+    return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
+
+
+def robot_meshes(
+    shapes: Mapping[str, Sequence[Array]], poses: Mapping[str, Array], color: tuple[float, float, float]
+) -> list[Mesh]:
+    """The links of a robot, given triangles in the frame of each link and the (4, 4) pose of each link in world."""
+    return [Mesh(placed(corners, poses[link]), color) for link, parts in shapes.items() for corners in parts]
