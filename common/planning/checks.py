@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import UnknownName, ZencellError
-from common.messages import JointGoal, PathGoal, PlanningScene, PlanRequest
+from common.messages import ArcGoal, JointGoal, PathGoal, PlanningScene, PlanRequest, PoseGoal, SequenceGoal
 from common.planning.collision import CollisionWorld, Pair
-from common.planning.problem import Region, ToolPath
+from common.planning.problem import Arc, Goal, GoalSequence, Part, Region, ToolPath
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, pose_to_matrix
 
@@ -32,10 +32,10 @@ class BadRequest(ZencellError):
 
 @dataclass(frozen=True)
 class CheckedRequest:
-    """Start (dof,) [rad] and goal, joint positions, a region or a path, of a request whose numbers fit the robot."""
+    """Start (dof,) [rad] and goal, such as joint positions or a region, of a request whose numbers fit the robot."""
 
     start: Array
-    goal: Array | Region | ToolPath
+    goal: Goal
 
 
 def check_request(
@@ -59,15 +59,25 @@ def check_request(
         start = _positions(robot, list(current), "current state", "bad_start")
     start = _within_limits(robot, start, "start", "start_out_of_limits")
     goal = request.goal
-    if isinstance(goal, JointGoal):
-        return CheckedRequest(start, _joint_goal(robot, goal))
     if isinstance(goal, PathGoal):
         return CheckedRequest(start, _tool_path(robot, start, goal))
+    if isinstance(goal, SequenceGoal):
+        parts = [Part(_single_goal(robot, item.goal), item.straight, item.blend_radius) for item in goal.items]
+        return CheckedRequest(start, GoalSequence(tuple(parts)))
+    return CheckedRequest(start, _single_goal(robot, goal))
+
+
+def _single_goal(robot: RobotModel, goal: JointGoal | PoseGoal | ArcGoal) -> Array | Region | Arc:
+    if isinstance(goal, JointGoal):
+        return _joint_goal(robot, goal)
+    if isinstance(goal, ArcGoal):
+        via, center = (None if p is None else np.array([p.x, p.y, p.z]) for p in (goal.via, goal.center))
+        return Arc(pose_to_matrix(goal.pose), via, center)
     tolerance = goal.position_tolerance
     sides = np.array([tolerance.x, tolerance.y, tolerance.z])
     if (sides < 0).any():
         raise BadRequest("bad_goal", f"goal has a negative position tolerance {float(sides.min()):g} m")
-    return CheckedRequest(start, Region(pose_to_matrix(goal.pose), sides / 2, goal.tilt_tolerance, goal.yaw_tolerance))
+    return Region(pose_to_matrix(goal.pose), sides / 2, goal.tilt_tolerance, goal.yaw_tolerance)
 
 
 def check_collisions(world: CollisionWorld, checked: CheckedRequest) -> None:

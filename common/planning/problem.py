@@ -44,12 +44,40 @@ class ToolPath:
 
 
 @dataclass(frozen=True)
+class Arc:
+    """A pose T_world_tcp (4, 4) at the end of a circular arc through `via`, or about `center` (3,) [m]."""
+
+    T_world_tcp: Array
+    via: Array | None = None
+    center: Array | None = None
+
+
+@dataclass(frozen=True)
+class Part:
+    """One motion of a sequence; the corner to the next is rounded off within `blend_radius` [m] of the goal."""
+
+    goal: Array | Region | Arc
+    straight: bool
+    blend_radius: float
+
+
+@dataclass(frozen=True)
+class GoalSequence:
+    """Goals to reach one after the other."""
+
+    parts: tuple[Part, ...]
+
+
+Goal = Array | Region | ToolPath | Arc | GoalSequence
+
+
+@dataclass(frozen=True)
 class Problem:
     """One checked request: the start is free and within limits.
 
     Attributes:
         start: (dof,) [rad].
-        goal: (dof,) [rad] for a joint goal, else a region for the TCP or a path that it follows.
+        goal: (dof,) [rad] for a joint goal, else a region for the TCP, a path that it follows, or several goals.
         straight: only a straight line of the TCP will do.
         velocity, acceleration, jerk: scaled limits (dof,).
         attempts: how many tries a sampling planner has.
@@ -59,7 +87,7 @@ class Problem:
     robot: RobotModel
     world: CollisionWorld
     start: Array
-    goal: Array | Region | ToolPath
+    goal: Goal
     straight: bool
     velocity: Array
     acceleration: Array

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from common.config import Parameters
-from common.planning.path import SmoothPath, dense_path
+from common.planning.path import dense_path
 from common.planning.problem import Problem
 from common.planning.retiming import TimedPath, parametrise
 from common.planning.timing import LIMIT_SHARE
 
 Array = NDArray[np.float64]
 
-_UNLIMITED = 1e9
+
+@dataclass(frozen=True)
+class ToolWaypoints:
+    """Waypoints (N, dof) [rad] that lie close together, and the ways of the tool up to each.
+
+    `ways` (N, 2) are way [m] and turn [rad] from the first; constant where the tool's own limits do not hold.
+    """
+
+    positions: Array
+    ways: Array
 
 
 class ToolLimits(Parameters):
@@ -29,7 +40,7 @@ class ToolLimits(Parameters):
     rotation_speed: float = Field(1.57, gt=0, le=10, description="of the tool [rad/s]")
 
 
-def follow_in_time(problem: Problem, waypoints: Array, ways: Array, limits: ToolLimits) -> TimedPath:
+def follow_in_time(problem: Problem, path: ToolWaypoints, limits: ToolLimits) -> TimedPath:
     """The fastest trajectory through waypoints that lie close together, from rest to rest.
 
     The ways of the tool are retimed as two more joints with limits of their own. Where the tool's limits are the lower
@@ -37,8 +48,7 @@ def follow_in_time(problem: Problem, waypoints: Array, ways: Array, limits: Tool
 
     Args:
         problem: the joint limits, already scaled.
-        waypoints: (N, dof) [rad].
-        ways: (N, 2) way [m] and turn [rad] of the tool up to each waypoint; constant where its limits do not hold.
+        path: waypoints and ways.
         limits: of the tool.
 
     Raises:
@@ -52,19 +62,15 @@ def follow_in_time(problem: Problem, waypoints: Array, ways: Array, limits: Tool
     tool_a = scale_a * limits.acceleration * np.array([1.0, turning])
     tool_b = scale_a * limits.deceleration * np.array([1.0, turning])
     velocity, acceleration = LIMIT_SHARE * problem.velocity, LIMIT_SHARE * problem.acceleration
-    still = np.abs(waypoints - waypoints[0]).max() < 1e-9
-    if still:
+    waypoints = path.positions
+    if np.abs(waypoints - waypoints[0]).max() < 1e-9:
         rest = np.zeros((2, robot.dof))
         return TimedPath(np.array([0.0, 0.01]), np.array([waypoints[0], waypoints[0]]), rest, rest)
     timed = parametrise(
-        _smooth(waypoints, ways),
+        dense_path(np.hstack([waypoints, path.ways])),
         np.concatenate([velocity, tool_v]),
         np.concatenate([acceleration, tool_a]),
         braking=np.concatenate([acceleration, tool_b]),
     )
     dof = robot.dof
     return TimedPath(timed.times, timed.positions[:, :dof], timed.velocities[:, :dof], timed.accelerations[:, :dof])
-
-
-def _smooth(waypoints: Array, ways: Array) -> SmoothPath:
-    return dense_path(np.hstack([waypoints, ways]))

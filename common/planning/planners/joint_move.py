@@ -7,7 +7,7 @@ import ruckig
 from numpy.typing import NDArray
 
 from common.config import Parameters
-from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result, ToolPath
+from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result
 from common.planning.retiming import TimedPath
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
     All joints move in proportion, so one profile along the edge (ruckig, state to state) times them all, and the states
     at its phases' ends give cubics between them exactly.
     """
-    if isinstance(problem.goal, Region | ToolPath) or problem.straight:
+    if not isinstance(problem.goal, np.ndarray) or problem.straight:
         return Result(error=NOT_APPLICABLE, message="joint moves need a joint goal and no straight line of the tool")
     hit = None
     if not problem.world.edge_free(problem.start, problem.goal):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -11,7 +12,7 @@ from pydantic import Field
 
 from common.planning.planners import cartesian
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result
-from common.planning.tool_timing import ToolLimits, follow_in_time
+from common.planning.tool_timing import ToolLimits, ToolWaypoints, follow_in_time
 
 Array = NDArray[np.float64]
 
@@ -28,15 +29,22 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
     """A trajectory along the whole line to a pose goal, or what ends the line."""
     if not isinstance(problem.goal, Region):
         return Result(error=NOT_APPLICABLE, message="a straight line of the tool needs a pose goal")
+    found = line_waypoints(problem, problem.goal, options, cancel)
+    if isinstance(found, Result):
+        return found
+    return Result(trajectory=follow_in_time(problem, found, options), fraction=1.0)
+
+
+def line_waypoints(problem: Problem, goal: Region, options: Options, cancel: Cancel) -> ToolWaypoints | Result:
+    """Evenly spaced waypoints of the line, or what ends it."""
     given = cartesian.Options(
         step=options.step, rotation_step=options.rotation_step, jump_threshold=options.jump_threshold, min_fraction=1.0
     )
-    result = cartesian.plan(problem, given, cancel)
+    result = cartesian.plan(replace(problem, goal=goal), given, cancel)
     if result.waypoints is None:
         return result
     shares = np.linspace(0, 1, len(result.waypoints))[:, None]
-    ways = shares * line_ways(problem.robot.fk(problem.start), problem.goal.T_world_tcp)
-    return Result(trajectory=follow_in_time(problem, result.waypoints, ways, options), fraction=1.0)
+    return ToolWaypoints(result.waypoints, shares * line_ways(problem.robot.fk(problem.start), goal.T_world_tcp))
 
 
 def line_ways(T_from: Array, T_to: Array) -> Array:

@@ -18,7 +18,7 @@ from common.config import Parameters
 from common.messages import PlanAttempt
 from common.planning.collision import CollisionWorld
 from common.planning.goal_sampling import least_time, sample_goals
-from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result, ToolPath
+from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
 
     A straight edge to one of the goals is taken when there is one: it is free for most pairs and nothing is shorter.
     """
-    if problem.straight or isinstance(problem.goal, ToolPath):
+    if problem.straight or not isinstance(problem.goal, Region | np.ndarray):
         return Result(error=NOT_APPLICABLE, message="a sampled path is no straight line of the tool")
     if isinstance(problem.goal, Region):
         samples = sample_goals(problem, problem.goal, cancel, wanted=options.goals, tries=options.goal_tries)
