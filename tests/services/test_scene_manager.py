@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Callable
+
 from common import messages as m
 from common import topics
 from common.clock import Clock
@@ -22,6 +25,13 @@ def frame(bus_stamp: int, *balls: tuple[float, float]) -> m.MarkerArray:
     return m.MarkerArray(header=m.Header(stamp=bus_stamp, frame_id="world"), markers=markers)
 
 
+async def film(expose: Callable[[], None]) -> None:
+    """Frames that go on, as those of a camera do: the first may come before the camera is known."""
+    while True:
+        expose()
+        await asyncio.sleep(0.02)
+
+
 async def test_seen_ball_becomes_an_object_with_an_id_and_moves_into_the_hand_that_takes_it() -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test", clock=Clock())
@@ -39,10 +49,11 @@ async def test_seen_ball_becomes_an_object_with_an_id_and_moves_into_the_hand_th
         first = await scene.next()
         assert {o.role for o in first.objects} == {"fixture", "container"}
         ball = (0.307, 0.0)  # below the hand at home, as far as the match radius is concerned not in it
-        seen = first
-        while not [o for o in seen.objects if o.role == "target"]:
-            detected.put(frame(bus.clock.now_ns(), ball))
-            seen = await scene.next()
+        async with asyncio.TaskGroup() as group:
+            camera = group.create_task(film(lambda: detected.put(frame(bus.clock.now_ns(), ball))))
+            while not [o for o in (await scene.next()).objects if o.role == "target"]:
+                pass
+            camera.cancel()
         grip.put(m.GripperState(header=bus.header(), width=0.06, holding=True))
         held = await scene.next()
         while not held.attached:
