@@ -472,6 +472,17 @@ class TaskCommand(Message):
     command: Literal["start", "pause", "resume", "stop"]
 
 
+class TaskStatus(Message):
+    """How far a task is, as the answer to a command: every task has more to say in a status of its own."""
+
+    header: Header = Header()
+    state: str = "IDLE"
+    paused: bool = False
+    started: bool = False
+    stage: str = ""
+    message: str = ""
+
+
 class PlanFigure(Message):
     """One successful plan, for the summary."""
 
@@ -612,6 +623,7 @@ class OutlineStatus(Message):
     length_m: Finite = 0.0
     closed: bool = False
     invalid_depth: int = Field(0, description="pixels of the contour whose depth was filled from neighbours")
+    standoff: Finite = Field(0.0, description="of the tool above the contour [m]")
     failures: int = 0
     plans: list[PlanFigure] = []
     moving_seconds: Finite = 0.0

@@ -30,6 +30,11 @@ class Topic(Generic[M]):
     writer: str
     doc: str
 
+    @property
+    def writers(self) -> list[str]:
+        """Services that write it, of which a cell has one."""
+        return self.writer.split(", ")
+
 
 @dataclass(frozen=True)
 class Request(Generic[Q, A]):
@@ -41,6 +46,11 @@ class Request(Generic[Q, A]):
     writer: str
     doc: str
     kind: Literal["request"] = "request"
+
+    @property
+    def writers(self) -> list[str]:
+        """Services that answer it, of which a cell has one."""
+        return self.writer.split(", ")
 
 
 SCENE_BALLS = Topic("scene_balls", m.PoseArray, "state", "trajectory_executor",
@@ -58,8 +68,8 @@ REJECTED_TARGETS = Topic("rejected_targets", m.Rejections, "event", "workspace_v
                          "detections that it can not take, with the reason, once for each place")
 WORKSPACE_MARKERS = Topic("workspace_markers", m.MarkerArray, "state", "workspace_validator",
                           "reachable shell and excluded column as cylinders")
-PLANNING_SCENE = Topic("planning_scene", m.PlanningScene, "state", "scene_manager",
-                       "fixtures and perceived objects with track ids, attached object, allowed collisions")
+PLANNING_SCENE = Topic("planning_scene", m.PlanningScene, "state", "scene_manager, outline_scene",
+                       "fixtures and perceived objects with ids, attached object, allowed collisions")
 JOINT_STATES = Topic("joint_states", m.JointState, "stream", "trajectory_executor", "joint positions, 100 Hz")
 TF = Topic("tf", m.TFMessage, "stream", "robot_state_publisher", "poses of the robot's links")
 TF_STATIC = Topic("tf_static", m.TFMessage, "state", "robot_state_publisher", "poses that never change: base, camera")
@@ -100,7 +110,7 @@ WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "trajectory_ex
                      "add, move, remove, reset; simulated hardware only")
 OUTLINE_SELECT = Request("outline/select", m.OutlineSelect, m.OutlineSelection, "contour_detector",
                          "choose the object to outline")
-TASK_COMMAND = Request("task/command", m.TaskCommand, m.PickPlaceStatus, "smart_pick_place",
+TASK_COMMAND = Request("task/command", m.TaskCommand, m.TaskStatus, "smart_pick_place, contour_tracer",
                        "start, pause, resume or stop the task")
 
 AnyTopic = Topic[m.Message] | Request[m.Message, m.Message]

@@ -38,7 +38,7 @@ class Rates:
         rates = [
             (self.of_topic(topic.key), topic.key)
             for topic in self._topics.values()
-            if topic.kind != "request" and topic.writer == service
+            if topic.kind != "request" and service in topic.writers
         ]
         rate, key = max(rates, default=(0.0, ""))
         return (key, rate) if rate > 0 else None

@@ -57,7 +57,7 @@ import asyncio
 from common import topics
 from common.config import Parameters
 from common.errors import Refused
-from common.messages import Image, PickPlaceStatus
+from common.messages import Image, TaskStatus
 from common.transport.service import main
 
 class Config(Parameters):
@@ -69,7 +69,7 @@ async def run(bus, config):
             raise Refused("busy", "not now")
         if request.command == "resume":
             await asyncio.Event().wait()
-        return PickPlaceStatus(header=bus.header(), paused=request.command == "pause")
+        return TaskStatus(header=bus.header(), paused=request.command == "pause")
     images = bus.writer(topics.CAMERA_IMAGE)
     bus.serve(topics.TASK_COMMAND, answer)
     await bus.ready()

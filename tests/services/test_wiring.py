@@ -42,9 +42,9 @@ async def test_service_writes_and_serves_what_the_topic_table_says(name: str) ->
     found = await wired(name)
     shared = {"log", "counters"}
     assert {t.key for t in found.writes} - shared == {
-        t.key for t in topics.all_topics().values() if t.kind != "request" and t.writer == name}
+        t.key for t in topics.all_topics().values() if t.kind != "request" and name in t.writers}
     assert {t.key for t in found.serves} == {
-        t.key for t in topics.all_topics().values() if t.kind == "request" and t.writer == name}
+        t.key for t in topics.all_topics().values() if t.kind == "request" and name in t.writers}
 
 
 async def test_every_topic_that_is_read_or_asked_is_written_or_served_by_a_service_of_the_cell() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from common import topics
 from common.errors import NoResponder
-from common.messages import Image, LogLine, PickPlaceStatus, TaskCommand
+from common.messages import Image, LogLine, PickPlaceStatus, TaskCommand, TaskStatus
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from common.transport.wiring import wiring
@@ -23,10 +23,10 @@ async def service(bus: Bus, config: Config) -> None:
     status = bus.writer(topics.PICK_PLACE_STATUS)
     bus.client(topics.MOTION_PLAN)
 
-    async def handle(request: TaskCommand) -> PickPlaceStatus:
+    async def handle(request: TaskCommand) -> TaskStatus:
         if request.command == "stop":
             raise RuntimeError("the handler has a bug")
-        return PickPlaceStatus()
+        return TaskStatus()
 
     bus.serve(topics.TASK_COMMAND, handle)
     if config.fail:

@@ -6,7 +6,7 @@ import pytest
 
 from common import topics
 from common.errors import NoResponder, Refused, RemoteError, RequestLost, RequestTimeout
-from common.messages import PickPlaceStatus, TaskCommand
+from common.messages import TaskCommand, TaskStatus
 from common.topics import Request
 from common.transport.bus import Bus
 from common.transport.codec import decode_error, encode
@@ -16,8 +16,8 @@ PATIENCE = 20.0
 START = TaskCommand(command="start")
 
 
-async def answer(request: TaskCommand) -> PickPlaceStatus:
-    return PickPlaceStatus(message=request.command)
+async def answer(request: TaskCommand) -> TaskStatus:
+    return TaskStatus(message=request.command)
 
 
 async def ask_raw(bus: Bus, key: str, payload: bytes | None) -> list[RawReply]:
@@ -75,7 +75,7 @@ async def test_server_that_is_not_ready_is_no_responder(new_bus) -> None:
 
 
 async def test_refusal_reaches_the_requester_with_code_and_reason(new_bus) -> None:
-    async def refuse(_: TaskCommand) -> PickPlaceStatus:
+    async def refuse(_: TaskCommand) -> TaskStatus:
         raise Refused("full", "the container is full")
 
     server, client = await new_bus("server"), await new_bus("client")
@@ -88,7 +88,7 @@ async def test_refusal_reaches_the_requester_with_code_and_reason(new_bus) -> No
 
 
 async def test_held_request_times_out_and_the_next_is_served_meanwhile(new_bus) -> None:
-    async def hold_first(request: TaskCommand) -> PickPlaceStatus:
+    async def hold_first(request: TaskCommand) -> TaskStatus:
         if request.command == "pause":
             await asyncio.Event().wait()
         return await answer(request)
@@ -106,7 +106,7 @@ async def test_held_request_times_out_and_the_next_is_served_meanwhile(new_bus) 
 async def test_server_that_closes_loses_the_request_in_work(new_bus) -> None:
     began = asyncio.Event()
 
-    async def hold(_: TaskCommand) -> PickPlaceStatus:
+    async def hold(_: TaskCommand) -> TaskStatus:
         began.set()
         await asyncio.Event().wait()
         raise AssertionError
@@ -127,7 +127,7 @@ async def test_server_that_closes_loses_the_request_in_work(new_bus) -> None:
 
 
 async def test_handler_with_a_bug_is_told_to_the_requester_and_ends_the_service(new_bus) -> None:
-    async def crash(_: TaskCommand) -> PickPlaceStatus:
+    async def crash(_: TaskCommand) -> TaskStatus:
         raise KeyError("slot")
 
     async def service(bus: Bus) -> None:
@@ -149,7 +149,7 @@ async def test_failure_of_a_request_within_a_handler_is_told_and_does_not_end_th
     server, client = await new_bus("server"), await new_bus("client")
     inner = server.client(topics.MOTION_STOP)
 
-    async def ask_on(_: TaskCommand) -> PickPlaceStatus:
+    async def ask_on(_: TaskCommand) -> TaskStatus:
         raise NoResponder(inner.topic.key)
 
     await served(server, ask_on)
@@ -173,7 +173,7 @@ async def test_bad_requests_are_refused_with_the_reason_and_the_next_is_served(n
         (key, None, "bad_request", "a TaskCommand as payload is needed"),
         (key, b"\xc1", "invalid", "not msgpack"),
         (key, encode(START)[:-1], "invalid", "not msgpack"),
-        (key, encode(PickPlaceStatus()), "invalid", "TaskCommand"),
+        (key, encode(TaskStatus()), "invalid", "TaskCommand"),
     ]
     for asked, payload, code, reason in cases:
         replies = await ask_raw(client, asked, payload)
@@ -191,7 +191,7 @@ async def test_plain_client_is_answered_under_the_exact_key(new_bus) -> None:
     await client.client(topics.TASK_COMMAND).wait_available(PATIENCE)
     [reply] = await ask_raw(client, f"{server.cell}/task/command", encode(START))
     assert reply.sample.key == f"{server.cell}/task/command"
-    assert reply.sample.encoding == "application/msgpack;PickPlaceStatus"
+    assert reply.sample.encoding == "application/msgpack;TaskStatus"
 
 
 async def test_answer_of_another_kind_is_a_remote_error(new_bus) -> None:
@@ -213,9 +213,9 @@ async def test_answer_of_another_kind_is_a_remote_error(new_bus) -> None:
 async def test_one_of_two_servers_acts(new_bus) -> None:
     acted = []
 
-    async def act(request: TaskCommand) -> PickPlaceStatus:
+    async def act(request: TaskCommand) -> TaskStatus:
         acted.append(request)
-        return PickPlaceStatus()
+        return TaskStatus()
 
     first, second, client = await new_bus("first"), await new_bus("second"), await new_bus("client")
     await served(first, act)

@@ -6,7 +6,7 @@ from typing import Literal
 from common import topics
 from common.config import Parameters
 from common.errors import ConfigError, Refused
-from common.messages import PickPlaceStatus, TaskCommand
+from common.messages import PickPlaceStatus, TaskCommand, TaskStatus
 from common.transport.bus import Bus
 from common.transport.service import main
 
@@ -19,7 +19,7 @@ class Config(Parameters):
 async def run(bus: Bus, config: Config) -> None:
     status = bus.writer(topics.PICK_PLACE_STATUS)
 
-    async def handle(request: TaskCommand) -> PickPlaceStatus:
+    async def handle(request: TaskCommand) -> TaskStatus:
         if request.command == "pause":
             bus.log.info("holding")
             await asyncio.Event().wait()
@@ -27,7 +27,7 @@ async def run(bus: Bus, config: Config) -> None:
             raise Refused("busy", "not now")
         if request.command == "resume":
             raise RuntimeError("the handler has a bug")
-        return PickPlaceStatus(placed=config.placed)
+        return TaskStatus(stage=str(config.placed))
 
     bus.serve(topics.TASK_COMMAND, handle)
     await bus.ready()

@@ -1,0 +1,41 @@
+"""A request that is asked until somebody answers."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import TypeVar
+
+from common.errors import RemoteError, RequestFailed
+from common.messages import Message
+from common.transport.requests import Client
+
+A = TypeVar("A", bound=Message)
+Q = TypeVar("Q", bound=Message)
+
+NOT_YET = ("no_scene", "no_state")  # the planner has not heard enough to answer
+AGAIN_AFTER = 0.1  # [s] wall
+
+
+async def persist(
+    client: Client[Q, A], request: Q, timeout: float, refused: Callable[[RemoteError], A], note: Callable[[str], None]
+) -> A:
+    """The answer to a request that is asked again until there is one. Its id makes that safe: nothing is done twice.
+
+    Args:
+        client: of the request.
+        request: with an id of its own.
+        timeout: of each try [s, wall].
+        refused: makes the answer that stands for a refusal.
+        note: is told what went wrong in between.
+    """
+    while True:
+        try:
+            return await client.call(request, timeout=timeout)
+        except RemoteError as error:
+            if error.code not in NOT_YET:
+                return refused(error)
+            note(str(error))
+        except RequestFailed as error:
+            note(str(error))
+        await asyncio.sleep(AGAIN_AFTER)

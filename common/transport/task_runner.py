@@ -1,0 +1,145 @@
+"""Runs a task: steps it whenever something is heard, and asks for what it wants until somebody answers."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol, TypeVar
+
+from common import messages as m
+from common import topics
+from common.errors import RemoteError
+from common.transport.bus import Bus
+from common.transport.persist import persist
+from common.transport.reader import Reader
+from common.transport.requests import Client
+from common.transport.writer import Writer
+
+A = TypeVar("A", bound=m.Message)
+Q = TypeVar("Q", bound=m.Message)
+
+GOAL_TIMEOUT = 1.0  # [s] wall: for a goal to be accepted
+PLAN_OVERTIME = 5.0  # [s] wall: that a plan may take beyond its planning time
+LONGEST_STEP = 0.05  # [s] wall: time passes too
+
+Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest
+
+
+Status = m.PickPlaceStatus | m.OutlineStatus
+
+
+class Task(Protocol):
+    """A state machine that is fed with what is known and answers with what it wants done."""
+
+    @property
+    def status(self) -> Status:
+        """How far it is."""
+
+    def step(self, view: Any) -> list[Command]:
+        """What to ask for now."""
+
+    def command(self, command: str, view: Any) -> list[Command]:
+        """Do what a person says."""
+
+    def on_plan(self, response: m.PlanResponse, view: Any) -> None:
+        """Take in a plan."""
+
+    def on_goal(self, answer: m.MotionStatus | m.GripperState, view: Any) -> None:
+        """Take in whether a goal was accepted."""
+
+
+class TaskRunner:
+    """Steps a task, sends what it asks for and brings the answers back."""
+
+    def __init__(
+        self, bus: Bus, task: Task, look: Callable[[], Any], status: Writer[Any], planning_time: float
+    ) -> None:
+        """Declare the requests of a task and the command that it serves.
+
+        Args:
+            bus: of the service.
+            task: is stepped.
+            look: what is known now.
+            status: where the task's status goes.
+            planning_time: that the task asks for [s, wall].
+        """
+        self._task, self._look, self._status, self._bus = task, look, status, bus
+        self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
+        self._stop, self._grip = bus.client(topics.MOTION_STOP), bus.client(topics.GRIPPER_COMMAND)
+        self._plan_timeout = planning_time + PLAN_OVERTIME
+        self._woken = asyncio.Event()
+        self._told: list[Command] = []
+        self._before: Status | None = None
+        bus.serve(topics.TASK_COMMAND, self._obey)
+
+    async def run(self, heard: Iterable[Reader[Any]]) -> None:
+        """Step whenever something is heard, and at least 20 times a second, until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            for reader in heard:
+                group.create_task(self._wake_on(reader))
+            while True:
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(LONGEST_STEP):  # wait_for of Python 3.11 can lose a cancellation
+                        await self._woken.wait()
+                self._woken.clear()
+                told, self._told = self._told, []
+                for command in [*told, *self._task.step(self._look())]:
+                    group.create_task(self._do(command))
+                self._tell()
+
+    async def _obey(self, command: m.TaskCommand) -> m.TaskStatus:
+        self._bus.log.info("told to %s", command.command)
+        self._told += self._task.command(command.command, self._look())
+        self._woken.set()
+        now = self._task.status
+        return m.TaskStatus(
+            header=self._bus.header(), state=now.state, paused=now.paused, started=now.started, stage=now.stage,
+            message=now.message,
+        )
+
+    def _tell(self) -> None:
+        """Publish the status when more of it has changed than the time."""
+        now, before = self._task.status, self._before
+        if before and now.model_copy(update={"task_seconds": before.task_seconds, "header": before.header}) == before:
+            return
+        if now.message not in ("", before.message if before else "") or (before and now.state != before.state):
+            self._bus.log.info("%s", f"{now.state} {now.message}".rstrip())
+        now.header = self._bus.header()
+        self._status.put(now)
+        self._before = now.model_copy(deep=True)
+
+    def _note(self, problem: str) -> None:
+        self._task.status.message = problem
+
+    async def _wake_on(self, reader: Reader[Any]) -> None:
+        async for _ in reader:
+            self._woken.set()
+
+    async def _do(self, command: Command) -> None:
+        """Send what a command stands for; what is refused is an answer too."""
+        if isinstance(command, m.PlanRequest):
+            await self._ask(self._plan, command, self._plan_timeout, self._planned, lambda error: m.PlanResponse(
+                id=command.id, ok=False, error=error.code, message=error.message))
+        elif isinstance(command, m.GripperCommand):
+            await self._ask(self._grip, command, GOAL_TIMEOUT, self._answered, lambda error: m.GripperState(
+                id=command.id, state="rejected", message=error.message))
+        elif isinstance(command, m.ExecuteRequest):
+            await self._ask(self._execute, command, GOAL_TIMEOUT, self._answered, lambda error: m.MotionStatus(
+                id=command.id, state="rejected", error=error.code, message=error.message))
+        else:
+            await self._ask(self._stop, command, GOAL_TIMEOUT, lambda _: None, lambda error: m.MotionStatus(
+                message=error.message))
+
+    async def _ask(
+        self, client: Client[Q, A], request: Q, timeout: float, then: Callable[[A], None],
+        refused: Callable[[RemoteError], A],
+    ) -> None:
+        then(await persist(client, request, timeout, refused, self._note))
+        self._woken.set()
+
+    def _planned(self, response: m.PlanResponse) -> None:
+        self._task.on_plan(response, self._look())
+
+    def _answered(self, answer: m.MotionStatus | m.GripperState) -> None:
+        self._task.on_goal(answer, self._look())
