@@ -1,0 +1,64 @@
+"""From pixels and their depth to points in world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from common.errors import ZencellError
+from common.perception.pinhole import Pinhole
+
+Array = npt.NDArray[np.float64]
+Depth = npt.NDArray[np.float32]
+
+
+class DepthError(ZencellError):
+    """A depth image that does not tell where an object is. `kind` is for programs: size, nothing, invalid or far."""
+
+    def __init__(self, kind: str, message: str) -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+def check_depth(depth: npt.NDArray[np.float32], width: int, height: int) -> None:
+    """Return when the depth image fits a picture of that size and has any depth.
+
+    Raises:
+        DepthError: one line that says what does not fit.
+    """
+    if depth.ndim != 2 or depth.shape != (height, width):
+        shape = "x".join(str(n) for n in depth.shape[::-1])
+        raise DepthError("size", f"the depth image is {shape}, but the picture is {width}x{height}")
+    if not is_valid(depth).any():
+        raise DepthError("nothing", "the depth image has no valid depth at all: nothing is within the camera's range")
+
+
+def is_valid(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """Where a depth is a distance: finite and in front of the camera."""
+    return np.asarray(np.isfinite(depth) & (depth > 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays through pixels in world, one metre of depth long: a point at depth d is `origin + d * directions`."""
+
+    origin: Array
+    directions: Array
+
+    @classmethod
+    def through(cls, camera: Pinhole, pixels: npt.ArrayLike) -> Rays:
+        """Rays (..., 3) through pixels (..., 2)."""
+        p = np.asarray(pixels, dtype=float)
+        x, y = (p[..., 0] - camera.cx) / camera.fx, (p[..., 1] - camera.cy) / camera.fy
+        optical = np.stack([x, y, np.ones_like(x)], axis=-1)
+        return cls(camera.position, optical @ camera.T_world_optical[:3, :3].T)
+
+    def at_depth(self, depth: npt.ArrayLike) -> Array:
+        """Points (..., 3) [m] at depths (...) [m] along the optical axis."""
+        return np.asarray(self.origin + np.asarray(depth, dtype=float)[..., None] * self.directions)
+
+    def at_height(self, z: npt.ArrayLike) -> Array:
+        """Points (..., 3) [m] at heights z (...) [m] in world."""
+        return self.at_depth((np.asarray(z, dtype=float) - self.origin[2]) / self.directions[..., 2])
