@@ -41,7 +41,7 @@ async def test_seen_ball_becomes_an_object_with_an_id_and_moves_into_the_hand_th
         header=bus.header("world"), child_frame_id="camera_optical_frame",
         transform=matrix_to_pose(CAMERA.T_world_optical))]))
     home = CELL.robot.named_poses["home"]
-    bus.writer(topics.JOINT_STATES).put(m.JointState(header=bus.header(), name=CELL.robot.joints, position=home))
+    joints = bus.writer(topics.JOINT_STATES)
     grip = bus.writer(topics.GRIPPER_STATE)
     grip.put(m.GripperState(header=bus.header(), width=0.08))
     config = service_config(CELL, "scene_manager", scene_manager.Config)
@@ -49,14 +49,19 @@ async def test_seen_ball_becomes_an_object_with_an_id_and_moves_into_the_hand_th
         first = await scene.next()
         assert {o.role for o in first.objects} == {"fixture", "container"}
         ball = (0.307, 0.0)  # below the hand at home, as far as the match radius is concerned not in it
+
+        def expose() -> None:
+            joints.put(m.JointState(header=bus.header(), name=CELL.robot.joints, position=home))
+            detected.put(frame(bus.clock.now_ns(), ball))
+
         async with asyncio.TaskGroup() as group:
-            camera = group.create_task(film(lambda: detected.put(frame(bus.clock.now_ns(), ball))))
+            camera = group.create_task(film(expose))
             while not [o for o in (await scene.next()).objects if o.role == "target"]:
                 pass
-            camera.cancel()
-        grip.put(m.GripperState(header=bus.header(), width=0.06, holding=True))
-        held = await scene.next()
-        while not held.attached:
+            grip.put(m.GripperState(header=bus.header(), width=0.06, holding=True))
             held = await scene.next()
+            while not held.attached:
+                held = await scene.next()
+            camera.cancel()
         assert held.attached[0].link == "panda_hand_tcp"
         assert ("panda_hand", held.attached[0].object.id) in held.allowed_collisions
