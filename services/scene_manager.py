@@ -6,7 +6,7 @@ import asyncio
 
 from common import topics
 from common.config import RobotConfig, Surroundings
-from common.perception.intake import Unusable, camera_of
+from common.perception.intake import Cameras, Unusable
 from common.robot.model import RobotModel
 from common.scene.perceived import PerceivedScene, SceneParameters
 from common.transport.bus import Bus
@@ -34,6 +34,7 @@ async def run(bus: Bus, config: Config) -> None:
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
     unusable: set[str] = set()
     out.put(scene.scene())
+    cameras = Cameras()
     await bus.ready()
 
     def hand() -> None:
@@ -54,7 +55,7 @@ async def run(bus: Bus, config: Config) -> None:
     async def watch_table() -> None:
         async for markers in detected:
             try:
-                camera = camera_of(infos.latest, statics.latest, config.world.camera.frame)
+                camera = cameras.of(infos.latest, statics.latest, config.world.camera.frame)
             except Unusable as error:
                 if error.kind not in unusable and error.kind != "unknown_camera":  # usual in the first moments
                     bus.log.warning("detections left out: %s (told once)", error)

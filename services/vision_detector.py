@@ -12,7 +12,7 @@ from common.messages import Color, Header, Marker, MarkerArray, Pose, Vector3
 from common.perception.annotation import annotate
 from common.perception.detector import Detection, Detector, DetectorOptions
 from common.perception.image import array_to_image
-from common.perception.intake import Unusable, camera_of, picture_of
+from common.perception.intake import Cameras, Unusable, picture_of
 from common.transport.bus import Bus
 from common.transport.service import main
 
@@ -55,10 +55,11 @@ async def run(bus: Bus, config: Config) -> None:
     cv2.setNumThreads(1)  # the other cores have other services
     detector = Detector(config.world, config)
     unusable: Counter[str] = Counter()
+    cameras = Cameras()
     await bus.ready()
     async for image in images:
         try:
-            camera = camera_of(infos.latest, statics.latest, image.header.frame_id)
+            camera = cameras.of(infos.latest, statics.latest, image.header.frame_id)
             picture = picture_of(image, camera)
         except Unusable as error:
             unusable[error.kind] += 1

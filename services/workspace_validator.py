@@ -11,7 +11,7 @@ from pydantic import Field
 from common import topics
 from common.config import Grasp, RobotConfig, Surroundings
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
-from common.perception.intake import Unusable, camera_of
+from common.perception.intake import Cameras, Unusable
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
 from common.scene.validation import Validation
@@ -65,6 +65,7 @@ async def run(bus: Bus, config: Config) -> None:
     work, idle = asyncio.Event(), asyncio.Event()
     unfinished: tuple[MarkerArray, Pinhole] | None = None  # sent without the places that were still worked on
     unusable: Counter[str] = Counter()
+    cameras = Cameras()
     await bus.ready()
 
     def send(frame: MarkerArray, camera: Pinhole) -> None:
@@ -82,7 +83,7 @@ async def run(bus: Bus, config: Config) -> None:
     async def watch() -> None:
         async for frame in detected:
             try:
-                camera = camera_of(infos.latest, statics.latest)
+                camera = cameras.of(infos.latest, statics.latest)
             except Unusable as error:
                 unusable[error.kind] += 1
                 if unusable[error.kind] == 1 and error.kind != "unknown_camera":  # usual in the first moments

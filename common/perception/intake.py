@@ -48,6 +48,24 @@ def camera_of(info: CameraInfo | None, transforms: TFMessage | None, frame_id: s
         raise Unusable("camera", str(error)) from None
 
 
+class Cameras:
+    """`camera_of` that works the camera out again only for other messages than the last time."""
+
+    def __init__(self) -> None:
+        """Nothing is known yet."""
+        self._last: tuple[CameraInfo, TFMessage, str, Pinhole] | None = None
+
+    def of(self, info: CameraInfo | None, transforms: TFMessage | None, frame_id: str = "") -> Pinhole:
+        """The camera; the same object for the same messages."""
+        last = self._last
+        if last is not None and last[0] is info and last[1] is transforms and last[2] == frame_id:
+            return last[3]
+        camera = camera_of(info, transforms, frame_id)
+        assert info is not None and transforms is not None
+        self._last = (info, transforms, frame_id, camera)
+        return camera
+
+
 def picture_of(image: Image, camera: Pinhole) -> Picture:
     """The bgr8 picture (height, width, 3) of an image message.
 

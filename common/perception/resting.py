@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,18 +54,18 @@ class Resting:
         The slab method: the ray is inside between the last entry into and the first exit from the three pairs of
         planes.
         """
-        o, d = np.asarray(origin, dtype=float), np.asarray(direction, dtype=float)
+        o, d = np.asarray(origin, dtype=float).tolist(), np.asarray(direction, dtype=float).tolist()
         c, h = self.container, self.container.half_side
-        low = np.array([c.x - h, c.y - h, self.table_height])
-        high = np.array([c.x + h, c.y + h, self.stack_height])
-        parallel = np.abs(d) < 1e-12
-        if bool(np.any(parallel & ((o < low) | (o > high)))):
-            return False
-        safe = np.where(parallel, 1.0, d)
-        first, second = (low - o) / safe, (high - o) / safe
-        entry = float(np.where(parallel, -np.inf, np.minimum(first, second)).max())
-        leave = float(np.where(parallel, np.inf, np.maximum(first, second)).min())
-        return max(entry, 0.0) <= leave
+        slabs = ((c.x - h, c.x + h), (c.y - h, c.y + h), (self.table_height, self.stack_height))
+        entry, leave = 0.0, math.inf
+        for at, along, (low, high) in zip(o, d, slabs, strict=True):  # three numbers: arrays take ten times as long
+            if abs(along) < 1e-12:
+                if not low <= at <= high:
+                    return False
+                continue
+            first, second = (low - at) / along, (high - at) / along
+            entry, leave = max(entry, min(first, second)), min(leave, max(first, second))
+        return entry <= leave
 
     def heights(self, camera: Pinhole, pixel: npt.ArrayLike) -> list[float]:
         """z [m] at which the centre of a ball seen at a pixel can be."""

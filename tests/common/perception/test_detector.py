@@ -276,3 +276,35 @@ def test_annotation_marks_what_was_found_on_a_copy():
     for d, color in zip(sorted(found, key=lambda d: d.pixel[0]), ((0, 200, 255), (0, 255, 0)), strict=True):
         u, v = (round(value) for value in d.pixel)
         assert tuple(shown[v, u].tolist()) == color
+
+
+def places(detections):
+    return [d.position for d in detections]
+
+
+def test_picture_that_comes_again_and_one_that_differs_are_both_looked_at_rightly():
+    one, other = (draw(on_table(spots), camera, around) for spots in ([(0.4, 0.1)], [(0.4, 0.1), (0.6, -0.2)]))
+    remembering = Detector(around)
+    fresh = [places(Detector(around).detect(picture, camera)) for picture in (one, one, other, one)]
+    assert [places(remembering.detect(picture.copy(), camera)) for picture in (one, one, other, one)] == fresh
+    assert [len(found) for found in fresh] == [1, 1, 2, 1]
+
+
+def test_same_picture_of_another_camera_shows_balls_elsewhere():
+    remembering = Detector(around)
+    moved = camera.T_world_optical.copy()
+    moved[0, 3] += 0.1
+    elsewhere = Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, moved)
+    picture = draw(on_table([(0.4, 0.1)]), camera, around)
+    (here,), (there,) = (places(remembering.detect(picture, seen_by)) for seen_by in (camera, elsewhere))
+    np.testing.assert_allclose(np.subtract(there, here), [0.1, 0.0, 0.0], atol=1e-6)
+
+
+def test_caller_that_draws_into_the_picture_or_the_list_spoils_nothing():
+    remembering = Detector(around)
+    picture = draw(on_table([(0.4, 0.1)]), camera, around)
+    mine = picture.copy()
+    remembering.detect(mine, camera).clear()
+    mine[:] = 0
+    assert remembering.detect(mine, camera) == []
+    assert len(remembering.detect(picture, camera)) == 1

@@ -4,7 +4,7 @@ import pytest
 from common.config import CameraConfig
 from common.messages import Header, Image, TFMessage, TransformStamped
 from common.perception.image import array_to_image
-from common.perception.intake import Unusable, camera_of, picture_of
+from common.perception.intake import Cameras, Unusable, camera_of, picture_of
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import matrix_to_pose
 
@@ -24,6 +24,18 @@ def test_camera_is_put_together_from_camera_info_and_tf():
         made = camera_of(info, tf, frame)
         np.testing.assert_allclose(made.T_world_optical, camera.T_world_optical, atol=1e-12)
         assert (made.fx, made.cx, made.width) == (520, 16, 32)
+
+
+def test_camera_is_worked_out_again_for_other_messages_only():
+    cameras = Cameras()
+    first = cameras.of(info, tf)
+    assert cameras.of(info, tf) is first
+    moved = camera.T_world_optical.copy()
+    moved[0, 3] += 0.1
+    transform = tf.transforms[0].model_copy(update={"transform": matrix_to_pose(moved)})
+    np.testing.assert_allclose(cameras.of(info, TFMessage(transforms=[transform])).T_world_optical, moved, atol=1e-12)
+    with pytest.raises(Unusable):
+        cameras.of(info, None)
 
 
 @pytest.mark.parametrize(
