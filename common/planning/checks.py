@@ -47,7 +47,7 @@ def check_request(
         BadRequest: start or goal do not fit the robot, names that are not known, a scene in another frame.
     """
     frame = scene.header.frame_id
-    if frame not in ("", "world", robot.config.base_link):
+    if frame not in robot.world_frames:
         raise BadRequest("bad_scene", f"planning scene is in frame {frame!r}, not in world")
     if request.attach and request.release:
         raise BadRequest("bad_request", f"attach {request.attach!r} and release contradict each other")

@@ -110,6 +110,12 @@ class RobotModel:
         return [self.config.group, *self.config.group_aliases]
 
     @property
+    def world_frames(self) -> list[str]:
+        """Names of frames whose coordinates are those of world: the base link too, when it stands at the origin."""
+        at_origin = not any(self.config.base_position) and not any(self.config.base_rpy)
+        return ["", WORLD, *([self.config.base_link] if at_origin else [])]
+
+    @property
     def link_names(self) -> list[str]:
         """All links of the robot."""
         return list(self._links)
