@@ -198,6 +198,8 @@ class SimulatedWorld:
         """
         if request.op == "reset":
             return self._reset()
+        if self._config.objects and not self._layout:
+            raise Refused("no_balls", "this world has objects and no balls; objects are placed by world.objects")
         name = request.id
         if request.op == "add":
             name = name or next(n for i in range(1, len(self._balls) + 2) if (n := f"ball_{i}") not in self._balls)

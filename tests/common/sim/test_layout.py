@@ -25,6 +25,13 @@ def test_given_balls_replace_layout_and_count(world_config: World) -> None:
     assert layout(given_balls, 1, anywhere) == [(0.3, 0.0)]
 
 
+@pytest.mark.parametrize("how", ["fixed", "random"])
+def test_world_without_balls_has_an_empty_layout(world_config: World, how: str) -> None:
+    empty = World.model_validate(world_config.model_dump() | {"count": 0, "spots": [], "layout": how})
+    assert layout(empty, 1, anywhere) == []
+    assert SimulatedWorld(empty, []).ids == []
+
+
 def within_reach(x: float, y: float) -> bool:
     return 0.28 <= math.hypot(x, y) <= 0.78
 
