@@ -76,6 +76,15 @@ def picture_of(image: Image, camera: Pinhole) -> Picture:
         raise Unusable(
             "size", f"image of {image.width}x{image.height}, but camera_info says {camera.width}x{camera.height}"
         )
+    return colour_picture(image)
+
+
+def colour_picture(image: Image) -> Picture:
+    """The bgr8 picture (height, width, 3) of an image message, whatever camera took it.
+
+    Raises:
+        Unusable: not a colour picture, or bytes that do not add up.
+    """
     if image.encoding not in ("bgr8", "rgb8"):
         raise Unusable("encoding", f"encoding {image.encoding!r} is no colour picture; choices: bgr8, rgb8")
     try:

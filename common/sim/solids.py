@@ -1,9 +1,9 @@
-"""Solids of the world as triangles, for a camera to see: upright objects, fixtures, the links of a robot."""
+"""Solids of the world as triangles, for a camera to see: upright objects and fixtures."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,10 +117,3 @@ def primitive(shape: str, dimensions: Sequence[float]) -> Array:
 def placed(corners: Array, T: Array) -> Array:
     """Triangles (n, 3, 3) after a rigid (4, 4) transform."""
     return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
-
-
-def robot_meshes(
-    shapes: Mapping[str, Sequence[Array]], poses: Mapping[str, Array], color: tuple[float, float, float]
-) -> list[Mesh]:
-    """The links of a robot, given triangles in the frame of each link and the (4, 4) pose of each link in world."""
-    return [Mesh(placed(corners, poses[link]), color) for link, parts in shapes.items() for corners in parts]

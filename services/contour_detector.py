@@ -1,0 +1,94 @@
+"""Finds the contours of objects in the picture, and keeps the one that was chosen."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+
+import cv2
+from pydantic import Field
+
+from common import topics
+from common.errors import ConfigError, Refused
+from common.messages import Contour, Contours, Image, OutlineSelect, OutlineSelection
+from common.perception.contours import ContourOptions, Picture, find_contours
+from common.perception.contours_choice import NoSuchContour, parse_choice
+from common.perception.contours_drawing import annotate_contours
+from common.perception.contours_following import Following
+from common.perception.image import array_to_image
+from common.perception.intake import Unusable, colour_picture
+from common.transport.bus import Bus
+from common.transport.service import main
+
+
+class Config(ContourOptions):
+    """How contours are found, and which is chosen at the start."""
+
+    select: str | int = Field(
+        "auto", description="at the start: none, auto (largest that does not touch the border), a colour, or an index"
+    )
+
+
+def initial_choice(select: str | int) -> OutlineSelect | None:
+    """The choice at the start.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    try:
+        return parse_choice(select)
+    except NoSuchContour as error:
+        raise ConfigError("services.contour_detector.select", ..., str(error)) from None
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Look at every picture as it comes; what can not be looked at is dropped, counted and told once."""
+    images = bus.reader(topics.DEPTH_CAMERA_IMAGE)
+    found, shown = bus.writer(topics.CONTOURS), bus.writer(topics.CONTOUR_IMAGE)
+    cv2.setNumThreads(1)  # the other cores have other services
+    following = Following(initial_choice(config.select))
+    last: tuple[Image, Picture, list[Contour]] | None = None
+    told = ""
+    unusable: Counter[str] = Counter()
+
+    def publish(selected: int, message: str) -> None:
+        nonlocal told
+        if last is None:
+            return
+        image, picture, contours = last
+        found.put(Contours(
+            header=image.header, width=image.width, height=image.height, contours=contours, selected=selected,
+            message=message,
+        ))
+        shown.put(array_to_image(annotate_contours(picture, contours, selected), "bgr8", image.header))
+        if message and message != told:
+            bus.log.warning("%s", message)
+        told = message
+
+    async def select(wanted: OutlineSelect) -> OutlineSelection:
+        if last is None:
+            raise Refused("no_picture", "no picture came yet")
+        try:
+            contour = following.select(last[2], wanted)
+        except NoSuchContour as error:
+            raise Refused(error.code, str(error)) from None
+        bus.log.info("%s is chosen", contour.label)
+        publish(contour.index, "")
+        return OutlineSelection(index=contour.index, label=contour.label)
+
+    bus.serve(topics.OUTLINE_SELECT, select)
+    await bus.ready()
+    async for image in images:
+        try:
+            picture = colour_picture(image)
+        except Unusable as error:
+            unusable[error.kind] += 1
+            if unusable[error.kind] == 1:
+                bus.log.warning("picture dropped: %s (told once; further ones are counted)", error)
+            continue
+        last = (image, picture, await asyncio.to_thread(find_contours, picture, config))
+        publish(*following.find(last[2]))
+
+
+if __name__ == "__main__":
+    main(run, Config)

@@ -1,0 +1,66 @@
+"""Casts rays at the simulated world and the arm in it, and sends what a depth camera sends."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import numpy as np
+from pydantic import Field
+
+from common import topics
+from common.config import Parameters, RobotConfig, Run, Surroundings
+from common.messages import WorldObjects
+from common.perception.image import array_to_image
+from common.perception.point_cloud import point_cloud
+from common.robot.model import RobotModel
+from common.sim.depth_view import DepthView, disturbed
+from common.transport.bus import Bus
+from common.transport.service import main
+
+
+class Config(Parameters):
+    """Rate, range and noise."""
+
+    world: Surroundings
+    robot: RobotConfig
+    run: Run
+    rate: float = Field(1.0, gt=0, le=30, description="frames per second of cell time [Hz]")
+    max_rate: float = Field(5.0, gt=0, le=30, description="frames per second of wall time at most [Hz]")
+    nearest: float = Field(0.10, gt=0, le=100, description="smallest depth that is measured [m]")
+    farthest: float = Field(2.25, gt=0, le=100, description="largest depth that is measured [m]")
+    depth_noise_std: float = Field(0.0, ge=0, le=0.1, description="standard deviation of Gaussian noise [m]")
+    depth_dropout: float = Field(0.0, ge=0, le=1, description="part of the pixels that measure no depth")
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Send pictures at the rate, from the first time on that the world says what is in it and the arm where it is."""
+    truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
+    images, depths = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
+    points, infos = bus.writer(topics.DEPTH_CAMERA_POINTS), bus.writer(topics.DEPTH_CAMERA_INFO)
+    frame = config.world.camera.frame
+    rng = np.random.default_rng(config.run.seed)
+    view = await asyncio.to_thread(lambda: DepthView(config.world, RobotModel.load(config.robot)))
+    await bus.ready()
+    await truth.next()
+    await joints.next()
+    infos.put(view.camera.info(bus.header(frame)))
+    loop = asyncio.get_running_loop()
+    period = 1.0 / bus.clock.wall_rate(config.rate, config.max_rate)
+    due = loop.time()
+    while True:
+        header = bus.header(frame)  # the instant of exposure: of picture, depth and points alike
+        objects = (truth.latest or WorldObjects()).objects
+        seen = await asyncio.to_thread(view.see, objects, joints.latest)
+        depth = seen.depth_within(config.nearest, config.farthest)
+        depth = disturbed(depth, rng, config.depth_noise_std, config.depth_dropout)
+        depths.put(array_to_image(depth, "32FC1", header))  # first: who has the picture has its depth
+        images.put(array_to_image(seen.colour, "bgr8", header))
+        if points.matched:
+            points.put(point_cloud(seen.colour, depth, view.camera, header))
+        due += period * max(1, math.ceil((loop.time() - due) / period))  # on a fixed grid: no drift and no bursts
+        await asyncio.sleep(due - loop.time())
+
+
+if __name__ == "__main__":
+    main(run, Config)

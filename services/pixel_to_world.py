@@ -1,0 +1,93 @@
+"""Turns the chosen contour into the outline of the object's top face in world, with the depth of its pixels."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+
+from common import topics
+from common.errors import ZencellError
+from common.messages import Contours, Header, Image, OutlinePoints, Pose, Vector3
+from common.perception.contours import is_hole
+from common.perception.depth import check_depth
+from common.perception.depth_intake import depth_of
+from common.perception.intake import camera_of
+from common.perception.pinhole import Pinhole
+from common.perception.top_face import TopFace, TopFaceOptions, top_face
+from common.transport.bus import Bus
+from common.transport.service import main
+
+WORLD = "world"
+KEPT = 4  # depth images that wait for the contours of their picture
+
+
+class Config(TopFaceOptions):
+    """How the top face is found."""
+
+
+def outline(contours: Contours, image: Image, camera: Pinhole, config: Config) -> TopFace:
+    """The outline of the chosen object.
+
+    Raises:
+        Unusable, DepthError: one line that says why there is none.
+    """
+    depth = depth_of(image)
+    check_depth(depth, contours.width, contours.height)
+    chosen = contours.contours[contours.selected]
+    return top_face(chosen.pixels, depth, camera, config, hole=is_hole(contours.contours, chosen.index))
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Answer the contours of each picture with an outline, or with why there is none."""
+    contours, depths = bus.reader(topics.CONTOURS), bus.reader(topics.DEPTH_CAMERA_DEPTH)
+    infos, statics = bus.reader(topics.DEPTH_CAMERA_INFO), bus.reader(topics.TF_STATIC)
+    out = bus.writer(topics.CONTOUR_POINTS)
+    images: OrderedDict[int, Image] = OrderedDict()
+    waiting: Contours | None = None  # contours whose depth image has not come yet
+    told = ""
+    await bus.ready()
+
+    async def answer() -> None:
+        nonlocal waiting, told
+        now = waiting
+        if now is None or (now.selected >= 0 and now.header.stamp not in images):
+            return
+        waiting = None
+        points = OutlinePoints(header=Header(stamp=now.header.stamp, frame_id=WORLD), message=now.message)
+        if now.selected >= 0:
+            image = images[now.header.stamp]
+            label = now.contours[now.selected].label
+            try:
+                camera = camera_of(infos.latest, statics.latest, image.header.frame_id)
+                face = await asyncio.to_thread(outline, now, image, camera, config)
+            except ZencellError as error:
+                points = points.model_copy(update={"object": label, "message": f"{label}: {error}"})
+            else:
+                poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in face.outline.tolist()]
+                found = {"object": label, "poses": poses, "invalid_depth": face.filled}
+                points = points.model_copy(update=found)
+        out.put(points)
+        if points.message and points.message != told and points.object:
+            bus.log.warning("%s", points.message)
+        told = points.message
+
+    async def collect() -> None:
+        async for image in depths:
+            images[image.header.stamp] = image
+            while len(images) > KEPT:
+                images.popitem(last=False)
+            await answer()
+
+    async def follow() -> None:
+        nonlocal waiting
+        async for newest in contours:
+            waiting = newest
+            await answer()
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(collect())
+        group.create_task(follow())
+
+
+if __name__ == "__main__":
+    main(run, Config)

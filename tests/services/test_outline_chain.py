@@ -1,0 +1,185 @@
+"""From the truth to the path: camera, contours, world points and cleared path, on a network within the process."""
+
+import asyncio
+from contextlib import AsyncExitStack
+
+import numpy as np
+import pytest
+
+from common import topics
+from common.config import (
+    CameraConfig,
+    ObjectConfig,
+    RobotConfig,
+    Run,
+    Surroundings,
+    World,
+    check,
+    config_root,
+    find_file,
+    read_robot,
+    read_yaml,
+)
+from common.errors import ConfigError, RemoteError
+from common.messages import Header, JointState, OutlineSelect, TFMessage, WorldObjects
+from common.perception.image import array_to_image, image_to_array
+from common.perception.pinhole import Pinhole
+from common.robot.transforms import rpy_to_matrix, transform
+from common.sim.objects import world_object
+from common.transport.local import LocalNetwork
+from common.transport.wiring import wiring
+from services import contour_detector, depth_camera, duplicate_remover, pixel_to_world
+from services.robot_state_publisher import stamped
+
+ROBOT = check(RobotConfig, read_robot(find_file("robots", "ur5")))
+W5 = check(World, read_yaml(config_root() / "worlds" / "w5.yaml"))
+AROUND = Surroundings.model_validate({f: getattr(W5, f) for f in Surroundings.model_fields})
+CAMERA = depth_camera.Config(world=AROUND, robot=ROBOT, run=Run(cell="test"), rate=30, max_rate=30)
+DETECTOR, WORLD, REMOVER = contour_detector.Config(), pixel_to_world.Config(), duplicate_remover.Config()
+
+
+class Cell:
+    """The services, and what a tester says and hears."""
+
+    def __init__(self):
+        self.net = LocalNetwork()
+        self.bus = self.net.bus()
+        self.truth, self.joints = self.bus.writer(topics.SCENE_OBJECTS), self.bus.writer(topics.JOINT_STATES)
+        self.static = self.bus.writer(topics.TF_STATIC)
+        self.contours, self.points = self.bus.reader(topics.CONTOURS), self.bus.reader(topics.CONTOUR_POINTS)
+        self.paths, self.select = self.bus.reader(topics.CONTOUR_PATH), self.bus.client(topics.OUTLINE_SELECT)
+
+    def say(self, objects):
+        camera: CameraConfig = AROUND.camera
+        T = transform(rpy_to_matrix(*camera.rpy), camera.position)
+        self.static.put(TFMessage(transforms=[stamped("world", camera.frame, T, 0)]))
+        self.joints.put(JointState(header=Header(), name=ROBOT.joints, position=ROBOT.named_poses["home"]))
+        self.truth.put(WorldObjects(objects=[world_object(thing) for thing in objects]))
+
+
+async def until(reader, wanted):
+    async with asyncio.timeout(20):
+        while not wanted(message := await reader.next()):
+            pass
+        return message
+
+
+def middle(points):
+    return np.mean([(p.position.x, p.position.y, p.position.z) for p in points.poses], axis=0)
+
+
+async def running(stack, cell, *, detector=DETECTOR, world=WORLD, camera=True):
+    services = [(contour_detector, detector), (pixel_to_world, world), (duplicate_remover, REMOVER)]
+    for module, config in ([(depth_camera, CAMERA)] if camera else []) + services:
+        await stack.enter_async_context(cell.net.running(module.run, config, name=module.__name__.rpartition(".")[2]))
+
+
+async def test_the_largest_object_is_chosen_and_its_outline_becomes_a_path():
+    async with AsyncExitStack() as stack:
+        cell = Cell()
+        await running(stack, cell)
+        cell.say(W5.objects)
+        points = await until(cell.points, lambda p: bool(p.poses))
+        path = await until(cell.paths, lambda p: bool(p.poses))
+        np.testing.assert_allclose(middle(points), (0.46, -0.12, 1.05), atol=1e-3)
+        assert points.invalid_depth == 0 and points.header.frame_id == "world"
+        assert 4 <= len(path.poses) < len(points.poses) / 4
+        assert path.object == points.object
+
+
+async def test_another_object_can_be_chosen_by_colour_and_stays_chosen():
+    async with AsyncExitStack() as stack:
+        cell = Cell()
+        await running(stack, cell, detector=DETECTOR.model_copy(update={"select": "none"}))
+        cell.say(W5.objects)
+        none = await until(cell.points, lambda p: bool(p.message))
+        assert "choices: 0 (Object_0" in none.message and not none.poses
+        answer = await cell.select.call(OutlineSelect(rule="colour", colour="red"))
+        points = await until(cell.points, lambda p: p.object == answer.label)
+        np.testing.assert_allclose(middle(points), (0.52, 0.02, 1.08), atol=1e-3)
+        later = await until(cell.points, lambda p: p.header.stamp > points.header.stamp)
+        np.testing.assert_allclose(middle(later), (0.52, 0.02, 1.08), atol=1e-3)
+
+
+async def test_a_choice_that_is_not_there_is_refused_with_the_choices():
+    async with AsyncExitStack() as stack:
+        cell = Cell()
+        await running(stack, cell)
+        with pytest.raises(RemoteError, match="no picture"):
+            await cell.select.call(OutlineSelect())
+        cell.say(W5.objects)
+        await until(cell.contours, lambda c: c.selected >= 0)
+        with pytest.raises(RemoteError, match=r"no contour 7; choices: 0 \(Object_0, .*green"):
+            await cell.select.call(OutlineSelect(rule="index", index=7))
+        with pytest.raises(RemoteError, match=r"no yellow contour; choices: .*red"):
+            await cell.select.call(OutlineSelect(rule="colour", colour="yellow"))
+
+
+async def test_an_empty_world_and_one_with_an_object_at_the_border_say_why_there_is_no_path():
+    async with AsyncExitStack() as stack:
+        cell = Cell()
+        await running(stack, cell)
+        cell.say([])
+        path = await until(cell.paths, lambda p: bool(p.message))
+        assert path.message == "the picture has no contour" and not path.poses
+        cell.say([ObjectConfig(id="edge", shape="box", x=0.5, y=0.25, z=1.0, size=(0.06, 0.06), height=0.05)])
+        path = await until(cell.paths, lambda p: "border" in p.message)
+        assert path.message.startswith("every contour touches the border") and not path.poses
+
+
+async def test_exposure_stamps_picture_depth_and_points_alike_and_points_come_only_when_listened_to():
+    async with AsyncExitStack() as stack:
+        cell = Cell()
+        readers = [cell.bus.reader(t) for t in (
+            topics.DEPTH_CAMERA_IMAGE, topics.DEPTH_CAMERA_DEPTH, topics.DEPTH_CAMERA_POINTS)]
+        await stack.enter_async_context(cell.net.running(depth_camera.run, CAMERA, name="depth_camera"))
+        cell.say(W5.objects)
+        stamps = [(await until(reader, lambda _: True)).header.stamp for reader in readers]
+        assert len(set(stamps)) == 1
+        cloud = np.frombuffer(readers[2].latest.data, "<f4").reshape(768, 1024, 4)
+        depth = image_to_array(readers[1].latest)
+        np.testing.assert_array_equal(cloud[..., 2], depth)
+        assert np.nanmin(depth) == pytest.approx(2.75 - 1.08) and np.isnan(depth).any()
+
+
+async def test_depth_that_does_not_fit_the_picture_is_told_in_one_line():
+    async with AsyncExitStack() as stack:
+        cell = Cell()
+        depths, infos = cell.bus.writer(topics.DEPTH_CAMERA_DEPTH), cell.bus.writer(topics.DEPTH_CAMERA_INFO)
+        images = cell.bus.writer(topics.DEPTH_CAMERA_IMAGE)
+        await running(stack, cell, camera=False)
+        cell.say([])
+        header = Header(stamp=5, frame_id=AROUND.camera.frame)
+        infos.put(Pinhole.from_config(AROUND.camera).info(header))
+        picture = np.zeros((768, 1024, 3), np.uint8)
+        picture[300:400, 400:500] = (0, 255, 255)
+        nothing = np.full((768, 1024), np.nan, np.float32)
+        for stamp, depth, said in ((5, nothing[::2], "the depth image is 1024x384, but the picture is 1024x768"),
+                                   (6, nothing, "the depth image has no valid depth at all")):
+            header = Header(stamp=stamp, frame_id=AROUND.camera.frame)
+            depths.put(array_to_image(np.ascontiguousarray(depth), "32FC1", header))
+            images.put(array_to_image(picture, "bgr8", header))
+            path = await until(cell.paths, lambda p, stamp=stamp: p.header.stamp == stamp)
+            assert said in path.message and path.message.startswith("Object_0: ") and not path.poses
+
+
+async def test_the_camera_alone_reads_the_truth():
+    assert topics.SCENE_OBJECTS in (await wiring(depth_camera.run, CAMERA)).reads
+    for module, config in ((contour_detector, DETECTOR), (pixel_to_world, WORLD), (duplicate_remover, REMOVER)):
+        assert topics.SCENE_OBJECTS not in (await wiring(module.run, config)).reads
+
+
+@pytest.mark.parametrize("module, config", [
+    (depth_camera, CAMERA), (contour_detector, DETECTOR), (pixel_to_world, WORLD), (duplicate_remover, REMOVER)])
+async def test_wiring_is_what_the_topic_table_says(module, config):
+    found, name = await wiring(module.run, config), module.__name__.rpartition(".")[2]
+    table = topics.all_topics().values()
+    assert {t.key for t in found.writes} - {"log", "counters"} == {
+        t.key for t in table if t.kind != "request" and t.writer == name}
+    assert {t.key for t in found.serves} == {t.key for t in table if t.kind == "request" and t.writer == name}
+
+
+def test_a_choice_at_the_start_that_is_none_is_a_bad_parameter():
+    with pytest.raises(ConfigError, match=r"services.contour_detector.select.*'bleu'.*choices: none, auto"):
+        contour_detector.initial_choice("bleu")
+
