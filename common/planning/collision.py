@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.errors import UnknownName
 from common.messages import CollisionObject, PlanningScene, Pose
-from common.planning.obstacles import MARGINS, ObstacleCache, Rules, Solid
+from common.planning.obstacles import MARGINS, ObstacleBank, ObstacleCache, Rules, Solid
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, pose_to_matrix
@@ -163,7 +163,17 @@ class CollisionWorld:
             found.update(np.flatnonzero(either).tolist())
         return frozenset(found)
 
-    def _pair(self, index: int) -> Pair:
+    @property
+    def bank(self) -> ObstacleBank:
+        """The geometry: the robot among the solids of the scene."""
+        return self._bank
+
+    def rules_at(self, q: Array) -> Rules:
+        """Which pairs count when the robot is at q (dof,) [rad], and how far apart they must be."""
+        return self._near if self._near is not self._far and self._travel(q) < self.contact_distance else self._far
+
+    def pair(self, index: int) -> Pair:
+        """Names of the link or attached object, and of what it is paired with."""
         return self._names[self._bank.first[index]], self._names[self._bank.second[index]]
 
     def _travel(self, q: Array) -> float:
@@ -181,11 +191,11 @@ class CollisionWorld:
 
     def colliding_pair(self, q: Array) -> Pair | None:
         """Names of a link or attached object and of what it touches at q; None when nothing touches."""
-        rules = self._near if self._near is not self._far and self._travel(q) < self.contact_distance else self._far
+        rules = self.rules_at(q)
         if not rules.hit(q):
             return None
         found = rules.pairs(q)
-        return self._pair(found[0]) if found else None
+        return self.pair(found[0]) if found else None
 
     def _proved_free(self, q: Array, moves: float, tcp_moves: float) -> bool:
         """Whether all positions are free within which no point moves farther than `moves` [m] from where it is at q."""

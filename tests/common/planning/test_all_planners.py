@@ -10,10 +10,13 @@ from common.robot.transforms import tool_down
 from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sound, wall, with_planner
 from tests.common.planning.planning_scenes import ROBOT, above, last, scene, solid, to_joints, to_pose
 
-JOINT_GOALS = ["joint_move", "lerp", "ompl", "ptp"]
-POSE_GOALS = ["cartesian", "lerp", "lin", "ompl", "ptp"]
+JOINT_GOALS = ["chomp", "joint_move", "lerp", "ompl", "ptp"]
+POSE_GOALS = ["cartesian", "chomp", "lerp", "lin", "ompl", "ptp"]
 ALL = sorted({*JOINT_GOALS, *POSE_GOALS})
+QUICK = {"chomp": {"iterations": 30}}
 PIPELINES = {name: with_planner(name) for name in ALL}
+GIVING_UP = {name: with_planner(name, **QUICK.get(name, {})) for name in ALL}
+AROUND_WALLS = ["chomp", "ompl"]
 NEVER_FOUND = [name for name in ALL if name != "ompl"]
 
 
@@ -75,7 +78,7 @@ def test_way_that_is_blocked_is_reported_with_waypoint_and_pair(planner):
     request = request_for(planner, tool_down(0.5, 0.3, 0.2), RIGHT, stage="transfer")
     if planner in JOINT_GOALS:
         request = to_joints(LEFT, RIGHT, stage="transfer")
-    response = PIPELINES[planner].plan(request, high)
+    response = GIVING_UP[planner].plan(request, high)
     assert not response.ok
     assert response.trajectory is None
     assert response.error == "collision"
@@ -85,6 +88,16 @@ def test_way_that_is_blocked_is_reported_with_waypoint_and_pair(planner):
         found = re.search(r"waypoint (\d+) of \d+", response.message)
         assert int(found[1]) == response.attempts[-1].waypoint
     assert "\n" not in response.message
+
+
+@pytest.mark.parametrize("planner", AROUND_WALLS)
+def test_way_around_a_wall_is_found(planner):
+    low = wall(height=0.3, depth=0.3)
+    request = to_joints(LEFT, RIGHT)
+    assert not PIPELINES["lerp"].plan(request, low).ok
+    response = PIPELINES[planner].plan(request, low)
+    assert_sound(PIPELINES[planner], request, low, response)
+    assert np.allclose(last(response), LEFT, atol=1e-6)
 
 
 @pytest.mark.parametrize("planner", ALL)

@@ -1,0 +1,109 @@
+"""Covariant gradient descent: a smooth path that obstacles push away, after CHOMP.
+
+Ratliff, Zucker, Bagnell, Srinivasa: "CHOMP: Gradient Optimization Techniques for Efficient Motion Planning" (ICRA
+2009). Distances are those between convex hulls, to the nearest obstacle of each link, instead of a distance field
+about spheres. It finds a path that is near its first guess or none: a local method without a second try.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from common.config import Parameters
+from common.planning.joint_goals import first_success, joint_goals
+from common.planning.optimised_path import check_path, evenly_spaced, quintic
+from common.planning.problem import Cancel, Problem, Result
+from common.planning.proximity import Near, Proximity
+
+Array = NDArray[np.float64]
+
+_OWN_CLEARANCE = 0.03  # [m] between links of the robot, which are always close to each other somewhere
+_CHECK_EVERY = 5  # iterations, once the waypoints alone are free
+_LARGEST_UPDATE = 0.1  # [rad] of a joint in one iteration
+
+
+class Options(Parameters):
+    """Weights and limits of the descent."""
+
+    iterations: int = Field(200, ge=1, le=10000, description="at most")
+    smoothness: float = Field(0.1, ge=0, le=1000, description="weight of the squared accelerations")
+    obstacle: float = Field(1.0, gt=0, le=1000, description="weight of being near obstacles")
+    learning_rate: float = Field(0.01, gt=0, le=10, description="share of the covariant gradient in a step")
+    clearance: float = Field(0.2, gt=0, le=1, description="distance from which on obstacles push [m]")
+    waypoints: int = Field(30, ge=5, le=200, description="of the path that is optimised")
+    goals: int = Field(4, ge=1, le=100, description="IK solutions of a pose goal to choose from")
+
+
+def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
+    """A path that the descent made free of collision, or what still collides when its iterations are over."""
+    goals = joint_goals(problem, cancel, wanted=options.goals)
+    if isinstance(goals, Result):
+        return goals
+    own = min(_OWN_CLEARANCE, options.clearance)
+    proximity = Proximity(problem.world, options.clearance, own_reach=own, nearest=True)
+    return first_success(goals, lambda goal: _descend(problem, goal, options, proximity, cancel), cancel, problem)
+
+
+def _descend(problem: Problem, goal: Array, options: Options, proximity: Proximity, cancel: Cancel) -> Result:
+    path = quintic(problem.start, goal, options.waypoints)
+    if problem.world.edge_free(problem.start, goal):  # nothing is smoother
+        return Result(waypoints=evenly_spaced(path), dense=True, fraction=1.0)
+    A = accelerations(len(path))
+    inverse = np.linalg.inv(A[1:-1, 1:-1])
+    scale = float(inverse.max())  # so that a learning rate means the same for any number of waypoints
+    lower, upper = problem.robot.lower, problem.robot.upper
+    proximity.forget()
+    failure = Result(error="collision", message="")
+    next_check = 0
+    for iteration in range(options.iterations + 1):
+        stop = cancel.reason(problem)
+        if stop:
+            return Result(error=stop, message=f"planning was ended after {iteration} iterations")
+        near = proximity.measure(path)
+        last = iteration == options.iterations
+        if last or (iteration >= next_check and (near.distance > 0).all()):
+            next_check = iteration + _CHECK_EVERY
+            even = evenly_spaced(path)
+            hit = check_path(problem, even)
+            if hit is None:
+                return Result(waypoints=even, dense=True, fraction=1.0)
+            failure = hit
+        if last:
+            break
+        smooth = options.smoothness * (A @ path)[1:-1] * scale
+        pushed = options.obstacle * obstacle_gradient(near, len(path))[1:-1]
+        update = -options.learning_rate * (inverse / scale) @ (smooth + pushed)
+        largest = np.abs(update).max(axis=0)
+        update *= np.minimum(1.0, _LARGEST_UPDATE / np.maximum(largest, 1e-12))
+        path[1:-1] = np.clip(path[1:-1] + update, lower, upper)
+    message = f"{failure.message} after {options.iterations} iterations"
+    return Result(
+        error=failure.error,
+        message=message,
+        waypoint=failure.waypoint,
+        colliding=failure.colliding,
+        fraction=failure.fraction,
+    )
+
+
+def accelerations(count: int) -> Array:
+    """(count, count) A with path^T A path = the sum of squared accelerations of a path that is at rest at its ends."""
+    K = np.zeros((count, count))
+    for i in range(count):
+        K[i, i] -= 2
+        K[i, max(i - 1, 0)] += 1
+        K[i, min(i + 1, count - 1)] += 1
+    return np.asarray(K.T @ K)
+
+
+def obstacle_gradient(near: Near, count: int) -> Array:
+    """(count, dof) gradient of the sum over waypoints of each pair's cost (3) of the paper.
+
+    -d + e/2 within an obstacle, (d - e)^2 / 2e within the clearance e about it.
+    """
+    slope = np.where(near.distance < 0, -1.0, (near.distance - near.reach) / near.reach)
+    gradient = np.zeros((count, near.gradient.shape[1]))
+    np.add.at(gradient, near.position, slope[:, None] * near.gradient)
+    return gradient
