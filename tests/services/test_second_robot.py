@@ -18,7 +18,8 @@ from common.transport.local import LocalNetwork
 from services import robot_state_publisher, trajectory_executor
 from tests.services.test_trajectory_executor import move
 
-CELL = load_cell("panda", ["robot=ur5"], world="w2")
+SEED_TOLERANCES = "services.trajectory_executor.tolerances={path: 0.2, goal: 0.1, stopped_velocity: 0.2}"
+CELL = load_cell("panda", ["robot=ur5", SEED_TOLERANCES], world="w2")
 SPEED = 10.0
 assert CELL.robot.gripper is not None
 GRIPPER = CELL.robot.gripper
