@@ -14,14 +14,18 @@ def color_of(rgb: Rgb) -> m.Color:
 
 def fixed_objects(around: Surroundings) -> list[m.CollisionObject]:
     """All solids that never move, poses in world."""
-    objects = [
+    return fixture_objects(around) + container_panels(around.container, around.table_height)
+
+
+def fixture_objects(around: Surroundings) -> list[m.CollisionObject]:
+    """The fixtures, without the container: a cell that fills none has none."""
+    return [
         m.CollisionObject(
             id=f.id, role="fixture", shape=f.shape, dimensions=list(f.dimensions), color=color_of(f.color),
             pose=matrix_to_pose(transform(rpy_to_matrix(*f.rpy), f.position)),
         )
         for f in around.fixtures
     ]
-    return objects + container_panels(around.container, around.table_height)
 
 
 def container_panels(box: Container, table_height: float) -> list[m.CollisionObject]:

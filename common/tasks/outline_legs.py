@@ -1,0 +1,140 @@
+"""The motions of outlining one object, as goals for the tool centre point, and what the task knows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+from common import messages as m
+from common.config import GripperConfig
+from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
+
+Place = tuple[float, float, float]
+NEAR = 0.01  # [m] an object that was perceived is this exact
+
+
+@dataclass(eq=False)
+class Leg:
+    """A motion of the arm; `trajectory` is there once it was planned. `touches` are pairs that may touch in it."""
+
+    name: str
+    state: m.OutlineState
+    goal: m.PoseGoal | m.PathGoal | m.JointGoal
+    straight: bool = False
+    touches: list[tuple[str, str]] = field(default_factory=list)
+    trajectory: m.JointTrajectory | None = None
+
+    def end(self) -> list[float]:
+        """Joint positions [rad] at its end; empty when it is not planned."""
+        return self.trajectory.points[-1].positions if self.trajectory else []
+
+    @property
+    def seconds(self) -> float:
+        """How long it takes, cell time."""
+        return self.trajectory.points[-1].time_from_start if self.trajectory else 0.0
+
+
+@dataclass(eq=False)
+class Close:
+    """The fingers come together: they trace closed."""
+
+    name = "close"
+    state: m.OutlineState = "PLANNING"
+
+
+@dataclass
+class OutlineView:
+    """What the task knows at an instant: only what was perceived or reported. Times are cell time [s]."""
+
+    now: float
+    path: m.OutlinePoints | None = None
+    scene: m.PlanningScene | None = None
+    gripper: m.GripperState | None = None
+    motion: m.MotionStatus | None = None
+    q: list[float] | None = None
+    tcp: m.Pose | None = None
+
+    @property
+    def missing(self) -> list[str]:
+        """Topics that have not said anything yet, without which nothing can be done."""
+        known = {"gripper/state": self.gripper, "planning_scene": self.scene, "joint_states": self.q,
+                 "motion/status": self.motion}
+        return [key for key, value in known.items() if value is None]
+
+    def solid(self) -> str:
+        """Id of the perceived object that the path goes round; empty while the planning scene does not have it."""
+        if self.path is None or self.scene is None or self.scene.header.stamp < self.path.header.stamp:
+            return ""
+        places = [(p.position.x, p.position.y, p.position.z) for p in self.path.poses]
+        around = [o for o in self.scene.objects if o.role == "target" and all(_beside(o, place) for place in places)]
+        return min(around, key=_area, default=None).id if around else ""  # type: ignore[union-attr]
+
+
+def _beside(thing: m.CollisionObject, place: Place) -> bool:
+    """Whether a place lies within the box about an upright prism."""
+    at = thing.pose.position
+    xs, ys = zip(*thing.outline, strict=True) if thing.outline else ((0.0,), (0.0,))
+    x, y, z = place
+    return (min(xs) - NEAR <= x - at.x <= max(xs) + NEAR and min(ys) - NEAR <= y - at.y <= max(ys) + NEAR
+            and abs(z - at.z) <= thing.dimensions[-1] / 2 + NEAR)
+
+
+def _area(thing: m.CollisionObject) -> float:
+    xs, ys = zip(*thing.outline, strict=True) if thing.outline else ((0.0,), (0.0,))
+    return float((max(xs) - min(xs)) * (max(ys) - min(ys)))
+
+
+def closed(path: m.OutlinePoints) -> list[Place]:
+    """The points of a path [m] and the first once more."""
+    points = [(p.position.x, p.position.y, p.position.z) for p in path.poses]
+    return [*points, points[0]]
+
+
+def length(points: list[Place]) -> float:
+    """Length [m] of the lines through points."""
+    return sum(math.dist(a, b) for a, b in pairwise(points))
+
+
+@dataclass(frozen=True)
+class Legs:
+    """Builds the motions; knows heights and speed, nothing of what happens."""
+
+    standoff: float
+    clearance: float
+    tool_rpy: tuple[float, float, float]
+    tool_speed: float
+    step: float
+    min_fraction: float
+    gripper: GripperConfig
+
+    def outline(self, points: list[Place], solid: str) -> list[Leg]:
+        """Above the first point, down, along all points, up, home."""
+        x, y, z = points[0]
+        touches = [(link, solid) for link in self.gripper.links]
+        trace = m.PathGoal(waypoints=[self._pose(p) for p in points], step=self.step, min_fraction=self.min_fraction,
+                           tool_speed=self.tool_speed)
+        above = m.PoseGoal(pose=self._pose((x, y, z + self.clearance)))
+        return [
+            Leg("approach", "APPROACHING", above),
+            Leg("descend", "APPROACHING", m.PoseGoal(pose=self._pose(points[0])), straight=True, touches=touches),
+            Leg("trace", "TRACING", trace, touches=touches),
+            Leg("retreat", "RETREATING", above, straight=True, touches=touches),
+            self.home(),
+        ]
+
+    def home(self) -> Leg:
+        """To the pose from which the camera sees everything."""
+        return Leg("home", "HOMING", m.JointGoal(named="home"))
+
+    def retreat(self, tcp: m.Pose, scene: m.PlanningScene, contact: tuple[str, str] | None = None) -> Leg:
+        """Straight up from where the tool is, whatever its finger tips touch there now."""
+        at = tcp.position
+        pose = tcp.model_copy(update={"position": m.Vector3(x=at.x, y=at.y, z=at.z + self.clearance)})
+        touches = [(link, o.id) for link in self.gripper.links for o in scene.objects if o.role == "target"]
+        return Leg("retreat", "RETREATING", m.PoseGoal(pose=pose), straight=True,
+                   touches=[*touches, *([contact] if contact else [])])
+
+    def _pose(self, at: Place) -> m.Pose:
+        x, y, z = at
+        return matrix_to_pose(transform(rpy_to_matrix(*self.tool_rpy), (x, y, z + self.standoff)))

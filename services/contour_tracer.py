@@ -1,0 +1,56 @@
+"""Runs the outline task: watches contour, scene, gripper and motion, and asks for plans and motion."""
+
+from __future__ import annotations
+
+import uuid
+
+from common import topics
+from common.config import RobotConfig, Run
+from common.robot.model import RobotModel
+from common.robot.transforms import matrix_to_pose
+from common.tasks.outline import Outline, OutlineParameters
+from common.tasks.outline_legs import OutlineView
+from common.transport.bus import Bus
+from common.transport.service import main
+from common.transport.task_runner import TaskRunner
+
+
+class Config(OutlineParameters):
+    """Parameters of the task and the sections that it needs."""
+
+    robot: RobotConfig
+    run: Run
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Step the task whenever something is heard, and at least 20 times a second."""
+    path, scene = bus.reader(topics.CONTOUR_PATH), bus.reader(topics.PLANNING_SCENE)
+    gripper, motion = bus.reader(topics.GRIPPER_STATE), bus.reader(topics.MOTION_STATUS)
+    joints = bus.reader(topics.JOINT_STATES)
+    status = bus.writer(topics.OUTLINE_STATUS)
+    robot = RobotModel.load(config.robot)
+    if config.robot.gripper is None:
+        raise ValueError("the task needs a robot with a gripper")
+    # Waiting for a person or for pictures is by the clock on the wall, also in a fast cell.
+    parameters = config.model_copy(update={"selection_timeout": config.selection_timeout * bus.clock.speed})
+    home, prefix = config.robot.named_poses["home"], uuid.uuid4().hex[:8]
+    task = Outline(parameters, config.robot.gripper, home, prefix, config.run.autostart)
+    view = OutlineView(now=bus.clock.now())
+
+    def look() -> OutlineView:
+        view.now = bus.clock.now()
+        view.path, view.scene = path.latest, scene.latest
+        view.gripper, view.motion = gripper.latest, motion.latest
+        measured = joints.latest
+        q = robot.order(measured.name, measured.position) if measured else None
+        if q is not None:
+            view.q, view.tcp = q.tolist(), matrix_to_pose(robot.fk(q))
+        return view
+
+    runner = TaskRunner(bus, task, look, status, config.planning_time)
+    await bus.ready()
+    await runner.run((path, scene, gripper, motion))
+
+
+if __name__ == "__main__":
+    main(run, Config)

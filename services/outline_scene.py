@@ -1,0 +1,85 @@
+"""Keeps the planning scene of the outlining cell: fixtures, and every solid in the newest picture without the arm."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+
+from common import topics
+from common.config import Parameters, RobotConfig, Surroundings
+from common.messages import Contours, Image
+from common.perception.image import ImageError, image_to_array
+from common.perception.intake import Cameras, Unusable
+from common.perception.perceived_solids import perceived_solids
+from common.scene.outline_scene import HomeWatch, planning_scene
+from common.transport.bus import Bus
+from common.transport.service import main
+
+KEPT = 5  # depth images that wait for their contours
+
+
+class Config(Parameters):
+    """What is fixed in the cell, and where the arm is at home."""
+
+    robot: RobotConfig
+    world: Surroundings
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Publish the planning scene for every picture that was taken with the arm at home."""
+    contours = bus.reader(topics.CONTOURS)
+    depths = bus.reader(topics.DEPTH_CAMERA_DEPTH)
+    infos = bus.reader(topics.DEPTH_CAMERA_INFO)
+    statics = bus.reader(topics.TF_STATIC)
+    joints = bus.reader(topics.JOINT_STATES)
+    out = bus.writer(topics.PLANNING_SCENE)
+    home = HomeWatch(config.robot.named_poses["home"])
+    cameras = Cameras()
+    kept: deque[Image] = deque(maxlen=KEPT)
+    unusable: set[str] = set()
+    out.put(planning_scene(config.world, [], 0))
+    await bus.ready()
+
+    async def watch_arm() -> None:
+        async for state in joints:
+            found = dict(zip(state.name, state.position, strict=True))
+            if all(name in found for name in config.robot.joints):
+                home.note([found[name] for name in config.robot.joints], state.header.stamp)
+
+    async def watch_depth() -> None:
+        async for image in depths:
+            kept.append(image)
+            await look(contours.latest)
+
+    async def watch_contours() -> None:
+        async for found in contours:
+            await look(found)
+
+    newest = 0
+
+    async def look(found: Contours | None) -> None:
+        """Publish what a picture shows once its contours and its depth are both here."""
+        nonlocal newest
+        if found is None or found.header.stamp <= newest or not home.covers(found.header.stamp):
+            return
+        depth = next((image for image in kept if image.header.stamp == found.header.stamp), None)
+        if depth is None:
+            return
+        newest = found.header.stamp
+        try:
+            camera = cameras.of(infos.latest, statics.latest, depth.header.frame_id)
+            solids = await asyncio.to_thread(perceived_solids, found.contours, image_to_array(depth), camera)
+        except (Unusable, ImageError) as error:
+            if error.kind not in unusable:
+                bus.log.warning("picture left out: %s (told once)", error)
+            unusable.add(error.kind)
+            return
+        out.put(planning_scene(config.world, solids, found.header.stamp))
+
+    async with asyncio.TaskGroup() as group:
+        for watch in (watch_arm(), watch_depth(), watch_contours()):
+            group.create_task(watch)
+
+
+if __name__ == "__main__":
+    main(run, Config)
