@@ -187,7 +187,8 @@ class Operation:
         from common.supervision.collector import Collector
 
         assert self._screen is not None
-        self._collector = Collector(bus, self.cell.task, self.summary, self.began, self._screen.progress)
+        self._collector = Collector(bus, self.cell.task, self.summary, self.began, self._screen.progress,
+                                    self.cell.robot)
 
     async def _until_ended(self, bus: Bus) -> int:
         from common import topics

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from common.messages import PickPlaceStatus, ServiceStatus
+from common.messages import ServiceStatus, TaskReport
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Content:
 
     services: list[ServiceStatus]
     rates: dict[str, tuple[str, float]]  # by service: the topic that it writes most often, and how often [Hz]
-    task: PickPlaceStatus | None
+    task: TaskReport | None
 
 
 class Screen(Protocol):

@@ -632,6 +632,9 @@ class OutlineStatus(Message):
     message: str = ""
 
 
+TaskReport = PickPlaceStatus | OutlineStatus  # what the task of a cell says about itself
+
+
 class WorldObject(Message):
     """A solid of the simulated world, standing upright: its outline [m] in world and its height.
 

@@ -5,34 +5,32 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from common import topics
-from common.messages import PickPlaceStatus
+from common.config import RobotConfig
+from common.messages import Message, TaskReport
 from common.supervision.rates import Rates
 from common.supervision.summary import Summary, is_settled, progress_line
-from common.topics import Topic
 
 if TYPE_CHECKING:
-    from common.transport.bus import Bus
+    from common.transport.bus import Bus, Reader
 
 SETTLE_TIMEOUT = 2.0  # [s] for what still falls after the task ended
 ENDED = ("DONE", "ERROR")
 
+M = TypeVar("M", bound=Message)
+
 # On which topic a task says how far it is, where it is not pick_place_status.
-STATUS_OF_TASK: dict[str, Topic[PickPlaceStatus]] = {}
-
-
-def status_topic(task: str) -> Topic[PickPlaceStatus]:
-    """The topic on which a task's service publishes its status."""
-    return STATUS_OF_TASK.get(task, topics.PICK_PLACE_STATUS)
+STATUS_OF_TASK = {"contour_tracer": topics.OUTLINE_STATUS}
 
 
 class Collector:
     """Feeds a `Summary` and `Rates` from a cell's topics."""
 
     def __init__(
-        self, bus: Bus, task: str, summary: Summary, started_at: float, on_progress: Callable[[str], None]
+        self, bus: Bus, task: str, summary: Summary, started_at: float, on_progress: Callable[[str], None],
+        robot: RobotConfig | None = None,
     ) -> None:
         """Declare what is listened to.
 
@@ -42,21 +40,32 @@ class Collector:
             summary: is fed.
             started_at: when this process began [s, monotonic].
             on_progress: called with a line whenever the task got further.
+            robot: whose tool tip is followed in a cell that outlines objects.
         """
         self.summary = summary
         self.rates = Rates(topics.all_topics())
-        self.task_status: PickPlaceStatus | None = None
+        self.task_status: TaskReport | None = None
         self.ended = asyncio.Event()
         self._clock = bus.clock
         self._started_at = started_at
         self._on_progress = on_progress
         self._progress = ""
-        self._status = bus.reader(status_topic(task))
+        self._status: Reader[Any] = bus.reader(STATUS_OF_TASK.get(task, topics.PICK_PLACE_STATUS))
         self._motion = bus.reader(topics.MOTION_STATUS)
         self._targets = bus.reader(topics.VALIDATED_TARGETS)
         self._rejected = bus.reader(topics.REJECTED_TARGETS)
         self._balls = bus.reader(topics.SCENE_BALLS)
         self._counters = bus.reader(topics.COUNTERS)
+        self._noted: list[tuple[Reader[Any], Callable[[Any], None]]] = []
+        if robot is not None and STATUS_OF_TASK.get(task) is topics.OUTLINE_STATUS:
+            from common.supervision.traced import Traced
+
+            traced = summary.traced = Traced(robot)
+            self._noted = [
+                (bus.reader(topics.JOINT_STATES), traced.on_joints),
+                (bus.reader(topics.CONTOUR_PATH), traced.on_path),
+                (bus.reader(topics.SCENE_OBJECTS), traced.on_truth),
+            ]
 
     async def run(self) -> None:
         """Listen until cancelled."""
@@ -64,7 +73,7 @@ class Collector:
             asyncio.create_task(follow)
             for follow in (
                 self._follow_status(), self._follow_motion(), self._follow_targets(), self._follow_rejections(),
-                self._follow_counters(),
+                self._follow_counters(), *(_follow(reader, note) for reader, note in self._noted),
             )
         ]
         try:
@@ -115,3 +124,8 @@ class Collector:
     async def _follow_counters(self) -> None:
         async for counters in self._counters:
             self.rates.update(counters, time.monotonic())
+
+
+async def _follow(reader: Reader[M], note: Callable[[M], None]) -> None:
+    async for message in reader:
+        note(message)

@@ -5,9 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from common.messages import MotionStatus, PickPlaceStatus, PlanFigure, PoseArray, Rejection, Vector3
+from common.messages import (
+    MotionStatus,
+    OutlineStatus,
+    PickPlaceStatus,
+    PlanFigure,
+    PoseArray,
+    Rejection,
+    TaskReport,
+    Vector3,
+)
+
+if TYPE_CHECKING:
+    from common.supervision.traced import Traced
 
 SAME_PLACE = 0.03  # [m] rejections closer than this are of the same thing
 NOT_LEFT_BEHIND = "inside the container"  # such a detection is of what was placed
@@ -44,11 +56,10 @@ class Counted:
     plans: list[PlanFigure] = field(default_factory=list)
 
     @classmethod
-    def of(cls, status: PickPlaceStatus) -> Counted:
+    def of(cls, status: TaskReport) -> Counted:
         """The figures in a status."""
-        return cls(
-            status.failures, status.retries, status.moving_seconds, status.planning_seconds, list(status.plans)
-        )
+        retries = status.retries if isinstance(status, PickPlaceStatus) else 0
+        return cls(status.failures, retries, status.moving_seconds, status.planning_seconds, list(status.plans))
 
     def __add__(self, other: Counted) -> Counted:
         """Figures of one life of the process and of the next."""
@@ -85,7 +96,8 @@ class Summary:
         self.cell = cell
         self.seed = seed
         self.speed = speed
-        self.status = PickPlaceStatus()
+        self.status: TaskReport = PickPlaceStatus()
+        self.traced: Traced | None = None  # of a cell that outlines objects
         self.ready: float | None = None  # wall time [s] from the start of the process to the cell being ready
         self.first_motion: float | None = None  # wall time [s] from the start of the process
         self.truth: PoseArray | None = None
@@ -98,8 +110,10 @@ class Summary:
         self._task_since: float | None = None  # cell time [s]
         self._task_until = 0.0  # cell time [s]
 
-    def on_status(self, status: PickPlaceStatus) -> None:
+    def on_status(self, status: TaskReport) -> None:
         """Take note of the task's status."""
+        if isinstance(status, OutlineStatus) and self.traced is not None:
+            self.traced.on_status(status)
         figures = Counted.of(status)
         if figures.restarted_since(self._now):
             self._before = self._before + self._now
@@ -130,21 +144,22 @@ class Summary:
     def as_dict(self) -> dict[str, Any]:
         """The summary file."""
         rejected = Rejected(list(self.rejected.places))
-        rejected.add(self.status.skipped)
+        task = self.status if isinstance(self.status, PickPlaceStatus) else PickPlaceStatus()
+        rejected.add(task.skipped)
         figures = self._before + self._now
-        task = self._task_until - self._task_since if self._task_since is not None else 0.0
+        took = self._task_until - self._task_since if self._task_since is not None else 0.0
         return {
             "cell": self.cell,
             "state": self.state,
-            "placed": self.status.placed,
-            "targets": self.status.targets,
+            "placed": task.placed,
+            "targets": task.targets,
             "rejected": [{"position": _xyz(place.position), "reason": place.reason} for place in rejected.places],
             "failures": figures.failures,
             "retries": figures.retries,
             "seconds": {
                 "ready": _rounded(self.ready),
                 "first_motion": _rounded(self.first_motion),
-                "task": _rounded(task),
+                "task": _rounded(took),
                 "moving": _rounded(figures.moving),
                 "planning": _rounded(figures.planning),
             },
@@ -157,6 +172,7 @@ class Summary:
             "seed": self.seed,
             "speed": self.speed,
             "truth": count_truth(self.truth),
+            **({"outline": self.traced.figures()} if self.traced else {}),
         }
 
 
@@ -181,13 +197,16 @@ def percentile(values: Sequence[float], fraction: float) -> float | None:
     return sorted(values)[max(0, math.ceil(fraction * len(values)) - 1)]
 
 
-def progress_line(task: PickPlaceStatus | None) -> str:
-    """Where the task is, as "3 of 7 placed - GRASPING ball_4"."""
+def progress_line(task: TaskReport | None) -> str:
+    """Where the task is, as "3 of 7 placed - GRASPING ball_4" or "TRACING Object_1, 0.400 m"."""
     if task is None:
         return "the task has not spoken yet"
-    line = f"{task.placed} of {task.targets} placed - {task.state}"
-    if task.target:
-        line += f" {task.target}"
+    if isinstance(task, OutlineStatus):
+        line = f"{task.state} {task.object}, {task.length_m:.3f} m" if task.object else task.state
+    else:
+        line = f"{task.placed} of {task.targets} placed - {task.state}"
+        if task.target:
+            line += f" {task.target}"
     if task.paused:
         line += " (paused)"
     elif not task.started and task.state == "IDLE":
@@ -198,8 +217,12 @@ def progress_line(task: PickPlaceStatus | None) -> str:
 def describe(summary: dict[str, Any]) -> list[str]:
     """The summary in a few lines for people."""
     seconds = summary["seconds"]
-    lines = [f"{summary['cell']}: {summary['state']}, {summary['placed']} of {summary['targets']} placed"]
-    if truth := summary["truth"]:
+    lines = [f"{summary['cell']}: {summary['state']}, "]
+    if "outline" in summary:
+        lines[0] += _outlined(summary["outline"])
+    else:
+        lines[0] += f"{summary['placed']} of {summary['targets']} placed"
+    if (truth := summary["truth"]) and "outline" not in summary:
         lines[0] += f" (truth: {truth['in_box']} in the box, {truth['on_table']} on the table"
         lines[0] += f", {truth['elsewhere']} elsewhere)" if truth["elsewhere"] else ")"
     for place in summary["rejected"]:
@@ -221,6 +244,17 @@ def describe(summary: dict[str, Any]) -> list[str]:
     if restarted := {name: count for name, count in summary["restarts"].items() if count}:
         lines.append("  started again: " + ", ".join(f"{name} {count} x" for name, count in restarted.items()))
     return lines
+
+
+def _outlined(outline: dict[str, Any]) -> str:
+    """What was traced and how exactly."""
+    if not outline["object"]:
+        return "nothing outlined"
+    text = f"{outline['object']} outlined: {outline['fraction']:.1%} of {outline['length_m']:.3f} m"
+    for what, name in (("deviation_mm", "the true outline"), ("tracking_mm", "the contour")):
+        if figures := outline[what]:
+            text += f", {figures['mean']:.2f} mm from {name} ({figures['max']:.2f} mm at most)"
+    return text
 
 
 def _seconds(value: float | None) -> str:

@@ -26,14 +26,11 @@ LONGEST_STEP = 0.05  # [s] wall: time passes too
 Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest
 
 
-Status = m.PickPlaceStatus | m.OutlineStatus
-
-
 class Task(Protocol):
     """A state machine that is fed with what is known and answers with what it wants done."""
 
     @property
-    def status(self) -> Status:
+    def status(self) -> m.TaskReport:
         """How far it is."""
 
     def step(self, view: Any) -> list[Command]:
@@ -70,7 +67,7 @@ class TaskRunner:
         self._plan_timeout = planning_time + PLAN_OVERTIME
         self._woken = asyncio.Event()
         self._told: list[Command] = []
-        self._before: Status | None = None
+        self._before: m.TaskReport | None = None
         bus.serve(topics.TASK_COMMAND, self._obey)
 
     async def run(self, heard: Iterable[Reader[Any]]) -> None:

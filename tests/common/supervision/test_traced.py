@@ -1,0 +1,155 @@
+"""Figures of a traced outline: of a tool tip whose way is known, against a path and a truth that are known."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+
+import numpy as np
+import pytest
+
+from common import messages as m
+from common import topics
+from common.config import load_cell
+from common.robot.ik import solve_ik
+from common.robot.model import RobotModel
+from common.robot.transforms import rpy_to_matrix, transform
+from common.supervision.collector import Collector
+from common.supervision.summary import Summary, describe, progress_line
+from common.supervision.traced import Traced, distances
+from common.transport.local import LocalNetwork
+
+CELL = load_cell("ur5")
+ROBOT = RobotModel.load(CELL.robot)
+TOP = 1.1
+SQUARE = [(0.45, -0.05), (0.55, -0.05), (0.55, 0.05), (0.45, 0.05)]
+
+
+def joints_at(x: float, y: float, z: float, stamp: int) -> m.JointState:
+    q = solve_ik(ROBOT, transform(rpy_to_matrix(0, -math.pi, -math.pi), (x, y, z)), ROBOT.named("home"))
+    assert q is not None
+    return m.JointState(header=m.Header(stamp=stamp), name=ROBOT.joint_names, position=q.tolist())
+
+
+def status(state: str, stamp: int, **values: object) -> m.OutlineStatus:
+    return m.OutlineStatus.model_validate({
+        "header": m.Header(stamp=stamp), "state": state, "started": True, "object": "Object_1", "points": 4,
+        "fraction": 1.0, "length_m": 0.4, **values})
+
+
+def path(shift: float = 0.0, stamp: int = 0) -> m.OutlinePoints:
+    poses = [m.Pose(position=m.Vector3(x=x + shift, y=y, z=TOP)) for x, y in SQUARE]
+    return m.OutlinePoints(header=m.Header(stamp=stamp), poses=poses, object="Object_1")
+
+
+def truth(shift: float = 0.0) -> m.WorldObjects:
+    cube = m.WorldObject(id="cube", shape="box", outline=[(x + shift, y) for x, y in SQUARE], base=1.0, height=0.1)
+    other = m.WorldObject(id="other", shape="cylinder", outline=[(0.1, 0.3), (0.2, 0.3), (0.2, 0.4)], base=0, height=1)
+    return m.WorldObjects(objects=[other, cube])
+
+
+def traced(standoff: float = 0.0, off: float = 0.0) -> Traced:
+    """A square that was traced at its corners, `off` [m] outside of it in x."""
+    follower = Traced(CELL.robot)
+    follower.on_path(path())
+    follower.on_truth(truth())
+    follower.on_status(status("APPROACHING", 10, standoff=standoff))
+    follower.on_joints(joints_at(0.5, 0.0, 1.2, 11))
+    follower.on_status(status("TRACING", 20, standoff=standoff))
+    for k, (x, y) in enumerate([*SQUARE, SQUARE[0]]):
+        follower.on_joints(joints_at(x + math.copysign(off, x - 0.5), y, TOP + standoff, 21 + k))
+    follower.on_status(status("RETREATING", 30, standoff=standoff, closed=True))
+    follower.on_joints(joints_at(0.5, 0.0, 1.2, 31))
+    follower.on_path(m.OutlinePoints(poses=[m.Pose()] * 3, object="arm"))
+    follower.on_status(status("DONE", 40, standoff=standoff, closed=True))
+    follower.on_path(m.OutlinePoints(poses=[m.Pose()] * 3, object="arm"))
+    return follower
+
+
+def test_only_places_while_it_traced_count_and_are_on_the_outline() -> None:
+    figures = traced().figures()
+    assert figures["object"] == "Object_1" and figures["closed"] and figures["fraction"] == 1.0
+    assert (figures["points"], figures["length_m"]) == (4, 0.4)
+    assert figures["deviation_mm"]["max"] < 0.02
+    assert figures["tracking_mm"]["max"] < 0.02
+    json.dumps(figures)
+
+
+def test_tool_that_is_off_by_a_millimetre_is_a_millimetre_off() -> None:
+    figures = traced(off=0.001).figures()
+    assert figures["deviation_mm"]["mean"] == pytest.approx(1.0, abs=0.02)
+    assert figures["tracking_mm"]["max"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_contour_that_is_off_counts_against_the_truth_and_not_as_tracking() -> None:
+    follower = traced()
+    follower.on_truth(truth(shift=0.002))
+    figures = follower.figures()
+    assert figures["deviation_mm"]["max"] == pytest.approx(2.0, abs=0.03)
+    assert figures["tracking_mm"]["max"] < 0.02
+
+
+def test_standoff_is_no_deviation() -> None:
+    assert traced(standoff=0.01).figures()["deviation_mm"]["max"] < 0.02
+
+
+def test_inner_edge_of_a_ring_is_compared_with_the_edge_of_its_hole() -> None:
+    follower = traced()
+    around = [(x + math.copysign(0.02, x - 0.5), y + math.copysign(0.02, y)) for x, y in SQUARE]
+    ring = m.WorldObject(id="ring", shape="ring", outline=around, hole=SQUARE, base=1.0, height=0.1)
+    follower.on_truth(m.WorldObjects(objects=[ring]))
+    assert follower.figures()["deviation_mm"]["max"] < 0.02
+
+
+def test_outline_that_ends_elsewhere_is_not_closed() -> None:
+    follower = traced()
+    follower._states = [s for s in follower._states if s.header.stamp < 24]
+    assert not follower.figures()["closed"]
+
+
+def test_nothing_traced_and_no_truth_give_no_deviation() -> None:
+    empty = Traced(CELL.robot).figures()
+    assert (empty["deviation_mm"], empty["tracking_mm"], empty["closed"], empty["object"]) == (None, None, False, "")
+    follower = traced()
+    follower.on_truth(m.WorldObjects())
+    assert follower.figures()["deviation_mm"] is None
+    assert follower.figures()["tracking_mm"] is not None
+
+
+def test_distance_from_a_closed_polyline_counts_its_last_side_too() -> None:
+    square = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], dtype=float)
+    places = np.array([(0.5, 0, 0), (0, 0.5, 0), (0.5, 0.4, 0), (2, 2, 0), (0.5, 1, 0.3)])
+    assert np.allclose(distances(places, square), [0, 0, 0.4, math.sqrt(2), 0.3])
+
+
+def test_progress_of_an_outline_in_one_line() -> None:
+    assert progress_line(status("TRACING", 1)) == "TRACING Object_1, 0.400 m"
+    assert progress_line(m.OutlineStatus(started=True, state="SELECTING")) == "SELECTING"
+
+
+async def test_collector_follows_an_outline_to_its_end() -> None:
+    net = LocalNetwork()
+    cell = net.bus("cell", cell="test")
+    summary = Summary("test", 0, 1.0)
+    bus, lines = net.bus("supervisor", cell="test"), asyncio.Queue[str]()
+    collector = Collector(bus, "contour_tracer", summary, 0.0, lines.put_nowait, CELL.robot)
+    listening = asyncio.create_task(collector.run())
+    cell.writer(topics.SCENE_OBJECTS).put(truth())
+    statuses, states = cell.writer(topics.OUTLINE_STATUS), cell.writer(topics.JOINT_STATES)
+    cell.writer(topics.CONTOUR_PATH).put(path())
+    async with asyncio.timeout(20):
+        for state, stamp in (("PLANNING", 5), ("APPROACHING", 10), ("TRACING", 20)):
+            statuses.put(status(state, stamp))
+            assert state in await lines.get()
+        for k, (x, y) in enumerate([*SQUARE, SQUARE[0]]):
+            states.put(joints_at(x, y, TOP, 21 + k))
+            while len(summary.traced._states) <= k:  # type: ignore[union-attr]  # noqa: ASYNC110
+                await asyncio.sleep(0.001)
+        statuses.put(status("DONE", 30, closed=True))
+        await collector.ended.wait()
+    listening.cancel()
+    figures = summary.as_dict()
+    assert figures["outline"]["closed"]
+    assert figures["outline"]["deviation_mm"]["max"] < 0.02
+    assert describe(figures)[0].startswith("test: DONE, Object_1 outlined: 100.0% of 0.400 m, 0.0")
