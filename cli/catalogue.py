@@ -39,7 +39,7 @@ def _first_line(path: Path) -> str:
 
 
 def service(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="a name of `zencell services` or of the cell")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="of `zencell services`, of the cell, or a module")],
     cell: Annotated[str, typer.Option("--cell", metavar="CELL", help="the cell that it belongs to")] = "panda",
     overrides: options.Overrides = None,
     world: options.WorldName = None,
@@ -49,7 +49,15 @@ def service(
 ) -> None:
     """Run one service of a cell in the foreground, beside a cell that is up or its own router."""
     from common.config import ServiceEntry, load_cell, service_names
-    from common.supervision.launch import ROUTER, ROUTER_MODULE, Launch, place_of, python_module, python_path
+    from common.supervision.launch import (
+        ROUTER,
+        ROUTER_MODULE,
+        Launch,
+        place_of,
+        python_module,
+        python_path,
+        require_module,
+    )
 
     number, endpoint = place_of(domain, connect)
     launch = Launch(cell, tuple(overrides or ()), world, options.whole("--seed", seed, 0), number, endpoint)
@@ -59,7 +67,9 @@ def service(
         entries = {known: ServiceEntry(name=known, module=f"services.{known}") for known in service_names()}
         for key, entry in load_cell(cell, launch.overrides, world=world, seed=launch.seed).services.items():
             entries[key] = entries[entry.name] = entry
-        if name not in entries:
+        if name not in entries and "." not in name:
             raise UnknownName("service", name, entries)
-        command = launch.service_command(entries[name], gate=False)
+        entry = entries.get(name) or ServiceEntry(name=name.rpartition(".")[2], module=name)
+        require_module(name, entry)
+        command = launch.service_command(entry, gate=False)
     os.execvpe(command[0], command, {**os.environ, "PYTHONPATH": python_path()})

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import AsyncGenerator, Awaitable, Callable
+from contextlib import aclosing
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -72,27 +74,57 @@ def echo(
     domain: options.Domain = None,
     connect: options.Connect = None,
 ) -> None:
-    """Show what comes, until Ctrl-C or N messages; pictures as one line."""
-    from cli.inspection import inspect
-
-    topic = published(key)
+    """Show what comes, until Ctrl-C or N messages; pictures as one line. A key of your own services will do too."""
     most = options.whole("--count", count, 1)
+    topic = published_or_foreign(key)
 
     async def visit(bus: Bus) -> None:
         shown = 0
-        async for message in bus.reader(topic):
-            typer.echo(_shown(message.model_dump(), as_json))
-            shown += 1
-            if shown == most:
-                return
+        lines = _messages(bus, topic, as_json) if topic else _foreign_messages(bus, key, as_json)
+        async with aclosing(lines):
+            async for line in lines:
+                typer.echo(line)
+                shown += 1
+                if shown == most:
+                    return
 
-    inspect(visit, cell=cell, domain=domain, connect=connect)
+    _visit(visit, topic, key, cell, domain, connect)
 
 
-def _shown(message: dict[str, Any], as_json: bool) -> str:
+async def _messages(bus: Bus, topic: Topic[Any], as_json: bool) -> AsyncGenerator[str, None]:
     from cli.rendering import one_line, to_json
 
-    return to_json(message) if as_json else one_line(message)
+    async for message in bus.reader(topic):
+        yield to_json(message.model_dump()) if as_json else one_line(message.model_dump())
+
+
+async def _foreign_messages(bus: Bus, key: str, as_json: bool) -> AsyncGenerator[str, None]:
+    import msgpack
+
+    from cli.foreign import samples
+    from cli.rendering import to_json
+    from cli.zenoh_codec import decode
+
+    async with aclosing(samples(bus, key)) as coming:
+        async for sample in coming:
+            line = decode(sample.key, sample.payload)
+            whole = as_json and not line.startswith("<")  # what is no message has no other form
+            yield to_json(msgpack.unpackb(sample.payload, raw=False, strict_map_key=False)) if whole else line
+
+
+def _visit(
+    visit: Callable[[Bus], Awaitable[None]], topic: Topic[Any] | None, key: str, cell: str | None,
+    domain: str | None, connect: str | None,
+) -> None:
+    from cli.foreign import SilentKey
+    from cli.inspection import NothingUp, inspect
+
+    try:
+        inspect(visit, cell=cell, domain=domain, connect=connect)
+    except NothingUp as error:
+        if topic is None:
+            raise SilentKey(key, f"and there is {error}") from None
+        raise
 
 
 @app.command()
@@ -105,7 +137,7 @@ def hz(
     connect: options.Connect = None,
 ) -> None:
     """Show how many messages come each second, until Ctrl-C or N lines."""
-    _measure(published(key), cell, count, as_json, domain, connect, in_bytes=False)
+    _measure(key, cell, count, as_json, domain, connect, in_bytes=False)
 
 
 @app.command()
@@ -118,27 +150,31 @@ def bw(
     connect: options.Connect = None,
 ) -> None:
     """Show how many bytes come each second, until Ctrl-C or N lines."""
-    _measure(published(key), cell, count, as_json, domain, connect, in_bytes=True)
+    _measure(key, cell, count, as_json, domain, connect, in_bytes=True)
 
 
 def _measure(
-    topic: Topic[Any], cell: str | None, count: str | None, as_json: bool, domain: str | None, connect: str | None,
+    key: str, cell: str | None, count: str | None, as_json: bool, domain: str | None, connect: str | None,
     *, in_bytes: bool,
 ) -> None:
-    from cli.inspection import inspect
+    from cli.foreign import samples
     from cli.measuring import describe, windows
 
     most = options.whole("--count", count, 1)
+    topic = published_or_foreign(key)
 
     async def visit(bus: Bus) -> None:
+        if topic is None:
+            async with aclosing(samples(bus, key)) as coming:
+                await anext(coming)  # somebody writes it
         shown = 0
-        async for figures in windows(bus, f"{bus.cell}/{topic.key}"):
-            typer.echo(json.dumps({"key": topic.key, **figures}) if as_json else describe(figures, in_bytes=in_bytes))
+        async for figures in windows(bus, f"{bus.cell}/{key}"):
+            typer.echo(json.dumps({"key": key, **figures}) if as_json else describe(figures, in_bytes=in_bytes))
             shown += 1
             if shown == most:
                 return
 
-    inspect(visit, cell=cell, domain=domain, connect=connect)
+    _visit(visit, topic, key, cell, domain, connect)
 
 
 def topic_of(key: str) -> AnyTopic:
@@ -167,3 +203,14 @@ def published(key: str) -> Topic[Any]:
     if not isinstance(topic, Topic):
         raise UnknownName("published key", key, [k for k, t in all_topics().items() if isinstance(t, Topic)])
     return topic
+
+
+def published_or_foreign(key: str) -> Topic[Any] | None:
+    """The topic of a key that is published; None for a key of somebody else's.
+
+    Raises:
+        UnknownName: with the keys that are published, for one that is requested.
+    """
+    from common.topics import all_topics
+
+    return published(key) if key in all_topics() else None

@@ -417,18 +417,28 @@ def find_file(kind: str, name: str, beside: Path | None = None) -> Path:
 
 
 def read_robot(path: Path) -> dict[str, Any]:
-    """A robot file, with references to files that lie beside it made absolute.
+    """A robot file, with references to files and folders that lie beside it made absolute.
 
     Raises:
         ConfigError: as `read_yaml`.
     """
-    robot = read_yaml(path)
+    return _made_absolute(read_yaml(path), path.parent)
+
+
+def _made_absolute(robot: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The robot, whose descriptions and folders of descriptions are absolute where they lie in a folder."""
     attachments = robot.get("attachments")
     for part in [robot, *(attachments if isinstance(attachments, list) else [])]:
         for field in ("urdf", "srdf"):
             reference = part.get(field) if isinstance(part, dict) else None
-            if isinstance(reference, str) and "://" not in reference and (path.parent / reference).is_file():
-                part[field] = str((path.parent / reference).resolve())
+            if isinstance(reference, str) and "://" not in reference and (folder / reference).is_file():
+                part[field] = str((folder / reference).resolve())
+    packages = robot.get("package_dirs")
+    if isinstance(packages, list):
+        robot["package_dirs"] = [
+            str((folder / name).resolve()) if isinstance(name, str) and (folder / name).is_dir() else name
+            for name in packages
+        ]
     return robot
 
 
@@ -513,16 +523,18 @@ def load_cell(
     path = find_file("cells", cell)
     tree = read_yaml(path)
     parsed = [parse_override(text) for text in overrides]
-    for parts, value in parsed:  # which file to read may itself be overridden
-        if len(parts) == 1 and parts[0] in ("robot", "world", "pipeline"):
-            tree[parts[0]] = value
-    if world is not None:
-        tree["world"] = world
+    given = {parts[0]: value for parts, value in parsed if len(parts) == 1}  # which file to read may be overridden
+    given |= {"world": world} if world is not None else {}
+    tree |= {part: given[part] for part in ("robot", "world", "pipeline") if part in given}
     for part in ("robot", "world", "pipeline"):
         value = tree.get(part)
         if isinstance(value, str):
+            # A path in the cell is relative to it; one that a person gives, to where the person stands.
+            here = part in given and Path(value).expanduser().is_file()
             read = read_robot if part == "robot" else read_yaml
-            tree[part] = read(find_file(f"{part}s", value, path.parent))
+            tree[part] = read(find_file(f"{part}s", value, None if here else path.parent))
+        elif part == "robot" and isinstance(value, dict):
+            tree[part] = _made_absolute(value, path.parent)
         elif not isinstance(value, dict):
             raise ConfigError(part, value, f"must be a name or a mapping; choices: {', '.join(names_of(part + 's'))}")
     services = tree.get("services")

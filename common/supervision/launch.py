@@ -104,16 +104,25 @@ def require_modules(cell: Cell) -> None:
     Raises:
         ConfigError: names the first that can not.
     """
+    for key, entry in cell.services.items():
+        require_module(key, entry)
+
+
+def require_module(key: str, entry: ServiceEntry) -> None:
+    """Return when the module of a service, which goes by `key` in the cell, can be found.
+
+    Raises:
+        ConfigError: it can not.
+    """
     for folder in python_path().split(os.pathsep):
         if folder not in sys.path:
             sys.path.append(folder)
-    for key, entry in cell.services.items():
-        try:
-            found = importlib.util.find_spec(entry.module) is not None
-        except ModuleNotFoundError:
-            found = False
-        if not found:
-            raise ConfigError(f"services.{key}", entry.module, "is not a module that can be found from here")
+    try:
+        found = importlib.util.find_spec(entry.module) is not None
+    except ModuleNotFoundError:
+        found = False
+    if not found:
+        raise ConfigError(f"services.{key}", entry.module, "is not a module that can be found from here")
 
 
 def require_free_port(endpoint: str) -> None:

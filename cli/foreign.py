@@ -1,0 +1,69 @@
+"""Keys that common/topics.py does not have, such as those of a person's own services: shown as the msgpack they are."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator
+from typing import TYPE_CHECKING
+
+from common.errors import DecodeError, UnknownName
+
+if TYPE_CHECKING:
+    from common.transport.bus import Bus
+    from common.transport.session import RawSample
+
+PATIENCE = 2.0  # [s] until a key on which nothing came is taken for a slip of the hand
+
+
+class SilentKey(UnknownName):
+    """A key that is not known, and nothing says that somebody writes it."""
+
+    def __init__(self, key: str, why: str) -> None:
+        from common.topics import Topic, all_topics
+
+        super().__init__("key", key, [known for known, topic in all_topics().items() if isinstance(topic, Topic)])
+        self.args = (f"{self}; {why}",)
+
+
+async def samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
+    """What comes on a key of the cell, the last value first where it can be asked for; repetitions are left out.
+
+    Raises:
+        SilentKey: nothing came in the first moments.
+    """
+    full = f"{bus.cell}/{key}"
+    newest: dict[str, int] = {}  # sequence number by writer
+    arriving = bus.raw_reader(full)
+    following = asyncio.ensure_future(anext(arriving))
+    try:
+        latched = await bus.raw_get(full, PATIENCE)
+        for sample in latched:
+            if _is_news(sample, newest):
+                yield sample
+        if not latched:
+            await asyncio.wait({following}, timeout=PATIENCE)
+            if not following.done():
+                raise SilentKey(key, f"nothing came on {full} within {PATIENCE:g} s")
+        while True:
+            sample = await following
+            following = asyncio.ensure_future(anext(arriving))
+            if _is_news(sample, newest):
+                yield sample
+    finally:
+        following.cancel()  # which closes what it waits for
+        await asyncio.wait({following})
+
+
+def _is_news(sample: RawSample, newest: dict[str, int]) -> bool:
+    """Whether it is no repetition of a state; a writer that says nothing about itself only has news."""
+    from common.transport.codec import decode_attachment
+
+    try:
+        attachment = decode_attachment(sample.attachment)
+    except DecodeError:
+        attachment = None
+    if attachment is None:
+        return True
+    before = newest.get(attachment.writer)
+    newest[attachment.writer] = attachment.sequence
+    return before != attachment.sequence
