@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +14,8 @@ from common.planning.problem import Problem, Result
 
 Array = NDArray[np.float64]
 
+_BEND = 0.5  # [rad] standard deviation of each joint
+_BEND_TRIES = 50
 _SPACING = 0.1  # [rad] between waypoints of a path that is handed on
 
 
@@ -20,6 +25,31 @@ def quintic(start: Array, goal: Array, count: int) -> Array:
     path: Array = start + t**3 * (10 - 15 * t + 6 * t**2) * (goal - start)
     path[-1] = goal
     return path
+
+
+def bent(problem: Problem, path: Array) -> Array:
+    """Another first guess: the path (N, dof) [rad] bent so that its middle is at some free position not far away."""
+    robot, middle = problem.robot, path[len(path) // 2]
+    bump = np.sin(np.pi * np.linspace(0, 1, len(path)))[:, None] ** 2
+    for _ in range(_BEND_TRIES):
+        place = np.clip(middle + problem.rng.normal(0.0, _BEND, robot.dof), robot.lower, robot.upper)
+        if not problem.world.collides(place):
+            break
+    return np.asarray(np.clip(path + bump * (place - middle), robot.lower, robot.upper))
+
+
+def with_restarts(
+    problem: Problem, path: Array, restarts: int, attempt: Callable[[Array], Result]
+) -> Result:
+    """The result of the first attempt that succeeds, from the path itself and then from bent ones; else the first."""
+    first = attempt(path)
+    if first.error != "collision" or not restarts:
+        return first
+    for _ in range(restarts):
+        result = attempt(bent(problem, path))
+        if result.error != "collision":
+            return result
+    return replace(first, message=f"{first.message}, nor is the way free from {restarts} other guesses")
 
 
 def evenly_spaced(path: Array, spacing: float = _SPACING) -> Array:

@@ -2,10 +2,12 @@
 
 Ratliff, Zucker, Bagnell, Srinivasa: "CHOMP: Gradient Optimization Techniques for Efficient Motion Planning" (ICRA
 2009). Distances are those between convex hulls, to the nearest obstacle of each link, instead of a distance field
-about spheres. It finds a path that is near its first guess or none: a local method without a second try.
+about spheres. It finds a path that is near its first guess or none, so there are a few guesses.
 """
 
 from __future__ import annotations
+
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +15,7 @@ from pydantic import Field
 
 from common.config import Parameters
 from common.planning.joint_goals import first_success, joint_goals
-from common.planning.optimised_path import check_path, evenly_spaced, quintic
+from common.planning.optimised_path import check_path, evenly_spaced, quintic, with_restarts
 from common.planning.problem import Cancel, Problem, Result
 from common.planning.proximity import Near, Proximity
 
@@ -33,6 +35,7 @@ class Options(Parameters):
     learning_rate: float = Field(0.01, gt=0, le=10, description="share of the covariant gradient in a step")
     clearance: float = Field(0.2, gt=0, le=1, description="distance from which on obstacles push [m]")
     waypoints: int = Field(30, ge=5, le=200, description="of the path that is optimised")
+    restarts: int = Field(2, ge=0, le=100, description="other first guesses, when the straight edge leads nowhere")
     goals: int = Field(4, ge=1, le=100, description="IK solutions of a pose goal to choose from")
 
 
@@ -43,13 +46,20 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
         return goals
     own = min(_OWN_CLEARANCE, options.clearance)
     proximity = Proximity(problem.world, options.clearance, own_reach=own, nearest=True)
-    return first_success(goals, lambda goal: _descend(problem, goal, options, proximity, cancel), cancel, problem)
+
+    def attempt(goal: Array) -> Result:
+        path = quintic(problem.start, goal, options.waypoints)
+        if problem.world.edge_free(problem.start, goal):  # nothing is smoother
+            return Result(waypoints=evenly_spaced(path), dense=True, fraction=1.0)
+        from_guess = partial(_descend, problem, options, proximity, cancel)
+        return with_restarts(problem, path, options.restarts, from_guess)
+
+    return first_success(goals, attempt, cancel, problem)
 
 
-def _descend(problem: Problem, goal: Array, options: Options, proximity: Proximity, cancel: Cancel) -> Result:
-    path = quintic(problem.start, goal, options.waypoints)
-    if problem.world.edge_free(problem.start, goal):  # nothing is smoother
-        return Result(waypoints=evenly_spaced(path), dense=True, fraction=1.0)
+def _descend(problem: Problem, options: Options, proximity: Proximity, cancel: Cancel, guess: Array) -> Result:
+    """The path that the descent makes of a first guess (N, dof) [rad], or what is wrong with it."""
+    path = guess.copy()
     A = accelerations(len(path))
     inverse = np.linalg.inv(A[1:-1, 1:-1])
     scale = float(inverse.max())  # so that a learning rate means the same for any number of waypoints

@@ -10,13 +10,13 @@ from common.robot.transforms import tool_down
 from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sound, wall, with_planner
 from tests.common.planning.planning_scenes import ROBOT, above, last, scene, solid, to_joints, to_pose
 
-JOINT_GOALS = ["chomp", "joint_move", "lerp", "ompl", "ptp"]
-POSE_GOALS = ["cartesian", "chomp", "lerp", "lin", "ompl", "ptp"]
+JOINT_GOALS = ["chomp", "joint_move", "lerp", "ompl", "ptp", "trajopt"]
+POSE_GOALS = ["cartesian", "chomp", "lerp", "lin", "ompl", "ptp", "trajopt"]
 ALL = sorted({*JOINT_GOALS, *POSE_GOALS})
-QUICK = {"chomp": {"iterations": 30}}
+QUICK = {"chomp": {"iterations": 30, "restarts": 1}, "trajopt": {"iterations": 15, "restarts": 1}}
 PIPELINES = {name: with_planner(name) for name in ALL}
 GIVING_UP = {name: with_planner(name, **QUICK.get(name, {})) for name in ALL}
-AROUND_WALLS = ["chomp", "ompl"]
+AROUND_WALLS = ["chomp", "ompl", "trajopt"]
 NEVER_FOUND = [name for name in ALL if name != "ompl"]
 
 

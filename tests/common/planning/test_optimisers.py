@@ -1,11 +1,15 @@
 """Planners that optimise a whole path."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from common.planning.collision import CollisionWorld
+from common.planning.joint_goals import line
 from common.planning.optimised_path import evenly_spaced, quintic
 from common.planning.planners.chomp import accelerations, obstacle_gradient
+from common.planning.planners.trajopt import _chain, _step
 from common.planning.problem import Cancel
 from common.planning.proximity import Near, Proximity
 from tests.common.planning.planner_checks import AROUND, LEFT, RIGHT, assert_sound, wall, with_planner
@@ -48,8 +52,9 @@ def test_obstacles_push_within_their_clearance_and_hardest_inside():
     assert np.allclose(obstacle_gradient(near, 4)[:, 0], [-1, -1, -0.5, 0])
 
 
-def test_straight_way_that_is_free_is_kept():
-    pipeline = with_planner("chomp")
+@pytest.mark.parametrize("planner", ["chomp", "trajopt"])
+def test_straight_way_that_is_free_is_kept(planner):
+    pipeline = with_planner(planner)
     request = to_joints(LEFT, RIGHT)
     timed = assert_sound(pipeline, request, AROUND, pipeline.plan(request, AROUND))
     span = LEFT - RIGHT
@@ -57,17 +62,26 @@ def test_straight_way_that_is_free_is_kept():
     assert np.allclose(timed.positions, RIGHT + shares[:, None] * span, atol=1e-9)
 
 
-def test_descent_that_has_too_few_iterations_says_what_still_collides():
-    response = with_planner("chomp", iterations=1).plan(to_joints(LEFT, RIGHT), LOW_WALL)
+@pytest.mark.parametrize("planner", ["chomp", "trajopt"])
+def test_planner_that_has_too_few_iterations_says_what_still_collides(planner):
+    response = with_planner(planner, iterations=1, restarts=0).plan(to_joints(LEFT, RIGHT), LOW_WALL)
     assert response.error == "collision"
     assert response.colliding[1] == "wall"
-    assert response.message.endswith("after 1 iterations")
+    assert "after 1 iterations" in response.message
 
 
-def test_larger_clearance_keeps_farther_from_the_wall():
+@pytest.mark.parametrize("planner", ["chomp", "trajopt"])
+def test_other_guesses_are_counted_when_they_lead_nowhere(planner):
+    response = with_planner(planner, iterations=1, restarts=2).plan(to_joints(LEFT, RIGHT), wall(height=2.0))
+    assert response.error == "collision"
+    assert response.message.endswith("nor is the way free from 2 other guesses")
+
+
+@pytest.mark.parametrize("planner", ["chomp", "trajopt"])
+def test_larger_clearance_keeps_farther_from_the_wall(planner):
     least = []
-    for clearance in (0.02, 0.3):
-        pipeline = with_planner("chomp", clearance=clearance)
+    for clearance in (0.01, 0.1):
+        pipeline = with_planner(planner, clearance=clearance)
         request = to_joints(LEFT, RIGHT)
         timed = assert_sound(pipeline, request, LOW_WALL, pipeline.plan(request, LOW_WALL))
         world = CollisionWorld(ROBOT, LOW_WALL, start=RIGHT, cache=cache())
@@ -76,7 +90,8 @@ def test_larger_clearance_keeps_farther_from_the_wall():
     assert least[0] < least[1]
 
 
-def test_descent_ends_when_it_is_cancelled():
+@pytest.mark.parametrize("planner", ["chomp", "trajopt"])
+def test_optimisation_ends_when_it_is_cancelled(planner):
     class AfterAWhile(Cancel):
         left = 5
 
@@ -84,7 +99,35 @@ def test_descent_ends_when_it_is_cancelled():
             self.left -= 1
             return "cancelled" if self.left < 0 else ""
 
-    response = with_planner("chomp", iterations=10000).plan(
+    response = with_planner(planner, iterations=10000).plan(
         to_joints(LEFT, RIGHT), wall(height=2.0), cancel=AfterAWhile()
     )
     assert response.error == "cancelled"
+
+
+def test_chain_measures_edges_and_puts_middles_between_waypoints():
+    path = line(RIGHT, LEFT, 6)
+    chain = _chain(RIGHT, LEFT, 6)
+    positions = chain.positions(path[1:-1])
+    assert np.allclose(positions[::2], path)
+    assert np.allclose(positions[1::2], 0.5 * (path[:-1] + path[1:]))
+    other = path.copy()
+    other[1:-1] += np.random.default_rng(0).normal(0, 0.1, other[1:-1].shape)
+    edges = [0.5 * (np.diff(p, axis=0) ** 2).sum() for p in (path, other)]
+    assert chain.cost(other[1:-1]) - chain.cost(path[1:-1]) == pytest.approx(edges[1] - edges[0])
+
+
+def test_shortest_path_is_kept_where_nothing_is_in_the_way_and_left_where_something_is():
+    chain = _chain(np.zeros(7), np.ones(7), 10)
+    waypoints = line(np.zeros(7), np.ones(7), 10)[1:-1]
+    problem = SimpleNamespace(robot=SimpleNamespace(lower=np.full(7, -3), upper=np.full(7, 3)))
+    nothing = Near(np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0), np.zeros(0), np.zeros((0, 7)))
+    same, merit = _step(problem, chain, waypoints, nothing, 0.1, 10.0, 0.02)
+    assert np.allclose(same, waypoints, atol=1e-6)
+    assert merit == pytest.approx(chain.cost(waypoints))
+    something = Near(np.array([10]), np.array([3]), np.array([-0.01]), np.array([0.07]), np.eye(7)[:1])
+    moved, merit = _step(problem, chain, waypoints, something, 0.1, 10.0, 0.02)
+    assert moved[4, 0] - waypoints[4, 0] == pytest.approx(0.03, abs=1e-4)
+    assert np.allclose(moved[:, 1:], waypoints[:, 1:], atol=1e-6)
+    little, _ = _step(problem, chain, waypoints, something, 0.01, 10.0, 0.02)
+    assert np.abs(little - waypoints).max() == pytest.approx(0.01)
