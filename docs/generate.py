@@ -117,8 +117,8 @@ def parameters() -> str:
 
 
 def topic_table() -> str:
-    """All topics of a cell."""
-    lines = ["| key, after `panda/` | message | kind | written or served by | |", "|---|---|---|---|---|"]
+    """All topics, of both cells."""
+    lines = ["| key, after the cell | message | kind | written or served by | |", "|---|---|---|---|---|"]
     for topic in topics.all_topics().values():
         message = topic.message.__name__
         if isinstance(topic, topics.Request):
@@ -127,9 +127,9 @@ def topic_table() -> str:
     return "\n".join(lines)
 
 
-def service_table() -> str:
-    """The services of the panda cell in start order, with what each reads, writes, serves and asks."""
-    cell = c.load_cell("panda")
+def service_table(name: str) -> str:
+    """The services of a cell in start order, with what each reads, writes, serves and asks."""
+    cell = c.load_cell(name)
     lines = ["| | service | what it does | reads | writes | serves | asks |", "|---|---|---|---|---|---|---|"]
     for number, name in enumerate(cell.services, 1):
         module = importlib.import_module(f"services.{name}")
@@ -142,7 +142,7 @@ def service_table() -> str:
 
 def readme(text: str) -> str:
     """The README with its generated tables made anew, between their markers."""
-    for name, table in (("services", service_table()), ("topics", topic_table())):
+    for name, table in (("services", service_table("panda")), ("ur5", service_table("ur5")), ("topics", topic_table())):
         pattern = re.compile(rf"(<!-- {name}: made by docs/generate.py -->\n).*?(\n<!-- end of {name} -->)", re.DOTALL)
         if not pattern.search(text):
             raise SystemExit(f"README.md has no place for the table of {name}")
