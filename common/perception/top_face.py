@@ -1,10 +1,13 @@
 """The outline of an object's top face, told from its side walls by depth.
 
-A camera above sees the walls that face its axis: the contour in the picture is then that of top and walls together. The
-top face is the plateau of greatest height within the contour. A point of the contour beside the plateau lies on its
-edge. A point beside a wall lies below an edge: an upright wall has the same x and y from top to bottom, so the point
-where the ray meets the wall is lifted to the height of the top. Should the edge found so not be the edge of the plateau
-(walls that slope, one object upon another), the edge of the plateau itself is taken, to the pixel.
+A camera above sees the walls that face its axis: the contour in the picture is then that of top and walls together.
+Depth tells the height of the top face, which is the plateau of greatest height within the contour, and that of what the
+object stands on. Where an edge faces away from the axis, the contour is the edge of the top. Where it faces the axis
+and the wall is upright, the contour is the foot of that wall, which has the x and y of the edge above it. Between the
+two the contour runs along upright edges, which are points of the outline: those parts are left out.
+
+An outline found so must go along the edge of the plateau. If it does not (walls that slope or hang over, one object
+upon another), the edge of the plateau itself is taken, to the pixel.
 """
 
 from __future__ import annotations
@@ -19,17 +22,19 @@ from pydantic import Field
 from common.config import Parameters
 from common.perception.contours_refinement import normals
 from common.perception.depth import Depth, DepthError, Rays, is_valid
+from common.perception.outline_joining import joined
 from common.perception.pinhole import Pinhole
 
 Array = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
 Mask = npt.NDArray[np.uint8]
 
 MARGIN = 12  # of the cut about a contour [px]
-WINDOW = 3  # depth is taken from pixels up to so far from a point of the contour [px]
+AROUND = 4  # the object about a hole is looked at so far from its edge [px]
+INWARDS = 0.75  # from a point of a sub-pixel contour to the pixel of the object beside it [px]
 OUTSIDE = 3.0  # the height beside an object is looked at so far from its contour [px]
-NARROW = 2.5  # walls that are seen narrower than this may have no pixel of their own [px]
 HIGHEST = 98  # percentile of the heights in a contour that lies on the top face
-RIDGE = 1e-7  # keeps a wall determined that is seen along its edge only
+SHORT = 0.3  # upright edges that are seen shorter than this are not looked for [px]
 SQUARE = np.ones((3, 3), np.uint8)
 
 
@@ -47,8 +52,8 @@ class TopFaceOptions(Parameters):
 class TopFace:
     """The outline (n, 3) [m] in world, heights [m] of the top and of what lies around it, and how it was found.
 
-    `base` is None when nothing around the object is within the camera's range. `filled` counts pixels of the contour
-    without depth; `upright` is whether the walls are.
+    `base` is None when nothing lower around the object is within the camera's range. `filled` counts pixels of the
+    contour without depth; `upright` is whether the walls are.
     """
 
     outline: Array
@@ -56,6 +61,16 @@ class TopFace:
     base: float | None
     filled: int
     upright: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """What lies about a contour: heights [m] in world, NaN where unknown, the object and the hole in it."""
+
+    low: npt.NDArray[np.int_]
+    heights: Array
+    inside: Mask
+    hole: Mask
 
 
 def top_face(
@@ -74,40 +89,30 @@ def top_face(
         DepthError: too much of the contour has no depth, or nothing of it.
     """
     contour = np.asarray(pixels, dtype=float)
-    cells = np.rint(contour).astype(int)
     height, width = depth.shape
-    cells = np.clip(cells, 0, (width - 1, height - 1))
+    out = normals(contour, hole=hole)
+    inwards = 0.0 if _to_the_pixel(contour) else INWARDS
+    cells = np.clip(np.rint(contour - inwards * out).astype(int), 0, (width - 1, height - 1))
     filled = int(np.count_nonzero(~is_valid(depth[cells[:, 1], cells[:, 0]])))
     if filled > options.max_invalid * len(cells):
-        raise DepthError(
-            "invalid" if filled < len(cells) else "far",
-            f"{filled} of the {len(cells)} pixels of the contour have no valid depth, more than "
-            f"{options.max_invalid:.0%}: out of the camera's range?",
-        )
-    low = np.maximum(cells.min(axis=0) - MARGIN, 0)
-    high = np.minimum(cells.max(axis=0) + MARGIN + 1, (width, height))
-    cut = depth[low[1] : high[1], low[0] : high[0]]
-    inside = _inside(cells - low, cut.shape, hole=hole)
-    columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
-    heights = Rays.through(camera, np.stack([columns, rows], axis=-1)).at_depth(cut)[..., 2]
-    heights[~is_valid(cut)] = np.nan
-    core = _core(inside)
-    usable = core & np.isfinite(heights)
-    if not usable.any():
-        raise DepthError("invalid", "no pixel within the contour has a valid depth")
-    tolerance = max(options.top_tolerance, 4 * _noise(heights, usable))
-    top = _plateau(heights[usable], tolerance)
-    out = normals(contour, hole=hole)
+        raise DepthError("invalid", f"{filled} of the {len(cells)} pixels of the contour have no valid depth, more "
+                                    f"than {options.max_invalid:.0%}: is the object within the camera's range?")
+    cut = _cut(cells, depth, camera, hole=hole)
+    core = _core(cut.inside) & np.isfinite(cut.heights)
+    if not core.any():
+        raise DepthError("nothing", "no pixel within the contour has a valid depth")
+    tolerance = max(options.top_tolerance, 4 * _noise(cut.heights, core))
+    near = core if not hole else core & (cv2.dilate(cut.hole, np.ones((2 * AROUND + 1,) * 2, np.uint8)) > 0)
+    top = _plateau(cut.heights[near if near.any() else core], tolerance)
     beside = _heights_beside(contour, out, depth, camera)
-    points, is_wall = _edges(contour, low, usable, heights, cut, camera, top, tolerance)
-    flat = ~is_wall
-    points[flat] = _without_narrow_walls(points[flat], contour[flat], out[flat], beside[flat], top - tolerance, camera)
-    points[:, 2] = top
-    upright = hole or _fits(points, low, usable, heights, tolerance, camera)
+    lower = beside[beside < top - tolerance]
+    base = float(np.median(lower)) if len(lower) else None
+    level = np.abs(cut.heights - top) <= tolerance
+    edge = _edge_of_hole(cut, level) if hole else _edge_of_plateau(cut, level)
+    points = _edges(contour, camera, top, base, edge, hole=hole)
+    upright = _goes_along(points, edge, cut, camera)
     if not upright:
-        points = _plateau_edge(low, inside, heights, tolerance, top, camera)
-    known = beside[np.isfinite(beside) & (beside < top - tolerance)]
-    base = float(np.percentile(known, 10)) if len(known) else None
+        points = Rays.through(camera, edge).at_height(np.full(len(edge), top))
     return TopFace(rounded(points, options.rounding), top, base, filled, upright)
 
 
@@ -116,24 +121,35 @@ def rounded(points: Array, step: float) -> Array:
     return np.round(np.rint(points / step) * step, 9) if step else points
 
 
-def _inside(cells: npt.NDArray[np.int_], shape: tuple[int, ...], *, hole: bool) -> Mask:
-    """Pixels of the object: within its contour, or around the contour of a hole."""
-    polygon = [cells.astype(np.int32)]
-    filled = cv2.fillPoly(np.zeros(shape, np.uint8), polygon, 1)
+# --- heights ----------------------------------------------------------------------------------------------------
+
+
+def _cut(cells: npt.NDArray[np.int_], depth: Depth, camera: Pinhole, *, hole: bool) -> _Cut:
+    """What lies about a contour. A pixel without depth has none here either: its neighbours stand for it."""
+    height, width = depth.shape
+    margin = MARGIN + (int(np.ptp(cells, axis=0).max()) // 2 if hole else 0)  # the top may be seen far from a hole
+    low = np.maximum(cells.min(axis=0) - margin, 0)
+    high = np.minimum(cells.max(axis=0) + margin + 1, (width, height))
+    part = depth[low[1] : high[1], low[0] : high[0]]
+    columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+    heights = Rays.through(camera, np.stack([columns, rows], axis=-1)).at_depth(part)[..., 2]
+    heights[~is_valid(part)] = np.nan
+    polygon = [(cells - low).astype(np.int32)]
+    filled = np.asarray(cv2.fillPoly(np.zeros(part.shape, np.uint8), polygon, 1), np.uint8)
     if not hole:
-        return np.asarray(filled, np.uint8)
-    edge = cv2.polylines(np.zeros(shape, np.uint8), polygon, True, 1) > 0
-    around = cv2.dilate(filled, np.ones((2 * WINDOW + 3, 2 * WINDOW + 3), np.uint8)) > 0
-    return np.asarray(around & ((filled == 0) | edge), np.uint8)
+        return _Cut(low, heights, filled, np.zeros_like(filled))
+    edge = cv2.polylines(np.zeros(part.shape, np.uint8), polygon, True, 1) > 0
+    within = ((filled > 0) & ~edge).astype(np.uint8)
+    return _Cut(low, heights, 1 - within, within)
 
 
-def _core(inside: Mask) -> npt.NDArray[np.bool_]:
+def _core(inside: Mask) -> Bools:
     """Pixels whose rays certainly meet the object: not those at its edge, unless it is too thin."""
     core = cv2.erode(inside, SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return np.asarray((core if np.count_nonzero(core) >= 9 else inside) > 0)
 
 
-def _noise(heights: Array, usable: npt.NDArray[np.bool_]) -> float:
+def _noise(heights: Array, usable: Bools) -> float:
     """Standard deviation [m] of the noise of heights, from the differences of neighbours."""
     pairs = usable[:, 1:] & usable[:, :-1]
     steps = np.abs(heights[:, 1:] - heights[:, :-1])[pairs]
@@ -150,8 +166,7 @@ def _plateau(heights: Array, tolerance: float) -> float:
 
 def _heights_beside(contour: Array, out: Array, depth: Depth, camera: Pinhole) -> Array:
     """Height [m] of what is seen a little outside of each point of the contour (n,); NaN where that is unknown."""
-    places = contour + OUTSIDE * out
-    cells = np.rint(places).astype(int)
+    cells = np.rint(contour + OUTSIDE * out).astype(int)
     height, width = depth.shape
     inside = (cells >= 0).all(axis=1) & (cells < (width, height)).all(axis=1)
     cells = np.clip(cells, 0, (width - 1, height - 1))
@@ -160,105 +175,79 @@ def _heights_beside(contour: Array, out: Array, depth: Depth, camera: Pinhole) -
     return np.where(inside & is_valid(seen), found, np.nan)
 
 
-def _edges(
-    contour: Array, low: npt.NDArray[np.int_], usable: npt.NDArray[np.bool_], heights: Array, cut: Depth,
-    camera: Pinhole, top: float, tolerance: float,
-) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Where the rays of the contour meet the object (n, 3) [m], and which of them meet a wall (n,).
+# --- edges ------------------------------------------------------------------------------------------------------
 
-    A plane has 1/depth affine in the pixel, and an upright one has 1/depth = a . h, where h (2,) is the horizontal
-    part of the ray. `a` is fitted to the wall pixels around each point; where those lie along one ray only, as at a
-    corner, the nearest of them decides.
-    """
-    steps = np.arange(-WINDOW, WINDOW + 1)
-    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    grid = grid[np.argsort((grid**2).sum(axis=1), kind="stable")]
-    cells = np.rint(contour).astype(int)[:, None, :] - low + grid
-    rows, columns = usable.shape
-    within = (cells >= 0).all(axis=2) & (cells < (columns, rows)).all(axis=2)
-    u, v = np.clip(cells[..., 0], 0, columns - 1), np.clip(cells[..., 1], 0, rows - 1)
-    good = within & usable[v, u]
-    has = good.any(axis=1)
-    if not has.any():
-        raise DepthError("invalid", "no pixel beside the contour has a valid depth")
-    distance = ((cells + low - contour[:, None, :]) ** 2).sum(axis=2)
-    nearest = np.argmin(np.where(good, distance, np.inf), axis=1)
-    each = np.arange(len(contour))
-    lower = heights[v, u] < top - tolerance
-    is_wall = has & lower[each, nearest]
+
+def _edges(contour: Array, camera: Pinhole, top: float, base: float | None, edge: Array, *, hole: bool) -> Array:
+    """The outline (n, 3) [m] at the height `top` of an upright object with this contour that stands at `base`."""
     rays = Rays.through(camera, contour)
-    points = rays.at_height(np.full(len(contour), top))
-    if is_wall.any():
-        w = np.flatnonzero(is_wall)
-        use = (good & lower)[w]
-        h = Rays.through(camera, cells[w] + low).directions[..., :2]
-        inverse = np.where(use, 1.0 / np.where(use, cut[v[w], u[w]], 1.0), 0.0)
-        pick = np.arange(len(w))
-        near_h, near_inverse = h[pick, nearest[w]], inverse[pick, nearest[w]]
-        first = near_h * (near_inverse / np.maximum((near_h**2).sum(axis=1), 1e-12))[:, None]
-        weighted = h * use[..., None]
-        matrix = np.einsum("nki,nkj->nij", weighted, h) + RIDGE * np.eye(2)
-        rest = np.einsum("nki,nk->ni", weighted, inverse - np.einsum("nki,ni->nk", h, first))
-        a = first + np.linalg.solve(matrix, rest[..., None])[..., 0]
-        slope = (a * rays.directions[w, :2]).sum(axis=1)
-        seen = Rays.through(camera, cells[w, nearest[w]] + low).at_depth(cut[v[w, nearest[w]], u[w, nearest[w]]])
-        with np.errstate(divide="ignore"):
-            met = Rays(rays.origin, rays.directions[w]).at_depth(np.where(slope > 0, 1.0 / slope, 0.0))
-        pixel = (top - rays.origin[2]) / rays.directions[w, 2] / camera.fx  # [m]
-        near = np.linalg.norm(met[:, :2] - seen[:, :2], axis=1) <= 2 * WINDOW * pixel
-        points[w] = np.where(near[:, None], met, seen)
-    return points, is_wall
+    at_top = rays.at_height(np.full(len(contour), top))
+    if base is None:
+        return at_top
+    at_foot = rays.at_height(np.full(len(contour), base))
+    at_foot[:, 2] = top
+    lifted = camera.project(at_foot)  # where the contour would be seen if it were all foot
+    fine = not _to_the_pixel(contour)
+    near_radial, slack = (0.06, 0.25) if fine else (0.1, 1.0)
+    away = contour - lifted  # towards the camera's axis, as long as an upright edge is seen
+    length = np.linalg.norm(away, axis=1)
+    out = normals(contour if fine else _smoothed(contour), hole=hole)
+    facing = (out * away).sum(axis=1) / np.maximum(length, 1e-9)
+    is_foot = (facing > 0) & (length > SHORT)
+    sign = -1.0 if hole else 1.0
+    within_feet, within = _depth_within(contour, lifted) * sign, _depth_within(lifted, contour) * sign
+    keep = (np.where(is_foot, within, within_feet) >= -slack) & (np.abs(facing) >= near_radial) | (length <= SHORT)
+    if np.count_nonzero(keep) < 3:
+        return at_top
+    points = np.where(is_foot[:, None], at_foot, at_top)[keep]
+    pixel = float(np.linalg.norm(at_top - rays.origin, axis=1).min()) / camera.fx  # [m]
+    plateau = Rays.through(camera, edge).at_height(np.full(len(edge), top))
+    return joined(points, contour[keep], is_foot[keep], pixel, plateau)
 
 
-def _without_narrow_walls(
-    points: Array, contour: Array, out: Array, beside: Array, below: float, camera: Pinhole
-) -> Array:
-    """Edges of the top (n, 3), moved inwards by as much of a wall as can be seen without having pixels of its own.
-
-    Walls that face the camera's axis are seen between the edge of the top and the contour, which is their foot. Only
-    the part of that shift across the edge counts: along it the outline stays the same.
-    """
-    rays = Rays.through(camera, contour)
-    R = camera.T_world_optical[:3, :3]
-    across = (np.column_stack([out[:, 0] / camera.fx, out[:, 1] / camera.fy]) @ R[:, :2].T)[:, :2]
-    length = np.linalg.norm(across, axis=1, keepdims=True)
-    across = np.divide(across, length, out=np.zeros_like(across), where=length > 0)
-    foot = rays.at_height(np.where(beside < below, beside, points[:, 2]))
-    shift = ((foot - points)[:, :2] * across).sum(axis=1)
-    pixel = (points[:, 2] - rays.origin[2]) / rays.directions[:, 2] / camera.fx  # [m]
-    moved = points.copy()
-    narrow = (shift < 0) & (shift > -NARROW * pixel)
-    moved[narrow, :2] += shift[narrow, None] * across[narrow]
-    return moved
+def _depth_within(points: Array, polygon: Array) -> Array:
+    """How far inside of a polygon (m, 2) points (n, 2) are [px], negative outside."""
+    corners = polygon.astype(np.float32)[:, None, :]
+    return np.array([cv2.pointPolygonTest(corners, (float(x), float(y)), True) for x, y in points])
 
 
-def _fits(
-    points: Array, low: npt.NDArray[np.int_], usable: npt.NDArray[np.bool_], heights: Array, tolerance: float,
-    camera: Pinhole,
-) -> bool:
-    """Whether an outline goes along the edge of the plateau: they differ by no more than a line of pixels."""
-    polygon = np.rint((camera.project(points) - low) * 16).astype(np.int32)
-    outlined = cv2.fillPoly(np.zeros(usable.shape, np.uint8), [polygon], 1, cv2.LINE_8, 4)
-    level = usable & (np.abs(heights - points[0, 2]) <= tolerance)
-    differs = np.asarray((outlined > 0) != _filled(level.astype(np.uint8)), np.uint8)
-    return not cv2.erode(differs, np.ones((5, 5), np.uint8)).any()
+def _to_the_pixel(contour: Array) -> bool:
+    return bool(np.array_equal(contour, np.rint(contour)))
 
 
-def _filled(mask: Mask) -> npt.NDArray[np.bool_]:
-    """The largest part of a mask, with its holes filled."""
-    return np.asarray(cv2.fillPoly(np.zeros_like(mask), [_largest(mask)], 1) > 0)
+def _smoothed(contour: Array) -> Array:
+    """A closed contour whose steps from pixel to pixel are evened out."""
+    return np.asarray(sum(np.roll(contour, k, axis=0) for k in range(-2, 3)) / 5)
 
 
-def _largest(mask: Mask) -> npt.NDArray[np.int32]:
-    """The pixels (n, 2) along the outer edge of the largest part of a mask."""
+# --- plateau ----------------------------------------------------------------------------------------------------
+
+
+def _edge_of_plateau(cut: _Cut, level: Bools) -> Array:
+    """The outer edge of the plateau as points (n, 2) [px], half a pixel outside of its last pixels."""
+    return _outline(((cut.inside > 0) & level).astype(np.uint8)) + cut.low
+
+
+def _edge_of_hole(cut: _Cut, level: Bools) -> Array:
+    """The edge of the plateau around a hole, as `_edge_of_plateau`."""
+    below = ((cut.inside == 0) | ~level).astype(np.uint8)
+    count, parts = cv2.connectedComponents(below, connectivity=4)
+    seen = parts[cut.hole > 0]
+    return _outline((parts == np.bincount(seen[seen > 0], minlength=count).argmax()).astype(np.uint8)) + cut.low
+
+
+def _outline(mask: Mask) -> Array:
+    """The outer edge (n, 2) of the largest part of a mask, half a pixel outside of the centres of its pixels."""
     chains, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return np.asarray(max(chains, key=cv2.contourArea).reshape(-1, 2), np.int32)
+    chain = max(chains, key=cv2.contourArea).reshape(-1, 2).astype(float)
+    return np.asarray(chain + 0.5 * normals(chain, hole=False))
 
 
-def _plateau_edge(
-    low: npt.NDArray[np.int_], inside: Mask, heights: Array, tolerance: float, top: float, camera: Pinhole
-) -> Array:
-    """The pixels along the edge of the plateau as points (n, 3) [m] at its height."""
-    level = (inside > 0) & (np.abs(heights - top) <= tolerance)
-    chain = _largest(level.astype(np.uint8))
-    return Rays.through(camera, chain + low).at_height(np.full(len(chain), top))
+def _goes_along(points: Array, edge: Array, cut: _Cut, camera: Pinhole) -> bool:
+    """Whether an outline goes along the edge of the plateau: they differ by no more than two lines of pixels."""
+    first, second = (
+        cv2.fillPoly(np.zeros_like(cut.inside), [np.rint((line - cut.low) * 16).astype(np.int32)], 1, cv2.LINE_8, 4)
+        for line in (camera.project(points), edge)
+    )
+    differs = (first != second) & np.isfinite(cut.heights)
+    return not cv2.erode(differs.astype(np.uint8), SQUARE).any()

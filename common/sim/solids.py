@@ -82,7 +82,8 @@ def _is_ear(corners: Array, left: Sequence[int], i: int) -> bool:
     if _cross(b - a, c - b) <= 0:
         return False
     others = corners[[k for k in left if k not in (left[i - 1], left[i], left[(i + 1) % len(left)])]]
-    within = (_cross(b - a, others - a) > 0) & (_cross(c - b, others - b) > 0) & (_cross(a - c, others - c) > 0)
+    sides = [_cross(q - p, others - p) >= 0 for p, q in ((a, b), (b, c), (c, a))]  # on a side counts too
+    within = sides[0] & sides[1] & sides[2]
     return not bool(within.any())
 
 
