@@ -1,0 +1,239 @@
+"""docs/extending.md: its files in a folder of their own, and its commands word for word, with real processes."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from benchmarks.runs import free_domain
+from common.config import check, load_cell, service_config
+from common.errors import ConfigError, UnknownName
+from common.hardware.interface import Limits
+from common.hardware.loading import find_backend, load_hardware
+from common.messages import CameraInfo, Image, Pose, PoseArray, Vector3
+from common.planning.planners import load_planner
+from common.robot.model import RobotModel
+from common.topics import CAMERA_IMAGE, CAMERA_INFO, SCENE_BALLS
+from common.transport.local import LocalNetwork
+from common.transport.wiring import wiring
+
+ROOT = Path(__file__).resolve().parent.parent
+BIN = Path(sys.executable).parent
+PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+FILES = dict(re.findall(r"^`([\w./]+)`:\n\n```\w+\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE))
+COMMANDS = [
+    line for block in re.findall(r"^```sh\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE) for line in block.splitlines()
+]
+HERE, ANYWHERE = (
+    [line for line in COMMANDS if re.match(rf"{start}zencell run", line)] for start in ("", r"PYTHONPATH=\S+ ")
+)
+PATIENCE = 60  # [s]
+DONE = "DONE, 1 of 1 placed (truth: 1 in the box, 0 on the table)"
+
+
+def environment(**more: str) -> dict[str, str]:
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("ZENCELL_", "PYTHONPATH"))}
+    return {**kept, "PATH": f"{BIN}:{os.environ['PATH']}", "ZENCELL_DOMAIN": str(free_domain()), **more}
+
+
+def tell(line: str, folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(shlex.split(line), cwd=folder, env=environment(**more), text=True, capture_output=True,
+                          timeout=PATIENCE, check=False)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder that the page builds, with what its commands make in it; its modules can be imported here too."""
+    folder = tmp_path_factory.mktemp("outside") / "my_cell"
+    for name, text in FILES.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text, encoding="utf-8")
+    for line in COMMANDS:
+        if line.startswith(("xacro ", "zencell robot ")):
+            made = tell(line, folder)
+            assert made.returncode == 0, made.stderr
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        yield folder
+    for name in [name for name in sys.modules if name.partition(".")[0] == "my_pkg"]:
+        del sys.modules[name]
+
+
+def test_page_says_where_every_file_goes() -> None:
+    listed = re.search(r"^```\nmy_cell/\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
+    assert listed is not None
+    assert set(re.findall(r"[\w.]+\.\w+", listed[1])) == {Path(name).name for name in FILES}
+    assert len(HERE) == 2 and len(ANYWHERE) == 1
+
+
+def test_robot_is_made_of_its_files_wherever_one_stands(folder: Path) -> None:
+    cell = load_cell(str(folder / "my_cell.yaml"))
+    robot = RobotModel.load(cell.robot)
+    assert {"tool0", "palm", "left_finger", "my_tcp"} <= set(robot.link_names)
+    T_tool_tcp = np.linalg.inv(robot.link_poses(robot.named("home"))["tool0"]) @ robot.fk(robot.named("home"))
+    assert T_tool_tcp[:3, 3] == pytest.approx([0, 0, 0.1])
+    srdf = (folder / "my_robot.srdf").read_text(encoding="utf-8")
+    assert 'link1="palm" link2="left_finger"' in srdf and 'link1="forearm_link" link2="palm"' not in srdf
+
+
+def test_folders_of_descriptions_may_lie_beside_the_robot_file(folder: Path) -> None:
+    package = folder / "descriptions" / "my_description"
+    package.mkdir(parents=True)
+    (package / "my_gripper.urdf").write_bytes((folder / "my_gripper.urdf").read_bytes())
+    text = FILES["my_robot.yaml"].replace("urdf: my_gripper.urdf", "urdf: package://my_description/my_gripper.urdf")
+    (folder / "packaged.yaml").write_text(f"{text}package_dirs: [descriptions]\n", encoding="utf-8")
+    cell = load_cell("panda", [f"robot={folder / 'packaged.yaml'}"])
+    assert "palm" in RobotModel.load(cell.robot).link_names
+
+
+def test_paths_on_the_command_line_are_those_of_where_one_stands(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder.parent)
+    world = load_cell("panda", world="my_cell/my_world.yaml").world
+    assert world == load_cell(str(folder / "my_cell.yaml")).world
+    assert load_cell("panda", ["world=my_cell/my_world.yaml"]).world == world
+    with pytest.raises(ConfigError, match=r"my_world\.yaml' is not a file"):
+        load_cell("panda", world="my_world.yaml")
+
+
+def test_hardware_reads_in_steps_of_its_encoders(folder: Path) -> None:
+    options = ["robot.hardware.backend=my_pkg.encoder_arm", "robot.hardware.options.resolution=0.01"]
+    config = load_cell("panda", options).robot
+    robot = RobotModel.load(config)
+    limits = Limits(tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration)
+    hardware = load_hardware(config, limits, robot.named("home"))
+    q = robot.named("home") + 0.013
+    hardware.write(q, 0 * q, 0.1)
+    read, _ = hardware.read(0.1)
+    assert read == pytest.approx(np.round(q / 0.01) * 0.01) and abs(read - q).max() > 1e-4
+    too_coarse = load_cell("panda", [*options, "robot.hardware.options.resolution=1"]).robot
+    with pytest.raises(ConfigError, match=r"robot\.hardware\.options\.resolution: 1 "):
+        load_hardware(too_coarse, limits, q)
+    with pytest.raises(ConfigError, match=r"my_pkg\.no_arm.*can not be imported"):
+        find_backend(load_cell("panda", ["robot.hardware.backend=my_pkg.no_arm"]).robot)
+
+
+def test_options_of_the_planner_are_checked_as_all_are(folder: Path) -> None:
+    with pytest.raises(ConfigError, match=r"my_pkg\.over_home\.goals: 0 must be greater than or equal to 1"):
+        load_planner("my_pkg.over_home", {"goals": 0})
+    with pytest.raises(ConfigError, match=r"my_pkg\.over_hill.*can not be imported"):
+        load_planner("my_pkg.over_hill", {})
+    with pytest.raises(ConfigError, match=r"my_pkg\.my_topics.*must have plan\(\)"):
+        load_planner("my_pkg.my_topics", {})
+
+
+async def test_services_read_and_write_what_the_page_says(folder: Path) -> None:
+    cell = load_cell(str(folder / "my_cell.yaml"))
+    keys = {}
+    for name in ("evening_camera", "nearest_target"):
+        module = importlib.import_module(f"my_pkg.{name}")
+        wired = await wiring(module.run, service_config(cell, name, module.Config))
+        keys[name] = {t.key for t in wired.reads}, {t.key for t in wired.writes}
+    assert keys["evening_camera"] == ({"scene_balls"}, {"camera/image_raw", "camera/camera_info"})
+    assert keys["nearest_target"] == ({"validated_targets"}, {"nearest_target"})
+    dark = load_cell(str(folder / "my_cell.yaml"), ["services.evening_camera.blue=0"])
+    with pytest.raises(ConfigError, match=r"services\.evening_camera\.blue: 0 must be greater than 0"):
+        service_config(dark, "evening_camera", importlib.import_module("my_pkg.evening_camera").Config)
+    with pytest.raises(UnknownName, match="evening_camera"):
+        load_cell(str(folder / "my_cell.yaml"), ["services.camera_simulator.rate=5"])
+
+
+async def test_camera_sends_pictures_with_less_blue(folder: Path) -> None:
+    module = importlib.import_module("my_pkg.evening_camera")
+    config = check(module.Config, {"world": service_config_world(folder), "blue": 0.5})
+    net = LocalNetwork()
+    bus = net.bus()
+    images, infos = bus.reader(CAMERA_IMAGE), bus.reader(CAMERA_INFO)
+    async with net.running(module.run, config):
+        ball = Pose(position=Vector3(x=0.5, y=0.0, z=0.03))
+        bus.writer(SCENE_BALLS).put(PoseArray(header=bus.header("world"), poses=[ball], labels=["table"]))
+        image: Image = await images.next()
+        info: CameraInfo = await infos.next()
+    picture = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
+    assert (info.width, info.height) == (image.width, image.height)
+    assert tuple(picture[1, 1]) == (64, 128, 128)
+
+
+def service_config_world(folder: Path) -> object:
+    module = importlib.import_module("my_pkg.evening_camera")
+    return service_config(load_cell(str(folder / "my_cell.yaml")), "evening_camera", module.Config).world
+
+
+def run_to_end(line: str, where: Path, summary: Path, **more: str) -> dict[str, object]:
+    ran = tell(f"{line} --speed 10 --set world.count=1 --summary {summary}", where, **more)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert DONE in ran.stdout
+    loaded: dict[str, object] = json.loads(summary.read_text(encoding="utf-8"))
+    return loaded
+
+
+def planners(summary: dict[str, object]) -> set[str]:
+    plans = summary["plans"]
+    assert isinstance(plans, list)
+    return {plan["planner"] for plan in plans}
+
+
+@pytest.mark.cell
+@pytest.mark.parametrize("line", HERE)
+def test_cell_of_the_clone_runs_with_one_part_of_ours(line: str, folder: Path, tmp_path: Path) -> None:
+    summary = run_to_end(line, folder, tmp_path / "summary.json")
+    assert ("over_home" in planners(summary)) == ("my_pipeline" in line)
+
+
+@pytest.mark.cell
+def test_cell_of_ours_runs_from_anywhere(folder: Path, tmp_path: Path) -> None:
+    variable, line = ANYWHERE[0].replace("~/my_cell", str(folder)).split(" ", 1)
+    name, _, path = variable.partition("=")
+    summary = run_to_end(line, tmp_path, tmp_path / "summary.json", **{name: path})
+    services = [name.rpartition(".")[2] for name in yaml.safe_load(FILES["my_cell.yaml"])["services"]]
+    assert {"evening_camera", "nearest_target"} <= set(services)
+    assert (summary["cell"], summary["restarts"]) == ("mine", dict.fromkeys(["router", *services], 0))
+    assert "over_home" in planners(summary)
+
+
+@pytest.mark.cell
+def test_service_of_ours_joins_a_cell_and_its_topic_is_shown(folder: Path) -> None:
+    up, join, echo = COMMANDS[COMMANDS.index("zencell up panda"):][:3]
+    env = environment()
+    with start(up, folder, env) as cell:
+        assert cell.stdout is not None
+        while "is up at" not in (said := cell.stdout.readline()):
+            assert said, "the cell did not come up"
+        with start(join, folder, env) as service:
+            while "panda/nearest_target" not in tell("zencell node list", folder, **env).stdout:
+                assert service.poll() is None, service.communicate()
+            asked = [start(line, folder, env) for line in (
+                echo, "zencell topic hz nearest_target -n 1", "zencell topic echo neerest_target")]
+            shown, rate, slip = (question.communicate(timeout=PATIENCE) for question in asked)
+            service.send_signal(signal.SIGINT)
+            service.communicate(timeout=PATIENCE)
+        cell.send_signal(signal.SIGINT)
+        cell.communicate(timeout=PATIENCE)
+    value = json.loads(shown[0])
+    assert value["distance"] > 0.2 and set(value) == {"header", "position", "distance"} and not shown[1]
+    assert " Hz, " in rate[0] and not rate[1]
+    assert "unknown key 'neerest_target'" in slip[1] and "nothing came on panda/neerest_target within 2 s" in slip[1]
+    assert [question.returncode for question in asked] == [0, 0, 2]
+    assert (service.returncode, cell.returncode) == (0, 0)
+
+
+def start(line: str, folder: Path, env: dict[str, str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(shlex.split(line), cwd=folder, env=env, text=True, stdout=subprocess.PIPE,
+                            stderr=subprocess.PIPE)
+
+
+def test_service_that_is_no_module_is_refused_by_name(folder: Path) -> None:
+    told = tell("zencell service my_pkg.farthest_target --cell panda", folder)
+    assert told.returncode == 2
+    assert told.stderr.count("\n") == 1 and "'my_pkg.farthest_target' is not a module that can be found" in told.stderr
