@@ -9,7 +9,7 @@ import signal
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from common.supervision.supervisor import Supervisor
     from common.transport.bus import Bus
 
+T = TypeVar("T")
+
 VIEWER = "viewer"
 START_REQUEST_TIMEOUT = 5.0  # [s]
 
@@ -29,6 +31,8 @@ Speed = Annotated[str, typer.Option("--speed", metavar="X", help="cell time per 
 NoViewer = Annotated[bool, typer.Option("--no-viewer", help="without the operator's page")]
 SummaryFile = Annotated[str | None, typer.Option("--summary", metavar="FILE.json", help="write the figures there")]
 LogJson = Annotated[bool, typer.Option("--log-json", help="log lines as JSON objects")]
+Ask = Annotated[bool, typer.Option("--ask", help="outlining: ask at the terminal which object")]
+From = Annotated[str | None, typer.Option("--from", metavar="DIR", help="outlining: trace coordinates stored there")]
 
 
 def run(
@@ -42,9 +46,13 @@ def run(
     no_viewer: NoViewer = False,
     summary: SummaryFile = None,
     log_json: LogJson = False,
+    ask: Ask = False,
+    source: From = None,
 ) -> None:
     """Bring a cell up, run its task to the end, print a summary and shut down; exit 0 only if the task is DONE."""
-    operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json)
+    chosen = choices(cell, overrides, world, ask=ask, source=source)
+    operation = Operation(cell, chosen, world, seed, speed, domain, connect, no_viewer, summary, log_json)
+    operation.ask = ask
     raise typer.Exit(operation.run_to_end())
 
 
@@ -65,12 +73,41 @@ def up(
     raise typer.Exit(operation.stay())
 
 
+def choices(
+    cell: str, overrides: list[str] | None, world: str | None, *, ask: bool, source: str | None
+) -> list[str]:
+    """The overrides, and before them those that say how the object to outline is chosen.
+
+    Raises:
+        ConfigError: nobody can be asked, the coordinates can not be used, or the cell outlines nothing.
+    """
+    given = list(overrides or ())
+    if not ask and source is None:
+        return given
+    from cli.asking import CHOOSE_BY_HAND, require_terminal
+    from common.config import load_cell
+    from common.errors import ConfigError
+    from common.perception.stage_files import CLEARED, read_coordinates
+
+    for option, wanted in (("--ask", ask), ("--from", source is not None)):
+        if wanted and load_cell(cell, given, world=world).task != "contour_tracer":
+            raise ConfigError(option, cell, "needs a cell that outlines objects, such as ur5")
+    if ask and source is not None:
+        raise ConfigError("--ask", ..., "and --from are two ways to choose: give one of them")
+    if ask:
+        require_terminal()
+        return [*CHOOSE_BY_HAND, *given]
+    file = (Path(source or "") / CLEARED).absolute()
+    read_coordinates(file)
+    return [f"services.duplicate_remover.coordinates={json.dumps(str(file))}", *given]
+
+
 class Operation:
     """One bring-up, as a person asked for it."""
 
     def __init__(
         self, cell: str, overrides: list[str] | None, world: str | None, seed: str | None, speed: str,
-        domain: str | None, connect: str | None, no_viewer: bool, summary: str | None, log_json: bool,
+        domain: str | None, connect: str | None, no_viewer: bool, summary: str | None = None, log_json: bool = False,
     ) -> None:
         """Check everything that was asked for; nothing is started yet.
 
@@ -111,6 +148,28 @@ class Operation:
         self._supervisor: Supervisor | None = None
         self._collector: Collector | None = None
         self._screen: Screen | None = None
+        self.ask = False  # the person at the terminal which object is to be outlined
+
+    def leave_out(self, name: str) -> None:
+        """Do not start a service."""
+        kept = {key: entry for key, entry in self.cell.services.items() if entry.name != name}
+        self.cell = self.cell.model_copy(update={"services": kept})
+
+    def visit(self, visit: Callable[[Bus], Awaitable[T]]) -> T:
+        """What a visit to the cell returns that is brought up for it.
+
+        Raises:
+            KeyboardInterrupt: a signal ended it.
+        """
+        results: list[T] = []
+
+        async def work(bus: Bus) -> int:
+            results.append(await visit(bus))
+            return 0
+
+        if asyncio.run(self._operate(work)) or not results:
+            raise KeyboardInterrupt
+        return results[0]
 
     def run_to_end(self) -> int:
         """Exit code of a run: 0 when the task is DONE, 1 when it is not, 130 after Ctrl-C."""
@@ -166,7 +225,7 @@ class Operation:
     def _open_screen(self, early: list[tuple[str, str]]) -> None:
         from cli.screens import ScreenHandler, open_screen
 
-        self._screen = open_screen(self._content, log_json=self.launch.log_json)
+        self._screen = open_screen(self._content, log_json=self.launch.log_json, plain=self.ask)
         for name, text in early:
             self._screen.line(name, text)
         root = logging.getLogger()
@@ -200,6 +259,10 @@ class Operation:
             await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"), START_REQUEST_TIMEOUT)
 
         async def end() -> None:
+            if self.ask:
+                from cli.asking import ask
+
+                await ask(bus, Path.cwd())
             await collector.ended.wait()
             await collector.settle()
 

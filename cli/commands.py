@@ -110,6 +110,21 @@ def stop(cell: options.CellName = None, domain: options.Domain = None, connect: 
     _task("stop", cell, domain, connect)
 
 
+@task.command()
+def select(
+    which: Annotated[str, typer.Argument(metavar="N", help="an index, a label such as Object_2, a colour, or auto")],
+    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+) -> None:
+    """Choose the object to outline."""
+    from common import topics
+    from common.perception.contours_choice import parse_choice
+
+    wanted = parse_choice(which)
+    if wanted is None:
+        raise ConfigError("task select", which, "chooses nothing; choices: an index, a label, a colour, or auto")
+    _send(topics.OUTLINE_SELECT, wanted, TIMEOUT, cell, domain, connect)
+
+
 # --- world ------------------------------------------------------------------------------------------------------
 
 

@@ -89,11 +89,11 @@ class JsonScreen:
         """Nothing to leave behind."""
 
 
-def open_screen(content: Callable[[], Content], *, log_json: bool) -> Screen:
-    """The screen that suits where stderr goes."""
+def open_screen(content: Callable[[], Content], *, log_json: bool, plain: bool = False) -> Screen:
+    """The screen that suits where stderr goes; `plain` keeps the terminal free for a question."""
     if log_json:
         return JsonScreen()
-    if sys.stderr.isatty() and os.environ.get("TERM", "dumb") != "dumb":
+    if not plain and sys.stderr.isatty() and os.environ.get("TERM", "dumb") != "dumb":
         from rich.console import Console
 
         from cli.live import LiveScreen

@@ -601,6 +601,7 @@ class OutlinePoints(PoseArray):
 
     object: str = Field("", description="label of the chosen contour")
     invalid_depth: int = Field(0, ge=0, description="pixels whose depth was filled from neighbours")
+    given: bool = Field(False, description="by a file: need not be the outline of anything that was seen")
     message: str = ""
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from pydantic import Field
 
 from common import topics
 from common.config import Parameters
+from common.errors import ConfigError
 from common.messages import OutlinePoints, Pose, Vector3
 from common.perception.duplicates import simplified, without_duplicates
+from common.perception.stage_files import StageFileError, read_coordinates
 from common.transport.bus import Bus
 from common.transport.service import main
 
@@ -19,25 +23,45 @@ class Config(Parameters):
     tolerance: float = Field(
         0.00005, ge=0, le=0.1, description="points without which the outline moves by no more than this go [m]; 0: none"
     )
+    coordinates: str = Field(
+        "", description="file with points [[x, y, z], ...] [m] that are traced instead of what is seen; `run --from`"
+    )
 
 
-def cleared(points: OutlinePoints, tolerance: float) -> OutlinePoints:
+def cleared(poses: list[Pose], tolerance: float) -> list[Pose]:
     """The same outline without duplicates and without points that are not needed."""
-    if not points.poses:
-        return points
-    places = np.array([(p.position.x, p.position.y, p.position.z) for p in points.poses])
+    if not poses:
+        return poses
+    places = np.array([(p.position.x, p.position.y, p.position.z) for p in poses])
     kept = simplified(without_duplicates(places), tolerance)
-    poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in kept.tolist()]
-    return points.model_copy(update={"poses": poses, "ids": [], "labels": []})
+    return [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in kept.tolist()]
+
+
+def points_of(file: Path) -> list[Pose]:
+    """The points in a file.
+
+    Raises:
+        ConfigError: it is missing or malformed.
+    """
+    try:
+        return [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in read_coordinates(file).tolist()]
+    except StageFileError as error:
+        raise ConfigError("services.duplicate_remover.coordinates", ..., str(error)) from None
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Clear every outline as it comes."""
+    """Clear every outline as it comes, or answer it with the points of a file."""
     outlines = bus.reader(topics.CONTOUR_POINTS)
     paths = bus.writer(topics.CONTOUR_PATH)
+    file = Path(config.coordinates)
+    given = cleared(points_of(file), 0.0) if config.coordinates else []
+    name = f"{file.parent.name}/{file.name}"
     await bus.ready()
-    async for points in outlines:
-        paths.put(cleared(points, config.tolerance))
+    async for seen in outlines:
+        if given:
+            paths.put(OutlinePoints(header=seen.header, poses=given, object=name, given=True))
+        else:
+            paths.put(seen.model_copy(update={"poses": cleared(seen.poses, config.tolerance), "ids": [], "labels": []}))
 
 
 if __name__ == "__main__":

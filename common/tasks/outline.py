@@ -7,16 +7,15 @@ camera sees the arm. What goes wrong ends in ERROR with one line, the arm at res
 from __future__ import annotations
 
 import itertools
-import math
 from collections import deque
 from collections.abc import Iterator
 
 from pydantic import Field
 
 from common import messages as m
-from common.config import GripperConfig, Parameters
+from common.config import GripperConfig
 from common.tasks.execution import Execution, note_plan
-from common.tasks.outline_legs import Close, Leg, Legs, OutlineView, closed, length
+from common.tasks.outline_legs import Close, Leg, Legs, OutlineView, TracingParameters, closed, length
 
 Stage = Leg | Close
 Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest
@@ -25,17 +24,9 @@ AT_HOME = 0.01  # [rad] from it
 SHUT = 0.002  # [m] fingers this close together count as closed
 
 
-class OutlineParameters(Parameters):
+class OutlineParameters(TracingParameters):
     """How the task behaves; times are cell time unless they say wall."""
 
-    standoff: float = Field(0.0, ge=0, le=0.2, description="of the finger tips above the contour [m]")
-    approach_clearance: float = Field(0.10, gt=0, le=0.5, description="approach and retreat above the contour [m]")
-    tool_rpy: tuple[float, float, float] = Field(
-        (0.0, -math.pi, -math.pi), description="of the tool in world while tracing [rad], R = Rz Ry Rx"
-    )
-    tool_speed: float = Field(0.05, gt=0, le=1, description="along the contour, where limits and corners allow [m/s]")
-    step: float = Field(0.001, ge=1e-4, le=0.05, description="along the contour between IK solutions [m]")
-    min_fraction: float = Field(0.99, gt=0, le=1, description="of the contour that must be possible")
     planning_time: float = Field(10.0, gt=0, le=600, description="wall time for one plan [s]")
     overtime: float = Field(30.0, gt=0, le=3600, description="a motion that takes so much longer is stopped [s]")
     selection_timeout: float = Field(
@@ -59,9 +50,8 @@ class Outline:
             prefix: begins every id that is minted here; unlike that of any other process.
             started: whether to begin without being told.
         """
-        p = self.p = parameters
-        self.legs = Legs(p.standoff, p.approach_clearance, p.tool_rpy, p.tool_speed, p.step, p.min_fraction, gripper)
-        self.status = m.OutlineStatus(started=started, standoff=p.standoff)
+        self.p, self.legs = parameters, Legs(parameters, gripper)
+        self.status = m.OutlineStatus(started=started, standoff=parameters.standoff)
         self._home = home
         self._ids = (f"{prefix}-{n}" for n in itertools.count(1))
         self._stages: deque[Stage] = deque()
@@ -197,8 +187,9 @@ class Outline:
         path = view.path
         if path is not None and path.header.stamp * 1e-9 < self._still_since:
             path = None
-        if path is not None and len(path.poses) > 1 and view.solid():
-            self._take(path, view)
+        solid = view.solid()
+        if path is not None and len(path.poses) > 1 and solid is not None:
+            self._take(path, solid, view)
             return
         if path is None:
             problem = "no contour came from the camera"
@@ -212,7 +203,8 @@ class Outline:
         if 0 < self.p.selection_timeout < view.now - since:
             self._fail(problem, view)
 
-    def _take(self, path: m.OutlinePoints, view: OutlineView) -> None:
+    def _take(self, path: m.OutlinePoints, solid: str, view: OutlineView) -> None:
+        """Make the motions for a contour that goes round a solid of the planning scene."""
         assert view.gripper is not None
         points = closed(path)
         status = self.status
@@ -221,7 +213,7 @@ class Outline:
         status.invalid_depth = path.invalid_depth
         if view.gripper.width > SHUT:
             self._stages.append(Close())
-        self._stages += self.legs.outline(points, view.solid())
+        self._stages += self.legs.outline(points, solid)
 
     def _is_home(self, view: OutlineView) -> bool:
         assert view.q is not None

@@ -6,8 +6,10 @@ import math
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+from pydantic import Field
+
 from common import messages as m
-from common.config import GripperConfig
+from common.config import GripperConfig, Parameters
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
 
 Place = tuple[float, float, float]
@@ -62,13 +64,19 @@ class OutlineView:
                  "motion/status": self.motion}
         return [key for key, value in known.items() if value is None]
 
-    def solid(self) -> str:
-        """Id of the perceived object that the path goes round; empty while the planning scene does not have it."""
+    def solid(self) -> str | None:
+        """Id of the perceived object that the path goes round; None while the planning scene does not have it.
+
+        A path that was given need not go round anything: then the id of what it comes near, or an empty string.
+        """
         if self.path is None or self.scene is None or self.scene.header.stamp < self.path.header.stamp:
-            return ""
+            return None
         places = [(p.position.x, p.position.y, p.position.z) for p in self.path.poses]
-        around = [o for o in self.scene.objects if o.role == "target" and all(_beside(o, place) for place in places)]
-        return min(around, key=_area, default=None).id if around else ""  # type: ignore[union-attr]
+        beside = {o.id: sum(_beside(o, at) for at in places) for o in self.scene.objects if o.role == "target"}
+        if self.path.given:
+            return max((name for name, count in beside.items() if count), key=beside.__getitem__, default="")
+        around = [o for o in self.scene.objects if beside.get(o.id) == len(places)]
+        return min(around, key=_area).id if around else None
 
 
 def _beside(thing: m.CollisionObject, place: Place) -> bool:
@@ -96,25 +104,33 @@ def length(points: list[Place]) -> float:
     return sum(math.dist(a, b) for a, b in pairwise(points))
 
 
+class TracingParameters(Parameters):
+    """How the tool goes along a contour."""
+
+    standoff: float = Field(0.0, ge=0, le=0.2, description="of the finger tips above the contour [m]")
+    approach_clearance: float = Field(0.10, gt=0, le=0.5, description="approach and retreat above the contour [m]")
+    tool_rpy: tuple[float, float, float] = Field(
+        (0.0, -math.pi, -math.pi), description="of the tool in world while tracing [rad], R = Rz Ry Rx"
+    )
+    tool_speed: float = Field(0.05, gt=0, le=1, description="along the contour, where limits and corners allow [m/s]")
+    step: float = Field(0.001, ge=1e-4, le=0.05, description="along the contour between IK solutions [m]")
+    min_fraction: float = Field(0.99, gt=0, le=1, description="of the contour that must be possible")
+
+
 @dataclass(frozen=True)
 class Legs:
     """Builds the motions; knows heights and speed, nothing of what happens."""
 
-    standoff: float
-    clearance: float
-    tool_rpy: tuple[float, float, float]
-    tool_speed: float
-    step: float
-    min_fraction: float
+    p: TracingParameters
     gripper: GripperConfig
 
     def outline(self, points: list[Place], solid: str) -> list[Leg]:
         """Above the first point, down, along all points, up, home."""
         x, y, z = points[0]
-        touches = [(link, solid) for link in self.gripper.links]
-        trace = m.PathGoal(waypoints=[self._pose(p) for p in points], step=self.step, min_fraction=self.min_fraction,
-                           tool_speed=self.tool_speed)
-        above = m.PoseGoal(pose=self._pose((x, y, z + self.clearance)))
+        touches = [(link, solid) for link in self.gripper.links] if solid else []
+        trace = m.PathGoal(waypoints=[self._pose(p) for p in points], step=self.p.step,
+                           min_fraction=self.p.min_fraction, tool_speed=self.p.tool_speed)
+        above = m.PoseGoal(pose=self._pose((x, y, z + self.p.approach_clearance)))
         return [
             Leg("approach", "APPROACHING", above),
             Leg("descend", "APPROACHING", m.PoseGoal(pose=self._pose(points[0])), straight=True, touches=touches),
@@ -130,11 +146,11 @@ class Legs:
     def retreat(self, tcp: m.Pose, scene: m.PlanningScene, contact: tuple[str, str] | None = None) -> Leg:
         """Straight up from where the tool is, whatever its finger tips touch there now."""
         at = tcp.position
-        pose = tcp.model_copy(update={"position": m.Vector3(x=at.x, y=at.y, z=at.z + self.clearance)})
+        pose = tcp.model_copy(update={"position": m.Vector3(x=at.x, y=at.y, z=at.z + self.p.approach_clearance)})
         touches = [(link, o.id) for link in self.gripper.links for o in scene.objects if o.role == "target"]
         return Leg("retreat", "RETREATING", m.PoseGoal(pose=pose), straight=True,
                    touches=[*touches, *([contact] if contact else [])])
 
     def _pose(self, at: Place) -> m.Pose:
         x, y, z = at
-        return matrix_to_pose(transform(rpy_to_matrix(*self.tool_rpy), (x, y, z + self.standoff)))
+        return matrix_to_pose(transform(rpy_to_matrix(*self.p.tool_rpy), (x, y, z + self.p.standoff)))

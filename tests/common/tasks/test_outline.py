@@ -75,6 +75,19 @@ def test_inner_edge_of_a_hole_is_traced_touching_the_solid_around_it() -> None:
     assert {name for _, name in trace.allowed_collisions} == {"Object_0"}
 
 
+def test_path_that_was_given_need_not_go_round_anything() -> None:
+    cell = OutlineDouble()
+    assert cell.path is not None
+    away = outline_of([(0.5, -0.3), (0.52, -0.3), (0.5, -0.28)], 0, "a.json")
+    cell.path = away.model_copy(update={"given": True})
+    cell.until("DONE")
+    assert [r.allowed_collisions for r in cell.plans()] == [[]] * 5
+    near = OutlineDouble()
+    near.path = outline_of([(0.5, 0.05), (0.5, 0.1), (0.45, 0.05)], 0, "a.json").model_copy(update={"given": True})
+    near.until("DONE")
+    assert {name for r in near.plans() for _, name in r.allowed_collisions} == {"Object_1"}
+
+
 @pytest.mark.parametrize("stage", ["approach", "descend", "trace", "retreat", "home"])
 def test_way_that_can_not_be_planned_ends_in_error_before_the_arm_moves(stage: str) -> None:
     cell = OutlineDouble()
