@@ -31,12 +31,13 @@ def colour_name(color: Color) -> str:
     return min(HUES, key=lambda name: abs((hue * 360 - HUES[name] + 180) % 360 - 180))
 
 
-def described(contours: Sequence[Contour]) -> str:
-    """The choices, one after the other: number, label, colour and what is special."""
-    if not contours:
+def described(contours: Sequence[Contour], some: Sequence[Contour] | None = None) -> str:
+    """The contours, or some of them, one after the other: number, label, colour and what is special."""
+    shown = contours if some is None else some
+    if not shown:
         return "none"
     parts = []
-    for contour in contours:
+    for contour in shown:
         notes = [colour_name(contour.color)]
         if is_hole(contours, contour.index):
             notes = [f"hole in Object_{contour.parent}"]
@@ -93,5 +94,6 @@ def choose(contours: Sequence[Contour], wanted: OutlineSelect) -> Contour:
     whole = [c for c in objects if not c.touches_border]
     if not whole:
         which = f"every {colour}" if wanted.rule == "colour" else "every"
-        raise NoSuchContour("border", f"{which} contour touches the border of the picture: {described(objects)}")
+        choices = described(contours, objects)
+        raise NoSuchContour("border", f"{which} contour touches the border of the picture: {choices}")
     return max(whole, key=lambda contour: contour.area)

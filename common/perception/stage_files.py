@@ -53,7 +53,7 @@ def write_pictures(folder: Path, picture: Picture, depth: Depth) -> None:
     metres = np.where(known, depth, 0.0)
     millimetres = np.rint(np.clip(metres * 1000, 0, 65535)).astype(np.uint16)
     near, far = (float(metres[known].min()), float(metres[known].max())) if known.any() else (0.0, 1.0)
-    scaled = np.where(known, 55 + 200 * (far - metres) / max(far - near, 1e-6), 0.0)
+    scaled = np.where(known, np.rint(55 + 200 * (far - metres) / max(far - near, 1e-6)), 0.0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         np.save(folder / DEPTH, depth.astype(np.float32))

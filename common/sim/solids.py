@@ -82,7 +82,8 @@ def _is_ear(corners: Array, left: Sequence[int], i: int) -> bool:
     if _cross(b - a, c - b) <= 0:
         return False
     others = corners[[k for k in left if k not in (left[i - 1], left[i], left[(i + 1) % len(left)])]]
-    sides = [_cross(q - p, others - p) >= 0 for p, q in ((a, b), (b, c), (c, a))]  # on a side counts too
+    least = -1e-9 * _cross(b - a, c - b)  # what lies on a side is within, also when rounding puts it beside it
+    sides = [_cross(q - p, others - p) >= least for p, q in ((a, b), (b, c), (c, a))]
     within = sides[0] & sides[1] & sides[2]
     return not bool(within.any())
 

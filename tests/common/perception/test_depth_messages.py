@@ -1,0 +1,64 @@
+import numpy as np
+import pytest
+
+from common.messages import Header
+from common.perception.depth import DepthError, Rays, check_depth
+from common.perception.depth_intake import depth_of
+from common.perception.image import array_to_image
+from common.perception.intake import Unusable, colour_picture
+from common.perception.point_cloud import point_cloud
+from tests.common.perception.outline_scenes import seen_world
+
+HEADER = Header(frame_id="camera")
+
+
+def test_depth_in_metres_and_in_millimetres_is_the_same():
+    metres = np.array([[1.5, np.nan], [0.75, 2.0]], np.float32)
+    np.testing.assert_array_equal(depth_of(array_to_image(metres, "32FC1", HEADER)), metres)
+    millimetres = np.array([[1500, 0], [750, 2000]], np.uint16)
+    np.testing.assert_allclose(depth_of(array_to_image(millimetres, "16UC1", HEADER)), metres)
+
+
+def test_what_is_no_depth_image_is_refused():
+    picture = array_to_image(np.zeros((2, 2, 3), np.uint8), "bgr8", HEADER)
+    with pytest.raises(Unusable, match="'bgr8' is no depth image; choices: 32FC1, 16UC1"):
+        depth_of(picture)
+    depth = array_to_image(np.zeros((2, 2), np.float32), "32FC1", HEADER)
+    with pytest.raises(Unusable, match="too few"):
+        depth_of(depth.model_copy(update={"data": b"abc"}))
+    with pytest.raises(Unusable, match="is no colour picture"):
+        colour_picture(depth)
+
+
+def test_sizes_and_a_depth_image_without_depth_are_told():
+    with pytest.raises(DepthError, match="the depth image is 5x4, but the picture is 5x3"):
+        check_depth(np.ones((4, 5), np.float32), 5, 3)
+    for value in (np.nan, np.inf, 0.0, -1.0):
+        with pytest.raises(DepthError, match="no valid depth at all"):
+            check_depth(np.full((4, 5), value, np.float32), 5, 4)
+    check_depth(np.ones((4, 5), np.float32), 5, 4)
+
+
+def test_rays_lead_to_the_point_that_is_seen_at_a_pixel():
+    camera, _, _ = seen_world("w2")
+    pixels = np.random.default_rng(0).uniform(0, (1024, 768), (50, 2))
+    for points in (Rays.through(camera, pixels).at_depth(np.full(50, 1.4)),
+                   Rays.through(camera, pixels).at_height(np.full(50, 1.1))):
+        np.testing.assert_allclose(camera.project(points), pixels, atol=1e-9)
+    np.testing.assert_allclose(points[:, 2], 1.1)
+    u, v = 600.0, 300.0  # the convention of the cell: x = y_cam + 0.5, y = x_cam, z = 2.75 - depth
+    point = Rays.through(camera, (u, v)).at_depth(1.5)
+    np.testing.assert_allclose(point, [(v - 384) * 1.5 / camera.fy + 0.5, (u - 512) * 1.5 / camera.fx, 1.25], atol=1e-9)
+
+
+def test_points_of_a_cloud_lie_on_their_rays_and_have_the_colour_of_their_pixel():
+    camera, picture, depth = seen_world("w5")
+    cloud = point_cloud(picture, depth, camera, HEADER)
+    rows = np.frombuffer(cloud.data, "<f4").reshape(cloud.height, cloud.width, 4)
+    known = np.isfinite(depth)
+    world = rows[..., :3][known] @ camera.T_world_optical[:3, :3].T + camera.position
+    v, u = np.nonzero(known)
+    np.testing.assert_allclose(camera.project(world), np.column_stack([u, v]), atol=1e-2)
+    packed = np.ascontiguousarray(rows[..., 3]).view("<u4")
+    np.testing.assert_array_equal(packed & 255, picture[..., 0])
+    np.testing.assert_array_equal(packed >> 16, picture[..., 2])
