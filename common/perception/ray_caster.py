@@ -2,8 +2,8 @@
 
 All rays start at one point, so a triangle's rays are the pixels within its projection: going through the triangles
 and testing the rays of a whole row at once needs no search tree. With the few thousand triangles of a work cell numpy
-does that at the pace of embree (benchmarks/outline_perception.py), with the same result on every platform and no
-further dependency.
+is faster so than embree is ray by ray (benchmarks/outline_perception.py compares time and depth), and it is the same
+on every platform, without a dependency that has no wheel for some.
 
 A ray that passes within rounding of the edge of two triangles meets one of them: there are no gaps between them.
 """
