@@ -8,7 +8,6 @@ changing the margin of all pairs for each check would cost more than the check.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,14 +18,12 @@ from numpy.typing import NDArray
 
 from common.errors import ZencellError
 from common.messages import CollisionObject
+from common.planning.prism import is_line, prism
 from common.planning.robot_geometry import RobotGeometry, largest
 
 Array = NDArray[np.float64]
 
 MARGINS = (0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)  # [m]
-
-
-_FLAT = 1e-6  # [m] an outline that spreads less across its longest direction is a line
 
 
 class BadShape(ZencellError):
@@ -50,10 +47,8 @@ class Solid:
         Raises:
             BadShape: the outline of a prism is a line.
         """
-        if thing.shape == "prism":
-            flat = np.array(thing.outline)
-            if np.linalg.svd(flat - flat.mean(axis=0), compute_uv=False)[-1] < _FLAT:
-                raise BadShape(f"{thing.id}: the {len(flat)} points of its outline lie on one line")
+        if thing.shape == "prism" and is_line(thing.outline):
+            raise BadShape(f"{thing.id}: the {len(thing.outline)} points of its outline lie on one line")
         return cls(thing.shape, tuple(thing.dimensions), joint, frame, tuple(thing.outline))
 
     def geometry(self) -> coal.CollisionGeometry:
@@ -63,17 +58,8 @@ class Solid:
         if self.shape == "sphere":
             return coal.Sphere(*self.dimensions)
         if self.shape == "prism":
-            return _convex_prism(self.outline, self.dimensions[0])
+            return prism(self.outline, self.dimensions[0])
         return coal.Cylinder(*self.dimensions)
-
-
-def _convex_prism(outline: Sequence[tuple[float, float]], length: float) -> coal.CollisionGeometry:
-    """The convex hull of a cross-section [m], as long as given along z and centred there."""
-    corners = coal.StdVec_Vec3s()
-    for z in (-length / 2, length / 2):
-        for x, y in outline:
-            corners.append(np.array([x, y, z]))
-    return coal.ConvexBase.convexHull(corners, True, "Qt")
 
 
 class _Level:

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.messages import CollisionObject, PathGoal, PlanningScene, PlanRequest, Pose, Vector3
+from common.messages import PathGoal, PlanningScene, PlanRequest
 from common.planning.pipeline import PlanningPipeline
 from common.planning.retiming import TimedPath, sample
 from common.planning.validation import timed_path
 from common.robot.transforms import matrix_to_pose, tool_down
-from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, WORLD, above, scene, solid
+from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, above, scene, solid
 
 PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
 EMPTY = scene(box=False)
@@ -146,28 +146,3 @@ def test_planners_that_can_not_follow_a_path_say_so(planner):
     request = along(SQUARE).model_copy(update={"planner": planner})
     response = PIPELINE.plan(request, EMPTY)
     assert response.error == "no_planner"
-
-
-def prism(name: str, outline, position, length: float = 0.1) -> CollisionObject:
-    x, y, z = position
-    return CollisionObject(id=name, role="target", shape="prism", dimensions=[length], outline=outline,
-                           pose=Pose(position=Vector3(x=x, y=y, z=z)))
-
-
-def test_prism_is_solid_where_its_hull_is_and_may_be_touched_by_those_allowed():
-    angle = [(-0.05, -0.05), (0.05, -0.05), (0.05, -0.03), (-0.03, -0.03), (-0.03, 0.05), (-0.05, 0.05)]
-    around = PlanningScene(header=WORLD, objects=[prism("angle", angle, (0.5, 0.0, 0.15))])
-    inside = along([(0.5, -0.01), (0.49, -0.01)])  # in the hull of the angle, not in its legs
-    response = PIPELINE.plan(inside, around)
-    assert response.error == "start_in_collision"
-    assert response.colliding[1] == "angle"
-    touching = [(link, "angle") for link in ("panda_hand", "panda_leftfinger", "panda_rightfinger")]
-    assert PIPELINE.plan(inside.model_copy(update={"allowed_collisions": touching}), around).ok
-    assert PIPELINE.plan(along([(0.5, 0.3), (0.45, 0.3)]), around).ok
-
-
-def test_prism_without_area_is_refused_by_name():
-    around = PlanningScene(header=WORLD, objects=[prism("line", [(0, 0), (0.01, 0.01), (0.02, 0.02)], (0.5, 0.3, 0.1))])
-    response = PIPELINE.plan(along(SQUARE), around)
-    assert response.error == "bad_scene"
-    assert "line: the 3 points of its outline lie on one line" in response.message
