@@ -127,9 +127,9 @@ def topic_table() -> str:
     return "\n".join(lines)
 
 
-def service_table(name: str) -> str:
+def service_table(cell_name: str) -> str:
     """The services of a cell in start order, with what each reads, writes, serves and asks."""
-    cell = c.load_cell(name)
+    cell = c.load_cell(cell_name)
     lines = ["| | service | what it does | reads | writes | serves | asks |", "|---|---|---|---|---|---|---|"]
     for number, name in enumerate(cell.services, 1):
         module = importlib.import_module(f"services.{name}")
