@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 
 _SAME = 1e-9  # [rad] waypoints closer than this are one
 _SHORTEST = 1e-5  # [rad], [m] a shorter blend is a stop
+_LESS_THAN_HALF = 0.45  # of an edge: what is left is long enough to be timed
 _TURN_BACK = -0.985  # cosine of the angle at a corner that is too sharp to blend
 
 
@@ -84,17 +85,18 @@ def blended_path(waypoints: Array, blends: Array, lengths: Array | None = None) 
     Args:
         waypoints: (N, dof) [rad], each other than the one before.
         blends: (N,) length taken from both edges at each waypoint; next to 0 means to stop there. Half the
-            shorter edge at most is used.
+            shorter edge at most is used; a little less when lengths are given, which may differ by a hair.
         lengths: (N - 1,) of the edges, by which the path is then measured; their lengths in joint space [rad] when
             not given.
     """
     edges = np.diff(waypoints, axis=0)
     spans = np.linalg.norm(edges, axis=1)
+    most = 0.5 if lengths is None else _LESS_THAN_HALF
     lengths = spans if lengths is None else lengths
     directions = edges / lengths[:, None]
     cosines = (edges[:-1] * edges[1:]).sum(axis=1) / (spans[:-1] * spans[1:])
     cut = np.zeros(len(waypoints))
-    longest = np.minimum(blends[1:-1], 0.5 * np.minimum(lengths[:-1], lengths[1:]))
+    longest = np.minimum(blends[1:-1], most * np.minimum(lengths[:-1], lengths[1:]))
     cut[1:-1] = np.where((longest > _SHORTEST) & (cosines > _TURN_BACK), longest, 0.0)
     paths = []
     pieces: list[tuple[Array, Array, Array, float]] = []

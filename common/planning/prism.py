@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _FLAT = 1e-6  # [m] an outline that spreads less across its longest direction is a line
-_STRAIGHT = 1e-12  # [m^2] twice the area of a triangle whose corners lie on a line
+_DECIMALS = 7  # points are taken to a tenth of a micrometre: nearer ones would be corners without a direction
 
 
 def is_line(outline: Sequence[tuple[float, float]]) -> bool:
@@ -44,12 +44,12 @@ def prism(outline: Sequence[tuple[float, float]], length: float) -> coal.Convex:
 
 def convex_hull(points: Array) -> Array:
     """Corners (N, 2) of the convex hull of points (M, 2), anticlockwise: Andrew's monotone chain."""
-    order = np.unique(points, axis=0).tolist()
+    order = np.unique(np.round(points, _DECIMALS) + 0.0, axis=0).tolist()
     chains = []
     for way in (order, order[::-1]):
         chain: list[list[float]] = []
         for x, y in way:
-            while len(chain) > 1 and _twice_area(chain[-2], chain[-1], x, y) <= _STRAIGHT:
+            while len(chain) > 1 and _twice_area(chain[-2], chain[-1], x, y) <= 0:
                 chain.pop()
             chain.append([x, y])
         chains += chain[:-1]

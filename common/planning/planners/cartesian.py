@@ -12,6 +12,7 @@ from pydantic import Field
 
 from common.config import Parameters
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result, ToolPath, ToolWay
+from common.planning.smoothing import smoothed
 from common.robot.ik import converge
 from common.robot.model import RobotModel
 
@@ -19,6 +20,8 @@ Array = NDArray[np.float64]
 
 _SAME = 1e-5  # [m], [rad] a goal this close to the start needs no motion
 _REACH_OF_TURN = 0.1  # [m] a turn by a radian counts as this much way
+_SHARP = 0.5  # [rad] turn of a path that is meant; at less it may be smoothed
+_SMOOTHED = 0.65  # of the tolerance; the rest is for rounding off
 _SINGULAR = 0.03  # smallest singular value of the Jacobian [m, rad per rad] near a singularity
 
 
@@ -31,16 +34,17 @@ class Options(Parameters):
     goal_tolerance: float = Field(0.002, gt=0, le=0.1, description="a shortened line ends this close to its goal [m]")
     jump_threshold: float = Field(0.35, gt=0, le=3.2, description="a joint that moves more in a step has jumped [rad]")
     path_tolerance: float = Field(
-        8e-5, gt=2e-5, le=0.05, description="how far corners of a path with several lines are rounded off [m]"
+        9e-5, gt=2e-5, le=0.05, description="a path of several lines is smoothed and rounded off by so much [m]"
     )
 
 
 @dataclass(frozen=True)
 class _Target:
-    """A pose for the TCP on its way: `length` [m] of the way there from the target before."""
+    """A pose for the TCP, `length` [m] of its way after the one before; its turn alone would count as `turned` [m]."""
 
     pose: pin.SE3
     length: float
+    turned: float
     point: int  # of the path to which it leads
 
 
@@ -87,6 +91,7 @@ def _path(problem: Problem, goal: ToolPath, options: Options, cancel: Cancel) ->
         last = pose if between else last
     if not targets:
         return Result(waypoints=np.array([problem.start, problem.start]), dense=True, fraction=1.0)
+    targets, cuts = _smooth(poses[0], targets, options.path_tolerance)
     waypoints, failure = _follow(problem, options, cancel, targets, options.path_tolerance)
     lengths = np.array([target.length for target in targets])
     done = len(waypoints) - 1
@@ -99,8 +104,7 @@ def _path(problem: Problem, goal: ToolPath, options: Options, cancel: Cancel) ->
             f" (fraction {fraction:.2f})"
         )
         return replace(failure, fraction=fraction, message=message, waypoint=target.point)
-    cuts = _cuts(poses[0], targets[:done], options.path_tolerance)
-    way = ToolWay(lengths[:done], cuts, goal.speed)
+    way = ToolWay(lengths[:done], cuts[: done + 1], goal.speed)
     return Result(waypoints=waypoints, way=way, tool_line=goal.speed is None, fraction=fraction)
 
 
@@ -117,23 +121,36 @@ def _between(a: pin.SE3, b: pin.SE3, step: float, rotation_step: float, point: i
         return []
     way, turn = b.translation - a.translation, pin.log3(a.rotation.T @ b.rotation)
     count = max(1, math.ceil(distance / step - 1e-6), math.ceil(angle / rotation_step - 1e-6))
-    length = max(distance, _REACH_OF_TURN * angle) / count
+    turned = _REACH_OF_TURN * angle / count
+    length = max(distance / count, turned)
     return [
-        _Target(pin.SE3(a.rotation @ pin.exp3(share * turn), a.translation + share * way), length, point)
+        _Target(pin.SE3(a.rotation @ pin.exp3(share * turn), a.translation + share * way), length, turned, point)
         for share in (i / count for i in range(1, count + 1))
     ]
 
 
-def _cuts(first: pin.SE3, targets: list[_Target], tolerance: float) -> Array:
-    """(N,) how much of the way at each waypoint is rounded off [m] so that the path passes within the tolerance.
+def _smooth(first: pin.SE3, targets: list[_Target], tolerance: float) -> tuple[list[_Target], Array]:
+    """The targets, smoothed, and (N,) how much of the way at each waypoint is rounded off [m], within the tolerance.
 
     A parabola that takes c from both sides of a corner passes it at c sin(turn / 2) / 2.
     """
     places = np.array([first.translation, *(target.pose.translation for target in targets)])
+    sharp = np.concatenate([[0.0], 2 * np.arcsin(_half_turns(places)), [0.0]]) > _SHARP
+    moved = smoothed(places, np.where(sharp, 0.0, _SMOOTHED * tolerance))
+    away, ways = np.linalg.norm(moved - places, axis=1), np.linalg.norm(np.diff(moved, axis=0), axis=1)
+    following = [
+        _Target(pin.SE3(target.pose.rotation, place), max(float(way), target.turned), target.turned, target.point)
+        for target, place, way in zip(targets, moved[1:], ways, strict=True)
+    ]
+    cuts = 2 * (tolerance - away[1:-1]) / np.maximum(_half_turns(moved), 1e-6)
+    return following, np.concatenate([[0.0], cuts, [0.0]])
+
+
+def _half_turns(places: Array) -> Array:
+    """Sine of half the angle (N - 2,) by which the line through places (N, 3) turns at those between its ends."""
     edges = np.diff(places, axis=0)
     directions = edges / np.maximum(np.linalg.norm(edges, axis=1), 1e-12)[:, None]
-    halves = np.linalg.norm(np.diff(directions, axis=0), axis=1) / 2  # sin(turn / 2)
-    return np.concatenate([[0.0], 2 * tolerance / np.maximum(halves, 1e-6), [0.0]])
+    return np.asarray(np.minimum(np.linalg.norm(np.diff(directions, axis=0), axis=1) / 2, 1.0))
 
 
 def _follow(

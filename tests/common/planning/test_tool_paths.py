@@ -146,3 +146,15 @@ def test_planners_that_can_not_follow_a_path_say_so(planner):
     request = along(SQUARE).model_copy(update={"planner": planner})
     response = PIPELINE.plan(request, EMPTY)
     assert response.error == "no_planner"
+
+
+def test_noise_of_a_measured_contour_does_not_slow_the_tool():
+    rng = np.random.default_rng(3)
+    noisy = [(x + rng.uniform(-4e-5, 4e-5), y + rng.uniform(-4e-5, 4e-5)) for x, y in circle(0.05, 240)[:-1]]
+    points = [*noisy, noisy[0]]
+    dt = 0.002
+    tip = tips(traced(along(points, tool_speed=0.05)), dt)
+    assert off_lines(tip, points).max() < 1e-4
+    moved = np.linalg.norm(np.diff(tip, axis=0), axis=1) / dt
+    away = np.linalg.norm(tip[:-1, :2] - points[0], axis=1) > 0.005
+    assert np.abs(moved[away] - 0.05).max() < 0.005
