@@ -45,6 +45,7 @@ def snapshot(
     from common.perception.contours_choice import parse_choice
     from common.supervision.launch import place_of, require_free_port
     from common.transport.endpoint import endpoint_of
+    from common.transport.router import PortInUse
 
     wanted, place = parse_choice(select), Path(folder)
 
@@ -56,7 +57,7 @@ def snapshot(
         if endpoint is None:
             require_free_port(endpoint_of(number))
         is_up = endpoint is not None
-    except ConfigError:
+    except PortInUse:  # somebody has the port: a router, if it is zencell's
         is_up = True
     if is_up:
         name = load_cell(cell, tuple(overrides or ()), world=world).name
