@@ -100,7 +100,9 @@ class TaskRunner:
         now, before = self._task.status, self._before
         if before and now.model_copy(update={"task_seconds": before.task_seconds, "header": before.header}) == before:
             return
-        if now.message not in ("", before.message if before else "") or (before and now.state != before.state):
+        if now.state == "ERROR" and (before is None or before.state != "ERROR"):
+            self._bus.log.error("%s", now.message)
+        elif now.message not in ("", before.message if before else "") or (before and now.state != before.state):
             self._bus.log.info("%s", f"{now.state} {now.message}".rstrip())
         now.header = self._bus.header()
         self._status.put(now)

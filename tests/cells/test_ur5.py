@@ -148,7 +148,7 @@ def test_what_can_not_be_outlined_ends_with_one_line_and_the_arm_at_home(
     assert summary["state"] == "ERROR"
     assert summary["seconds"]["moving"] < 4  # cell time: the fingers at most
     assert summary["seconds"]["first_motion"] is None
-    told = [line for line in text.splitlines() if line.startswith("INFO contour_tracer: ERROR ")]
+    told = [line for line in text.splitlines() if line.startswith("ERROR contour_tracer: ")]
     assert len(told) == 1 and said in told[0]
     assert "Traceback" not in text
 
