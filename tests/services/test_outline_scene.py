@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+
+from common import messages as m
+from common import topics
+from common.clock import Clock
+from common.config import Surroundings, load_cell, service_config
+from common.perception.image import array_to_image
+from common.perception.pinhole import Pinhole
+from common.robot.transforms import matrix_to_pose
+from common.transport.bus import Bus
+from common.transport.local import LocalNetwork
+from services import outline_scene
+
+CELL = load_cell("ur5")
+CONFIG = service_config(CELL, "outline_scene", outline_scene.Config)
+AROUND = CELL.section(Surroundings)
+assert isinstance(AROUND, Surroundings)
+CAMERA = Pinhole.from_config(AROUND.camera)
+HOME = CELL.robot.named_poses["home"]
+TOP, BASE = 1.65, 1.75  # depths [m] of a cube's top and of what it stands on
+
+
+class Neighbours:
+    """Says what the camera, the detector and the arm would say."""
+
+    def __init__(self, net: LocalNetwork) -> None:
+        self.bus: Bus = net.bus("tester", cell="test", clock=Clock())
+        frame = AROUND.camera.frame
+        self.depths, self.contours = self.bus.writer(topics.DEPTH_CAMERA_DEPTH), self.bus.writer(topics.CONTOURS)
+        self.joints = self.bus.writer(topics.JOINT_STATES)
+        self.scenes = self.bus.reader(topics.PLANNING_SCENE)
+        self.bus.writer(topics.DEPTH_CAMERA_INFO).put(CAMERA.info(m.Header(frame_id=frame)))
+        camera = m.TransformStamped(header=m.Header(frame_id="world"), child_frame_id=frame,
+                                    transform=matrix_to_pose(CAMERA.T_world_optical))
+        self.bus.writer(topics.TF_STATIC).put(m.TFMessage(transforms=[camera]))
+
+    def arm(self, q: list[float], stamp: int) -> None:
+        self.joints.put(m.JointState(header=m.Header(stamp=stamp), name=CELL.robot.joints, position=q))
+
+    def see(self, stamp: int) -> None:
+        """A cube in the middle of the picture, 200 pixels wide."""
+        depth = np.full((CAMERA.height, CAMERA.width), BASE, np.float32)
+        depth[284:485, 412:613] = TOP
+        self.depths.put(array_to_image(depth, "32FC1", m.Header(stamp=stamp, frame_id=AROUND.camera.frame)))
+        side = np.arange(201)
+        pixels = [*((412 + k, 284) for k in side), *((612, 284 + k) for k in side[1:]),
+                  *((612 - k, 484) for k in side[1:]), *((412, 484 - k) for k in side[1:-1])]
+        cube = m.Contour.model_validate({"index": 0, "label": "Object_0", "area": 4e4, "pixels": [
+            (float(u), float(v)) for u, v in pixels]})
+        self.contours.put(m.Contours(header=m.Header(stamp=stamp), width=CAMERA.width, height=CAMERA.height,
+                                     contours=[cube], selected=0))
+
+    async def scene(self) -> m.PlanningScene:
+        async with asyncio.timeout(10):
+            return await self.scenes.next()
+
+    async def seen(self, since: int) -> m.PlanningScene:
+        """The scene of one of the pictures that are taken from a stamp on."""
+        for stamp in range(since, since + 1000):  # the service may hear of the arm after the first ones
+            self.see(stamp)
+            try:
+                async with asyncio.timeout(0.1):
+                    return await self.scenes.next()
+            except TimeoutError:
+                continue
+        raise AssertionError("no picture became a scene")
+
+
+async def test_fixtures_are_known_at_once_and_what_was_seen_with_the_arm_at_home() -> None:
+    net = LocalNetwork()
+    async with net.running(outline_scene.run, CONFIG, name="outline_scene"):
+        around = Neighbours(net)
+        first = await around.scene()
+        assert [o.id for o in first.objects] == ["robot_base", "target_base"]
+        around.arm(HOME, 1)
+        seen = await around.seen(since=5)
+        cube = seen.objects[-1]
+        assert (cube.id, cube.shape) == ("Object_0", "prism")
+        at, half = cube.pose.position, 200 * TOP / CAMERA.fx / 2
+        assert np.allclose((at.x, at.y, at.z), (0.5, 0.0, 1.05), atol=0.002)
+        assert np.allclose(np.abs(np.array(cube.outline)).max(axis=0), half, atol=0.001)
+
+
+async def test_picture_with_the_arm_in_it_is_left_out() -> None:
+    net = LocalNetwork()
+    async with net.running(outline_scene.run, CONFIG, name="outline_scene"):
+        around = Neighbours(net)
+        await around.scene()
+        around.arm([0.0] * 6, 1)
+        around.see(5)
+        around.arm(HOME, 10)
+        assert (await around.seen(since=15)).header.stamp >= 15
