@@ -74,12 +74,19 @@ class Traced:
         return {
             "object": self._status.object,
             "points": self._status.points,
-            "fraction": round(self._status.fraction, 4),
+            "fraction": round(self._fraction(tips), 4),
             "length_m": round(self._status.length_m, 4),
             "closed": self._status.closed and len(tips) > 0 and float(np.linalg.norm(tips[0] - tips[-1])) <= CLOSED,
             "deviation_mm": _millimetres(min(near, key=lambda d: float(d.mean()), default=None)),
             "tracking_mm": _millimetres(distances(tips, path) if len(tips) and len(path) > 1 else None),
         }
+
+    def _fraction(self, tips: Array) -> float:
+        """How much of the contour was traced; what the status tells is how much of it was planned."""
+        if self._status.closed or not self._status.length_m:
+            return self._status.fraction
+        way = float(np.linalg.norm(np.diff(tips, axis=0), axis=1).sum()) if len(tips) > 1 else 0.0
+        return min(self._status.fraction, way / self._status.length_m)
 
     def _tips(self) -> Array:
         """Places (N, 3) [m] of the tool tip while it traced."""

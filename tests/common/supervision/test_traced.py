@@ -153,3 +153,14 @@ async def test_collector_follows_an_outline_to_its_end() -> None:
     assert figures["outline"]["closed"]
     assert figures["outline"]["deviation_mm"]["max"] < 0.02
     assert describe(figures)[0].startswith("test: DONE, Object_1 outlined: 100.0% of 0.400 m, 0.0")
+
+
+def test_trace_that_was_interrupted_counts_as_far_as_it_went_however_much_was_planned() -> None:
+    follower = Traced(CELL.robot)
+    follower.on_path(path())
+    follower.on_status(status("TRACING", 20))
+    for k, (x, y) in enumerate(SQUARE[:2]):
+        follower.on_joints(joints_at(x, y, TOP, 21 + k))
+    figures = follower.figures()
+    assert abs(figures["fraction"] - 0.25) < 0.002
+    assert not figures["closed"]
