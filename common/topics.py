@@ -5,7 +5,7 @@ A key on the wire is `<cell>/<topic>`, for example `panda/camera/image_raw`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, Literal, TypeVar
 
 from common import messages as m
@@ -104,6 +104,8 @@ MOTION_PLAN = Request("motion/plan", m.PlanRequest, m.PlanResponse, "motion_plan
 MOTION_EXECUTE = Request("motion/execute", m.ExecuteRequest, m.MotionStatus, "trajectory_executor",
                          "follow a trajectory; the result appears on motion/status")
 MOTION_STOP = Request("motion/stop", m.StopRequest, m.MotionStatus, "trajectory_executor", "bring the robot to rest")
+MOTION_HOLD = Request("motion/hold", m.HoldRequest, m.MotionStatus, "trajectory_executor",
+                      "pause the robot on its path, or let it go on")
 GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState, "trajectory_executor",
                           "move the fingers; the result appears on gripper/state")
 WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "trajectory_executor",
@@ -112,8 +114,15 @@ OUTLINE_SELECT = Request("outline/select", m.OutlineSelect, m.OutlineSelection, 
                          "choose the object to outline")
 TASK_COMMAND = Request("task/command", m.TaskCommand, m.TaskStatus, "smart_pick_place, contour_tracer",
                        "start, pause, resume or stop the task")
+PARAMETERS = Request("param/<service>", m.ParameterRequest, m.ParameterReply, "everyone",
+                     "parameters of a service: what there is, and changing it while it runs")
 
 AnyTopic = Topic[m.Message] | Request[m.Message, m.Message]
+
+
+def parameters_of(service: str) -> Request[m.ParameterRequest, m.ParameterReply]:
+    """The request that a service answers for its own parameters."""
+    return replace(PARAMETERS, key=f"param/{service}", writer=service)
 
 
 def all_topics() -> dict[str, AnyTopic]:

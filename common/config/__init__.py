@@ -1,0 +1,18 @@
+"""Configuration: a cell file names a robot, a world, a pipeline and its services; every value has a unit and bounds.
+
+`load_cell` resolves the names, applies `--set PATH=VALUE` overrides and checks all of it. A service declares a
+`Config` (a `Parameters`); its fields are either parameters, set under `services.<name>` of the cell, or sections of
+the cell, which are recognised by their type and filled in. Only what a service declares reaches it: `World` (where
+things really lie) is declared by the simulated hardware alone, everything else takes `Surroundings`.
+"""
+
+from __future__ import annotations
+
+from common.config.basics import Coordinate, Length, Number, Parameters, Point, Rgb, Section, Tunable
+from common.config.cell import Cell, ServiceEntry
+from common.config.checking import check
+from common.config.files import config_root, find_file, names_of, read_robot, read_yaml
+from common.config.loading import load_cell, parse_override, service_config, service_names
+from common.config.motion import Grasp, Motion, Pipeline, PlannerEntry, Run
+from common.config.robot import AttachmentConfig, GripperConfig, HardwareConfig, ParallelLinkage, RobotConfig, TcpConfig
+from common.config.world import CameraConfig, Container, Fixture, ObjectConfig, Surroundings, World

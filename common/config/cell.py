@@ -1,0 +1,47 @@
+"""A resolved cell."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field
+
+from common.config.basics import Section
+from common.config.motion import Grasp, Motion, Pipeline, Run
+from common.config.robot import RobotConfig
+from common.config.world import Surroundings, World
+
+
+class ServiceEntry(Section):
+    """A process of the cell: its module and its parameters, which are checked by the service itself."""
+
+    name: str
+    module: str
+    parameters: dict[str, Any] = {}
+
+
+class Cell(Section):
+    """A resolved cell: everything that its services are configured with."""
+
+    run: Run
+    robot: RobotConfig
+    world: World
+    motion: Motion = Motion()
+    grasp: Grasp = Grasp()
+    pipeline: Pipeline
+    services: dict[str, ServiceEntry]
+    task: str = Field(description="the service that runs the task and ends in DONE")
+
+    @property
+    def name(self) -> str:
+        """The first part of every key."""
+        return self.run.cell
+
+    def section(self, kind: type[Section]) -> Section:
+        """The section of that type; surroundings are cut out of the world, without what lies in it."""
+        if kind is Surroundings:
+            return Surroundings.model_validate({f: getattr(self.world, f) for f in Surroundings.model_fields})
+        for value in (self.run, self.robot, self.world, self.motion, self.grasp, self.pipeline):
+            if type(value) is kind:
+                return value
+        raise TypeError(f"{kind.__name__} is not a section of a cell")

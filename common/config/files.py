@@ -1,0 +1,85 @@
+"""Finding and reading the files of the configuration."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from common.errors import ConfigError, UnknownName
+
+
+def config_root() -> Path:
+    """The folder of the configuration: `ZENCELL_CONFIG`, or config/ beside the packages."""
+    given = os.environ.get("ZENCELL_CONFIG")
+    return Path(given) if given else Path(__file__).resolve().parents[2] / "config"
+
+
+def names_of(kind: str) -> list[str]:
+    """Names that can be given for a kind: cells, robots, worlds or pipelines."""
+    return sorted(path.stem for path in (config_root() / kind).glob("*.yaml"))
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A mapping from a YAML file.
+
+    Raises:
+        ConfigError: the file is not there, does not parse (with line and column), or holds no mapping.
+    """
+    try:
+        loaded = yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError("file", str(path), f"can not be read: {error}") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "not valid YAML"
+        raise ConfigError("file", str(path), f"does not parse{where}: {problem}") from None
+    if not isinstance(loaded, dict):
+        raise ConfigError("file", str(path), "must hold a mapping")
+    return loaded
+
+
+def find_file(kind: str, name: str, beside: Path | None = None) -> Path:
+    """The file that a name stands for: a path (absolute, or relative to `beside`), or a name of config/<kind>.
+
+    Raises:
+        UnknownName: with the choices.
+    """
+    if name.endswith((".yaml", ".yml")):
+        path = (beside or Path()) / Path(name).expanduser()
+        if not path.is_file():
+            raise ConfigError(kind.removesuffix("s"), str(path), "is not a file")
+        return path
+    path = config_root() / kind / f"{name}.yaml"
+    if not path.is_file():
+        raise UnknownName(kind.removesuffix("s"), name, names_of(kind))
+    return path
+
+
+def read_robot(path: Path) -> dict[str, Any]:
+    """A robot file, with references to files and folders that lie beside it made absolute.
+
+    Raises:
+        ConfigError: as `read_yaml`.
+    """
+    return made_absolute(read_yaml(path), path.parent)
+
+
+def made_absolute(robot: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The robot, whose descriptions and folders of descriptions are absolute where they lie in a folder."""
+    attachments = robot.get("attachments")
+    for part in [robot, *(attachments if isinstance(attachments, list) else [])]:
+        for field in ("urdf", "srdf"):
+            reference = part.get(field) if isinstance(part, dict) else None
+            if isinstance(reference, str) and "://" not in reference and (folder / reference).is_file():
+                part[field] = str((folder / reference).resolve())
+    packages = robot.get("package_dirs")
+    if isinstance(packages, list):
+        robot["package_dirs"] = [
+            str((folder / name).resolve()) if isinstance(name, str) and (folder / name).is_dir() else name
+            for name in packages
+        ]
+    return robot

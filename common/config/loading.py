@@ -1,0 +1,120 @@
+"""From files and overrides to a cell, and from a cell to the configuration of a service."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from common.config.basics import Parameters
+from common.config.cell import Cell
+from common.config.checking import check, is_section
+from common.config.files import find_file, made_absolute, names_of, read_robot, read_yaml
+from common.errors import ConfigError, UnknownName
+
+P = TypeVar("P", bound=Parameters)
+
+
+def parse_override(text: str) -> tuple[list[str], Any]:
+    """The dotted path and the value (as YAML) of `PATH=VALUE`."""
+    path, found, value = text.partition("=")
+    if not found or not path.strip():
+        raise ConfigError("--set", text, "must be PATH=VALUE, for example world.count=5")
+    try:
+        return path.strip().split("."), yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise ConfigError(f"--set {path}", value, "is not a YAML value") from None
+
+
+def _override(tree: dict[str, Any], path: Sequence[str], value: Any) -> None:
+    node = tree
+    for depth, part in enumerate(path[:-1]):
+        child = node.setdefault(part, {})
+        if child is None:
+            child = node[part] = {}
+        if not isinstance(child, dict):
+            raise ConfigError("--set", ".".join(path), f"can not go below {'.'.join(path[: depth + 1])}, a value")
+        node = child
+    node[path[-1]] = value
+
+
+def load_cell(
+    cell: str, overrides: Sequence[str] = (), *, world: str | None = None, seed: int | None = None
+) -> Cell:
+    """Resolve a cell by its name in config/cells or the path of a YAML file.
+
+    Args:
+        cell: a name, or a path that ends in .yaml.
+        overrides: `PATH=VALUE` each, applied after all files were read.
+        world: name or path of a world that replaces the cell's.
+        seed: replaces the cell's seed.
+
+    Raises:
+        ConfigError, UnknownName: one line naming the field, the value and the choices.
+    """
+    path = find_file("cells", cell)
+    tree = read_yaml(path)
+    parsed = [parse_override(text) for text in overrides]
+    given = {parts[0]: value for parts, value in parsed if len(parts) == 1}  # which file to read may be overridden
+    given |= {"world": world} if world is not None else {}
+    tree |= {part: given[part] for part in ("robot", "world", "pipeline") if part in given}
+    for part in ("robot", "world", "pipeline"):
+        value = tree.get(part)
+        if isinstance(value, str):
+            # A path in the cell is relative to it; one that a person gives, to where the person stands.
+            here = part in given and Path(value).expanduser().is_file()
+            read = read_robot if part == "robot" else read_yaml
+            tree[part] = read(find_file(f"{part}s", value, None if here else path.parent))
+        elif part == "robot" and isinstance(value, dict):
+            tree[part] = made_absolute(value, path.parent)
+        elif not isinstance(value, dict):
+            raise ConfigError(part, value, f"must be a name or a mapping; choices: {', '.join(names_of(part + 's'))}")
+    services = tree.get("services")
+    if not isinstance(services, dict):
+        raise ConfigError("services", services, "must be a mapping of services in start order")
+    by_name = {str(key).rpartition(".")[2]: key for key in services}  # a dotted module goes by its last part
+    for parts, value in parsed:
+        if parts[0] == "services" and len(parts) > 1 and parts[1] not in services:
+            if parts[1] not in by_name:
+                raise UnknownName("service", parts[1], by_name)
+            parts[1] = by_name[parts[1]]
+        if len(parts) > 1 or parts[0] not in ("robot", "world", "pipeline"):
+            _override(tree, parts, value)
+    run = {"cell": tree.pop("cell", path.stem), "autostart": tree.pop("autostart", True), "seed": tree.pop("seed", 0)}
+    if seed is not None:
+        run["seed"] = seed
+    tree["run"] = run
+    tree["services"] = {name: _service_entry(name, value) for name, value in services.items()}
+    return check(Cell, tree)
+
+
+def _service_entry(name: str, parameters: Any) -> dict[str, Any]:
+    if parameters is not None and not isinstance(parameters, dict):
+        raise ConfigError(f"services.{name}", parameters, "must be a mapping of parameters")
+    module = name if "." in name else f"services.{name}"
+    if "." not in name and importlib.util.find_spec(module) is None:
+        raise UnknownName("service", name, service_names())
+    return {"name": name.rpartition(".")[2], "module": module, "parameters": parameters or {}}
+
+
+def service_names() -> list[str]:
+    """Services that come with the project: the modules in services/."""
+    folder = Path(__file__).resolve().parents[2] / "services"
+    return sorted(path.stem for path in folder.glob("[a-z]*.py"))
+
+
+def service_config(cell: Cell, name: str, config: type[P]) -> P:
+    """The configuration of one service: its parameters from the cell, and the sections that it declares.
+
+    Raises:
+        ConfigError: names `services.<name>.<parameter>`, the value and the bounds or choices.
+    """
+    entry = next((entry for entry in cell.services.values() if entry.name == name), None)
+    given = dict(entry.parameters) if entry else {}
+    for field, info in config.model_fields.items():
+        if is_section(info.annotation):
+            given[field] = cell.section(info.annotation)  # type: ignore[arg-type]
+    return check(config, given, f"services.{name}")

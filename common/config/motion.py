@@ -1,0 +1,56 @@
+"""How the robot moves and grasps, and which planners are asked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field
+
+from common.config.basics import Section
+
+
+class Motion(Section):
+    """How fast the robot moves and how hard planning tries, unless a request says otherwise."""
+
+    velocity_scaling: float = Field(0.2, gt=0, le=1, description="fraction of the joints' velocity limits")
+    acceleration_scaling: float = Field(0.2, gt=0, le=1, description="fraction of the joints' acceleration limits")
+    cartesian_speed_scale: float = Field(
+        1.0, gt=0, le=1, description="stretch of straight-line trajectories after retiming: t/s, v*s, a*s^2"
+    )
+    planning_attempts: int = Field(5, ge=1, le=100, description="tries of a sampling planner, the best is kept")
+    planning_time: float = Field(10.0, gt=0, le=600, description="wall time for one plan [s]")
+    object_padding: float = Field(
+        0.003, ge=0, le=0.05, description="perceived objects are planned around with this much more radius [m]"
+    )
+
+
+class Grasp(Section):
+    """How an object is taken and put down, for the tool centre point with the tool pointing down."""
+
+    approach_clearance: float = Field(0.10, ge=0.02, le=0.5, description="pre-grasp above the grasp [m]")
+    grasp_clearance: float = Field(0.0, ge=-0.02, le=0.05, description="grasp above the centre of the object [m]")
+    min_grasp_z: float = Field(0.012, ge=0.0, le=0.5, description="the tool centre point never goes below this [m]")
+    lift_height: float = Field(0.15, ge=0.05, le=0.5, description="lift above the grasp [m]")
+    drop_z: float = Field(0.25, ge=0.18, le=0.6, description="height of release above the container [m]")
+
+
+class PlannerEntry(Section):
+    """A planner of the pipeline: a module of common/planning/planners, or a dotted module of your own."""
+
+    name: str
+    options: dict[str, Any] = {}
+
+
+class Pipeline(Section):
+    """Planners in the order in which they are tried, and the checks after them."""
+
+    planners: list[PlannerEntry] = Field(min_length=1)
+    validation_step: float = Field(0.01, gt=0, le=0.2, description="largest joint step between checked states [rad]")
+
+
+class Run(Section):
+    """What belongs to one run."""
+
+    cell: str
+    seed: int = Field(0, ge=0, le=2**31 - 1)
+    autostart: bool = True

@@ -1,0 +1,135 @@
+"""The robot: descriptions, limits, gripper and hardware."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any
+
+from pydantic import Field, model_validator
+
+from common.config.basics import Length, Number, Point, Section
+
+
+class ParallelLinkage(Section):
+    """Fingers on parallelograms, so that their pads stay parallel; the driven joint is an angle, 0 when open.
+
+    At an angle a the pads are 2 * length * (sin(open_angle - a) - sin(open_angle - closed)) apart [m].
+    """
+
+    length: Length = Field(description="of the four bars [m]")
+    open_angle: float = Field(ge=-1.6, le=1.6, description="of the bars from the tool axis when open, outwards [rad]")
+    closed: float = Field(gt=0, le=3.2, description="driven joint when the pads meet [rad]")
+
+
+class GripperConfig(Section):
+    """A parallel gripper: `width` is the distance between the inner faces of the fingers [m].
+
+    The first of the joints is driven. Without a linkage it slides by half the width.
+    """
+
+    group: str = Field("gripper", description="name of the fingers as a group")
+    joints: list[str] = Field(min_length=1, description="finger joints, the driven one first")
+    mimic: list[Number] = Field([], description="each joint per driven joint; all 1 when empty")
+    linkage: ParallelLinkage | None = Field(None, description="how the driven joint opens them; else each slides")
+    links: list[str] = Field(description="links that may touch what is grasped")
+    max_width: Length = Field(0.08, description="fully open [m]")
+    speed: Length = Field(0.2, description="closing speed of the width [m/s]")
+    acceleration: Length = Field(2.0, description="of the width [m/s^2]")
+    jerk: float = Field(50.0, gt=0, le=1e4, description="of the width [m/s^3]")
+    max_effort: float = Field(70.0, gt=0, le=1e4, description="grip force [N]")
+    controller: str = Field("gripper_controller", description="name of its controller, the source of its state")
+    named_widths: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field({}, description="such as open, closed [m]")
+
+    @model_validator(mode="after")
+    def _fits(self) -> GripperConfig:
+        if self.mimic and len(self.mimic) != len(self.joints):
+            raise ValueError(f"gripper.mimic has {len(self.mimic)} values for {len(self.joints)} joints")
+        if self.mimic and self.mimic[0] != 1:
+            raise ValueError(f"gripper.mimic begins with the driven joint itself: 1, not {self.mimic[0]:g}")
+        if self.linkage is not None:
+            bars = self.linkage
+            opens = 2 * bars.length * (math.sin(bars.open_angle) - math.sin(bars.open_angle - bars.closed))
+            if not abs(opens - self.max_width) <= 1e-4:
+                raise ValueError(f"gripper.linkage opens to {opens:.4f} m, but max_width is {self.max_width:g} m")
+        for name, width in self.named_widths.items():
+            if width > self.max_width:
+                raise ValueError(f"named width {name} is {width:g} m, more than max_width {self.max_width:g} m")
+        return self
+
+
+class AttachmentConfig(Section):
+    """Another URDF whose root is fixed to a link of the robot, such as a gripper."""
+
+    urdf: str = Field(description="path, or package://<package>/... from an installed description package")
+    parent_link: str
+    position: Point = Field((0.0, 0.0, 0.0), description="of its root in parent_link [m]")
+    rpy: tuple[Number, Number, Number] = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw [rad], R = Rz Ry Rx")
+
+
+class TcpConfig(Section):
+    """A tool centre point that the URDF does not have, fixed to one of its links."""
+
+    link: str = Field(description="its name")
+    parent: str
+    position: Point = Field((0.0, 0.0, 0.0), description="in parent [m]")
+    rpy: tuple[Number, Number, Number] = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw [rad], R = Rz Ry Rx")
+
+
+class HardwareConfig(Section):
+    """The backend that moves the joints: a module of common/hardware, or a dotted module of your own."""
+
+    backend: str = "mock"
+    options: dict[str, Any] = {}
+
+
+class RobotConfig(Section):
+    """A robot: its descriptions, the group that is planned for, and limits that the URDF does not give."""
+
+    name: str
+    urdf: str = Field(description="path, or package://<package>/... from an installed description package")
+    srdf: str = Field("", description="as urdf; its disabled collision pairs are used")
+    package_dirs: list[str] = Field([], description="where package:// is looked up, before the installed packages")
+    attachments: list[AttachmentConfig] = Field([], description="descriptions that are added to the URDF")
+    group: str = "arm"
+    group_aliases: list[str] = []
+    joints: list[str] = Field(min_length=1, description="joints of the group, in order")
+    base_link: str
+    base_position: Point = Field((0.0, 0.0, 0.0), description="of base_link in world [m]")
+    base_rpy: tuple[Number, Number, Number] = Field(
+        (0.0, 0.0, 0.0), description="of base_link in world: roll, pitch, yaw [rad], R = Rz Ry Rx"
+    )
+    tcp_link: str = Field("", description="link of the tool centre point; may be left out when `tcp` defines it")
+    tcp: TcpConfig | None = Field(None, description="the tool centre point, when the URDF has no link for it")
+    locked_joints: dict[str, Number] = Field({}, description="joints outside the group and where planning holds them")
+    named_poses: dict[str, list[Number]] = Field(description="joint positions [rad]; must have home")
+    velocity_limits: list[Annotated[float, Field(gt=0, le=100)]] = Field([], description="[rad/s]; else the URDF's")
+    acceleration_limits: list[Annotated[float, Field(gt=0, le=1000)]] = Field(description="[rad/s^2]")
+    jerk_limits: list[Annotated[float, Field(gt=0, le=1e6)]] = Field(description="[rad/s^3]")
+    controller: str = Field("controller", description="name of the arm's controller, the source of its status")
+    gripper: GripperConfig | None = None
+    hardware: HardwareConfig = HardwareConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _tcp_link_is_that_of_tcp(cls, values: Any) -> Any:
+        tcp = values.get("tcp") if isinstance(values, dict) else None
+        link = tcp.get("link") if isinstance(tcp, dict) else getattr(tcp, "link", None)
+        return values | {"tcp_link": link} if link and not values.get("tcp_link") else values
+
+    @model_validator(mode="after")
+    def _lengths_fit(self) -> RobotConfig:
+        if not self.tcp_link:
+            raise ValueError("tcp_link must be given, or tcp")
+        if self.tcp is not None and self.tcp.link != self.tcp_link:
+            raise ValueError(f"tcp_link is {self.tcp_link}, but tcp defines {self.tcp.link}")
+        for field in ("velocity_limits", "acceleration_limits", "jerk_limits"):
+            if field == "velocity_limits" and not self.velocity_limits:
+                continue
+            if len(getattr(self, field)) != len(self.joints):
+                raise ValueError(f"{field} has {len(getattr(self, field))} values for {len(self.joints)} joints")
+        if "home" not in self.named_poses:
+            raise ValueError("named_poses must have home")
+        for name, positions in self.named_poses.items():
+            if len(positions) != len(self.joints):
+                raise ValueError(f"named pose {name} has {len(positions)} values for {len(self.joints)} joints")
+        return self

@@ -1,0 +1,114 @@
+"""The world: what is fixed, the camera, and where things really lie."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from common.config.basics import Coordinate, Length, Number, Point, Rgb, Section
+
+
+class Fixture(Section):
+    """A solid that never moves, pose in world."""
+
+    id: str
+    shape: Literal["box", "sphere", "cylinder"] = "box"
+    dimensions: list[Length] = Field(description="box x, y, z; sphere radius; cylinder radius, length [m]")
+    position: Point
+    rpy: tuple[Number, Number, Number] = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw [rad], R = Rz Ry Rx")
+    color: Rgb = (0.5, 0.5, 0.5)
+
+
+class Container(Section):
+    """An open box of five panels in which balls lie in a 2 x 2 grid of slots, in layers."""
+
+    id: str = "box"
+    x: Coordinate = Field(0.55, description="centre [m]")
+    y: Coordinate = Field(0.25, description="centre [m]")
+    half_side: Length = Field(0.08, description="outer half side [m]")
+    floor_thickness: Length = Field(0.005, description="[m]")
+    wall_height: Length = Field(0.07, description="from the table [m]")
+    wall_thickness: Length = Field(0.008, description="[m]")
+    slot_offset: Length = Field(0.033, description="slots lie at plus and minus this from the centre [m]")
+    layers: int = Field(2, ge=1, le=5, description="of four slots each")
+    color: Rgb = (1.0, 0.6, 0.0)
+
+
+class CameraConfig(Section):
+    """A pinhole camera. +Z looks forward, +X is to the right in the picture, +Y is down."""
+
+    frame: str = "camera_optical_frame"
+    width: int = Field(640, ge=16, le=4096, description="[px]")
+    height: int = Field(480, ge=16, le=4096, description="[px]")
+    fx: float = Field(520.0, gt=1, le=1e5, description="focal length [px]")
+    fy: float = Field(520.0, gt=1, le=1e5, description="focal length [px]")
+    cx: float = Field(320.0, ge=0, le=4096, description="principal point [px]")
+    cy: float = Field(240.0, ge=0, le=4096, description="principal point [px]")
+    position: Point = Field((0.40, 0.0, 0.80), description="optical centre in world [m]")
+    rpy: tuple[Number, Number, Number] = Field(
+        (math.pi, 0.0, -math.pi / 2), description="of the optical frame in world [rad], R = Rz Ry Rx"
+    )
+
+
+class ObjectConfig(Section):
+    """A solid that stands upright somewhere: its cross-section about (x, y), turned by yaw, and its height."""
+
+    id: str
+    shape: Literal["box", "cylinder", "prism", "ring"]
+    x: Coordinate = Field(description="of the origin of the cross-section [m], world")
+    y: Coordinate = Field(description="of the origin of the cross-section [m], world")
+    z: Coordinate = Field(0.0, description="of what it stands on [m]")
+    yaw: Number = Field(0.0, description="[rad]")
+    height: Length = Field(description="[m]")
+    size: tuple[Length, Length] | None = Field(None, description="of a box, along its x and y [m]")
+    radius: Length | None = Field(None, description="of a cylinder, outer of a ring [m]")
+    inner_radius: Length | None = Field(None, description="of a ring [m]")
+    polygon: list[tuple[Coordinate, Coordinate]] = Field([], description="cross-section of a prism, anticlockwise [m]")
+    color: Rgb = (1.0, 1.0, 0.0)
+
+    @model_validator(mode="after")
+    def _has_what_its_shape_needs(self) -> ObjectConfig:
+        needs = {"box": ["size"], "cylinder": ["radius"], "ring": ["radius", "inner_radius"], "prism": ["polygon"]}
+        missing = [field for field in needs[self.shape] if not getattr(self, field)]
+        if missing:
+            raise ValueError(f"{self.id}: a {self.shape} needs {' and '.join(missing)}")
+        if self.radius and self.inner_radius and self.inner_radius >= self.radius:
+            raise ValueError(f"{self.id}: inner_radius {self.inner_radius:g} is not below radius {self.radius:g}")
+        if self.shape == "prism" and len(self.polygon) < 3:
+            raise ValueError(f"{self.id}: a polygon has at least 3 corners, not {len(self.polygon)}")
+        return self
+
+
+class Surroundings(Section):
+    """What everybody in the cell knows: what is fixed, where the camera is, how large the balls are."""
+
+    fixtures: list[Fixture] = []
+    container: Container = Container()
+    camera: CameraConfig = CameraConfig()
+    ball_radius: float = Field(0.03, ge=0.01, le=0.035, description="[m]")
+    ball_color: Rgb = (1.0, 0.15, 0.10)
+    table_height: Coordinate = Field(0.0, description="z of the surface on which balls rest [m]")
+
+
+class World(Surroundings):
+    """The surroundings and where things really lie: for simulated hardware only."""
+
+    layout: Literal["fixed", "random"] = "fixed"
+    count: int = Field(7, ge=0, le=8, description="balls in the world, when `balls` is empty")
+    spots: list[tuple[Coordinate, Coordinate]] = Field([], description="the fixed layout: the first `count` are used")
+    balls: list[tuple[Coordinate, Coordinate]] = Field([], description="centres [m]; replaces layout and count")
+    min_separation: Length = Field(0.07, description="random: least distance of centres [m]")
+    container_clearance: Length = Field(0.04, description="random: least distance of a ball from the container [m]")
+    objects: list[ObjectConfig] = Field([], description="objects other than balls")
+
+    @model_validator(mode="after")
+    def _balls_do_not_overlap(self) -> World:
+        for i, a in enumerate(self.balls):
+            for j, b in enumerate(self.balls[:i]):
+                if math.dist(a, b) < 2 * self.ball_radius - 1e-9:
+                    raise ValueError(f"balls {j} {list(b)} and {i} {list(a)} overlap")
+        if self.layout == "fixed" and not self.balls and self.count > len(self.spots):
+            raise ValueError(f"count {self.count} is more than the {len(self.spots)} spots of the fixed layout")
+        return self

@@ -1,0 +1,48 @@
+"""Every message that travels between services: SI units, quaternions x, y, z, w, names as in ROS where ROS has one.
+
+All models refuse unknown fields and numbers that are not finite. A pose is that of the named thing in
+`header.frame_id`. Stamps are cell time in ns since the Unix epoch and are taken once, when the frame is exposed.
+"""
+
+from __future__ import annotations
+
+from common.messages.basics import SCHEMA_VERSION, Finite, Fraction, Header, Message, Name, Positive
+from common.messages.camera import CameraInfo, Image, Marker, MarkerArray, PointCloud2, Rejection, Rejections
+from common.messages.execution import (
+    ExecuteRequest,
+    GoalState,
+    GripperCommand,
+    GripperState,
+    HoldRequest,
+    MotionStatus,
+    StopRequest,
+)
+from common.messages.geometry import Color, Pose, PoseArray, Quaternion, TFMessage, TransformStamped, Vector3
+from common.messages.outline import (
+    Contour,
+    Contours,
+    OutlinePoints,
+    OutlineSelect,
+    OutlineSelection,
+    OutlineState,
+    OutlineStatus,
+)
+from common.messages.parameters import Parameter, ParameterReply, ParameterRequest
+from common.messages.planning import (
+    ArcGoal,
+    JointGoal,
+    PathGoal,
+    PlanAttempt,
+    PlanRequest,
+    PlanResponse,
+    PoseGoal,
+    SequenceGoal,
+    SequenceItem,
+)
+from common.messages.processes import LogLine, ServiceCounters, ServiceStatus, SupervisorStatus
+from common.messages.robot import JointState, JointTrajectory, JointTrajectoryPoint
+from common.messages.scene import AttachedObject, CollisionObject, PlanningScene
+from common.messages.task import PickPlaceStatus, PlanFigure, TaskCommand, TaskState, TaskStatus
+from common.messages.world import SceneUpdate, WorldEdit, WorldEditReply, WorldObject, WorldObjects
+
+TaskReport = PickPlaceStatus | OutlineStatus  # what the task of a cell says about itself

@@ -1,0 +1,148 @@
+"""Asking for a plan, and the answer."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from common.messages.basics import Finite, Fraction, Header, Message, Name
+from common.messages.geometry import Pose, Vector3
+from common.messages.robot import JointTrajectory
+
+
+class JointGoal(Message):
+    """Joint positions to end at [rad], in the order of the robot's group; or the name of a named pose."""
+
+    kind: Literal["joints"] = "joints"
+    positions: list[Finite] = []
+    named: str = Field("", description="a named pose of the robot file, such as home; used when positions is empty")
+
+
+class PoseGoal(Message):
+    """A pose for the tool centre point, with a region about it for planners that can use one.
+
+    The straight-line planner ends at the pose itself. Sampling planners may end anywhere in the region: a box with
+    the sides `position_tolerance` [m] centred on the pose, tilted by at most `tilt_tolerance` [rad] from the pose's
+    tool axis and turned about it by at most `yaw_tolerance` [rad].
+    """
+
+    kind: Literal["pose"] = "pose"
+    pose: Pose
+    position_tolerance: Vector3 = Vector3()
+    tilt_tolerance: Annotated[float, Field(ge=0, le=math.pi, allow_inf_nan=False)] = 0.0
+    yaw_tolerance: Annotated[float, Field(ge=0, le=math.pi, allow_inf_nan=False)] = 0.0
+
+
+class PathGoal(Message):
+    """Poses for the tool centre point to pass in straight lines, in order, from the first, which is where it starts.
+
+    `tool_speed` is kept wherever joint limits and corners allow; without one the path is as fast as limits allow.
+    """
+
+    kind: Literal["path"] = "path"
+    waypoints: list[Pose] = Field(min_length=1, max_length=20000)
+    step: Annotated[float, Field(gt=0, le=0.1, allow_inf_nan=False)] | None = Field(
+        None, description="way between poses for which joint positions are solved [m]; None: the planner's"
+    )
+    min_fraction: Fraction | None = Field(None, description="less of the path is refused; None: the planner's")
+    tool_speed: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] | None = Field(None, description="[m/s]")
+
+
+class ArcGoal(Message):
+    """A pose that the tool centre point reaches on a circular arc from where it starts.
+
+    The circle is told by a point `via` which the arc passes, or by its `center`; then the shorter arc is taken. The
+    orientation turns evenly along it.
+    """
+
+    kind: Literal["arc"] = "arc"
+    pose: Pose
+    via: Vector3 | None = Field(None, description="a point that the arc passes [m]")
+    center: Vector3 | None = Field(None, description="of the circle [m]")
+
+    @model_validator(mode="after")
+    def _tells_one_circle(self) -> ArcGoal:
+        if (self.via is None) == (self.center is None):
+            raise ValueError("an arc has either via or center")
+        return self
+
+
+class SequenceItem(Message):
+    """One motion of a sequence: point to point, a straight line where `straight`, an arc for an arc goal.
+
+    The tool rounds the corner to the next item off within `blend_radius` of this goal; with none it stops there.
+    """
+
+    goal: Annotated[JointGoal | PoseGoal | ArcGoal, Field(discriminator="kind")]
+    straight: bool = False
+    blend_radius: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = Field(0.0, description="[m]")
+
+
+class SequenceGoal(Message):
+    """Goals to reach one after the other, in one trajectory."""
+
+    kind: Literal["sequence"] = "sequence"
+    items: list[SequenceItem] = Field(min_length=1, max_length=200)
+
+    @model_validator(mode="after")
+    def _stops_at_the_end(self) -> SequenceGoal:
+        if self.items[-1].blend_radius:
+            raise ValueError(f"the last item has blend_radius {self.items[-1].blend_radius:g}, but nothing follows it")
+        return self
+
+
+class PlanRequest(Message):
+    """Ask for a trajectory. Poses are in the robot's base frame, `world`.
+
+    `attach` names an object of the planning scene that is to be planned with as if it were already held (or as held
+    now); `release` plans as if nothing were held. Contact that an attached object has at the start is allowed until
+    the tool has moved `contact_distance`.
+    """
+
+    header: Header = Header()
+    id: Name
+    stage: str = Field("", description="what the motion is for: appears in every error")
+    start: list[Finite] = Field([], description="joint positions [rad]; empty: where the robot is now")
+    goal: Annotated[JointGoal | PoseGoal | PathGoal | ArcGoal | SequenceGoal, Field(discriminator="kind")]
+    straight: bool = Field(False, description="only a straight line of the tool will do")
+    allowed_collisions: list[tuple[str, str]] = Field([], description="in addition to the planning scene's")
+    attach: str = ""
+    attach_pose: Pose | None = Field(None, description="of the attached object in the tool frame, when not held yet")
+    release: bool = False
+    contact_distance: Annotated[float, Field(ge=0, le=0.2, allow_inf_nan=False)] = 0.02
+    velocity_scaling: Annotated[float, Field(gt=0, le=1)] | None = None
+    acceleration_scaling: Annotated[float, Field(gt=0, le=1)] | None = None
+    planning_time: Annotated[float, Field(gt=0, le=600)] | None = Field(None, description="wall time [s]")
+    planning_attempts: Annotated[int, Field(ge=1, le=100)] | None = None
+    planner: str = Field("", description="use this planner of the pipeline only")
+    seed: int | None = None
+
+
+class PlanAttempt(Message):
+    """One try of one planner. `error` is empty for a success."""
+
+    planner: str
+    seconds: Finite
+    error: str = ""
+    message: str = ""
+    fraction: Finite = 0.0
+    waypoint: int | None = None
+    colliding: tuple[str, str] | None = None
+
+
+class PlanResponse(Message):
+    """A trajectory, or the error of the planner that got furthest. All attempts are listed."""
+
+    header: Header = Header()
+    id: Name
+    ok: bool
+    trajectory: JointTrajectory | None = None
+    planner: str = ""
+    seconds: Finite = Field(0.0, description="wall time [s] of the whole request")
+    fraction: Finite = 0.0
+    error: str = Field("", description="code: start_in_collision, no_ik, collision, incomplete, timeout, ...")
+    message: str = Field("", description="one line naming stage, planner, waypoint and colliding pair")
+    colliding: tuple[str, str] | None = None
+    attempts: list[PlanAttempt] = []

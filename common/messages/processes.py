@@ -1,0 +1,48 @@
+"""Processes, their log lines and counters."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from common.messages.basics import Finite, Header, Message
+
+
+class ServiceStatus(Message):
+    """One process as the supervisor sees it."""
+
+    name: str
+    state: Literal["waiting", "starting", "ready", "restarting", "stopping", "stopped", "failed"]
+    pid: int | None = None
+    restarts: int = 0
+    ready_seconds: Finite | None = Field(None, description="wall time from its start to its readiness token [s]")
+    message: str = ""
+
+
+class SupervisorStatus(Message):
+    """All processes of the cell."""
+
+    header: Header = Header()
+    cell: str
+    services: list[ServiceStatus]
+
+
+class LogLine(Message):
+    """A line of a service's log."""
+
+    header: Header = Header()
+    service: str
+    level: Literal["debug", "info", "warning", "error", "critical"]
+    message: str
+
+
+class ServiceCounters(Message):
+    """What a service's transport counted: dropped, refused and handled messages by key."""
+
+    header: Header = Header()
+    service: str
+    received: dict[str, int] = {}
+    dropped: dict[str, int] = Field({}, description="newer message came before this one was read")
+    invalid: dict[str, int] = Field({}, description="payloads that did not parse or validate")
+    overflow: dict[str, int] = Field({}, description="events lost because the reader fell behind")

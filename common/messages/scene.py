@@ -1,0 +1,51 @@
+"""The planning scene: what motion avoids."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from common.messages.basics import Finite, Header, Message, Name, Positive
+from common.messages.geometry import Color, Pose
+
+
+class CollisionObject(Message):
+    """A solid in the planning scene.
+
+    `dimensions` [m]: box (x, y, z), sphere (radius,), cylinder (radius, length along z), prism (length along z). A
+    prism has the convex hull of `outline` [m] as its cross-section and, as all shapes, its pose at half its length.
+    """
+
+    id: Name
+    role: Literal["fixture", "container", "target", "contained", "attached"]
+    shape: Literal["box", "sphere", "cylinder", "prism"]
+    dimensions: list[Positive] = Field(min_length=1, max_length=3)
+    outline: list[tuple[Finite, Finite]] = Field([], description="cross-section of a prism [m], in its own frame")
+    pose: Pose
+    color: Color = Color()
+
+    @model_validator(mode="after")
+    def _dimensions_fit_shape(self) -> CollisionObject:
+        wanted = {"box": 3, "sphere": 1, "cylinder": 2, "prism": 1}[self.shape]
+        if (self.shape == "prism") != (len(self.outline) >= 3):
+            raise ValueError(f"a {self.shape} has {len(self.outline)} points of an outline")
+        if len(self.dimensions) != wanted:
+            raise ValueError(f"a {self.shape} has {wanted} dimensions, not {len(self.dimensions)}")
+        return self
+
+
+class AttachedObject(Message):
+    """A solid that moves with the robot: `object.pose` is its pose in the frame of `link`."""
+
+    link: Name
+    object: CollisionObject
+
+
+class PlanningScene(Message):
+    """What the planner avoids, all of it perceived or fixed; poses of `objects` are in `header.frame_id`."""
+
+    header: Header
+    objects: list[CollisionObject] = []
+    attached: list[AttachedObject] = []
+    allowed_collisions: list[tuple[str, str]] = Field([], description="pairs of link or object names that may touch")
