@@ -20,6 +20,13 @@ class ServiceEntry(Section):
     parameters: dict[str, Any] = {}
 
 
+class Members(Section):
+    """Who is in the cell: for what looks at all of it."""
+
+    services: list[str] = Field(description="in start order")
+    task: str = Field(description="the service that runs the task")
+
+
 class Cell(Section):
     """A resolved cell: everything that its services are configured with."""
 
@@ -41,6 +48,8 @@ class Cell(Section):
         """The section of that type; surroundings are cut out of the world, without what lies in it."""
         if kind is Surroundings:
             return Surroundings.model_validate({f: getattr(self.world, f) for f in Surroundings.model_fields})
+        if kind is Members:
+            return Members(services=[entry.name for entry in self.services.values()], task=self.task)
         for value in (self.run, self.robot, self.world, self.motion, self.grasp, self.pipeline):
             if type(value) is kind:
                 return value

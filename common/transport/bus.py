@@ -63,6 +63,7 @@ class Bus:
         self._servers: list[Server[Any, Any]] = []
         self._tokens: list[Declared] = []
         self._watches: dict[str, TokenWatch] = {}
+        self._heard: dict[Reader[Any], Declared] = {}  # readers that are subscribed
         self._alive: Alive | None = None
         self._counters: Writer[ServiceCounters] | None = None
         self._beat: asyncio.TimerHandle | None = None
@@ -74,12 +75,28 @@ class Bus:
 
     # --- declarations ---------------------------------------------------------------------------------------------
 
-    def reader(self, topic: Topic[M], *, size: int = 1000) -> Reader[M]:
-        """A reader of the topic; `size` is the most events that wait in it."""
+    def reader(self, topic: Topic[M], *, size: int = 1000, listening: bool = True) -> Reader[M]:
+        """A reader of the topic; `size` is the most events that wait in it.
+
+        With `listening=False` nothing comes until `listen` says so.
+        """
         reader = Reader(topic, self._loop, self.log, size=size, limit=self._limit)
         self._readers.append(reader)
+        if listening:
+            self.listen(reader, True)
+        return reader
+
+    def listen(self, reader: Reader[Any], on: bool) -> None:
+        """Subscribe a reader to its topic, or end that: some writers only write while somebody listens."""
+        topic = reader.topic
+        if not on:
+            if reader in self._heard:
+                self._heard.pop(reader).undeclare()
+            return
+        if reader in self._heard:
+            return
         key = f"{self.cell}/{topic.key}"
-        self._session.subscriber(key, reader.arrive)
+        self._heard[reader] = self._session.subscriber(key, reader.arrive)
         if topic.kind == "state":  # subscribed first: nothing can fall between the two
 
             def on_reply(reply: RawReply) -> None:
@@ -87,7 +104,6 @@ class Bus:
                     reader.arrive(reply.sample)
 
             self._session.get(key, on_reply, lambda: None, timeout=2.0)
-        return reader
 
     def writer(self, topic: Topic[M]) -> Writer[M]:
         """A writer of the topic."""

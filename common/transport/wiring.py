@@ -39,10 +39,10 @@ class Recorder(Bus):
         super().__init__(LocalNetwork().session(), service=service, cell="recorded", clock=Clock())
         self.wiring = Wiring()
 
-    def reader(self, topic: Topic[M], *, size: int = 1000) -> Reader[M]:
+    def reader(self, topic: Topic[M], *, size: int = 1000, listening: bool = True) -> Reader[M]:
         """A reader that gets nothing."""
         self.wiring.reads.add(topic)
-        return super().reader(topic, size=size)
+        return super().reader(topic, size=size, listening=listening)
 
     def writer(self, topic: Topic[M]) -> Writer[M]:
         """A writer that nobody listens to."""

@@ -269,3 +269,25 @@ async def test_header_has_cell_time(new_bus) -> None:
     before = bus.clock.now_ns()
     assert before <= bus.header("world").stamp <= bus.clock.now_ns()
     assert bus.header("world").frame_id == "world"
+
+
+async def test_reader_listens_only_while_it_is_told_to(new_bus, until) -> None:
+    sender, receiver = await new_bus("sender"), await new_bus("receiver")
+    reader, writer = receiver.reader(topics.CAMERA_IMAGE, listening=False), sender.writer(topics.CAMERA_IMAGE)
+    assert not writer.matched
+    receiver.listen(reader, True)
+    await matched(writer, until)
+    receiver.listen(reader, False)
+    await until(lambda: not writer.matched)
+    receiver.listen(reader, True)
+    await matched(writer, until)
+    writer.put(image(7))
+    assert (await next_of(reader)).header.stamp == 7
+
+
+async def test_state_reader_that_begins_to_listen_gets_the_last_value(new_bus, until) -> None:
+    sender, receiver = await new_bus("sender"), await new_bus("receiver")
+    reader = receiver.reader(topics.PICK_PLACE_STATUS, listening=False)
+    sender.writer(topics.PICK_PLACE_STATUS).put(status(4))
+    receiver.listen(reader, True)
+    assert (await next_of(reader)).placed == 4
