@@ -11,6 +11,7 @@ from typing import Generic, Literal, TypeVar
 from common import messages as m
 
 Kind = Literal["stream", "event", "state", "request"]
+PublishedKind = Literal["stream", "event", "state"]
 M = TypeVar("M", bound=m.Message)
 Q = TypeVar("Q", bound=m.Message)
 A = TypeVar("A", bound=m.Message)
@@ -26,7 +27,7 @@ class Topic(Generic[M]):
 
     key: str
     message: type[M]
-    kind: Literal["stream", "event", "state"]
+    kind: PublishedKind
     writer: str
     doc: str
 

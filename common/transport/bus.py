@@ -12,10 +12,11 @@ from typing import Any, TypeVar
 from common import topics
 from common.clock import Clock
 from common.messages import Header, Message, ServiceCounters
-from common.topics import Request, Topic
+from common.topics import PublishedKind, Request, Topic
 from common.transport.alive import Alive
 from common.transport.codec import DEFAULT_LIMIT
 from common.transport.handoff import Doorbell, call_on_loop
+from common.transport.raw_writer import RawWriter
 from common.transport.reader import Reader
 from common.transport.requests import Client, Server
 from common.transport.session import Declared, RawReply, RawSample, Session
@@ -60,6 +61,7 @@ class Bus:
         self._crash: asyncio.Future[BaseException] = self._loop.create_future()
         self._readers: list[Reader[Any]] = []
         self._writers: list[Writer[Any]] = []
+        self._raw_states: list[RawWriter] = []
         self._servers: list[Server[Any, Any]] = []
         self._tokens: list[Declared] = []
         self._watches: dict[str, TokenWatch] = {}
@@ -204,6 +206,20 @@ class Bus:
         finally:
             declared.undeclare()
 
+    def raw_subscriber(self, key: str, on_sample: Callable[[RawSample], None]) -> Declared:
+        """Call back, on a thread of the network's, for everything under a full key expression; it must return at once.
+
+        What is returned takes it back.
+        """
+        return self._session.subscriber(key, on_sample)
+
+    def raw_writer(self, key: str, encoding: str, kind: PublishedKind) -> RawWriter:
+        """A writer of bytes under a full key, such as what was recorded there."""
+        writer = RawWriter(self._session, key, encoding, kind, self.service)
+        if kind == "state":
+            self._raw_states.append(writer)
+        return writer
+
     async def raw_get(self, key: str, timeout: float = 1.0) -> list[RawSample]:
         """The values that can be asked for under a full key expression; requests refuse to be asked like this."""
         samples: list[RawSample] = []
@@ -241,6 +257,8 @@ class Bus:
         for writer in self._writers:
             if writer.topic.kind == "state":
                 writer.repeat()
+        for raw in self._raw_states:
+            raw.repeat()
         if self._counters is not None and self._counters.matched:
             self._counters.put(self.counters())
 
