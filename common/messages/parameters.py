@@ -22,6 +22,7 @@ class Parameter(Message):
     unit: str = ""
     description: str = ""
     runtime: bool = Field(False, description="may be changed while the service runs")
+    changed: bool = Field(False, description="is no longer what the service was started with")
 
 
 class ParameterRequest(Message):

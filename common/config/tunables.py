@@ -1,0 +1,265 @@
+"""The parameters of a service that runs: what there is, and a change of those that may change, all of them or none."""
+
+from __future__ import annotations
+
+import math
+import re
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, JsonValue
+from pydantic.fields import FieldInfo
+from pydantic_core import to_jsonable_python
+
+from common.config.basics import AtRunTime, Parameters, Section
+from common.config.cell import Cell
+from common.config.checking import check, is_section
+from common.config.world import Surroundings
+from common.errors import ConfigError, Refused, UnknownName
+from common.messages import Parameter
+
+Kind = Literal["number", "integer", "boolean", "string", "list", "mapping"]
+
+# A bracket of a description that holds a unit, as in "[m]" or "[s, wall time]", and not "[0..255]" or "[x, y, z]".
+UNIT = re.compile(r"\[(%|(?![xyz]\b)[A-Za-z][\w/^*]*|1/[a-z]+)(?:, [^\[\]]*)?\]")
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One parameter: where its value is kept, and what is said of it."""
+
+    path: str
+    owner: BaseModel
+    name: str
+    info: FieldInfo
+    default: Any  # `...` when it must be given
+
+    @property
+    def value(self) -> Any:
+        """What it is now."""
+        return getattr(self.owner, self.name)
+
+    @property
+    def runtime(self) -> bool:
+        """Whether it may change while the service runs."""
+        return is_tunable(self.info)
+
+
+@dataclass(frozen=True)
+class Change:
+    """A parameter and what it changes to; nothing has changed before `apply`."""
+
+    leaf: Leaf
+    value: Any
+
+    def __str__(self) -> str:
+        return f"{self.leaf.path}: {shown(self.leaf.value)} -> {shown(self.value)}"
+
+
+def is_tunable(info: FieldInfo) -> bool:
+    """Whether a field is marked as one that may change at run time."""
+    return any(isinstance(mark, AtRunTime) for mark in info.metadata)
+
+
+def tunable_sections(config: type[BaseModel]) -> dict[str, type[Section]]:
+    """The sections of the cell that a service declares and that have fields which may change, by their path."""
+    found = {}
+    for info in config.model_fields.values():
+        kind = info.annotation
+        if is_section(kind) and any(is_tunable(field) for field in kind.model_fields.values()):  # type: ignore[union-attr]
+            found[section_path(kind)] = kind  # type: ignore[arg-type]
+    return found  # type: ignore[return-value]
+
+
+def section_path(kind: type[Section]) -> str:
+    """What a cell file and `--set` call a section."""
+    if kind is Surroundings:
+        return "world"
+    return next(name for name, info in Cell.model_fields.items() if info.annotation is kind)
+
+
+def leaves(config: Parameters, service: str) -> dict[str, Leaf]:
+    """All parameters of a service by path: its own, nested ones too, and sections of the cell that it can change."""
+    found = {leaf.path: leaf for leaf in _leaves(config, f"services.{service}", None)}
+    sections = tunable_sections(type(config))
+    for name, info in type(config).model_fields.items():
+        for path, kind in sections.items():
+            if info.annotation is kind:
+                found |= {leaf.path: leaf for leaf in _leaves(getattr(config, name), path, None)}
+    return found
+
+
+def _leaves(model: BaseModel, prefix: str, defaults: BaseModel | None) -> Iterator[Leaf]:
+    for name, info in type(model).model_fields.items():
+        if is_section(info.annotation) and not isinstance(model, Section):
+            continue
+        default = getattr(defaults, name) if defaults is not None else info.get_default(call_default_factory=True)
+        if info.is_required() and defaults is None:
+            default = ...
+        value = getattr(model, name)
+        if isinstance(value, BaseModel):
+            yield from _leaves(value, f"{prefix}.{name}", default if isinstance(default, BaseModel) else None)
+        else:
+            yield Leaf(f"{prefix}.{name}", model, name, info, default)
+
+
+# --- saying what there is ---------------------------------------------------------------------------------------
+
+
+def values_of(config: Parameters, service: str) -> dict[str, JsonValue]:
+    """The values of all parameters of a service by path, as JSON has them."""
+    return {path: to_jsonable_python(leaf.value) for path, leaf in leaves(config, service).items()}
+
+
+def describe(config: Parameters, service: str, started: Mapping[str, JsonValue] | None = None) -> list[Parameter]:
+    """Every parameter of a service as it is now, in the order in which they are declared.
+
+    Args:
+        config: of the service.
+        service: its name.
+        started: values by path that the service was started with; else those of now.
+    """
+    return [_described(leaf, started or {}) for leaf in leaves(config, service).values()]
+
+
+def _described(leaf: Leaf, started: Mapping[str, JsonValue]) -> Parameter:
+    value = to_jsonable_python(leaf.value)
+    begun = started.get(leaf.path, value)
+    description = leaf.info.description or ""
+    units = UNIT.findall(description)
+    kind = kind_of(leaf.info.annotation)
+    minimum, maximum = _limits(leaf.info, whole=kind == "integer")
+    return Parameter(
+        path=leaf.path, value=value, default=begun if leaf.default is ... else to_jsonable_python(leaf.default),
+        type=kind, minimum=minimum, maximum=maximum, choices=choices_of(leaf.info.annotation),
+        unit=units[-1] if units else "", description=description, runtime=leaf.runtime, changed=value != begun,
+    )
+
+
+def kind_of(annotation: Any) -> Kind:
+    """What a value of a type looks like in JSON."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated:
+        return kind_of(arguments[0])
+    if origin in (typing.Union, types.UnionType):
+        kinds = [kind_of(argument) for argument in arguments if argument is not types.NoneType]
+        return kinds[0] if len(set(kinds)) == 1 else "string"  # which can be read as any of them
+    if origin is typing.Literal:
+        return kind_of(type(arguments[0]))
+    simple: dict[Any, Kind] = {bool: "boolean", int: "integer", float: "number", dict: "mapping", Mapping: "mapping"}
+    for kind in (tuple, list, set, frozenset):
+        simple[kind] = "list"
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return "mapping"
+    return simple.get(origin or annotation, "string")
+
+
+def choices_of(annotation: Any) -> list[str]:
+    """The values of a Literal; empty for what is none."""
+    return [str(value) for value in typing.get_args(annotation)] if typing.get_origin(annotation) is Literal else []
+
+
+def bounds_of(info: FieldInfo) -> str:
+    """Bounds of a field as people write them, such as "> 0, <= 1"; empty when there are none."""
+    parts = []
+    for names in (("ge", "gt"), ("le", "lt")):
+        signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+        parts += [f"{signs[n]} {getattr(mark, n):g}" for mark in info.metadata for n in names if hasattr(mark, n)][:1]
+    return ", ".join(parts)
+
+
+def _limits(info: FieldInfo, *, whole: bool) -> tuple[float | None, float | None]:
+    """Least and largest value, as far as a field has bounds; open ends count as closed unless the value is whole."""
+    low = high = None
+    for mark in info.metadata:
+        low = getattr(mark, "ge", low)
+        high = getattr(mark, "le", high)
+        if hasattr(mark, "gt"):
+            low = mark.gt + whole
+        if hasattr(mark, "lt"):
+            high = mark.lt - whole
+    return low, high
+
+
+def shown(value: Any) -> str:
+    """A value as YAML writes it on one line: what `PATH=VALUE` takes."""
+    text = yaml.safe_dump(to_jsonable_python(value), default_flow_style=True, width=math.inf, allow_unicode=True)
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+# --- changing it ------------------------------------------------------------------------------------------------
+
+
+def checked(config: Parameters, service: str, values: Mapping[str, Any]) -> list[Change]:
+    """The change that setting values by path would be, checked as a whole by the models; nothing has changed yet.
+
+    Raises:
+        Refused: nothing can be done: `unknown_parameter`, `needs_restart` or `bad_value`, with one line that names
+            the path, the value, and bounds or choices.
+    """
+    known = leaves(config, service)
+    for path, value in values.items():
+        if path not in known:
+            raise Refused("unknown_parameter", str(UnknownName(f"parameter of {service}", path, known)))
+        if not known[path].runtime:
+            raise Refused("needs_restart", f"{path}: needs a restart: zencell up CELL --set {path}={shown(value)}")
+    try:
+        candidate = _candidate(config, service, values)
+    except ConfigError as error:
+        raise Refused("bad_value", _with_bounds(error, known)) from None
+    changes = [Change(known[path], leaf.value) for path, leaf in candidate.items() if path in values]
+    for change in changes:
+        if not _is_finite(change.value):
+            raise Refused("bad_value", str(ConfigError(change.leaf.path, change.value, "must be finite")))
+    return [change for change in changes if change.value != change.leaf.value]
+
+
+def _candidate(config: Parameters, service: str, values: Mapping[str, Any]) -> dict[str, Leaf]:
+    """The parameters as they would be.
+
+    Raises:
+        ConfigError: they do not fit.
+    """
+    given = _updated(config, f"services.{service}", values)
+    sections = tunable_sections(type(config))
+    for name, info in type(config).model_fields.items():
+        for path, kind in sections.items():
+            if info.annotation is kind:
+                given[name] = check(kind, _updated(getattr(config, name), path, values), path)
+    return leaves(check(type(config), given, f"services.{service}"), service)
+
+
+def _updated(model: BaseModel, prefix: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a model with values by path in their places."""
+    given = {}
+    for name in type(model).model_fields:
+        path, value = f"{prefix}.{name}", getattr(model, name)
+        if isinstance(value, BaseModel) and any(other.startswith(f"{path}.") for other in values):
+            given[name] = _updated(value, path, values)
+        else:
+            given[name] = values.get(path, value)
+    return given
+
+
+def _with_bounds(error: ConfigError, known: Mapping[str, Leaf]) -> str:
+    leaf = known.get(error.field)
+    bounds = bounds_of(leaf.info) if leaf else ""
+    return f"{error} ({kind_of(leaf.info.annotation)}, {bounds})" if leaf and bounds else str(error)
+
+
+def _is_finite(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        return all(_is_finite(item) for item in value)
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def apply(changes: list[Change]) -> None:
+    """Make a change, in place: who keeps the model sees it at the next look, also on another thread all at once."""
+    for owner in {id(change.leaf.owner): change.leaf.owner for change in changes}.values():
+        mine = {change.leaf.name: change.value for change in changes if change.leaf.owner is owner}
+        vars(owner).update(mine)  # sections are frozen for everybody else
+        owner.model_fields_set.update(mine)
