@@ -74,8 +74,10 @@ class RunningCell:
             folder: where the files go; must be there.
             verb: run or up.
             cell: name of the cell.
-            arguments: further options, but for domain and summary.
+            arguments: further options, but for domain and summary; without `--viewer-port` there is no page.
         """
+        if "--viewer-port" not in arguments:
+            arguments = (*arguments, "--no-viewer")
         self.folder, self.name = folder, cell
         self.domain = free_domain()
         self.endpoint = endpoint_of(self.domain)

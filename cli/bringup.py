@@ -8,12 +8,13 @@ import logging
 import signal
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from cli import options
+from cli import options, viewing
 
 if TYPE_CHECKING:
     from cli.screens import Content, Screen
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-VIEWER = "viewer"
 START_REQUEST_TIMEOUT = 5.0  # [s]
 
 Speed = Annotated[str, typer.Option("--speed", metavar="X", help="cell time per wall time, 0.1 to 10")]
@@ -44,6 +44,8 @@ def run(
     domain: options.Domain = None,
     connect: options.Connect = None,
     no_viewer: NoViewer = False,
+    viewer_host: viewing.Host = None,
+    viewer_port: viewing.Port = None,
     summary: SummaryFile = None,
     log_json: LogJson = False,
     ask: Ask = False,
@@ -52,6 +54,7 @@ def run(
     """Bring a cell up, run its task to the end, print a summary and shut down; exit 0 only if the task is DONE."""
     chosen = choices(cell, overrides, world, ask=ask, source=source)
     operation = Operation(cell, chosen, world, seed, speed, domain, connect, no_viewer, summary, log_json)
+    operation.serve_page(viewer_host, viewer_port)
     operation.ask = ask
     raise typer.Exit(operation.run_to_end())
 
@@ -65,11 +68,14 @@ def up(
     domain: options.Domain = None,
     connect: options.Connect = None,
     no_viewer: NoViewer = False,
+    viewer_host: viewing.Host = None,
+    viewer_port: viewing.Port = None,
     summary: SummaryFile = None,
     log_json: LogJson = False,
 ) -> None:
     """Bring a cell up and stay until Ctrl-C; the task starts by itself unless the cell says `autostart: false`."""
     operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json)
+    operation.serve_page(viewer_host, viewer_port)
     raise typer.Exit(operation.stay())
 
 
@@ -138,7 +144,7 @@ class Operation:
         )
         loaded = load_cell(cell, self.launch.overrides, world=world, seed=self.launch.seed)
         if no_viewer:
-            kept = {name: entry for name, entry in loaded.services.items() if entry.name != VIEWER}
+            kept = {name: entry for name, entry in loaded.services.items() if entry.name != viewing.VIEWER}
             loaded = loaded.model_copy(update={"services": kept})
         self.cell: Cell = loaded
         self.summary = Summary(loaded.name, loaded.run.seed, self.launch.clock.speed)
@@ -148,7 +154,20 @@ class Operation:
         self._supervisor: Supervisor | None = None
         self._collector: Collector | None = None
         self._screen: Screen | None = None
+        self._page = ""  # address
         self.ask = False  # the person at the terminal which object is to be outlined
+
+    def serve_page(self, host: str | None, port: str | None) -> None:
+        """Say where the operator's page is to be, if the cell has one; without this the cell's own words hold.
+
+        Raises:
+            ConfigError: there is no page, the port is taken, or host or port can not be used.
+        """
+        page = viewing.page_of(self.cell, host, port)
+        if page is not None:
+            overrides = (*self.launch.overrides, *page.overrides)
+            self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
+            self._page = page.address
 
     def leave_out(self, name: str) -> None:
         """Do not start a service."""
@@ -284,6 +303,8 @@ class Operation:
     def _came_up(self) -> Collector:
         assert self._collector is not None
         self.summary.ready = time.monotonic() - self.began
+        if self._page and self._screen:
+            self._screen.note(f"Open {self._page}")
         return self._collector
 
     def _write_summary(self) -> None:

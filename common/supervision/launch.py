@@ -32,6 +32,7 @@ class Launch:
     connect: str | None = None  # endpoint of a router that runs already
     log_json: bool = False
     clock: Clock = field(default_factory=Clock)
+    extra: Mapping[str, str] = field(default_factory=dict, repr=False)  # environment that no command line may show
 
     def router_command(self) -> list[str]:
         """Command line of the router."""
@@ -53,8 +54,8 @@ class Launch:
         return ["--gate", "--log-json"] if self.log_json else ["--gate"]
 
     def environment(self, inherited: Mapping[str, str] = os.environ) -> dict[str, str]:
-        """Environment of every process: the caller's, the cell's clock, and where packages are found."""
-        return {**inherited, **self.clock.environment(), "PYTHONPATH": python_path(inherited)}
+        """Environment of every process: the caller's, what is extra, the cell's clock, and where packages are found."""
+        return {**inherited, **self.extra, **self.clock.environment(), "PYTHONPATH": python_path(inherited)}
 
 
 def clock_of(speed: float) -> Clock:

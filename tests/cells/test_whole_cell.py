@@ -23,7 +23,7 @@ from common.messages import SupervisorStatus
 
 pytestmark = pytest.mark.cell
 
-SERVICES = list(load_cell("panda").services)
+SERVICES = [name for name in load_cell("panda").services if name != "viewer"]
 GONE = 8.0  # [s] after Ctrl-C
 TOPICS = ("joint_states", "camera/image_raw", "camera/camera_info", "gripper/state", "tf", "planning_scene",
           "detected_objects", "validated_targets", "pick_place_status", "scene_balls", "supervisor/status")

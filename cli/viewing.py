@@ -1,0 +1,80 @@
+"""Where the operator's page of a cell is served, from the options of `run` and `up`."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from common.config import Cell
+
+VIEWER = "viewer"
+HIGHEST_PORT = 65535
+
+Port = Annotated[
+    str | None, typer.Option("--viewer-port", metavar="N", help="of the operator's page [8080, or the next free]")
+]
+Host = Annotated[
+    str | None, typer.Option("--viewer-host", metavar="HOST", help="that it listens at; a token beyond [127.0.0.1]")
+]
+
+
+@dataclass(frozen=True)
+class Page:
+    """Where the page of a cell will be, and what its service has to be told for that."""
+
+    address: str  # for the person, with the token if that was made here
+    overrides: tuple[str, ...]
+    environment: dict[str, str] = field(repr=False)
+
+
+def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
+    """Where the page of a cell is to be served; None for a cell without one.
+
+    Args:
+        cell: resolved, without the services that are not wanted.
+        host: of `--viewer-host`.
+        port: of `--viewer-port`.
+
+    Raises:
+        ConfigError: there is no page, the port is taken, or one of the options can not be used.
+    """
+    from common.errors import ConfigError
+    from common.viewer.access import TOKEN_VARIABLE, address_of, is_loopback, make_token
+    from common.viewer.listening import first_free_port, open_socket, refusal
+
+    entry = next((entry for entry in cell.services.values() if entry.name == VIEWER), None)
+    for option, value in (("--viewer-port", port), ("--viewer-host", host)):
+        if value is not None and entry is None:
+            raise ConfigError(option, value, "needs a cell with a viewer, and not --no-viewer")
+    if entry is None:
+        return None
+    at = str(entry.parameters.get("host", "127.0.0.1")) if host is None else host
+    wanted = entry.parameters.get("port") if port is None else _port(port)
+    if wanted is None:
+        number = first_free_port(at)
+    elif isinstance(wanted, int):
+        number = wanted
+        try:
+            open_socket(at, number).close()
+        except OSError as error:
+            raise refusal(error, at, number, "" if port is None else "--viewer-port") from None
+    else:
+        raise ConfigError("services.viewer.port", wanted, f"must be a whole number from 1 to {HIGHEST_PORT}")
+    overrides = [] if host is None else [f"services.viewer.host={at}"]
+    address, environment = address_of(at, number), {}
+    if not (is_loopback(at) or entry.parameters.get("token") or os.environ.get(TOKEN_VARIABLE)):
+        environment[TOKEN_VARIABLE] = make_token()
+        address += f"/?token={environment[TOKEN_VARIABLE]}"
+    return Page(address, (*overrides, f"services.viewer.port={number}"), environment)
+
+
+def _port(text: str) -> int:
+    from common.errors import ConfigError
+
+    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= HIGHEST_PORT):
+        raise ConfigError("--viewer-port", text, f"must be a whole number from 1 to {HIGHEST_PORT}")
+    return int(text)

@@ -1,0 +1,159 @@
+"""Who may open the page: what is asked of Host, Origin and token of a request, before anything else reads it.
+
+The page commands a robot, and a browser lets every web page that it shows talk to the machine it runs on. So a request
+that another page caused (its Origin is not our Host) is refused, and so is one for a name that is not ours: a foreign
+name can be made to point at this machine (DNS rebinding), and its pages would then be of our origin.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import re
+import secrets
+import socket
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from urllib.parse import parse_qs, urlsplit
+
+TOKEN_VARIABLE = "ZENCELL_VIEWER_TOKEN"  # in the environment, where no list of processes shows it
+SHORTEST_TOKEN = 16  # characters
+
+_AUTHORITY = re.compile(r"(?P<host>\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:(?P<port>\d{1,5}))?", re.IGNORECASE)
+_DEFAULT_PORTS = {"http": 80, "https": 443}
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches an address to listen at; a name other than localhost never counts as that."""
+    address = _address(host)
+    return host.lower() == "localhost" if address is None else address.is_loopback
+
+
+def make_token() -> str:
+    """A token that nobody guesses: 256 bits, in characters that need no escaping in an address."""
+    return secrets.token_urlsafe(32)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a request gets instead of the page."""
+
+    status: HTTPStatus
+    text: str  # HTML
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Access:
+    """The rules of one page."""
+
+    host: str  # that it listens at
+    port: int
+    token: str = field(default="", repr=False)  # empty: none is asked for
+
+    def answer(self, path: str, headers: Mapping[str, Sequence[str]], *, upgrade: bool) -> Answer | None:
+        """None for a request that may pass; else what it gets: a refusal, or the cookie for the token it brought.
+
+        Args:
+            path: of the request, with its query.
+            headers: values of `host`, `origin` and `cookie`, each as often as it was sent.
+            upgrade: whether a WebSocket is asked for.
+        """
+        hosts, origins = headers.get("host", ()), headers.get("origin", ())
+        host = _parts(hosts[0]) if len(hosts) == 1 else None
+        if host is None or not self._is_ours(host[0]):
+            return _refusal(HTTPStatus.FORBIDDEN, f"this page is not served under that name; open {self.address}")
+        if any(not _same_origin(origin, host) for origin in origins):
+            return _refusal(HTTPStatus.FORBIDDEN, "this page is not open to other web pages")
+        if not self.token or self._has_cookie(headers.get("cookie", ())):
+            return None
+        given = parse_qs(urlsplit(path).query).get("token", [])
+        if not given or not _equal(given[0], self.token):
+            return _refusal(HTTPStatus.UNAUTHORIZED, "this page needs its token: open the address with ?token=...")
+        return None if upgrade else self._welcome()
+
+    @property
+    def address(self) -> str:
+        """What a person opens, without the token."""
+        return address_of(self.host, self.port)
+
+    @property
+    def _cookie(self) -> str:
+        return f"zencell-{self.port}"  # a browser keeps one jar for all ports of a host
+
+    def _is_ours(self, name: str) -> bool:
+        if is_loopback(name) or name == self.host.lower():
+            return True
+        if is_loopback(self.host):
+            return False
+        # An address can not be rebound; a name must be this machine's own.
+        return _address(name) is not None or name in _own_names()
+
+    def _has_cookie(self, headers: Sequence[str]) -> bool:
+        pairs = [part.strip().partition("=") for header in headers for part in header.split(";")]
+        return any(name == self._cookie and _equal(value, self.token) for name, _, value in pairs)
+
+    def _welcome(self) -> Answer:
+        # Not a redirect: coming from a link in a mail, that would not carry a SameSite=Strict cookie yet.
+        return Answer(
+            HTTPStatus.OK,
+            '<!doctype html><meta charset="utf-8"><title>zencell</title><script>location.replace("/")</script>',
+            {"Set-Cookie": f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"},
+        )
+
+
+def address_of(host: str, port: int) -> str:
+    """What a person opens for a page that listens at host and port."""
+    address = _address(host)
+    if address is not None and address.is_unspecified:
+        host = _outward_address()
+    shown = f"[{host.strip('[]')}]" if ":" in host else host
+    return f"http://{shown}:{port}"
+
+
+def _refusal(status: HTTPStatus, why: str) -> Answer:
+    return Answer(status, f'<!doctype html><meta charset="utf-8"><title>{status.phrase}</title>{why}\n')
+
+
+def _equal(given: str, token: str) -> bool:
+    return hmac.compare_digest(given.encode("utf-8", "replace"), token.encode("utf-8", "replace"))
+
+
+def _parts(authority: str) -> tuple[str, int | None] | None:
+    """Host and port of `host:port`; None for what is not of that form."""
+    match = _AUTHORITY.fullmatch(authority.strip())
+    return (match["host"].lower(), int(match["port"]) if match["port"] else None) if match else None
+
+
+def _same_origin(origin: str, host: tuple[str, int | None]) -> bool:
+    scheme, _, rest = origin.strip().partition("://")
+    default = _DEFAULT_PORTS.get(scheme.lower())
+    parts = _parts(rest)
+    if default is None or parts is None:
+        return False
+    return (parts[0], parts[1] or default) == (host[0], host[1] or default)
+
+
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host.strip("[]"))
+    except ValueError:
+        return None
+
+
+def _own_names() -> set[str]:
+    name = socket.gethostname().lower()
+    short = name.partition(".")[0]
+    return {name, short, f"{short}.local"}
+
+
+def _outward_address() -> str:
+    """An address of this machine under which others may reach it; 127.0.0.1 when it has none."""
+    import psutil
+
+    for addresses in psutil.net_if_addrs().values():
+        for found in addresses:
+            if found.family == socket.AF_INET and not is_loopback(found.address):
+                return found.address
+    return "127.0.0.1"

@@ -1,0 +1,111 @@
+"""Where the page of a cell is to be, from what a person asked for."""
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from cli.viewing import page_of
+from common.config import Cell, load_cell
+from common.errors import ConfigError
+from common.viewer.access import TOKEN_VARIABLE
+from common.viewer.listening import FIRST_PORT
+from tests.cli.conftest import ask
+
+OPTIONS = (("--viewer-port", "9000"), ("--viewer-host", "0.0.0.0"))
+
+
+@pytest.fixture
+def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cell:
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    return cell_with(tmp_path, "{}")
+
+
+def cell_with(folder: Path, parameters: str) -> Cell:
+    file = folder / "viewed.yaml"
+    file.write_text(
+        "robot: panda\nworld: balls\npipeline: cartesian_ompl\ntask: last\n"
+        f"services:\n  anywhere.viewer: {parameters}\n  anywhere.last: {{}}\n"
+    )
+    return load_cell(str(file))
+
+
+@pytest.fixture
+def taken() -> Iterator[int]:
+    """A port that somebody listens at."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield server.getsockname()[1]
+
+
+def test_cell_without_a_viewer_has_no_page(cell: Cell) -> None:
+    bare = cell.model_copy(update={"services": {}})
+    assert page_of(bare, None, None) is None
+
+
+@pytest.mark.parametrize(("option", "value"), OPTIONS)
+def test_option_for_a_page_that_there_is_not_is_refused(tmp_path: Path, option: str, value: str) -> None:
+    done = ask(tmp_path, "up", "panda", "--no-viewer", option, value)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"zencell: {option}: {value!r} needs a cell with a viewer, and not --no-viewer\n"
+
+
+def test_page_is_on_this_machine_alone_unless_asked_for_more(cell: Cell) -> None:
+    page = page_of(cell, None, None)
+    assert page is not None
+    port = int(page.address.rpartition(":")[2])
+    assert page.address == f"http://127.0.0.1:{port}" and port >= FIRST_PORT
+    assert page.overrides == (f"services.viewer.port={port}",)
+    assert not page.environment
+
+
+def test_next_free_port_is_taken_when_none_was_named(cell: Cell, monkeypatch: pytest.MonkeyPatch, taken: int) -> None:
+    monkeypatch.setattr("common.viewer.listening.FIRST_PORT", taken)
+    monkeypatch.setattr("common.viewer.listening.LAST_PORT", taken + 50)
+    page = page_of(cell, None, None)
+    assert page is not None and taken < int(page.address.rpartition(":")[2]) <= taken + 50
+
+
+def test_no_free_port_is_said(cell: Cell, monkeypatch: pytest.MonkeyPatch, taken: int) -> None:
+    monkeypatch.setattr("common.viewer.listening.FIRST_PORT", taken)
+    monkeypatch.setattr("common.viewer.listening.LAST_PORT", taken)
+    with pytest.raises(ConfigError, match=f"--viewer-port: ports {taken} to {taken} are all in use"):
+        page_of(cell, None, None)
+
+
+def test_port_that_was_named_and_is_taken_is_refused_with_its_holder(cell: Cell, taken: int) -> None:
+    with pytest.raises(ConfigError, match=f"--viewer-port: {taken} is in use by .*python"):
+        page_of(cell, None, str(taken))
+
+
+def test_port_that_the_cell_names_and_that_is_taken_is_refused_too(tmp_path: Path, taken: int) -> None:
+    with pytest.raises(ConfigError, match=f"services.viewer.port: {taken} is in use by .*python"):
+        page_of(cell_with(tmp_path, f"{{port: {taken}}}"), None, None)
+
+
+@pytest.mark.parametrize("port", ["0", "65536", "-1", "80 80", "http", "²", ""])
+def test_port_that_is_none_is_refused(cell: Cell, port: str) -> None:
+    with pytest.raises(ConfigError, match=r"--viewer-port: .* must be a whole number from 1 to 65535"):
+        page_of(cell, None, port)
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "no.such.host.invalid"])
+def test_host_that_is_not_of_this_machine_is_refused(cell: Cell, host: str) -> None:
+    with pytest.raises(ConfigError, match=f"services.viewer.host: '{host}' can not be listened at: "):
+        page_of(cell, host, None)
+
+
+def test_beyond_this_machine_a_token_is_made_that_no_command_line_shows(cell: Cell) -> None:
+    page, other = page_of(cell, "0.0.0.0", None), page_of(cell, "0.0.0.0", None)
+    assert page is not None and other is not None
+    token = page.environment[TOKEN_VARIABLE]
+    assert len(token) > 40 and token != other.environment[TOKEN_VARIABLE]
+    assert page.address.endswith(f"/?token={token}") and "0.0.0.0" not in page.address
+    assert page.overrides[0] == "services.viewer.host=0.0.0.0"
+    assert token not in repr(page.overrides)
+
+
+def test_token_that_a_person_gave_is_not_shown(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(TOKEN_VARIABLE, "correct-horse-battery")
+    page = page_of(cell, "0.0.0.0", None)
+    assert page is not None and "token" not in page.address and not page.environment
