@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from common.messages.basics import Finite, Header, Message
+from common.messages.basics import Finite, Header, Message, Positive
 
 
 class ServiceStatus(Message):
@@ -26,6 +26,8 @@ class SupervisorStatus(Message):
     header: Header = Header()
     cell: str
     services: list[ServiceStatus]
+    speed: Positive = Field(1.0, description="cell time per wall time")
+    epoch: int = Field(0, ge=0, description="when cell time and wall time were equal [ns since the Unix epoch]")
 
 
 class LogLine(Message):

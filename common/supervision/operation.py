@@ -127,7 +127,10 @@ async def _publish(bus: Bus, supervisor: Supervisor) -> None:
         supervisor.mark_connected(bus.connected)
         if supervisor.changed.is_set():
             supervisor.changed.clear()
-            out.put(SupervisorStatus(header=bus.header(), cell=bus.cell, services=supervisor.statuses))
+            out.put(SupervisorStatus(
+                header=bus.header(), cell=bus.cell, services=supervisor.statuses, speed=bus.clock.speed,
+                epoch=bus.clock.epoch_ns,
+            ))
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(STATUS_PERIOD):  # wait_for can swallow a cancellation before Python 3.12
                 await supervisor.changed.wait()
