@@ -9,6 +9,8 @@ import typer
 
 from common.errors import ConfigError
 
+MOST_PER_SECOND = 1000.0  # messages or lines
+
 CellArgument = Annotated[
     str, typer.Argument(metavar="CELL", help="a name of `zencell cells`, or the path of a YAML file")
 ]
@@ -65,4 +67,16 @@ def whole(option: str, text: str | None, least: int) -> int | None:
         value = least - 1
     if value < least:
         raise ConfigError(option, text, f"must be a whole number, {least} or more")
+    return value
+
+
+def rate(text: str) -> float:
+    """The rate [Hz] that a text says, given to --rate.
+
+    Raises:
+        ConfigError: it is none that can be kept.
+    """
+    value = number("--rate", text)
+    if not 0 < value <= MOST_PER_SECOND:
+        raise ConfigError("--rate", text, f"must be more than 0 and at most {MOST_PER_SECOND:g} [Hz]")
     return value
