@@ -78,6 +78,16 @@ def rpy_to_matrix(roll: float, pitch: float, yaw: float) -> Array:
     )
 
 
+def matrix_to_rpy(rotation: Array) -> tuple[float, float, float]:
+    """Roll, pitch, yaw [rad] of a (3, 3) rotation, as `rpy_to_matrix` takes them; yaw is 0 where pitch is upright."""
+    m = rotation
+    level = math.hypot(m[0, 0], m[1, 0])
+    pitch = math.atan2(-m[2, 0], level)
+    if level < 1e-9:
+        return math.atan2(-m[1, 2], m[1, 1]), pitch, 0.0
+    return math.atan2(m[2, 1], m[2, 2]), pitch, math.atan2(m[1, 0], m[0, 0])
+
+
 def transform(rotation: Array, translation: Array | tuple[float, float, float]) -> Array:
     """(4, 4) matrix of a (3, 3) rotation and a translation [m]."""
     T = np.eye(4)
