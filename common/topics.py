@@ -5,6 +5,7 @@ A key on the wire is `<cell>/<topic>`, for example `panda/camera/image_raw`.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from typing import Generic, Literal, TypeVar
 
@@ -12,6 +13,7 @@ from common import messages as m
 
 Kind = Literal["stream", "event", "state", "request"]
 PublishedKind = Literal["stream", "event", "state"]
+SERVICE_NAME = re.compile(r"[A-Za-z_]\w*")
 M = TypeVar("M", bound=m.Message)
 Q = TypeVar("Q", bound=m.Message)
 A = TypeVar("A", bound=m.Message)
@@ -124,6 +126,14 @@ AnyTopic = Topic[m.Message] | Request[m.Message, m.Message]
 def parameters_of(service: str) -> Request[m.ParameterRequest, m.ParameterReply]:
     """The request that a service answers for its own parameters."""
     return replace(PARAMETERS, key=f"param/{service}", writer=service)
+
+
+def find_topic(key: str) -> AnyTopic | None:
+    """The topic or request of a key, also of the parameters of a service; None for one that is not known."""
+    prefix, _, service = key.partition("/")
+    if prefix == "param" and SERVICE_NAME.fullmatch(service):
+        return parameters_of(service)
+    return all_topics().get(key)
 
 
 def all_topics() -> dict[str, AnyTopic]:

@@ -116,5 +116,6 @@ def service_config(cell: Cell, name: str, config: type[P]) -> P:
     given = dict(entry.parameters) if entry else {}
     for field, info in config.model_fields.items():
         if is_section(info.annotation):
-            given[field] = cell.section(info.annotation)  # type: ignore[arg-type]
+            # A copy: what a service changes in it at run time stays with it.
+            given[field] = cell.section(info.annotation).model_copy()  # type: ignore[arg-type]
     return check(config, given, f"services.{name}")

@@ -66,6 +66,7 @@ class Bus:
         self._tokens: list[Declared] = []
         self._watches: dict[str, TokenWatch] = {}
         self._heard: dict[Reader[Any], Declared] = {}  # readers that are subscribed
+        self._retuned: list[Callable[[], None]] = []
         self._alive: Alive | None = None
         self._counters: Writer[ServiceCounters] | None = None
         self._beat: asyncio.TimerHandle | None = None
@@ -131,6 +132,15 @@ class Bus:
         """A client of the request key."""
         servers = self._watch(serves_key(self.cell, topic.key))
         return Client(self._session, self.cell, self.service, topic, servers, loop=self._loop, limit=self._limit)
+
+    def on_parameters(self, callback: Callable[[], None]) -> None:
+        """Have `callback()` called after parameters of this service were changed, for what is not read at each use."""
+        self._retuned.append(callback)
+
+    def parameters_changed(self) -> None:
+        """Tell the service that its parameters were changed."""
+        for callback in self._retuned:
+            callback()
 
     async def ready(self) -> None:
         """Tell the cell that this service is ready: what it serves first, its own token last."""

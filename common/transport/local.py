@@ -13,9 +13,11 @@ from typing import Any, TypeVar
 import zenoh
 
 from common.clock import Clock
+from common.config import Parameters
 from common.transport.bus import Bus
 from common.transport.codec import DEFAULT_LIMIT
 from common.transport.log import BusLog
+from common.transport.parameters import serve_parameters
 from common.transport.session import Declared, OnQuery, OnReply, OnSample, OnToken, RawReply, RawSample
 
 C = TypeVar("C")
@@ -263,6 +265,8 @@ class LocalNetwork:
         async def life() -> None:
             nonlocal crash
             try:
+                if isinstance(config, Parameters):
+                    serve_parameters(bus, config)
                 await bus.run(_coroutine(run, bus, config))
             except asyncio.CancelledError:
                 raise

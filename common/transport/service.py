@@ -20,6 +20,7 @@ from common.transport.endpoint import endpoint_of
 from common.transport.handoff import call_on_loop
 from common.transport.lifeline import Lifeline, fail, leave
 from common.transport.log import BusLog, log_to_stderr
+from common.transport.parameters import serve_parameters
 from common.transport.zenoh_session import ZenohSession, close_bounded, open_zenoh
 
 log = logging.getLogger(__name__)
@@ -185,6 +186,7 @@ async def _gate(lifeline: Lifeline) -> None:
 
 async def _run(run: Run[P], bus: Bus, config: P, lifeline: Lifeline) -> int:
     try:
+        serve_parameters(bus, config)
         await bus.run(run(bus, config))
     except (ConfigError, UnknownName) as error:  # found only by using it: a description that is not there
         bus.log.error("%s", error)
