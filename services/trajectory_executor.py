@@ -8,10 +8,11 @@ from __future__ import annotations
 import asyncio
 import math
 
+import numpy as np
 from pydantic import Field
 
 from common import topics
-from common.config import Grasp, Parameters, RobotConfig, Run, World
+from common.config import Grasp, Parameters, RobotConfig, Run, Tunable, World
 from common.hardware.checks import Tolerances
 from common.hardware.cycle import ControlCycle
 from common.hardware.interface import Limits
@@ -20,6 +21,7 @@ from common.messages import (
     ExecuteRequest,
     GripperCommand,
     GripperState,
+    HoldRequest,
     MotionStatus,
     StopRequest,
     WorldEdit,
@@ -46,6 +48,8 @@ class Config(Parameters):
     run: Run
     grasp: Grasp
     joint_state_rate: float = Field(100.0, ge=10, le=1000, description="control cycles in cell time [Hz]")
+    speed_scaling: Tunable[float] = Field(1.0, ge=0.05, le=1, description="trajectories are followed at this share "
+                                                                           "of their speed")
     tolerances: Tolerances = Tolerances()
     grasp_tolerances: GraspTolerances = Field(GraspTolerances(), description="simulated hardware only")
 
@@ -53,7 +57,10 @@ class Config(Parameters):
 def make_cycle(config: Config, simulated: bool) -> ControlCycle:
     """The controller with its hardware at the home pose and, when simulated, the balls laid out."""
     robot = RobotModel.load(config.robot)
-    limits = Limits(tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration)
+    deceleration = np.array(config.robot.deceleration_limits) if config.robot.deceleration_limits else None
+    limits = Limits(
+        tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration, deceleration
+    )
     home = robot.named("home")
     world = None
     if simulated:
@@ -93,6 +100,10 @@ async def run(bus: Bus, config: Config) -> None:
     async def stop(request: StopRequest) -> MotionStatus:
         return cycle.stop(request, bus.clock.now()).model_copy(update={"header": bus.header()})
 
+    async def hold(request: HoldRequest) -> MotionStatus:
+        bus.log.info("held: %s" if request.hold else "let go: %s", request.reason or "asked to")
+        return cycle.hold(request).model_copy(update={"header": bus.header()})
+
     async def command(request: GripperCommand) -> GripperState:
         return cycle.command(request, bus.clock.now()).model_copy(update={"header": bus.header()})
 
@@ -101,6 +112,7 @@ async def run(bus: Bus, config: Config) -> None:
 
     bus.serve(topics.MOTION_EXECUTE, execute)
     bus.serve(topics.MOTION_STOP, stop)
+    bus.serve(topics.MOTION_HOLD, hold)
     if gripper is not None:
         bus.serve(topics.GRIPPER_COMMAND, command)
     if simulated:
@@ -112,6 +124,7 @@ async def run(bus: Bus, config: Config) -> None:
         await bus.ready()
         due = loop.time()
         while True:
+            cycle.speed_scaling = config.speed_scaling
             report = cycle.step(bus.header("world"))
             if report.joints is not None:
                 joints.put(report.joints)

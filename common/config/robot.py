@@ -104,6 +104,9 @@ class RobotConfig(Section):
     named_poses: dict[str, list[Number]] = Field(description="joint positions [rad]; must have home")
     velocity_limits: list[Annotated[float, Field(gt=0, le=100)]] = Field([], description="[rad/s]; else the URDF's")
     acceleration_limits: list[Annotated[float, Field(gt=0, le=1000)]] = Field(description="[rad/s^2]")
+    deceleration_limits: list[Annotated[float, Field(gt=0, le=1000)]] = Field(
+        [], description="when braked for a hold or a stop [rad/s^2]; else acceleration_limits"
+    )
     jerk_limits: list[Annotated[float, Field(gt=0, le=1e6)]] = Field(description="[rad/s^3]")
     controller: str = Field("controller", description="name of the arm's controller, the source of its status")
     gripper: GripperConfig | None = None
@@ -122,8 +125,8 @@ class RobotConfig(Section):
             raise ValueError("tcp_link must be given, or tcp")
         if self.tcp is not None and self.tcp.link != self.tcp_link:
             raise ValueError(f"tcp_link is {self.tcp_link}, but tcp defines {self.tcp.link}")
-        for field in ("velocity_limits", "acceleration_limits", "jerk_limits"):
-            if field == "velocity_limits" and not self.velocity_limits:
+        for field in ("velocity_limits", "acceleration_limits", "deceleration_limits", "jerk_limits"):
+            if field in ("velocity_limits", "deceleration_limits") and not getattr(self, field):
                 continue
             if len(getattr(self, field)) != len(self.joints):
                 raise ValueError(f"{field} has {len(getattr(self, field))} values for {len(self.joints)} joints")

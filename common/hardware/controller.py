@@ -1,6 +1,7 @@
 """The trajectory controller: takes goals, gives set-points, judges how well they are followed. No clock of its own.
 
-An action's life: rejected at once, or active and then succeeded, aborted or cancelled. One goal at a time.
+An action's life: rejected at once, or active and then succeeded, aborted or cancelled. One goal at a time. While the
+robot is held its goal stays active, at rest on its path; one that comes meanwhile is accepted and waits at its start.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from common.errors import Refused
 from common.hardware.checks import Tolerances, checked_trajectory
 from common.hardware.goals import GoalMemory
 from common.hardware.interface import Limits, Vector
-from common.hardware.stopping import Stop, plan_stop
+from common.hardware.pacing import next_rate, way
 from common.hardware.trajectory import Trajectory
 from common.messages import GoalState, JointTrajectory, MotionStatus
 
@@ -23,25 +24,31 @@ BLEND_TIME = 0.3  # the difference between the robot's and the trajectory's star
 
 @dataclass
 class _Goal:
-    """The goal that moves the robot. `time` is on the trajectory's own time axis [s]."""
+    """The goal that moves the robot. `time` is on the trajectory's own time axis [s], which passes at `rate`."""
 
     id: str
     trajectory: Trajectory
     offset: Vector
     last: float  # cell time of the newest set-point
+    rate: float
     time: float = 0.0
-    stop: Stop | None = None
+    stopping: bool = False
     reason: str = ""
     ended: float | None = None  # cell time at which the set-points came to rest
 
-    def set_point(self) -> tuple[Vector, Vector]:
-        """Positions and velocities (dof,) at the goal's time, with what is left of the start's difference."""
-        rate = self.stop.rate if self.stop else 1.0
-        q, dq, _ = self.trajectory.at(self.time)
+    def at(self, time: float) -> tuple[Vector, Vector]:
+        """Positions [rad] and their change per second of the trajectory (dof,), blended from where the robot was."""
+        q, dq, _ = self.trajectory.at(time)
         blend = min(BLEND_TIME, self.trajectory.duration)
-        u = min(self.time / blend, 1.0)
+        u = min(time / blend, 1.0)
         left, slope = 1 - u**3 * (10 - 15 * u + 6 * u**2), -30 * u**2 * (1 - u) ** 2 / blend
-        return q + left * self.offset, (dq + slope * self.offset) * rate
+        return q + left * self.offset, dq + slope * self.offset
+
+    def advance(self, seconds: float, target: float, acceleration: Vector) -> None:
+        """Move on by cell time [s], bringing the rate towards the target."""
+        rate = next_rate(self.at, self.time, self.rate, target, seconds, acceleration)
+        self.time += way(self.rate, rate, seconds)
+        self.rate = rate
 
 
 class TrajectoryController:
@@ -59,7 +66,20 @@ class TrajectoryController:
         self._goal: _Goal | None = None
         self._memory: GoalMemory[MotionStatus] = GoalMemory(remember)
         self._fault = ""
-        self.status = MotionStatus()
+        self._held: str | None = None  # the reason, while the robot is held
+        self._status = MotionStatus()
+        self.speed_scaling = 1.0
+
+    @property
+    def status(self) -> MotionStatus:
+        """What became of the newest goal, and whether and how fast the robot may move."""
+        return self._as_of_now(self._status)
+
+    def _as_of_now(self, status: MotionStatus) -> MotionStatus:
+        now: dict[str, object] = {"held": self._held is not None, "speed_scaling": self.speed_scaling}
+        if self._held is not None and status.state != "active" and not status.message:
+            now["message"] = _told("held", self._held)
+        return status.model_copy(update=now)
 
     def accept(self, goal: str, trajectory: JointTrajectory, now: float, measured: Vector) -> MotionStatus:
         """The state of the goal: active, or rejected with code and message; for a known id what became of it.
@@ -72,7 +92,7 @@ class TrajectoryController:
         """
         known = self._memory.get(goal)
         if known is not None:
-            return known
+            return self._as_of_now(known)
         try:
             if self._fault:
                 raise Refused("hardware_fault", self._fault)
@@ -83,12 +103,13 @@ class TrajectoryController:
             rejected = MotionStatus(
                 id=goal, state="rejected", error=refusal.code, message=str(refusal), source=self._name
             )
-            return self._memory.put(goal, rejected)
+            return self._as_of_now(self._memory.put(goal, rejected))
         # Go on from the set-point, unless the arm was moved from outside since.
         near = np.all(np.abs(self._hold - measured) <= self._tolerances.start)
         begin = self._hold if near else measured
-        self._goal = _Goal(goal, checked, begin - checked.positions[0], now)
-        return self._report("active")
+        rate = 0.0 if self._held is not None else self.speed_scaling
+        self._goal = _Goal(goal, checked, begin - checked.positions[0], now, rate)
+        return self._report("active", message=self._holding(self._goal))
 
     def cancel(self, goal: str, reason: str, now: float) -> MotionStatus:
         """Begin to bring the robot to rest along its path. An empty id means whatever runs.
@@ -101,13 +122,25 @@ class TrajectoryController:
             if goal == "":
                 return self.status
             unknown = f"no goal {goal!r} is known"
-            return self._memory.get(goal) or MotionStatus(
+            return self._as_of_now(self._memory.get(goal) or MotionStatus(
                 id=goal, error="unknown_goal", message=unknown, source=self._name
-            )
-        if running.stop is None:
-            running.stop = plan_stop(running.trajectory, running.time, self._limits)
-            running.reason = reason
+            ))
+        if not running.stopping:
+            running.stopping, running.reason = True, reason
         return self._report("active", message=f"stopping: {running.reason}")
+
+    def hold(self, hold: bool, reason: str) -> MotionStatus:
+        """The status with `held` as asked: begin to bring the robot to rest on its path, or let it go on."""
+        self._held = reason if hold else None
+        if self._goal is not None and not self._goal.stopping:
+            return self._report("active", message=self._holding(self._goal))
+        return self.status
+
+    def _holding(self, goal: _Goal) -> str:
+        """What there is to say of a goal about being held."""
+        if self._held is None:
+            return ""
+        return _told("held" if goal.rate == 0.0 else "coming to rest", self._held)
 
     def update(self, now: float, measured: Vector, measured_velocity: Vector) -> tuple[Vector, Vector]:
         """The set-points (dof,) [rad], [rad/s] for now. `status` says what became of the goal.
@@ -127,14 +160,16 @@ class TrajectoryController:
             return self._hold, 0.0 * self._hold
         elapsed = min(max(now - goal.last, 0.0), LARGEST_STEP)
         goal.last = now
-        goal.time += goal.stop.advance(elapsed) if goal.stop else elapsed
-        over = goal.time >= goal.trajectory.duration or (goal.stop is not None and goal.stop.done)
+        braking = goal.stopping or self._held is not None
+        goal.advance(elapsed, 0.0 if braking else self.speed_scaling,
+                     self._limits.braking if braking else self._limits.acceleration)
+        over = goal.time >= goal.trajectory.duration or (goal.stopping and goal.rate == 0.0)
         if over and goal.ended is None:
             goal.ended = now
-        self._hold, velocity = goal.set_point()
-        if goal.stop is None:
-            self._report("active")
-        return self._hold, velocity
+        self._hold, change = goal.at(goal.time)
+        if not goal.stopping:
+            self._report("active", message=self._holding(goal))
+        return self._hold, change * goal.rate
 
     def abort(self, error: str, message: str, measured: Vector | None = None, source: str = "") -> None:
         """End the running goal and hold where the robot is."""
@@ -161,7 +196,7 @@ class TrajectoryController:
             return None
         rest = bool(np.all(np.abs(velocity) <= allowed.stopped_velocity))
         waited = now - goal.ended > allowed.goal_time
-        if goal.stop is not None:
+        if goal.stopping:
             if rest or waited:
                 self._finish("cancelled", "cancelled", goal.reason)
         elif rest and off[j] <= allowed.goal:
@@ -174,11 +209,15 @@ class TrajectoryController:
     def _report(self, state: GoalState, error: str = "", message: str = "", source: str = "") -> MotionStatus:
         assert self._goal is not None
         progress = 1.0 if state == "succeeded" else min(self._goal.time / self._goal.trajectory.duration, 1.0)
-        self.status = MotionStatus(
+        self._status = MotionStatus(
             id=self._goal.id, state=state, progress=progress, error=error, message=message, source=source or self._name
         )
-        return self._memory.put(self._goal.id, self.status)
+        return self._as_of_now(self._memory.put(self._goal.id, self._status))
 
     def _finish(self, state: GoalState, error: str = "", message: str = "", source: str = "") -> None:
         self._report(state, error, message, source)
         self._goal = None
+
+
+def _told(what: str, reason: str) -> str:
+    return f"{what}: {reason}" if reason else what

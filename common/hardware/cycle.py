@@ -19,6 +19,7 @@ from common.messages import (
     GripperCommand,
     GripperState,
     Header,
+    HoldRequest,
     JointState,
     MotionStatus,
     PoseArray,
@@ -148,6 +149,19 @@ class ControlCycle:
         """The state of the goal, which is being brought to rest if it was moving the robot."""
         return self._arm.cancel(request.id, request.reason, now)
 
+    def hold(self, request: HoldRequest) -> MotionStatus:
+        """The status, with the arm being brought to rest on its path, or going on; the fingers finish their motion."""
+        return self._arm.hold(request.hold, request.reason)
+
+    @property
+    def speed_scaling(self) -> float:
+        """Share of their speed at which trajectories are followed, 0 to 1."""
+        return self._arm.speed_scaling
+
+    @speed_scaling.setter
+    def speed_scaling(self, share: float) -> None:
+        self._arm.speed_scaling = share
+
     def command(self, request: GripperCommand, now: float) -> GripperState:
         """The state of the gripper's goal.
 
@@ -197,7 +211,7 @@ class ControlCycle:
 
     def _news_of_motion(self, header: Header, now: float) -> MotionStatus | None:
         status, told = self._arm.status, self._told_motion
-        same = told is not None and (told.id, told.state, told.message) == (status.id, status.state, status.message)
+        same = told is not None and told.model_copy(update={"progress": status.progress}) == status
         if same and (told == status or now - self._told_motion_at < PROGRESS_PERIOD):
             return None
         self._told_motion, self._told_motion_at = status, now

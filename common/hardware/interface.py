@@ -29,13 +29,22 @@ class HardwareFault(ZencellError):
 
 @dataclass(frozen=True)
 class Limits:
-    """What the joints can do, in the order of `names`; arrays are (dof,) in [rad], [rad/s], [rad/s^2]."""
+    """What the joints can do, in the order of `names`; arrays are (dof,) in [rad], [rad/s], [rad/s^2].
+
+    `deceleration` is what they can do in addition when they are braked for a hold or a stop.
+    """
 
     names: tuple[str, ...]
     lower: Vector
     upper: Vector
     velocity: Vector
     acceleration: Vector
+    deceleration: Vector | None = None
+
+    @property
+    def braking(self) -> Vector:
+        """Largest change of velocity for a hold or a stop (dof,) [rad/s^2]."""
+        return self.acceleration if self.deceleration is None else np.maximum(self.acceleration, self.deceleration)
 
 
 @dataclass(frozen=True)
