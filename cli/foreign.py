@@ -38,7 +38,7 @@ async def samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
     try:
         latched = await bus.raw_get(full, PATIENCE)
         for sample in latched:
-            if _is_news(sample, newest):
+            if is_news(sample, newest):
                 yield sample
         if not latched:
             await asyncio.wait({following}, timeout=PATIENCE)
@@ -47,14 +47,14 @@ async def samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
         while True:
             sample = await following
             following = asyncio.ensure_future(anext(arriving))
-            if _is_news(sample, newest):
+            if is_news(sample, newest):
                 yield sample
     finally:
         following.cancel()  # which closes what it waits for
         await asyncio.wait({following})
 
 
-def _is_news(sample: RawSample, newest: dict[str, int]) -> bool:
+def is_news(sample: RawSample, newest: dict[str, int]) -> bool:
     """Whether it is no repetition of a state; a writer that says nothing about itself only has news."""
     from common.transport.codec import decode_attachment
 

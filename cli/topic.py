@@ -1,4 +1,4 @@
-"""Topics: what there is, what it carries, what comes and how often."""
+"""Topics: what there is, what it carries, what comes, how often, how late, and sending by hand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import options
+from cli import delay, options, publishing
 from common.errors import UnknownName
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def echo(
                 if shown == most:
                     return
 
-    _visit(visit, topic, key, cell, domain, connect)
+    visit_topic(visit, topic, key, cell, domain, connect)
 
 
 async def _messages(bus: Bus, topic: Topic[Any], as_json: bool) -> AsyncGenerator[str, None]:
@@ -112,10 +112,16 @@ async def _foreign_messages(bus: Bus, key: str, as_json: bool) -> AsyncGenerator
             yield to_json(msgpack.unpackb(sample.payload, raw=False, strict_map_key=False)) if whole else line
 
 
-def _visit(
+def visit_topic(
     visit: Callable[[Bus], Awaitable[None]], topic: Topic[Any] | None, key: str, cell: str | None,
     domain: str | None, connect: str | None,
 ) -> None:
+    """Visit the cell for a topic, or for a foreign key when that is None.
+
+    Raises:
+        SilentKey: the key is foreign and no cell is up that could know it.
+        NothingUp: no cell is up.
+    """
     from cli.foreign import SilentKey
     from cli.inspection import NothingUp, inspect
 
@@ -174,7 +180,11 @@ def _measure(
             if shown == most:
                 return
 
-    _visit(visit, topic, key, cell, domain, connect)
+    visit_topic(visit, topic, key, cell, domain, connect)
+
+
+app.command()(publishing.pub)
+app.command()(delay.delay)
 
 
 def topic_of(key: str) -> AnyTopic:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +118,7 @@ class TransformTree:
         """
         T = np.eye(4)
         frames = self.path(target, source)
-        for near, far in zip(frames, frames[1:], strict=False):
+        for near, far in pairwise(frames):
             down = self.parent_of(far) == near
             T = T @ (self._edges[far][1] if down else invert(self._edges[near][1]))
         return T

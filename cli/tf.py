@@ -1,0 +1,194 @@
+"""Frames: where one is in another, and the tree that they make."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cli import options
+from common.errors import RequestFailed, ZencellError
+
+if TYPE_CHECKING:
+    from common.robot.transform_tree import TransformTree
+    from common.transport.bus import Bus
+
+app = typer.Typer(help="Frames: where one is in another, and the tree that they make.", no_args_is_help=True)
+
+PATIENCE = 2.0  # [s] until frames that nothing was heard of are taken for unknown
+GATHER = 0.5  # [s] in which every moving frame surely comes once
+
+Rate = Annotated[str, typer.Option("--rate", metavar="HZ", help="lines per second")]
+Once = Annotated[bool, typer.Option("--once", help="one line, then end")]
+
+
+class NoFrames(RequestFailed):
+    """Nobody says where anything is."""
+
+    def __init__(self, cell: str) -> None:
+        super().__init__(f"nothing came on {cell}/tf and {cell}/tf_static within {PATIENCE:g} s")
+
+
+@app.command()
+def echo(
+    target: Annotated[str, typer.Argument(metavar="A", help="the frame to measure in, as in `zencell tf frames`")],
+    source: Annotated[str, typer.Argument(metavar="B", help="the frame whose pose is wanted")],
+    once: Once = False,
+    rate: Rate = "1",
+    count: options.Count = None,
+    cell: options.CellName = None,
+    as_json: options.Json = False,
+    domain: options.Domain = None,
+    connect: options.Connect = None,
+) -> None:
+    """Show the pose of B in A: position, quaternion x y z w, and roll, pitch, yaw in degrees."""
+    from cli.inspection import inspect
+
+    period = 1 / options.rate(rate)
+    most = 1 if once else options.whole("--count", count, 1)
+
+    async def visit(bus: Bus) -> None:
+        frames = Frames(bus)
+        async with frames:
+            await frames.until_known(target, source)
+            shown = 0
+            while True:
+                figures = pose_figures(frames.tree, target, source)
+                typer.echo(json.dumps(figures) if as_json else describe(figures))
+                shown += 1
+                if shown == most:
+                    return
+                await asyncio.sleep(period)
+
+    inspect(visit, cell=cell, domain=domain, connect=connect)
+
+
+@app.command()
+def frames(
+    cell: options.CellName = None,
+    as_json: options.Json = False,
+    domain: options.Domain = None,
+    connect: options.Connect = None,
+) -> None:
+    """Show the tree of frames, and which of them move."""
+    from cli.inspection import inspect
+
+    async def visit(bus: Bus) -> None:
+        found = Frames(bus)
+        async with found:
+            await found.gather()
+        for depth, name in found.tree.walk():
+            parent = found.tree.parent_of(name)
+            moves = name in found.moving
+            if as_json:
+                typer.echo(json.dumps({"frame": name, "parent": parent, "moves": moves}))
+            else:
+                typer.echo(f"{'  ' * depth}{name}{'  (moves)' if moves else ''}")
+
+    inspect(visit, cell=cell, domain=domain, connect=connect)
+
+
+class Frames:
+    """The tree that tf and tf_static make, kept up to date inside an `async with`."""
+
+    def __init__(self, bus: Bus) -> None:
+        """Subscribe to both."""
+        from common import topics
+        from common.robot.transform_tree import TransformTree
+
+        self.tree: TransformTree = TransformTree()
+        self.moving: set[str] = set()
+        self._cell = bus.cell
+        self._changed = asyncio.Event()
+        self._moving = bus.reader(topics.TF)
+        self._fixed = bus.reader(topics.TF_STATIC)
+        self._following: list[asyncio.Task[None]] = []
+
+    async def __aenter__(self) -> Frames:
+        self._following = [asyncio.create_task(self._follow_moving()), asyncio.create_task(self._follow_fixed())]
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        for task in self._following:
+            task.cancel()
+        await asyncio.gather(*self._following, return_exceptions=True)
+
+    async def _follow_moving(self) -> None:
+        async for message in self._moving:
+            self.tree.update(message)
+            self.moving.update(each.child_frame_id for each in message.transforms)
+            self._changed.set()
+
+    async def _follow_fixed(self) -> None:
+        async for message in self._fixed:
+            self.tree.update(message)
+            self._changed.set()
+
+    async def until_known(self, target: str, source: str) -> None:
+        """Return when the pose of source in target is known.
+
+        Raises:
+            NoFrames: nothing came at all.
+            UnknownName, NotConnected: it still is not after a while.
+        """
+        try:
+            async with asyncio.timeout(PATIENCE):
+                while not self._known(target, source):
+                    self._changed.clear()
+                    await self._changed.wait()
+        except TimeoutError:
+            if not self.tree.frames:
+                raise NoFrames(self._cell) from None
+            self.tree.path(target, source)
+
+    def _known(self, target: str, source: str) -> bool:
+        try:
+            self.tree.path(target, source)
+        except ZencellError:
+            return False
+        return True
+
+    async def gather(self) -> None:
+        """Return when every frame that comes regularly is in the tree.
+
+        Raises:
+            NoFrames: nothing came at all.
+        """
+        try:
+            async with asyncio.timeout(PATIENCE):
+                while not self.tree.frames:
+                    self._changed.clear()
+                    await self._changed.wait()
+        except TimeoutError:
+            raise NoFrames(self._cell) from None
+        await asyncio.sleep(GATHER)
+
+
+def pose_figures(tree: TransformTree, target: str, source: str) -> dict[str, Any]:
+    """The pose of source in target as JSON can hold it: position [m], quaternion x, y, z, w, rpy [deg], stamp [ns]."""
+    from common.robot.transforms import matrix_to_quaternion, matrix_to_rpy
+
+    T = tree.pose(target, source)
+    # Of all that the pose is made of, what changed last.
+    stamp = max(map(tree.stamp_of, tree.path(target, source)))
+    return {
+        "target": target, "source": source, "stamp": stamp,
+        "position": [round(float(value), 6) + 0.0 for value in T[:3, 3]],
+        "quaternion": [round(value, 6) + 0.0 for value in matrix_to_quaternion(T[:3, :3])],
+        "rpy_degrees": [round(math.degrees(value), 3) + 0.0 for value in matrix_to_rpy(T[:3, :3])],
+    }
+
+
+def describe(figures: dict[str, Any]) -> str:
+    """The pose in one line for people."""
+
+    def listed(values: list[float], digits: int) -> str:
+        return " ".join(f"{round(value, digits) + 0.0:.{digits}f}" for value in values)
+
+    return (
+        f"{figures['source']} in {figures['target']}: position {listed(figures['position'], 4)} m, "
+        f"quaternion {listed(figures['quaternion'], 4)}, rpy {listed(figures['rpy_degrees'], 2)} deg"
+    )
