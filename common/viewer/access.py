@@ -19,6 +19,7 @@ from urllib.parse import parse_qs, urlsplit
 
 TOKEN_VARIABLE = "ZENCELL_VIEWER_TOKEN"  # in the environment, where no list of processes shows it
 SHORTEST_TOKEN = 16  # characters
+TOKEN = re.compile(rf"[A-Za-z0-9._~-]{{{SHORTEST_TOKEN},}}")  # what needs no escaping in an address or a cookie
 
 _AUTHORITY = re.compile(r"(?P<host>\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:(?P<port>\d{1,5}))?", re.IGNORECASE)
 _DEFAULT_PORTS = {"http": 80, "https": 443}

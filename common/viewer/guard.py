@@ -1,0 +1,216 @@
+"""A viser server that answers only who may open the page.
+
+viser has no authentication, and takes a WebSocket from any web page. Its server is one call of `websockets`' `serve`,
+which can ask a function about each request before anything else reads it. viser gives its own function there, which
+sends the page; ours is put in front of it, while the server is made. Nothing is copied through a second process and
+nothing else listens, so that no port is left unguarded.
+"""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import os
+import threading
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any
+
+import viser
+import websockets.asyncio.server as websocket_server
+from rich import get_console
+from viser._messages import ShareUrlDisconnect, ShareUrlRequest
+from websockets import Headers
+from websockets.http11 import Request, Response
+
+from common.errors import ConfigError
+from common.viewer.access import SHORTEST_TOKEN, TOKEN, TOKEN_VARIABLE, Access, Answer, is_loopback
+from common.viewer.listening import open_socket, refusal
+
+if TYPE_CHECKING:
+    import asyncio
+    import socket
+
+log = logging.getLogger(__name__)
+
+MAX_PAGES = 24  # open at once
+MAX_CONNECTIONS = 96  # among them requests that are still read, and those who send none
+MAX_MESSAGE = 4 * 2**20  # [bytes] from a browser
+OPEN_TIMEOUT = 5.0  # [s] until a connection has sent its request
+CLOSE_TIMEOUT = 0.5  # [s] for a browser to say goodbye
+
+# The page is one file: whatever it may become, it loads nothing from elsewhere, and stands in nobody else's frame.
+POLICY = (
+    "default-src 'none'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; media-src data: blob:; font-src 'self' data:; worker-src 'self' blob:; "
+    "connect-src 'self' {own} data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+
+Process = Callable[[websocket_server.ServerConnection, Request], "Awaitable[Response | None] | Response | None"]
+
+_replacing = threading.Lock()
+
+
+def make_server(host: str, port: int, token: str = "") -> viser.ViserServer:
+    """A server of pages at host and port that refuses foreign web pages, foreign names, and who has not the token.
+
+    Args:
+        host: address or name to listen at; beyond this machine there must be a token.
+        port: TCP port; 0 is any that is free (`server.get_port()`).
+        token: that a browser has to bring once; empty: `ZENCELL_VIEWER_TOKEN`, and without that none is asked for.
+
+    Raises:
+        ConfigError: the port is taken (names by whom), the host is not of this machine, or the token is missing or
+            too short.
+    """
+    token = token or os.environ.get(TOKEN_VARIABLE, "")
+    _check_token(host, token)
+    try:
+        listening = open_socket(host, port)
+    except OSError as error:
+        raise refusal(error, host, port) from None
+    guard = Guard(Access(host, listening.getsockname()[1], token))
+    try:
+        with _serving(listening, guard), _quiet():
+            server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    except BaseException:
+        listening.close()
+        raise
+    if not guard.in_place:
+        server.stop()
+        listening.close()
+        raise RuntimeError(f"viser {viser.__version__} serves in another way than the guard of its page knows")
+    # Whoever has the page open could ask for these, and get it tunnelled to a public server.
+    for message in (ShareUrlRequest, ShareUrlDisconnect):
+        server._websock_server.unregister_handler(message)
+    if not is_loopback(host):
+        log.warning(
+            "the page is served beyond this machine, without encryption: `ssh -L %d:127.0.0.1:%d HOST` to a page on "
+            "127.0.0.1 is the safe way", guard.access.port, guard.access.port,
+        )
+    return server
+
+
+def close_server(server: viser.ViserServer) -> None:
+    """Close all pages and stop listening."""
+    with _quiet():
+        server.stop()
+
+
+class Guard:
+    """Stands in front of what serves the page."""
+
+    def __init__(self, access: Access) -> None:
+        """Hold to these rules."""
+        self.access = access
+        self.in_place = False
+
+    def before(self, process: Process | None) -> Process:
+        """What to ask about a request instead of `process`, which is asked about those that may pass."""
+        self.in_place = process is not None
+
+        async def guarded(connection: websocket_server.ServerConnection, request: Request) -> Response | None:
+            said = {name: request.headers.get_all(name) for name in ("host", "origin", "cookie")}
+            upgrade = "upgrade" in request.headers
+            answer = self.access.answer(request.path, said, upgrade=upgrade)
+            if answer is None and upgrade and len(connection.server.connections) >= MAX_PAGES:
+                answer = Answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_PAGES} pages are open already: close one\n")
+            if answer is not None:
+                if answer.status is not HTTPStatus.OK:
+                    log.debug("refused %s: %s", connection.remote_address, answer.text)
+                return _protected(_response(answer), said["host"])
+            response = process(connection, request) if process else None
+            if inspect.isawaitable(response):
+                response = await response
+            return None if response is None else _protected(response, said["host"])
+
+        return guarded
+
+
+class Bounded(websocket_server.ServerConnection):
+    """A connection that is dropped at once when there are too many."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin, and end when this is one too many."""
+        super().connection_made(transport)
+        if len(self.server.handlers) > MAX_CONNECTIONS:
+            self.transport.abort()
+
+
+def _check_token(host: str, token: str) -> None:
+    if not token and not is_loopback(host):
+        raise ConfigError(
+            "services.viewer.token", ..., f"is needed for a page at {host}, as {TOKEN_VARIABLE} in the environment"
+        )
+    if token and not TOKEN.fullmatch(token):
+        raise ConfigError(
+            "services.viewer.token", ..., f"must have {SHORTEST_TOKEN} or more of the characters A-Z a-z 0-9 - . _ ~"
+        )
+
+
+def _response(answer: Answer) -> Response:
+    body = answer.text.encode()
+    headers = Headers(answer.headers)
+    headers["Content-Type"] = "text/html; charset=utf-8"
+    headers["Content-Length"] = str(len(body))
+    headers["Connection"] = "close"
+    return Response(answer.status.value, answer.status.phrase, headers, body)
+
+
+def _protected(response: Response, hosts: list[str]) -> Response:
+    # Safari before 15.4 does not take 'self' for a WebSocket. The name was checked if this is the page itself.
+    own = f"ws://{hosts[0]} wss://{hosts[0]}" if response.status_code == HTTPStatus.OK and len(hosts) == 1 else ""
+    response.headers["Content-Security-Policy"] = POLICY.format(own=own)
+    response.headers["X-Content-Type-Options"] = "nosniff"
+    response.headers["Referrer-Policy"] = "no-referrer"
+    response.headers["Cross-Origin-Resource-Policy"] = "same-origin"
+    response.headers["Cache-Control"] = "no-store"
+    return response
+
+
+@contextmanager
+def _serving(listening: socket.socket, guard: Guard) -> Iterator[None]:
+    """A block in which a WebSocket server that is made listens at that socket, behind that guard."""
+
+    def serve(handler: Any, host: Any, port: Any, *, process_request: Process | None = None, **options: Any) -> Any:
+        del host, port  # viser would try the next port, and the next, when one is taken
+        options |= {**OPTIONS, "sock": listening, "process_request": guard.before(process_request)}
+        return original(handler, **options)
+
+    with _replacing:
+        original = websocket_server.serve
+        websocket_server.serve = serve  # type: ignore[assignment,misc]
+        try:
+            yield
+        finally:
+            websocket_server.serve = original  # type: ignore[misc]
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """A block in which viser writes no frames around its address on stdout."""
+    console = get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    return record.getMessage() != "opening handshake failed"  # who only knocks, or is dropped, is none
+
+
+_connection_log = logging.getLogger(f"{__name__}.connections")
+_connection_log.setLevel(logging.WARNING)
+_connection_log.addFilter(_is_news)
+
+OPTIONS: Mapping[str, Any] = {
+    "create_connection": Bounded,
+    "max_size": MAX_MESSAGE,
+    "open_timeout": OPEN_TIMEOUT,
+    "close_timeout": CLOSE_TIMEOUT,
+    "logger": _connection_log,
+    "server_header": None,
+}
