@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from typing import Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 from common import messages as m
 
@@ -128,7 +128,7 @@ def parameters_of(service: str) -> Request[m.ParameterRequest, m.ParameterReply]
     return replace(PARAMETERS, key=f"param/{service}", writer=service)
 
 
-def find_topic(key: str) -> AnyTopic | None:
+def find_topic(key: str) -> Topic[Any] | Request[Any, Any] | None:
     """The topic or request of a key, also of the parameters of a service; None for one that is not known."""
     prefix, _, service = key.partition("/")
     if prefix == "param" and SERVICE_NAME.fullmatch(service):

@@ -31,10 +31,8 @@ async def run(bus: Bus, config: Config) -> None:
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
         raise ValueError("the task needs a robot with a gripper")
-    # Waiting for a person or for pictures is by the clock on the wall, also in a fast cell.
-    parameters = config.model_copy(update={"selection_timeout": config.selection_timeout * bus.clock.speed})
     home, prefix = config.robot.named_poses["home"], uuid.uuid4().hex[:8]
-    task = Outline(parameters, config.robot.gripper, home, prefix, config.run.autostart)
+    task = Outline(config, config.robot.gripper, home, prefix, config.run.autostart, bus.clock.speed)
     view = OutlineView(now=bus.clock.now())
 
     def look() -> OutlineView:
@@ -47,7 +45,7 @@ async def run(bus: Bus, config: Config) -> None:
             view.q, view.tcp = q.tolist(), matrix_to_pose(robot.fk(q))
         return view
 
-    runner = TaskRunner(bus, task, look, status, config.planning_time)
+    runner = TaskRunner(bus, task, look, status, lambda: config.planning_time)
     await bus.ready()
     await runner.run((path, scene, gripper, motion))
 

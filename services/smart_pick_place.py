@@ -7,7 +7,8 @@ import uuid
 from common import topics
 from common.config import Grasp, RobotConfig, Run, Surroundings
 from common.robot.model import RobotModel
-from common.tasks.pick_place import PickPlace, PickPlaceParameters
+from common.tasks.pick_place import PickPlace
+from common.tasks.pick_place_parameters import PickPlaceParameters
 from common.tasks.stages import View
 from common.transport.bus import Bus
 from common.transport.service import main
@@ -33,9 +34,9 @@ async def run(bus: Bus, config: Config) -> None:
     if config.robot.gripper is None:
         raise ValueError("the task needs a robot with a gripper")
     prefix = uuid.uuid4().hex[:8]
-    # A picture that is late by the clock on the wall is later still by that of a fast cell.
-    parameters = config.model_copy(update={"frame_timeout": config.frame_timeout * bus.clock.speed})
-    task = PickPlace(parameters, config.grasp, config.world, config.robot.gripper, prefix, config.run.autostart)
+    task = PickPlace(
+        config, config.grasp, config.world, config.robot.gripper, prefix, config.run.autostart, bus.clock.speed
+    )
     view = View(now=bus.clock.now())
 
     def look() -> View:
@@ -51,7 +52,7 @@ async def run(bus: Bus, config: Config) -> None:
             view.tcp = (float(x), float(y), float(z))
         return view
 
-    runner = TaskRunner(bus, task, look, status, config.planning_time)
+    runner = TaskRunner(bus, task, look, status, lambda: config.planning_time)
     await bus.ready()
     await runner.run((targets, scene, gripper, motion))
 

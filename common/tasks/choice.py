@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from common import messages as m
 from common.config import Container
-from common.tasks.grasp import HandShape, grasp_yaws
+from common.tasks.grasp import grasp_yaws
+from common.tasks.pick_place_parameters import PickPlaceParameters
 from common.tasks.stages import Cycle, Place, Spots, Target, View, appeared, same_place
 
 SETTLING = 1.5  # [s] from letting go until the ball lies in the container and was seen there
@@ -16,35 +18,36 @@ SETTLING = 1.5  # [s] from letting go until the ball lies in the container and w
 class Choice:
     """Chooses targets and remembers which places were missed or given up."""
 
-    def __init__(self, hand: HandShape, container: Container, radius: float, moved: float, max_retries: int) -> None:
+    def __init__(self, parameters: PickPlaceParameters, container: Container, radius: float) -> None:
         """Start with nothing given up.
 
         Args:
-            hand: shape of the open fingers.
+            parameters: shape of the open fingers, what counts as moved, and how often a place is tried.
             container: where balls go.
             radius: of a ball [m].
-            moved: an object further than this from where it was has moved [m].
-            max_retries: grasps of one place that may close on nothing before it is given up.
         """
-        self.hand, self.container, self.radius, self.moved = hand, container, radius, moved
-        self.max_retries = max_retries
+        self.p, self.container, self.radius = parameters, container, radius
         self._misses: list[tuple[Place, int]] = []
         self._given_up: list[tuple[Target, str, Spots]] = []
+        self._judged_by: dict[str, Any] = {}  # values of the parameters
         self._expected = (0, 0.0)  # balls that will be in the container soon, and until when that is only expected
 
     def next(self, view: View, origin: Sequence[float], under_way: Sequence[Cycle]) -> Cycle | None:
         """The nearest ball to `origin` (x, y) that can be taken, with its yaws; None when there is none now."""
         spots = view.spots(None, self.radius)
+        moved, judged_by = self.p.moved, self.p.model_dump(include=set(PickPlaceParameters.model_fields))
+        if judged_by != self._judged_by:  # what was impossible may not be so any more
+            self._given_up, self._judged_by = [], judged_by
         # Only while the table stays as it was: one ball less may be all that was needed.
         self._given_up = [
-            g for g in self._given_up if not appeared(spots, g[2], self.moved) and not appeared(g[2], spots, self.moved)
+            g for g in self._given_up if not appeared(spots, g[2], moved) and not appeared(g[2], spots, moved)
         ]
         candidates = [ball for ball in view.balls() if self._is_open(ball, view, under_way)]
         candidates.sort(key=lambda ball: math.dist(ball.position[:2], origin[:2]))
         full = self._is_full(view, bool(under_way))
         for ball in candidates:
             others = view.spots(ball, self.radius)
-            yaws = grasp_yaws(self.hand, ball.position, others, self.radius, self.container)
+            yaws = grasp_yaws(self.p.hand, ball.position, others, self.radius, self.container)
             if full:
                 self.give_up(ball, "the container is full", view)
             elif not yaws:
@@ -54,7 +57,7 @@ class Choice:
         return None
 
     def _is_open(self, ball: Target, view: View, under_way: Sequence[Cycle]) -> bool:
-        seen = any(math.dist(t[:2], ball.position[:2]) <= self.moved for t in view.targets)
+        seen = any(math.dist(t[:2], ball.position[:2]) <= self.p.moved for t in view.targets)
         taken = any(same_place(c.target.position, ball.position, self.radius) for c in under_way)
         given_up = any(same_place(g[0].position, ball.position, self.radius) for g in self._given_up)
         return seen and not taken and not given_up
@@ -76,7 +79,7 @@ class Choice:
         """The fingers closed on nothing there; after `max_retries` retries the place is given up."""
         count = 1 + next((n for p, n in self._misses if same_place(p, target.position, self.radius)), 0)
         self._forget(target)
-        if count > self.max_retries:
+        if count > self.p.max_retries:
             self.give_up(target, f"the fingers closed on nothing {count} times", view)
         else:
             self._misses.append((target.position, count))

@@ -10,22 +10,36 @@ from common import messages as m
 S = TypeVar("S")
 
 Report = m.MotionStatus | m.GripperState
+FOUND_HELD = "the robot was found held; resume or start to go on"
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 
 
 @dataclass(eq=False)
 class Execution(Generic[S]):
-    """A stage that was begun: `command` was sent at `since` [s, cell time] and may have been accepted."""
+    """A stage that was begun: `command` was sent and may have been accepted. Times are cell time [s].
+
+    While the arm is held no time counts, and at a share of its speed only that share of it.
+    """
 
     stage: S
     command: m.ExecuteRequest | m.GripperCommand
-    since: float
+    counted: float  # up to when; from the begin on
+    moving: float = 0.0  # in motion so far
+    spent: float = 0.0  # as if the motion were at full speed: what time-outs go by
     accepted: int | None = None  # stamp of the answer that accepted it
 
     @property
     def moves_arm(self) -> bool:
         """Whether the arm moves, and not the fingers."""
         return isinstance(self.command, m.ExecuteRequest)
+
+    def count(self, now: float, motion: m.MotionStatus) -> None:
+        """Count the time up to now."""
+        passed, self.counted = max(0.0, now - self.counted), max(now, self.counted)
+        if self.moves_arm and motion.held:
+            return
+        self.moving += passed
+        self.spent += passed * (motion.speed_scaling if self.moves_arm else 1.0)
 
     def accept(self, answer: Report) -> bool:
         """Take in the answer to the command: whether it was accepted."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from common.config import Container, Parameters
+from common.config import Container, Parameters, Tunable
 
 Array = NDArray[np.float64]
 
@@ -17,11 +17,15 @@ Array = NDArray[np.float64]
 class HandShape(Parameters):
     """The open fingers as seen from above: two rectangles beside the object, in the frame of the tool centre point."""
 
-    finger_inner: float = Field(0.040, gt=0, le=0.2, description="centre to inner finger face, open [m]")
-    finger_outer: float = Field(0.056, gt=0, le=0.2, description="centre to outer end of a finger tip, open [m]")
-    finger_half_width: float = Field(0.011, gt=0, le=0.1, description="half the width of a finger tip [m]")
-    min_clearance: float = Field(0.003, ge=0, le=0.05, description="least gap between a finger and a neighbour [m]")
-    yaw_count: int = Field(8, ge=1, le=36, description="orientations tried, spread over half a turn")
+    finger_inner: Tunable[float] = Field(0.040, gt=0, le=0.2, description="centre to inner finger face, open [m]")
+    finger_outer: Tunable[float] = Field(
+        0.056, gt=0, le=0.2, description="centre to outer end of a finger tip, open [m]"
+    )
+    finger_half_width: Tunable[float] = Field(0.011, gt=0, le=0.1, description="half the width of a finger tip [m]")
+    min_clearance: Tunable[float] = Field(
+        0.003, ge=0, le=0.05, description="least gap between a finger and a neighbour [m]"
+    )
+    yaw_count: Tunable[int] = Field(8, ge=1, le=36, description="orientations tried, spread over half a turn")
 
 
 def yaw_candidates(count: int) -> list[float]:

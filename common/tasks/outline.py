@@ -13,12 +13,12 @@ from collections.abc import Iterator
 from pydantic import Field
 
 from common import messages as m
-from common.config import GripperConfig
-from common.tasks.execution import Execution, note_plan
+from common.config import GripperConfig, Tunable
+from common.tasks.execution import FOUND_HELD, Execution, note_plan
 from common.tasks.outline_legs import Close, Leg, Legs, OutlineView, TracingParameters, closed, length
 
 Stage = Leg | Close
-Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest
+Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
 
 AT_HOME = 0.01  # [rad] from it
 SHUT = 0.002  # [m] fingers this close together count as closed
@@ -27,9 +27,11 @@ SHUT = 0.002  # [m] fingers this close together count as closed
 class OutlineParameters(TracingParameters):
     """How the task behaves; times are cell time unless they say wall."""
 
-    planning_time: float = Field(10.0, gt=0, le=600, description="wall time for one plan [s]")
-    overtime: float = Field(30.0, gt=0, le=3600, description="a motion that takes so much longer is stopped [s]")
-    selection_timeout: float = Field(
+    planning_time: Tunable[float] = Field(10.0, gt=0, le=600, description="wall time for one plan [s]")
+    overtime: Tunable[float] = Field(
+        30.0, gt=0, le=3600, description="a motion that takes so much longer is stopped [s]"
+    )
+    selection_timeout: Tunable[float] = Field(
         10.0, ge=0, le=3600, description="wait for a contour before giving up; 0: for ever [s, wall time]"
     )
 
@@ -39,20 +41,21 @@ class Outline:
 
     def __init__(
         self, parameters: OutlineParameters, gripper: GripperConfig, home: list[float], prefix: str,
-        started: bool = True,
+        started: bool = True, speed: float = 1.0,
     ) -> None:
         """Start from nothing known.
 
         Args:
-            parameters: heights, speed and times; the selection's in cell time too.
+            parameters: heights, speed and times, read where they are used: they may change meanwhile.
             gripper: its links may touch what is traced.
             home: joint positions [rad] at which the camera sees everything.
             prefix: begins every id that is minted here; unlike that of any other process.
             started: whether to begin without being told.
+            speed: cell time that passes per wall time.
         """
         self.p, self.legs = parameters, Legs(parameters, gripper)
         self.status = m.OutlineStatus(started=started, standoff=parameters.standoff)
-        self._home = home
+        self._home, self._speed = home, speed
         self._ids = (f"{prefix}-{n}" for n in itertools.count(1))
         self._stages: deque[Stage] = deque()
         self._running: Execution[Stage] | None = None
@@ -61,6 +64,7 @@ class Outline:
         self._selecting_since: float | None = None
         self._began: float | None = None
         self._traced = False
+        self._found = False  # whether the robot was looked at, or a person has said what to do
         self._returned = False  # home was reached and not left since
         self._still_since = 0.0  # only a later picture shows everything without the arm in it
         self._error = ""  # what went wrong, while the arm is brought home
@@ -69,20 +73,24 @@ class Outline:
     # --- what a person says ----------------------------------------------------------------------------------
 
     def command(self, command: str, view: OutlineView) -> list[Command]:
-        """Start, pause, resume or stop; with pause and stop the arm comes to rest at once.
+        """Start, pause, resume or stop: a pause holds the arm on its path, from which it goes on; a stop ends that.
 
-        After a pause the arm goes home and outlines the object anew: half an outline is no outline.
+        After a stop the arm goes home and outlines the object anew: half an outline is no outline.
         """
         status = self.status
-        self._selecting_since = None
+        self._selecting_since, self._found = None, True
+        if command == "pause":
+            status.paused = True
+            return [m.HoldRequest(hold=True, reason="the task is paused")]
+        reason = f"the task was told to {command}"
         if command in ("start", "resume"):
             status.started, status.paused = status.started or command == "start", False
             if command == "start" and status.state in ("DONE", "ERROR"):
                 status.state, status.message, status.closed = "IDLE", "", False
                 self._began, self._traced = None, False
-            return []
-        status.paused, status.started = command == "pause", command != "stop" and status.started
-        return self._stop(view, f"the task was told to {command}")
+            return [m.HoldRequest(hold=False, reason=reason)]
+        status.paused = status.started = False
+        return self._stop(view, reason) or [m.StopRequest(reason=reason)]
 
     # --- answers ---------------------------------------------------------------------------------------------
 
@@ -114,6 +122,10 @@ class Outline:
         if self._running is None or self._running.command.id != answer.id or self._running.accept(answer):
             return
         stage, self._running = self._running.stage, None
+        if isinstance(answer, m.MotionStatus) and answer.error == "busy":  # with what somebody else asked for
+            self._clear()
+            self._returned, self.status.message = False, f"{stage.name} has to wait: {answer.message}"
+            return
         self._fail(f"{stage.name} was refused: {answer.message}", view)
 
     # --- the step --------------------------------------------------------------------------------------------
@@ -124,12 +136,16 @@ class Outline:
             self.status.message = f"waiting for {', '.join(view.missing)}"
             return []
         assert view.motion is not None and view.gripper is not None
+        if not self._found:
+            self._found, self.status.paused = True, view.motion.held
+            if view.motion.held:
+                self.status.message = FOUND_HELD
         if self._began is None and self.status.started:
             self._began = view.now
         commands = self._watch(view)
         self._stopping = self._stopping and view.motion.state == "active"
-        ended = self.status.state in ("DONE", "ERROR")
-        if commands or self._stopping or ended or not self.status.started or self.status.paused:
+        waiting = self.status.paused or view.motion.held or not self.status.started
+        if commands or self._stopping or waiting or self.status.state in ("DONE", "ERROR"):
             return commands
         self.status.task_seconds = view.now - (self._began or view.now)
         if self._running is None and not self._stages and not (view.motion.state == "active" or view.gripper.moving):
@@ -138,15 +154,17 @@ class Outline:
 
     def _watch(self, view: OutlineView) -> list[Command]:
         """Follow the stage that runs to its end or its failure."""
-        if self._running is None:
-            return []
         assert view.motion is not None and view.gripper is not None
+        if self._running is None:
+            self._returned = self._returned and view.motion.state != "active"  # somebody else moves it
+            return []
         running, stage = self._running, self._running.stage
+        running.count(view.now, view.motion)
         outcome = running.outcome(view.motion, view.gripper)
         longest = self.p.overtime + (stage.seconds if isinstance(stage, Leg) else 0.0)
         if outcome == "ended":
             self._running = None
-            self.status.moving_seconds += max(0.0, view.now - running.since)
+            self.status.moving_seconds += running.moving
             reported = running.report(view.motion, view.gripper)
             if reported.state == "cancelled" and running.moves_arm:
                 self._clear()
@@ -161,7 +179,7 @@ class Outline:
         elif outcome == "forgotten":
             self._running = None
             self._fail(f"{stage.name} was forgotten by the controller", view)
-        elif view.now - running.since > longest:
+        elif running.spent > longest:
             stop = self._stop(view, "it takes too long")
             self._fail(f"{stage.name} took longer than {longest:.0f} s", view)
             return stop
@@ -200,7 +218,8 @@ class Outline:
         else:
             problem = f"the planning scene does not hold {path.object or 'the object'} around which the contour goes"
         self.status.message = problem
-        if 0 < self.p.selection_timeout < view.now - since:
+        # Waiting for a person or for pictures is by the clock on the wall, also in a fast cell.
+        if 0 < self.p.selection_timeout * self._speed < view.now - since:
             self._fail(problem, view)
 
     def _take(self, path: m.OutlinePoints, solid: str, view: OutlineView) -> None:
@@ -210,7 +229,7 @@ class Outline:
         status = self.status
         status.state, status.message, status.object = "PLANNING", "", path.object
         status.points, status.length_m, status.fraction, status.closed = len(path.poses), length(points), 0.0, False
-        status.invalid_depth = path.invalid_depth
+        status.invalid_depth, status.standoff = path.invalid_depth, self.p.standoff
         if view.gripper.width > SHUT:
             self._stages.append(Close())
         self._stages += self.legs.outline(points, solid)
@@ -297,5 +316,5 @@ class Outline:
         if self._running is None or not self._running.moves_arm:
             return []
         running, self._running, self._stopping = self._running, None, True
-        self.status.moving_seconds += max(0.0, view.now - running.since)
+        self.status.moving_seconds += running.moving
         return [m.StopRequest(id=running.command.id, reason=reason)]

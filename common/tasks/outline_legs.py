@@ -9,7 +9,7 @@ from itertools import pairwise
 from pydantic import Field
 
 from common import messages as m
-from common.config import GripperConfig, Parameters
+from common.config import GripperConfig, Number, Parameters, Tunable
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
 
 Place = tuple[float, float, float]
@@ -107,14 +107,18 @@ def length(points: list[Place]) -> float:
 class TracingParameters(Parameters):
     """How the tool goes along a contour."""
 
-    standoff: float = Field(0.0, ge=0, le=0.2, description="of the finger tips above the contour [m]")
-    approach_clearance: float = Field(0.10, gt=0, le=0.5, description="approach and retreat above the contour [m]")
-    tool_rpy: tuple[float, float, float] = Field(
+    standoff: Tunable[float] = Field(0.0, ge=0, le=0.2, description="of the finger tips above the contour [m]")
+    approach_clearance: Tunable[float] = Field(
+        0.10, gt=0, le=0.5, description="approach and retreat above the contour [m]"
+    )
+    tool_rpy: Tunable[tuple[Number, Number, Number]] = Field(
         (0.0, -math.pi, -math.pi), description="of the tool in world while tracing [rad], R = Rz Ry Rx"
     )
-    tool_speed: float = Field(0.05, gt=0, le=1, description="along the contour, where limits and corners allow [m/s]")
-    step: float = Field(0.001, ge=1e-4, le=0.05, description="along the contour between IK solutions [m]")
-    min_fraction: float = Field(0.99, gt=0, le=1, description="of the contour that must be possible")
+    tool_speed: Tunable[float] = Field(
+        0.05, gt=0, le=1, description="along the contour, where limits and corners allow [m/s]"
+    )
+    step: Tunable[float] = Field(0.001, ge=1e-4, le=0.05, description="along the contour between IK solutions [m]")
+    min_fraction: Tunable[float] = Field(0.99, gt=0, le=1, description="of the contour that must be possible")
 
 
 @dataclass(frozen=True)

@@ -12,33 +12,13 @@ import math
 from collections import deque
 from collections.abc import Iterator
 
-from pydantic import Field
-
 from common import messages as m
-from common.config import Grasp, GripperConfig, Parameters, Surroundings
+from common.config import Grasp, GripperConfig, Surroundings
 from common.tasks.choice import Choice
-from common.tasks.execution import Execution, Report, note_plan
-from common.tasks.grasp import HandShape
-from common.tasks.row import Rows, Tolerances
+from common.tasks.execution import FOUND_HELD, Execution, Report, note_plan
+from common.tasks.pick_place_parameters import PickPlaceParameters
+from common.tasks.row import Rows
 from common.tasks.stages import Command, Cycle, Grip, Move, Stage, Target, View, appeared
-
-
-class PickPlaceParameters(Parameters):
-    """How the task behaves; times are cell time unless they say wall."""
-
-    grasp_pos_tol: float = Field(0.04, gt=0, le=0.2, description="side of the goal box of pre-grasp and lift [m]")
-    place_pos_tol: float = Field(0.06, gt=0, le=0.2, description="side of the goal box above the container [m]")
-    orient_tol_rad: float = Field(0.25, ge=0, le=1.5, description="tilt of the tool that a goal allows [rad]")
-    orient_yaw_tol_rad: float = Field(3.14, ge=0, le=3.1415, description="turn about the tool that a goal allows [rad]")
-    planning_time: float = Field(2.0, gt=0, le=600, description="wall time for one plan [s]")
-    goal_timeout: float = Field(60.0, gt=0, le=3600, description="a motion that takes longer is stopped [s]")
-    grace: float = Field(8.0, ge=0, le=600, description="wait while only objects are left that can not be taken [s]")
-    empty: float = Field(1.0, ge=0.1, le=600, description="wait with an empty table before the task is done [s]")
-    frame_timeout: float = Field(1.0, ge=0.1, le=60, description="an older picture starts no motion [s, wall time]")
-    max_retries: int = Field(3, ge=0, le=100, description="grasps of one place that may close on nothing")
-    max_failures: int = Field(10, ge=1, le=1000, description="failures in a row after which the task gives up")
-    moved: float = Field(0.005, gt=0, le=0.05, description="an object that is further from where it was has moved [m]")
-    hand: HandShape = HandShape()
 
 
 class PickPlace:
@@ -46,24 +26,22 @@ class PickPlace:
 
     def __init__(
         self, parameters: PickPlaceParameters, grasp: Grasp, around: Surroundings, gripper: GripperConfig, prefix: str,
-        started: bool = True,
+        started: bool = True, speed: float = 1.0,
     ) -> None:
         """Start from nothing known.
 
         Args:
-            parameters: times, tolerances and counts.
+            parameters: times, tolerances and counts, read where they are used: they may change meanwhile.
             grasp: heights of approach, lift and release.
             around: the container and the size of a ball.
             gripper: its links and its width.
             prefix: begins every id that is minted here; unlike that of any other process.
             started: whether to begin without being told.
+            speed: cell time that passes per wall time.
         """
-        self.p, self.around, self.gripper, self.prefix = parameters, around, gripper, prefix
-        tolerances = Tolerances(parameters.grasp_pos_tol, parameters.place_pos_tol, parameters.orient_tol_rad,
-                                parameters.orient_yaw_tol_rad)
-        self.rows = Rows(grasp, around, gripper, tolerances)
-        self.choice = Choice(parameters.hand, around.container, around.ball_radius, parameters.moved,
-                             parameters.max_retries)
+        self.p, self.around, self.gripper, self.prefix, self._speed = parameters, around, gripper, prefix, speed
+        self.rows = Rows(grasp, around, gripper, parameters)
+        self.choice = Choice(parameters, around.container, around.ball_radius)
         self.status = m.PickPlaceStatus(started=started)
         self._stages: deque[Stage] = deque()
         self._running: Execution[Stage] | None = None
@@ -74,21 +52,26 @@ class PickPlace:
         self._quiet: tuple[float, bool] | None = None  # since which picture, and whether something is left
         self._began: float | None = None
         self._looked = False
+        self._found = False  # whether the robot was looked at, or a person has said what to do
         self._failures_in_a_row = 0
 
     # --- what a person says ----------------------------------------------------------------------------------
 
     def command(self, command: str, view: View) -> list[Command]:
-        """Start, pause, resume or stop; with pause and stop the arm comes to rest at once."""
+        """Start, pause, resume or stop: a pause holds the arm on its path, from which it goes on; a stop ends that."""
         status = self.status
-        self._quiet = None
+        self._quiet, self._found = None, True
+        if command == "pause":
+            status.paused = True
+            return [m.HoldRequest(hold=True, reason="the task is paused")]
+        reason = f"the task was told to {command}"
         if command in ("start", "resume"):
             status.started, status.paused = status.started or command == "start", False
             if command == "start" and status.state in ("DONE", "ERROR"):
                 status.state, self._failures_in_a_row = "IDLE", 0
-            return []
-        status.paused, status.started = command == "pause", command != "stop" and status.started
-        return self._stop(view, f"the task was told to {command}")
+            return [m.HoldRequest(hold=False, reason=reason)]
+        status.paused = status.started = False
+        return self._stop(view, reason) or [m.StopRequest(reason=reason)]
 
     # --- answers ---------------------------------------------------------------------------------------------
 
@@ -109,6 +92,11 @@ class PickPlace:
         if self._running is None or self._running.command.id != answer.id or self._running.accept(answer):
             return
         stage, self._running = self._running.stage, None
+        if isinstance(answer, m.MotionStatus) and answer.error == "busy":  # with what somebody else asked for
+            self._clear()
+            self._look_after = view.now
+            self.status.message = f"{stage.name} has to wait: {answer.message}"
+            return
         # A robot that is not where the plan began only needs a new plan.
         stale = isinstance(answer, m.MotionStatus) and answer.error == "start_mismatch"
         self._fail(f"{stage.name} was refused: {answer.message}", view, go_home=not stale)
@@ -124,11 +112,16 @@ class PickPlace:
         if not self._looked:
             # Balls in the container were placed before a restart, or by somebody else.
             self._looked, self.status.placed = True, len(view.objects("contained"))
+        if not self._found:
+            self._found, self.status.paused = True, view.motion.held
+            if view.motion.held:
+                self.status.message = FOUND_HELD
         if self._began is None and self.status.started:
             self._began = view.now
         commands = self._watch(view)
         self._stopping = self._stopping and view.motion.state == "active"
-        if commands or self._stopping or not self.status.started or self.status.paused or self.status.state == "ERROR":
+        waiting = self.status.paused or view.motion.held or not self.status.started or self.status.state == "ERROR"
+        if commands or self._stopping or waiting:
             return commands
         if self._running is None and not self._stages:
             if view.motion.state == "active" or view.gripper.moving:
@@ -151,10 +144,11 @@ class PickPlace:
             return []
         assert view.motion is not None and view.gripper is not None
         running, stage = self._running, self._running.stage
+        running.count(view.now, view.motion)
         outcome = running.outcome(view.motion, view.gripper)
         if outcome == "ended":
             self._running = None
-            self.status.moving_seconds += max(0.0, view.now - running.since)
+            self.status.moving_seconds += running.moving
             self._ended(stage, running.report(view.motion, view.gripper), view)
         elif outcome == "forgotten":
             self._running = None
@@ -163,7 +157,7 @@ class PickPlace:
             stop = self._stop(view, "the ball fell")
             self._fail(f"the ball fell during {stage.name}", view, go_home=False)
             return stop
-        elif view.now - running.since > self.p.goal_timeout:
+        elif running.spent > self.p.goal_timeout:
             stop = self._stop(view, "it takes too long")
             self._fail(f"{stage.name} took longer than {self.p.goal_timeout:g} s", view)
             return stop
@@ -245,7 +239,7 @@ class PickPlace:
         if self._running is None or not self._running.moves_arm:
             return []
         running, self._running, self._stopping = self._running, None, True
-        self.status.moving_seconds += max(0.0, view.now - running.since)
+        self.status.moving_seconds += running.moving
         return [m.StopRequest(id=running.command.id, reason=reason)]
 
     # --- what to do next -------------------------------------------------------------------------------------
@@ -266,7 +260,7 @@ class PickPlace:
     def _queue_next(self, view: View) -> bool:
         """Append the stages for the nearest ball that can be taken; whether there is one."""
         assert view.tcp is not None and view.gripper is not None
-        if min(view.targets_stamp, view.scene_stamp) <= self._look_after or not view.fresh(self.p.frame_timeout):
+        if min(view.targets_stamp, view.scene_stamp) <= self._look_after or not self._is_fresh(view):
             return False
         under_way = [self._running.stage.cycle] if self._running and self._running.stage.cycle else []
         box = self.around.container
@@ -286,7 +280,7 @@ class PickPlace:
         left = max(len(view.balls()), len(view.targets))  # one of the two may have just begun to look
         # Time of pictures, not of the clock: that nobody looks any more is no sign of an empty table.
         seen = max(self._look_after, min(view.targets_stamp, view.scene_stamp))
-        if not view.fresh(self.p.frame_timeout):
+        if not self._is_fresh(view):
             self._quiet, self.status.message = None, "no fresh picture"
         elif self._quiet is None or self._quiet[1] != bool(left):
             self._quiet = (seen, bool(left))
@@ -352,7 +346,7 @@ class PickPlace:
             if not self._is_planned(stage):
                 return
             if stage.name in ("pre-grasp", "descend"):
-                if not view.fresh(self.p.frame_timeout):
+                if not self._is_fresh(view):
                     self.status.message = f"{stage.name} waits for a fresh picture"
                     return
                 if not self._is_still_there(stage, view):
@@ -390,6 +384,11 @@ class PickPlace:
         """Whether the target is seen where it was when its motions were planned."""
         place = move.cycle.target.position if move.cycle else (0.0, 0.0, 0.0)
         return any(math.dist(t[:2], place[:2]) <= self.p.moved for t in view.targets)
+
+    def _is_fresh(self, view: View) -> bool:
+        """Whether the newest picture is new enough to decide by."""
+        # A picture that is late by the clock on the wall is later still by that of a fast cell.
+        return view.fresh(self.p.frame_timeout * self._speed)
 
     def _mint(self) -> str:
         self._minted += 1

@@ -7,17 +7,8 @@ from dataclasses import dataclass
 from common import messages as m
 from common.config import Grasp, GripperConfig, Surroundings
 from common.robot.transforms import matrix_to_pose, tool_down
+from common.tasks.pick_place_parameters import PickPlaceParameters
 from common.tasks.stages import Cycle, Grip, Move, Place, Stage, View
-
-
-@dataclass(frozen=True)
-class Tolerances:
-    """The region in which a motion may end: sides of a box [m], tilt and turn of the tool [rad]."""
-
-    grasp: float
-    place: float
-    tilt: float
-    yaw: float
 
 
 @dataclass(frozen=True)
@@ -27,7 +18,7 @@ class Rows:
     grasp: Grasp
     around: Surroundings
     gripper: GripperConfig
-    tolerances: Tolerances
+    parameters: PickPlaceParameters
 
     def pick_and_place(self, cycle: Cycle) -> list[Stage]:
         """Above the ball, straight down, close, up, across, release; uses up one yaw of the cycle."""
@@ -85,9 +76,10 @@ class Rows:
         return max(z + self.grasp.grasp_clearance, self.grasp.min_grasp_z)
 
     def _move(self, name: str, at: Place, yaw: float, cycle: Cycle | None, *, carries: bool = False) -> Move:
-        side = self.tolerances.place if name == "across" else self.tolerances.grasp
+        p = self.parameters
+        side = p.place_pos_tol if name == "across" else p.grasp_pos_tol
         goal = m.PoseGoal(
             pose=matrix_to_pose(tool_down(*at, yaw)), position_tolerance=m.Vector3(x=side, y=side, z=side),
-            tilt_tolerance=self.tolerances.tilt, yaw_tolerance=self.tolerances.yaw,
+            tilt_tolerance=p.orient_tol_rad, yaw_tolerance=p.orient_yaw_tol_rad,
         )
         return Move(name, "GRASPING", goal, cycle, carries=carries)

@@ -60,7 +60,7 @@ class Grip:
 
 
 Stage = Move | Grip
-Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest
+Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
 
 
 @dataclass

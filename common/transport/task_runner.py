@@ -23,7 +23,7 @@ GOAL_TIMEOUT = 1.0  # [s] wall: for a goal to be accepted
 PLAN_OVERTIME = 5.0  # [s] wall: that a plan may take beyond its planning time
 LONGEST_STEP = 0.05  # [s] wall: time passes too
 
-Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest
+Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
 
 
 class Task(Protocol):
@@ -50,7 +50,7 @@ class TaskRunner:
     """Steps a task, sends what it asks for and brings the answers back."""
 
     def __init__(
-        self, bus: Bus, task: Task, look: Callable[[], Any], status: Writer[Any], planning_time: float
+        self, bus: Bus, task: Task, look: Callable[[], Any], status: Writer[Any], planning_time: Callable[[], float],
     ) -> None:
         """Declare the requests of a task and the command that it serves.
 
@@ -59,14 +59,15 @@ class TaskRunner:
             task: is stepped.
             look: what is known now.
             status: where the task's status goes.
-            planning_time: that the task asks for [s, wall].
+            planning_time: that the task asks for now [s, wall].
         """
         self._task, self._look, self._status, self._bus = task, look, status, bus
         self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
         self._stop, self._grip = bus.client(topics.MOTION_STOP), bus.client(topics.GRIPPER_COMMAND)
-        self._plan_timeout = planning_time + PLAN_OVERTIME
+        self._planning_time = planning_time
         self._woken = asyncio.Event()
         self._told: list[Command] = []
+        self._asking: dict[str, asyncio.Task[None]] = {}  # the newest execute and the newest hold
         self._before: m.TaskReport | None = None
         bus.serve(topics.TASK_COMMAND, self._obey)
 
@@ -82,7 +83,7 @@ class TaskRunner:
                 self._woken.clear()
                 told, self._told = self._told, []
                 for command in [*told, *self._task.step(self._look())]:
-                    group.create_task(self._do(command))
+                    self._begin(group, command)
                 self._tell()
 
     async def _obey(self, command: m.TaskCommand) -> m.TaskStatus:
@@ -115,10 +116,20 @@ class TaskRunner:
         async for _ in reader:
             self._woken.set()
 
+    def _begin(self, group: asyncio.TaskGroup, command: Command) -> None:
+        """Send a command; what it makes void is not asked for again, should it still be without an answer."""
+        void = {m.StopRequest: m.ExecuteRequest, m.HoldRequest: m.HoldRequest}.get(type(command))
+        if void is not None and void.__name__ in self._asking:
+            self._asking.pop(void.__name__).cancel()
+        task = group.create_task(self._do(command))
+        if isinstance(command, m.ExecuteRequest | m.HoldRequest):
+            self._asking[type(command).__name__] = task
+
     async def _do(self, command: Command) -> None:
         """Send what a command stands for; what is refused is an answer too."""
         if isinstance(command, m.PlanRequest):
-            await self._ask(self._plan, command, self._plan_timeout, self._planned, lambda error: m.PlanResponse(
+            seconds = self._planning_time() + PLAN_OVERTIME
+            await self._ask(self._plan, command, seconds, self._planned, lambda error: m.PlanResponse(
                 id=command.id, ok=False, error=error.code, message=error.message))
         elif isinstance(command, m.GripperCommand):
             await self._ask(self._grip, command, GOAL_TIMEOUT, self._answered, lambda error: m.GripperState(
@@ -126,6 +137,9 @@ class TaskRunner:
         elif isinstance(command, m.ExecuteRequest):
             await self._ask(self._execute, command, GOAL_TIMEOUT, self._answered, lambda error: m.MotionStatus(
                 id=command.id, state="rejected", error=error.code, message=error.message))
+        elif isinstance(command, m.HoldRequest):
+            await self._ask(self._hold, command, GOAL_TIMEOUT, lambda _: None, lambda error: m.MotionStatus(
+                message=error.message))
         else:
             await self._ask(self._stop, command, GOAL_TIMEOUT, lambda _: None, lambda error: m.MotionStatus(
                 message=error.message))

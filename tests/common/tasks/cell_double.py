@@ -6,7 +6,8 @@ import math
 
 from common import messages as m
 from common.config import load_cell
-from common.tasks.pick_place import PickPlace, PickPlaceParameters
+from common.tasks.pick_place import PickPlace
+from common.tasks.pick_place_parameters import PickPlaceParameters
 from common.tasks.stages import View
 
 CELL = load_cell("panda")
