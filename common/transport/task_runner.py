@@ -25,6 +25,9 @@ LONGEST_STEP = 0.05  # [s] wall: time passes too
 
 Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
 
+# A stop makes the motion void that was asked for before it, a hold the hold before it.
+VOIDS: dict[type[m.Message], type[m.Message]] = {m.StopRequest: m.ExecuteRequest, m.HoldRequest: m.HoldRequest}
+
 
 class Task(Protocol):
     """A state machine that is fed with what is known and answers with what it wants done."""
@@ -64,10 +67,11 @@ class TaskRunner:
         self._task, self._look, self._status, self._bus = task, look, status, bus
         self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
         self._stop, self._grip = bus.client(topics.MOTION_STOP), bus.client(topics.GRIPPER_COMMAND)
+        self._hold = bus.client(topics.MOTION_HOLD)
         self._planning_time = planning_time
         self._woken = asyncio.Event()
         self._told: list[Command] = []
-        self._asking: dict[str, asyncio.Task[None]] = {}  # the newest execute and the newest hold
+        self._asking: dict[type[m.Message], asyncio.Task[None]] = {}  # the newest of each
         self._before: m.TaskReport | None = None
         bus.serve(topics.TASK_COMMAND, self._obey)
 
@@ -118,12 +122,10 @@ class TaskRunner:
 
     def _begin(self, group: asyncio.TaskGroup, command: Command) -> None:
         """Send a command; what it makes void is not asked for again, should it still be without an answer."""
-        void = {m.StopRequest: m.ExecuteRequest, m.HoldRequest: m.HoldRequest}.get(type(command))
-        if void is not None and void.__name__ in self._asking:
-            self._asking.pop(void.__name__).cancel()
-        task = group.create_task(self._do(command))
-        if isinstance(command, m.ExecuteRequest | m.HoldRequest):
-            self._asking[type(command).__name__] = task
+        void = self._asking.pop(VOIDS[type(command)], None) if type(command) in VOIDS else None
+        if void is not None:
+            void.cancel()
+        self._asking[type(command)] = group.create_task(self._do(command))
 
     async def _do(self, command: Command) -> None:
         """Send what a command stands for; what is refused is an answer too."""

@@ -56,10 +56,19 @@ class CellDouble:
             "pose": m.Pose(position=m.Vector3(x=p[0], y=p[1], z=p[2])),
         })
 
+    def tell(self, command: str) -> list[m.Message]:
+        """Say something to the task; what it asks for is answered."""
+        asked: list[m.Message] = list(self.task.command(command, self.view()))
+        for request in asked:
+            self.answer(request)
+        return asked
+
     def step(self) -> list[m.Message]:
         """One step of the task; every request is answered before the next."""
         self.now += 0.1
-        if self._ends and self.now >= self._arrival:
+        if self.motion.held:
+            self._arrival += 0.1
+        elif self._ends and self.now >= self._arrival:
             self._arrive(self._ends.pop())
         asked: list[m.Message] = list(self.task.step(self.view()))
         for request in asked:
@@ -79,15 +88,18 @@ class CellDouble:
                                              error=error, message=error and f"{request.stage}: {error}",
                                              planner="double", seconds=0.01, fraction=1.0), self.view())
         elif isinstance(request, m.ExecuteRequest):
-            self.motion = m.MotionStatus(header=header, id=request.id, state="active")
+            self.motion = m.MotionStatus(header=header, id=request.id, state="active", held=self.motion.held)
             self.task.on_goal(self.motion, self.view())
             self._ends.append(request)
             self._arrival = self.now + 0.45
         elif isinstance(request, m.GripperCommand):
             self._grip(request, header)
         elif isinstance(request, m.StopRequest):
-            self._ends.clear()
-            self.motion = m.MotionStatus(header=header, id=request.id, state="cancelled")
+            if self.motion.state == "active":
+                self._ends.clear()
+                self.motion = self.motion.model_copy(update={"header": header, "state": "cancelled"})
+        elif isinstance(request, m.HoldRequest):
+            self.motion = self.motion.model_copy(update={"header": header, "held": request.hold})
 
     def _arrive(self, request: m.ExecuteRequest) -> None:
         pose = self._goals.get(request.trajectory.header.frame_id)

@@ -66,9 +66,18 @@ class OutlineDouble:
         tcp = m.Pose(position=m.Vector3(x=0.5, z=1.1))
         return OutlineView(self.now, self.path, scene, self.gripper, self.motion, list(self.q), tcp)
 
+    def tell(self, command: str) -> list[m.Message]:
+        """Say something to the task; what it asks for is answered."""
+        asked: list[m.Message] = list(self.task.command(command, self.view()))
+        for request in asked:
+            self.answer(request)
+        return asked
+
     def step(self) -> list[m.Message]:
         self.now += 0.1
-        if self._ends and self.now >= self._arrival:
+        if self.motion.held:
+            self._arrival += 0.1
+        elif self._ends and self.now >= self._arrival:
             self._arrive(self._ends.pop())
         asked: list[m.Message] = list(self.task.step(self.view()))
         for request in asked:
@@ -94,7 +103,7 @@ class OutlineDouble:
         elif isinstance(request, m.ExecuteRequest) and request.trajectory.header.frame_id == self.refuse:
             self.task.on_goal(m.MotionStatus(id=request.id, state="rejected", message="no"), self.view())
         elif isinstance(request, m.ExecuteRequest):
-            self.motion = m.MotionStatus(header=header, id=request.id, state="active")
+            self.motion = m.MotionStatus(header=header, id=request.id, state="active", held=self.motion.held)
             self.q = [0.3, *HOME[1:]]
             self.task.on_goal(self.motion, self.view())
             self._ends.append(request)
@@ -103,8 +112,11 @@ class OutlineDouble:
             self.gripper = m.GripperState(header=header, id=request.id, state="succeeded", width=request.width)
             self.task.on_goal(self.gripper, self.view())
         elif isinstance(request, m.StopRequest):
-            self._ends.clear()
-            self.motion = m.MotionStatus(header=header, id=request.id, state="cancelled")
+            if self.motion.state == "active":
+                self._ends.clear()
+                self.motion = self.motion.model_copy(update={"header": header, "state": "cancelled"})
+        elif isinstance(request, m.HoldRequest):
+            self.motion = self.motion.model_copy(update={"header": header, "held": request.hold})
 
     def _arrive(self, request: m.ExecuteRequest) -> None:
         state, message = "succeeded", ""

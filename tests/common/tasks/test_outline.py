@@ -194,23 +194,6 @@ def test_motion_of_a_task_before_this_one_is_let_finish() -> None:
     cell.until("DONE")
 
 
-def test_pause_stops_the_arm_and_resume_outlines_anew() -> None:
-    cell = OutlineDouble()
-    cell.until("TRACING")
-    stop = cell.task.command("pause", cell.view())
-    assert [type(c) for c in stop] == [m.StopRequest]
-    for command in stop:
-        cell.answer(command)
-    for _ in range(20):
-        cell.step()
-    assert cell.moves() == ["approach", "descend", "trace"]
-    assert cell.status.paused
-    cell.task.command("resume", cell.view())
-    cell.until("DONE")
-    assert cell.moves() == ["approach", "descend", "trace", "retreat", "home", *WHOLE]
-    assert cell.status.closed
-
-
 def test_motion_stopped_from_outside_pauses_the_task() -> None:
     cell = OutlineDouble()
     cell.until("TRACING")

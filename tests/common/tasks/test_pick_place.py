@@ -224,19 +224,6 @@ def test_failures_in_a_row_end_in_error_and_start_tries_again() -> None:
     assert cell.task.status.skipped
 
 
-def test_pause_stops_the_arm_and_resume_carries_on() -> None:
-    cell = CellDouble([(0.40, -0.30)])
-    cell.until("pre-grasp")
-    for request in cell.task.command("pause", cell.view()):
-        assert isinstance(request, m.StopRequest)
-        cell.answer(request)
-    for _ in range(50):
-        assert cell.step() == []
-    cell.task.command("resume", cell.view())
-    cell.until("DONE")
-    assert cell.contained == 1
-
-
 def test_motion_stopped_by_somebody_else_pauses_the_task() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("pre-grasp")
