@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import typer
 
-from cli import bringup, catalogue, commands, doctor, node, outlining, robot, tf, topic
+from cli import bringup, catalogue, commands, doctor, node, outlining, robot, tf, top, topic
 from common.errors import RequestFailed, ZencellError
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -70,6 +70,7 @@ app.command()(bringup.up)
 app.command()(catalogue.cells)
 app.command()(catalogue.services)
 app.command()(catalogue.service)
+app.command()(top.top)
 app.add_typer(topic.app, name="topic")
 app.command(context_settings={"ignore_unknown_options": True})(commands.call)
 app.add_typer(node.app, name="node")
