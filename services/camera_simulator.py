@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import asyncio
-import math
-
 import numpy as np
 from pydantic import Field
 
 from common import topics
-from common.config import Parameters, Run, Surroundings
+from common.config import Parameters, Run, Surroundings, Tunable
 from common.messages import PoseArray
 from common.perception.drawing import draw
 from common.perception.image import array_to_image
 from common.perception.pinhole import Pinhole
 from common.transport.bus import Bus
+from common.transport.pace import Pace
 from common.transport.service import main
 
 UNSEEN = ("held", "elsewhere")  # hidden by the hand; off the table
@@ -25,10 +23,10 @@ class Config(Parameters):
 
     world: Surroundings
     run: Run
-    rate: float = Field(10.0, gt=0, le=250, description="frames per second of cell time [Hz]")
-    max_rate: float = Field(50.0, gt=0, le=250, description="frames per second of wall time at most [Hz]")
-    noise_std: float = Field(0.0, ge=0, le=100, description="standard deviation of Gaussian noise [0..255]")
-    brightness: float = Field(0.0, ge=-255, le=255, description="added to every channel [0..255]")
+    rate: Tunable[float] = Field(10.0, gt=0, le=250, description="frames per second of cell time [Hz]")
+    max_rate: Tunable[float] = Field(50.0, gt=0, le=250, description="frames per second of wall time at most [Hz]")
+    noise_std: Tunable[float] = Field(0.0, ge=0, le=100, description="standard deviation of Gaussian noise [0..255]")
+    brightness: Tunable[float] = Field(0.0, ge=-255, le=255, description="added to every channel [0..255]")
 
 
 def seen(balls: PoseArray) -> list[tuple[float, float, float]]:
@@ -51,22 +49,19 @@ async def run(bus: Bus, config: Config) -> None:
     await bus.ready()
     await truth.next()
     infos.put(camera.info(bus.header(frame)))
-    loop = asyncio.get_running_loop()
-    period = 1.0 / bus.clock.wall_rate(config.rate, config.max_rate)
-    due = loop.time()
+    pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
     drawn, picture = None, draw([], camera, config.world)
     while True:
         header = bus.header(frame)  # the instant of exposure: what is drawn is where the balls are now
         balls = seen(truth.latest or PoseArray())
-        if balls != drawn or config.noise_std:  # without noise, pictures of the same thing are the same
+        shown = (balls, config.noise_std, config.brightness)
+        if shown != drawn or config.noise_std:  # without noise, pictures of the same thing are the same
             picture = draw(
                 balls, camera, config.world, noise_std=config.noise_std, brightness=config.brightness, rng=rng
             )
-            drawn = balls
+            drawn = shown
         images.put(array_to_image(picture, "bgr8", header))
-        # Due times lie on a fixed grid: a late frame makes neither drift nor a burst, the ones it missed are left out.
-        due += period * max(1, math.ceil((loop.time() - due) / period))
-        await asyncio.sleep(due - loop.time())
+        await pace.wait()
 
 
 if __name__ == "__main__":

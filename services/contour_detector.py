@@ -86,7 +86,7 @@ async def run(bus: Bus, config: Config) -> None:
             if unusable[error.kind] == 1:
                 bus.log.warning("picture dropped: %s (told once; further ones are counted)", error)
             continue
-        last = (image, picture, await asyncio.to_thread(find_contours, picture, config))
+        last = (image, picture, await asyncio.to_thread(find_contours, picture, config.model_copy()))
         publish(*following.find(last[2]))
 
 

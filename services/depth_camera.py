@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-import math
 
 import numpy as np
 from pydantic import Field
 
 from common import topics
-from common.config import Parameters, RobotConfig, Run, Surroundings
+from common.config import Parameters, RobotConfig, Run, Surroundings, Tunable
 from common.messages import WorldObjects
 from common.perception.image import array_to_image
 from common.perception.point_cloud import point_cloud
 from common.robot.model import RobotModel
 from common.sim.depth_view import DepthView, disturbed
 from common.transport.bus import Bus
+from common.transport.pace import Pace
 from common.transport.service import main
 
 
@@ -25,12 +25,12 @@ class Config(Parameters):
     world: Surroundings
     robot: RobotConfig
     run: Run
-    rate: float = Field(1.0, gt=0, le=30, description="frames per second of cell time [Hz]")
-    max_rate: float = Field(5.0, gt=0, le=30, description="frames per second of wall time at most [Hz]")
-    nearest: float = Field(0.10, gt=0, le=100, description="smallest depth that is measured [m]")
-    farthest: float = Field(2.25, gt=0, le=100, description="largest depth that is measured [m]")
-    depth_noise_std: float = Field(0.0, ge=0, le=0.1, description="standard deviation of Gaussian noise [m]")
-    depth_dropout: float = Field(0.0, ge=0, le=1, description="part of the pixels that measure no depth")
+    rate: Tunable[float] = Field(1.0, gt=0, le=30, description="frames per second of cell time [Hz]")
+    max_rate: Tunable[float] = Field(5.0, gt=0, le=30, description="frames per second of wall time at most [Hz]")
+    nearest: Tunable[float] = Field(0.10, gt=0, le=100, description="smallest depth that is measured [m]")
+    farthest: Tunable[float] = Field(2.25, gt=0, le=100, description="largest depth that is measured [m]")
+    depth_noise_std: Tunable[float] = Field(0.0, ge=0, le=0.1, description="standard deviation of Gaussian noise [m]")
+    depth_dropout: Tunable[float] = Field(0.0, ge=0, le=1, description="part of the pixels that measure no depth")
 
 
 async def run(bus: Bus, config: Config) -> None:
@@ -45,9 +45,7 @@ async def run(bus: Bus, config: Config) -> None:
     await truth.next()
     await joints.next()
     infos.put(view.camera.info(bus.header(frame)))
-    loop = asyncio.get_running_loop()
-    period = 1.0 / bus.clock.wall_rate(config.rate, config.max_rate)
-    due = loop.time()
+    pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
     while True:
         header = bus.header(frame)  # the instant of exposure: of picture, depth and points alike
         objects = (truth.latest or WorldObjects()).objects
@@ -58,8 +56,7 @@ async def run(bus: Bus, config: Config) -> None:
         images.put(array_to_image(seen.colour, "bgr8", header))
         if points.matched:
             points.put(point_cloud(seen.colour, depth, view.camera, header))
-        due += period * max(1, math.ceil((loop.time() - due) / period))  # on a fixed grid: no drift and no bursts
-        await asyncio.sleep(due - loop.time())
+        await pace.wait()
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from common import topics
-from common.config import Parameters
+from common.config import Parameters, Tunable
 from common.errors import ConfigError
 from common.messages import OutlinePoints, Pose, Vector3
 from common.perception.duplicates import simplified, without_duplicates
@@ -20,7 +20,7 @@ from common.transport.service import main
 class Config(Parameters):
     """What counts as nothing."""
 
-    tolerance: float = Field(
+    tolerance: Tunable[float] = Field(
         0.00005, ge=0, le=0.1, description="points without which the outline moves by no more than this go [m]; 0: none"
     )
     coordinates: str = Field(

@@ -59,7 +59,7 @@ async def run(bus: Bus, config: Config) -> None:
             label = now.contours[now.selected].label
             try:
                 camera = camera_of(infos.latest, statics.latest, image.header.frame_id)
-                face = await asyncio.to_thread(outline, now, image, camera, config)
+                face = await asyncio.to_thread(outline, now, image, camera, config.model_copy())
             except ZencellError as error:
                 points = points.model_copy(update={"object": label, "message": f"{label}: {error}"})
             else:

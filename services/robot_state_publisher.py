@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common import topics
-from common.config import Parameters, RobotConfig, Surroundings
+from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import Header, JointState, TFMessage, TransformStamped
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_pose, rpy_to_matrix, transform
@@ -23,7 +23,7 @@ class Config(Parameters):
 
     robot: RobotConfig
     surroundings: Surroundings
-    rate: float = Field(50.0, ge=1, le=250, description="at most so many tf messages, cell time [Hz]")
+    rate: Tunable[float] = Field(50.0, ge=1, le=250, description="at most so many tf messages, cell time [Hz]")
 
 
 def stamped(parent: str, child: str, T_parent_child: NDArray[np.float64], stamp: int) -> TransformStamped:
@@ -77,10 +77,10 @@ async def run(bus: Bus, config: Config) -> None:
     fixed = [base, stamped(WORLD, camera.frame, T_world_camera, stamp), *frames.fixed(stamp)]
     tf_static.put(TFMessage(transforms=fixed))
     await bus.ready()
-    # A message that comes a little early still counts: otherwise jitter would halve the rate.
-    least_ns = 0.75e9 * bus.clock.speed / bus.clock.wall_rate(config.rate, MOST_MESSAGES)
     newest, told = 0, False
     async for state in joints:
+        # A message that comes a little early still counts: otherwise jitter would halve the rate.
+        least_ns = 0.75e9 * bus.clock.speed / bus.clock.wall_rate(config.rate, MOST_MESSAGES)
         if 0 <= state.header.stamp - newest < least_ns:
             continue
         newest = state.header.stamp

@@ -8,7 +8,8 @@ from common import topics
 from common.config import RobotConfig, Surroundings
 from common.perception.intake import Cameras, Unusable
 from common.robot.model import RobotModel
-from common.scene.perceived import PerceivedScene, SceneParameters
+from common.scene.perceived import PerceivedScene
+from common.scene.tracks import SceneParameters
 from common.transport.bus import Bus
 from common.transport.service import main
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pydantic import Field
 
 from common import topics
-from common.config import Grasp, RobotConfig, Surroundings
+from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
 from common.perception.intake import Cameras, Unusable
 from common.perception.pinhole import Pinhole
@@ -29,7 +29,7 @@ class Config(WorkspaceBounds):
     world: Surroundings
     robot: RobotConfig
     grasp: Grasp
-    forget_after: float = Field(
+    forget_after: Tunable[float] = Field(
         2.0, ge=0, le=3600, description="a rejection is told again once its place was empty for so long [s, cell time]"
     )
 
@@ -60,7 +60,12 @@ async def run(bus: Bus, config: Config) -> None:
     markers = bus.writer(topics.WORKSPACE_MARKERS)
     reach = ReachCache(RobotModel.load(config.robot), config.grasp, config)
     validation = Validation(config.world, reach, forget_after=config.forget_after)
-    markers.put(shells(config, bus.header(WORLD)))
+
+    def show() -> None:
+        markers.put(shells(config, bus.header(WORLD)))
+
+    show()
+    bus.on_parameters(show)
     places: list[tuple[float, float, float]] = []
     work, idle = asyncio.Event(), asyncio.Event()
     unfinished: tuple[MarkerArray, Pinhole] | None = None  # sent without the places that were still worked on
@@ -70,6 +75,7 @@ async def run(bus: Bus, config: Config) -> None:
 
     def send(frame: MarkerArray, camera: Pinhole) -> None:
         nonlocal unfinished
+        validation.forget_after = config.forget_after
         verdict = validation.judge(frame, camera)
         unfinished = (frame, camera) if verdict.unknown else None
         header = Header(stamp=frame.header.stamp, frame_id=WORLD)

@@ -6,20 +6,24 @@ from typing import Any
 
 from pydantic import Field
 
-from common.config.basics import Section
+from common.config.basics import Section, Tunable
 
 
 class Motion(Section):
     """How fast the robot moves and how hard planning tries, unless a request says otherwise."""
 
-    velocity_scaling: float = Field(0.2, gt=0, le=1, description="fraction of the joints' velocity limits")
-    acceleration_scaling: float = Field(0.2, gt=0, le=1, description="fraction of the joints' acceleration limits")
-    cartesian_speed_scale: float = Field(
+    velocity_scaling: Tunable[float] = Field(0.2, gt=0, le=1, description="fraction of the joints' velocity limits")
+    acceleration_scaling: Tunable[float] = Field(
+        0.2, gt=0, le=1, description="fraction of the joints' acceleration limits"
+    )
+    cartesian_speed_scale: Tunable[float] = Field(
         1.0, gt=0, le=1, description="stretch of straight-line trajectories after retiming: t/s, v*s, a*s^2"
     )
-    planning_attempts: int = Field(5, ge=1, le=100, description="tries of a sampling planner, the best is kept")
-    planning_time: float = Field(10.0, gt=0, le=600, description="wall time for one plan [s]")
-    object_padding: float = Field(
+    planning_attempts: Tunable[int] = Field(
+        5, ge=1, le=100, description="tries of a sampling planner, the best is kept"
+    )
+    planning_time: Tunable[float] = Field(10.0, gt=0, le=600, description="wall time for one plan [s]")
+    object_padding: Tunable[float] = Field(
         0.003, ge=0, le=0.05, description="perceived objects are planned around with this much more radius [m]"
     )
 
@@ -45,7 +49,9 @@ class Pipeline(Section):
     """Planners in the order in which they are tried, and the checks after them."""
 
     planners: list[PlannerEntry] = Field(min_length=1)
-    validation_step: float = Field(0.01, gt=0, le=0.2, description="largest joint step between checked states [rad]")
+    validation_step: Tunable[float] = Field(
+        0.01, gt=0, le=0.2, description="largest joint step between checked states [rad]"
+    )
 
 
 class Run(Section):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from common.config import Parameters
+from common.config import Parameters, Tunable
 from common.errors import Refused
 from common.hardware.interface import Limits, Vector
 from common.hardware.trajectory import Trajectory, from_message, with_best_interpolation
@@ -15,13 +15,17 @@ from common.messages import JointTrajectory
 class Tolerances(Parameters):
     """How exact a trajectory must be, and how exactly it must be followed."""
 
-    start: float = Field(0.01, gt=0, le=1, description="first point to measured position, each joint [rad]")
-    path: float = Field(0.1, gt=0, le=1, description="measured to commanded position while moving [rad]")
-    goal: float = Field(0.002, gt=0, le=1, description="measured to last position for success [rad]")
-    stopped_velocity: float = Field(0.01, gt=0, le=1, description="slower than this is at rest [rad/s]")
-    goal_time: float = Field(1.0, gt=0, le=60, description="cell time to settle after the last point [s]")
-    slack: float = Field(0.02, ge=0, le=0.5, description="share by which speed and acceleration limits may be exceeded")
-    position_slack: float = Field(1e-3, ge=0, le=0.1, description="position limits may be exceeded by this [rad]")
+    start: Tunable[float] = Field(0.01, gt=0, le=1, description="first point to measured position, each joint [rad]")
+    path: Tunable[float] = Field(0.1, gt=0, le=1, description="measured to commanded position while moving [rad]")
+    goal: Tunable[float] = Field(0.002, gt=0, le=1, description="measured to last position for success [rad]")
+    stopped_velocity: Tunable[float] = Field(0.01, gt=0, le=1, description="slower than this is at rest [rad/s]")
+    goal_time: Tunable[float] = Field(1.0, gt=0, le=60, description="cell time to settle after the last point [s]")
+    slack: Tunable[float] = Field(
+        0.02, ge=0, le=0.5, description="share by which speed and acceleration limits may be exceeded"
+    )
+    position_slack: Tunable[float] = Field(
+        1e-3, ge=0, le=0.1, description="position limits may be exceeded by this [rad]"
+    )
 
 
 def checked_trajectory(

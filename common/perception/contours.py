@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from common.config import Parameters
+from common.config import Parameters, Tunable
 from common.messages import Color, Contour
 from common.perception.contours_refinement import refine
 
@@ -21,14 +21,16 @@ Channel = Literal["saturation", "maximum", "grey"]
 class ContourOptions(Parameters):
     """How contours are found."""
 
-    channel: Channel = Field(
+    channel: Tunable[Channel] = Field(
         "saturation",
         description="what is compared with the threshold: saturation (largest less smallest of red, green and blue: "
         "sees colours on anything grey, so neither ground nor arm), maximum (of the three) or grey (as the seed)",
     )
-    threshold: int = Field(127, ge=0, le=254, description="a pixel above this belongs to an object [0..255]")
-    subpixel: bool = Field(True, description="place each point of a contour where the channel passes half its step")
-    min_area: float = Field(0.0, ge=0, le=1e6, description="smaller contours are left out [px^2]")
+    threshold: Tunable[int] = Field(127, ge=0, le=254, description="a pixel above this belongs to an object [0..255]")
+    subpixel: Tunable[bool] = Field(
+        True, description="place each point of a contour where the channel passes half its step"
+    )
+    min_area: Tunable[float] = Field(0.0, ge=0, le=1e6, description="smaller contours are left out [px^2]")
 
 
 def channel_of(picture: Picture, channel: Channel) -> Picture:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from common.config import Parameters, Surroundings
+from common.config import Parameters, Surroundings, Tunable
 from common.perception.fit import fit_each, fit_spheres
 from common.perception.outline import Blob, Mask, find_blobs
 from common.perception.pinhole import Pinhole
@@ -31,16 +31,18 @@ Hsv = tuple[Hue, Byte, Byte]
 class DetectorOptions(Parameters):
     """How red is told from the rest. HSV as OpenCV has it: hue 0 to 180, saturation and value 0 to 255."""
 
-    hsv_red_lo1: Hsv = Field((0, 120, 80), description="lower end of the first window: hue, saturation, value")
-    hsv_red_hi1: Hsv = Field((10, 255, 255), description="upper end of the first window")
-    hsv_red_lo2: Hsv = Field((170, 120, 80), description="lower end of the second window: red goes round the hue axis")
-    hsv_red_hi2: Hsv = Field((180, 255, 255), description="upper end of the second window")
-    morph_kernel_px: int = Field(7, ge=1, le=51, description="ellipse for opening, then closing [px]")
-    min_contour_area_px: float = Field(400.0, gt=0, le=1e7, description="smaller blobs are ignored [px^2]")
-    outline_offset_px: float = Field(
+    hsv_red_lo1: Tunable[Hsv] = Field((0, 120, 80), description="lower end of the first window: hue, saturation, value")
+    hsv_red_hi1: Tunable[Hsv] = Field((10, 255, 255), description="upper end of the first window")
+    hsv_red_lo2: Tunable[Hsv] = Field(
+        (170, 120, 80), description="lower end of the second window: red goes round the hue axis"
+    )
+    hsv_red_hi2: Tunable[Hsv] = Field((180, 255, 255), description="upper end of the second window")
+    morph_kernel_px: Tunable[int] = Field(7, ge=1, le=51, description="ellipse for opening, then closing [px]")
+    min_contour_area_px: Tunable[float] = Field(400.0, gt=0, le=1e7, description="smaller blobs are ignored [px^2]")
+    outline_offset_px: Tunable[float] = Field(
         -1.0, ge=-10, le=10, description="where the outline is expected, outside of the silhouette [px]"
     )
-    max_offset_px: float = Field(
+    max_offset_px: Tunable[float] = Field(
         2.0, gt=0, le=20, description="an outline that is further from where it is expected is not that of a ball [px]"
     )
 
@@ -87,24 +89,21 @@ class Detector:
 
         Args:
             surroundings: radius of the balls, height of the table, container.
-            options: colour windows and sizes.
+            options: colour windows and sizes; they may change between pictures.
         """
         self.options = options or DetectorOptions()
         self.resting = Resting.of(surroundings)
-        o, size = self.options, self.options.morph_kernel_px
-        self._windows = [
-            (np.array(o.hsv_red_lo1), np.array(o.hsv_red_hi1)), (np.array(o.hsv_red_lo2), np.array(o.hsv_red_hi2))
-        ]
-        self._kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-        self._last: tuple[Picture, Pinhole, list[Detection]] | None = None
+        self._last: tuple[Picture, Pinhole, DetectorOptions, list[Detection]] | None = None
 
     def masks(self, picture: Picture) -> tuple[Mask, Mask]:
         """What is red in a bgr8 picture: opened, and then closed; 255 where it is."""
+        o, size = self.options, self.options.morph_kernel_px
         hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
-        low = cv2.inRange(hsv, *self._windows[0])
-        high = cv2.inRange(hsv, *self._windows[1])
-        opened = cv2.morphologyEx(cv2.bitwise_or(low, high), cv2.MORPH_OPEN, self._kernel)
-        closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, self._kernel)
+        low = cv2.inRange(hsv, np.array(o.hsv_red_lo1), np.array(o.hsv_red_hi1))
+        high = cv2.inRange(hsv, np.array(o.hsv_red_lo2), np.array(o.hsv_red_hi2))
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+        opened = cv2.morphologyEx(cv2.bitwise_or(low, high), cv2.MORPH_OPEN, kernel)
+        closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel)
         return np.asarray(opened, np.uint8), np.asarray(closed, np.uint8)
 
     def detect(self, picture: Picture, camera: Pinhole) -> list[Detection]:
@@ -112,10 +111,11 @@ class Detector:
 
         A picture that is the last one again, as drawn ones without noise often are, is not looked at again.
         """
-        if self._last is not None and camera is self._last[1] and np.array_equal(picture, self._last[0]):
-            return list(self._last[2])
+        last = self._last
+        if last and camera is last[1] and self.options == last[2] and np.array_equal(picture, last[0]):
+            return list(last[3])
         found = self._look_at(picture, camera)
-        self._last = (picture.copy(), camera, found)
+        self._last = (picture.copy(), camera, self.options.model_copy(), found)
         return list(found)
 
     def _look_at(self, picture: Picture, camera: Pinhole) -> list[Detection]:

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from common.config import Parameters
+from common.config import Parameters, Tunable
 from common.perception.contours_refinement import normals
 from common.perception.depth import Depth, DepthError, Rays, is_valid
 from common.perception.outline_joining import joined
@@ -41,11 +41,13 @@ SQUARE = np.ones((3, 3), np.uint8)
 class TopFaceOptions(Parameters):
     """How the top face is found."""
 
-    top_tolerance: float = Field(
+    top_tolerance: Tunable[float] = Field(
         0.002, gt=0, le=0.1, description="heights that differ by less are one face [m]; grows with the depth's noise"
     )
-    max_invalid: float = Field(0.05, ge=0, le=1, description="part of a contour that may lack depth")
-    rounding: float = Field(0.0, ge=0, le=0.1, description="points are rounded to multiples of this [m]; 0: not at all")
+    max_invalid: Tunable[float] = Field(0.05, ge=0, le=1, description="part of a contour that may lack depth")
+    rounding: Tunable[float] = Field(
+        0.0, ge=0, le=0.1, description="points are rounded to multiples of this [m]; 0: not at all"
+    )
 
 
 @dataclass(frozen=True, eq=False)

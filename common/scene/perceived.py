@@ -6,28 +6,17 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from common import messages as m
-from common.config import GripperConfig, Parameters, Surroundings
+from common.config import GripperConfig, Surroundings
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, matrix_to_pose
 from common.scene.fixtures import color_of, fixed_objects
 from common.scene.slots import occupied_slots, slot_positions
-from common.scene.tracks import Place, Tracks
+from common.scene.tracks import Place, SceneParameters, Tracks
 from common.scene.workspace import inside_container
 
 Array = NDArray[np.float64]
-
-
-class SceneParameters(Parameters):
-    """How detections become objects; times are cell time."""
-
-    match_radius: float = Field(0.08, gt=0, le=0.5, description="a detection within this of a ball is that ball [m]")
-    confirm_frames: int = Field(2, ge=1, le=100, description="a ball exists once it was seen in this many frames")
-    forget_after: float = Field(0.35, ge=0, le=60, description="a ball not seen for this long is gone [s]")
-    smoothing: float = Field(0.3, gt=0, le=1, description="weight of a new detection of a ball that lies still")
-    still: float = Field(0.003, ge=0, le=0.05, description="displacement below which a ball lies still [m]")
 
 
 class PerceivedScene:
@@ -39,15 +28,13 @@ class PerceivedScene:
         """Start with the fixtures alone.
 
         Args:
-            parameters: of the tracking.
+            parameters: of the tracking; they may change meanwhile.
             around: fixtures, container, size and colour of a ball.
             gripper: its links may touch what is held.
             tcp_link: what is held moves with this link.
         """
         self.around, self.gripper, self.tcp_link = around, gripper, tcp_link
-        p = parameters
-        self._tracks = Tracks(p.match_radius, p.confirm_frames, p.forget_after, p.smoothing, p.still)
-        self._match_radius = p.match_radius
+        self.p, self._tracks = parameters, Tracks(parameters)
         self._fixed = fixed_objects(around)
         self._slots = slot_positions(around.container, around.ball_radius, around.table_height).reshape(-1, 3)
         self._occupied: set[int] = set()
@@ -89,7 +76,7 @@ class PerceivedScene:
             self._held = None
             return
         x, y, z = (float(v) for v in T_world_tcp[:3, 3])
-        track = self._tracks.take((x, y, z), self._match_radius)
+        track = self._tracks.take((x, y, z), self.p.match_radius)
         # The fingers have centred it between them; along them and along the tool it lies where it was seen.
         offset = np.zeros(3)
         if track is not None:

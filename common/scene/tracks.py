@@ -6,7 +6,27 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pydantic import Field
+
+from common.config import Parameters, Tunable
+
 Place = tuple[float, float, float]
+
+
+class SceneParameters(Parameters):
+    """How detections become objects; times are cell time."""
+
+    match_radius: Tunable[float] = Field(
+        0.08, gt=0, le=0.5, description="a detection within this of a ball is that ball [m]"
+    )
+    confirm_frames: Tunable[int] = Field(
+        2, ge=1, le=100, description="a ball exists once it was seen in this many frames"
+    )
+    forget_after: Tunable[float] = Field(0.35, ge=0, le=60, description="a ball not seen for this long is gone [s]")
+    smoothing: Tunable[float] = Field(
+        0.3, gt=0, le=1, description="weight of a new detection of a ball that lies still"
+    )
+    still: Tunable[float] = Field(0.003, ge=0, le=0.05, description="displacement below which a ball lies still [m]")
 
 
 @dataclass
@@ -22,18 +42,9 @@ class Track:
 class Tracks:
     """Matches detections to known balls, one to one, nearest pairs first."""
 
-    def __init__(self, match_radius: float, confirm: int, forget_after: float, smoothing: float, still: float) -> None:
-        """Start with no balls.
-
-        Args:
-            match_radius: a detection within this of a ball is that ball [m].
-            confirm: a ball exists once it was seen in this many frames.
-            forget_after: a ball not seen for this long is gone [s].
-            smoothing: weight of the newest detection of a ball that lies still, 0 to 1.
-            still: a ball displaced by less than this lies still and is smoothed [m].
-        """
-        self.match_radius, self.confirm, self.forget_after = match_radius, confirm, forget_after
-        self.smoothing, self.still = smoothing, still
+    def __init__(self, parameters: SceneParameters) -> None:
+        """Start with no balls; the parameters may change between frames."""
+        self.p = parameters
         self._tracks: list[Track] = []
         self._count = 0
 
@@ -43,7 +54,7 @@ class Tracks:
             (math.dist(t.position, p), i, j)
             for i, t in enumerate(self._tracks)
             for j, p in enumerate(positions)
-            if math.dist(t.position, p) <= self.match_radius
+            if math.dist(t.position, p) <= self.p.match_radius
         )
         matched_tracks: set[int] = set()
         matched: set[int] = set()
@@ -52,10 +63,10 @@ class Tracks:
                 continue
             matched_tracks.add(i)
             matched.add(j)
-            track, weight = self._tracks[i], self.smoothing if distance < self.still else 1.0
+            track, weight = self._tracks[i], self.p.smoothing if distance < self.p.still else 1.0
             x, y, z = (a + weight * (b - a) for a, b in zip(track.position, positions[j], strict=True))
             track.position, track.seen, track.last_seen = (x, y, z), track.seen + 1, now
-        self._tracks = [t for t in self._tracks if now - t.last_seen <= self.forget_after]
+        self._tracks = [t for t in self._tracks if now - t.last_seen <= self.p.forget_after]
         for j, position in enumerate(positions):
             if j not in matched:
                 self._count += 1
@@ -63,7 +74,7 @@ class Tracks:
 
     def confirmed(self) -> list[Track]:
         """Balls that were seen often enough to be believed."""
-        return [t for t in self._tracks if t.seen >= self.confirm]
+        return [t for t in self._tracks if t.seen >= self.p.confirm_frames]
 
     def take(self, position: Place, radius: float) -> Track | None:
         """The ball nearest to a position, within `radius` [m], which is no longer tracked after this."""

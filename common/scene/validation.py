@@ -47,12 +47,12 @@ class Validation:
         Args:
             around: container and size of the balls.
             reach: answers for places on the table.
-            forget_after: a place that was empty for so long is told again [s, cell time].
+            forget_after: a place that was empty for so long is told again [s, cell time]; may be changed.
             same_place: detections within this are at the same place [m]; less than balls are apart.
         """
         self._around = around
         self._reach = reach
-        self._forget_ns = int(forget_after * 1e9)
+        self.forget_after = forget_after
         self._same_place = same_place
         self._told: list[_Told] = []
 
@@ -60,7 +60,7 @@ class Validation:
         """What becomes of the detections of a frame. The same frame may be judged again when more is known."""
         verdict = Verdict()
         stamp = frame.header.stamp
-        self._told = [told for told in self._told if stamp - told.seen <= self._forget_ns]
+        self._told = [told for told in self._told if stamp - told.seen <= self.forget_after * 1e9]
         for marker in frame.markers:
             place, reason = self._reason(marker, camera)
             if reason is None:

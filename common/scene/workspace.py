@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from common.config import Grasp, Parameters, Surroundings
+from common.config import Grasp, Parameters, Surroundings, Tunable
 from common.perception.pinhole import Pinhole
 from common.perception.resting import Resting
 from common.robot.ik import solve_ik
@@ -31,16 +31,18 @@ _FROM_NEAR = 8
 class WorkspaceBounds(Parameters):
     """A cylindrical shell about the robot's base axis, and the effort to find a chain of poses within it."""
 
-    min_height: float = Field(-0.05, ge=-5, le=5, description="lowest z of an object [m]")
-    max_height: float = Field(0.98, ge=-5, le=5, description="highest z of an object [m]")
-    min_radius: float = Field(0.18, ge=0, le=5, description="least horizontal distance from the base axis [m]")
-    max_radius: float = Field(0.82, gt=0, le=5, description="largest horizontal distance from the base axis [m]")
-    singularity_radius: float = Field(
+    min_height: Tunable[float] = Field(-0.05, ge=-5, le=5, description="lowest z of an object [m]")
+    max_height: Tunable[float] = Field(0.98, ge=-5, le=5, description="highest z of an object [m]")
+    min_radius: Tunable[float] = Field(0.18, ge=0, le=5, description="least horizontal distance from the base axis [m]")
+    max_radius: Tunable[float] = Field(
+        0.82, gt=0, le=5, description="largest horizontal distance from the base axis [m]"
+    )
+    singularity_radius: Tunable[float] = Field(
         0.08, ge=0, le=5, description="column about the base axis in which the wrist axes line up [m]"
     )
-    yaw_count: int = Field(8, ge=1, le=36, description="hand orientations tried, spread over half a turn")
-    line_step: float = Field(0.02, gt=0, le=0.2, description="between poses checked along straight lines [m]")
-    max_joint_step: float = Field(
+    yaw_count: Tunable[int] = Field(8, ge=1, le=36, description="hand orientations tried, spread over half a turn")
+    line_step: Tunable[float] = Field(0.02, gt=0, le=0.2, description="between poses checked along straight lines [m]")
+    max_joint_step: Tunable[float] = Field(
         0.5, gt=0, le=3.2, description="a joint that moves further from one pose to the next has changed branch [rad]"
     )
 
@@ -120,7 +122,7 @@ class ReachCache:
         Args:
             robot: not to be used by another thread while `reason` runs; `known` may be called from any.
             grasp: heights of the stages.
-            bounds: of the workspace.
+            bounds: of the workspace; they may change meanwhile.
             cell: places in the same cube of this side share their answer [m].
             size: places that are remembered; the longest unused go first.
         """
@@ -131,6 +133,7 @@ class ReachCache:
         self._size = size
         self._lock = threading.Lock()
         self._known: OrderedDict[tuple[int, int, int], str] = OrderedDict()
+        self._effort = _effort(self._bounds)  # with which they were found
 
     def known(self, position: Sequence[float]) -> str | None:
         """The reason at a place without any inverse kinematics; None when that would be needed."""
@@ -139,17 +142,22 @@ class ReachCache:
             return reason
         key = self._key(position)
         with self._lock:
+            if self._effort != _effort(self._bounds):
+                self._known.clear()
+                self._effort = _effort(self._bounds)
             if key in self._known:
                 self._known.move_to_end(key)
             return self._known.get(key)
 
     def reason(self, position: Sequence[float]) -> str:
         """As `reach_reason`; the chain is computed for the place itself, the first that is asked for in its cell."""
+        bounds = self._bounds.model_copy()  # on the loop they may change while this thread computes
         known = self.known(position)
         if known is None:
-            known = chain_reason(self._robot, position, self._grasp, self._bounds)
+            known = chain_reason(self._robot, position, self._grasp, bounds)
             with self._lock:
-                self._known[self._key(position)] = known
+                if self._effort == _effort(bounds):
+                    self._known[self._key(position)] = known
                 if len(self._known) > self._size:
                     self._known.popitem(last=False)
         return known
@@ -157,6 +165,11 @@ class ReachCache:
     def _key(self, position: Sequence[float]) -> tuple[int, int, int]:
         x, y, z = (round(value / self._cell) for value in position)
         return x, y, z
+
+
+def _effort(bounds: WorkspaceBounds) -> tuple[float, ...]:
+    """What the answer of `chain_reason` depends on, besides the place."""
+    return bounds.yaw_count, bounds.line_step, bounds.max_joint_step
 
 
 def _yaws(count: int) -> list[float]:

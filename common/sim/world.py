@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from common.config import Parameters, World
+from common.config import Parameters, Tunable, World
 from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Header, Pose, PoseArray, SceneUpdate, Vector3, WorldEdit
 from common.sim.places import Slot, Slots, Table
@@ -30,10 +30,16 @@ FLOOR_BELOW_TABLE = 0.75  # what falls off the table lies this far below its sur
 class GraspTolerances(Parameters):
     """Where a ball must be for the fingers to catch it, in the frame of the tool centre point."""
 
-    across: float = Field(0.010, gt=0, le=0.05, description="centre from the finger pads' middle, tool x axis [m]")
-    along: float = Field(0.010, gt=0, le=0.05, description="centre from the tool centre point, tool z axis [m]")
-    sideways: float = Field(0.002, ge=0, le=0.05, description="a ball may overlap an open finger by this, tool y [m]")
-    release: float = Field(0.002, gt=0, le=0.02, description="let go when the fingers are this much wider [m]")
+    across: Tunable[float] = Field(
+        0.010, gt=0, le=0.05, description="centre from the finger pads' middle, tool x axis [m]"
+    )
+    along: Tunable[float] = Field(
+        0.010, gt=0, le=0.05, description="centre from the tool centre point, tool z axis [m]"
+    )
+    sideways: Tunable[float] = Field(
+        0.002, ge=0, le=0.05, description="a ball may overlap an open finger by this, tool y [m]"
+    )
+    release: Tunable[float] = Field(0.002, gt=0, le=0.02, description="let go when the fingers are this much wider [m]")
 
 
 @dataclass

@@ -6,7 +6,8 @@ from common import messages as m
 from common.config import Surroundings, load_cell
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import tool_down
-from common.scene.perceived import PerceivedScene, SceneParameters
+from common.scene.perceived import PerceivedScene
+from common.scene.tracks import SceneParameters
 
 CELL = load_cell("panda")
 AROUND = CELL.section(Surroundings)

@@ -3,12 +3,12 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.scene.tracks import Tracks
+from common.scene.tracks import SceneParameters, Tracks
 
 
 def tracks(**options: float) -> Tracks:
-    defaults = {"match_radius": 0.08, "confirm": 2, "forget_after": 0.5, "smoothing": 0.5, "still": 0.003}
-    return Tracks(**{**defaults, **options})
+    defaults = {"match_radius": 0.08, "confirm_frames": 2, "forget_after": 0.5, "smoothing": 0.5, "still": 0.003}
+    return Tracks(SceneParameters(**{**defaults, **options}))
 
 
 def test_ball_exists_after_two_frames_and_is_forgotten_after_a_while() -> None:
@@ -50,7 +50,7 @@ coordinate = st.floats(0.2, 0.8, allow_nan=False)
 
 @given(st.lists(st.lists(st.tuples(coordinate, coordinate, st.just(0.03)), max_size=8), min_size=1, max_size=6))
 def test_matching_is_one_to_one_whatever_is_seen(frames: list[list[tuple[float, float, float]]]) -> None:
-    t = tracks(confirm=1, forget_after=0.0)
+    t = tracks(confirm_frames=1, forget_after=0.0)
     for number, frame in enumerate(frames):
         t.update(frame, float(number))
         found = t.confirmed()

@@ -1,0 +1,37 @@
+"""Turns of a loop at a steady rate that may change while it waits."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable
+
+from common.transport.bus import Bus
+
+
+class Pace:
+    """Due times on a fixed grid: a late turn makes neither drift nor a burst, the times it missed are left out.
+
+    The rate is asked for again whenever parameters of the service were changed, also while waiting.
+    """
+
+    def __init__(self, bus: Bus, rate: Callable[[], float]) -> None:
+        """Begin now; `rate` says how many turns there are each second of wall time [Hz]."""
+        self._rate = rate
+        self._loop = asyncio.get_running_loop()
+        self._last = self._loop.time()
+        self._changed = asyncio.Event()
+        bus.on_parameters(self._changed.set)
+
+    async def wait(self) -> None:
+        """Return when the next turn is due."""
+        while True:
+            self._changed.clear()
+            period = 1 / self._rate()
+            due = self._last + period * max(1, math.ceil((self._loop.time() - self._last) / period))
+            try:
+                async with asyncio.timeout_at(due):
+                    await self._changed.wait()
+            except TimeoutError:
+                self._last = due
+                return
