@@ -8,11 +8,12 @@ import math
 from pydantic import Field
 
 from common import topics
-from common.config import Parameters, Surroundings
+from common.config import Parameters, Surroundings, Tunable
 from common.messages import CameraInfo
 from common.perception.image import array_to_image
 from common.perception.sources import Intrinsics, Rectifier, Source, open_source
 from common.transport.bus import Bus
+from common.transport.pace import Pace
 from common.transport.service import main
 
 
@@ -24,12 +25,12 @@ class Config(Parameters):
     intrinsics: str = Field(
         "", description="YAML file with width, height, fx, fy, cx, cy [px] and distortion d; empty: the world's camera"
     )
-    rate: float = Field(10.0, gt=0, le=250, description="pictures per second of wall time at most [Hz]")
+    rate: Tunable[float] = Field(10.0, gt=0, le=250, description="pictures per second of wall time at most [Hz]")
     loop: bool = Field(True, description="begin a file or folder again at its end")
-    reopen_after: float = Field(
+    reopen_after: Tunable[float] = Field(
         0.5, gt=0, le=60, description="wait before a device that is gone is opened again, doubled each time [s]"
     )
-    reopen_at_most: float = Field(10.0, gt=0, le=600, description="longest of these waits [s]")
+    reopen_at_most: Tunable[float] = Field(10.0, gt=0, le=600, description="longest of these waits [s]")
 
 
 async def run(bus: Bus, config: Config) -> None:
@@ -39,25 +40,25 @@ async def run(bus: Bus, config: Config) -> None:
     i = Intrinsics.load(config.intrinsics, config.world.camera)
     rectify = Rectifier(i)
     k = [i.fx, 0.0, i.cx, 0.0, i.fy, i.cy, 0.0, 0.0, 1.0]
+    pace = Pace(bus, lambda: config.rate)
     await bus.ready()
 
     async def send(source: Source) -> int:
         """Send what the source gives until it gives no more; the number of pictures."""
-        loop, count = asyncio.get_running_loop(), 0
-        due = loop.time()
+        loop, count, last = asyncio.get_running_loop(), 0, -math.inf
         while (picture := await asyncio.to_thread(source.read)) is not None:
             header = bus.header(frame)
             if not count:
                 infos.put(CameraInfo(header=header, height=i.height, width=i.width, d=[0.0] * 5, k=k))
-            late = loop.time() - due
-            if source.live and late < -0.5 / config.rate:
+            since = (loop.time() - last) * config.rate  # periods since the last picture was due
+            if source.live and since < 0.5:
                 continue  # a device is read at its own pace, or its buffer would fill with old pictures
+            last = last + 1 / config.rate if since < 2 else loop.time()
             straight = await asyncio.to_thread(rectify, picture, str(config.source))
             images.put(array_to_image(straight, "bgr8", header))
             count += 1
-            due += max(1, math.ceil(late * config.rate)) / config.rate
             if not source.live:
-                await asyncio.sleep(due - loop.time())
+                await pace.wait()
         return count
 
     wait = config.reopen_after

@@ -39,7 +39,7 @@ class PlanningPipeline:
         """
         self.robot = robot
         self._motion = motion
-        self._step = pipeline.validation_step
+        self._pipeline = pipeline
         self._seed = seed
         self._planners: dict[str, tuple[Plan, Parameters]] = {}
         for entry in pipeline.planners:
@@ -195,7 +195,7 @@ class PlanningPipeline:
             start=problem.start,
             velocity=problem.velocity,
             acceleration=problem.acceleration,
-            step=self._step,
+            step=self._pipeline.validation_step,
         )
 
 
