@@ -116,7 +116,7 @@ class PlanRequest(Message):
     acceleration_scaling: Annotated[float, Field(gt=0, le=1)] | None = None
     planning_time: Annotated[float, Field(gt=0, le=600)] | None = Field(None, description="wall time [s]")
     planning_attempts: Annotated[int, Field(ge=1, le=100)] | None = None
-    planner: str = Field("", description="use this planner of the pipeline only")
+    planner: str = Field("", description="use only this one, of the pipeline or of the project")
     seed: int | None = None
 
 

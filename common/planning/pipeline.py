@@ -15,7 +15,7 @@ from common.messages import JointTrajectory, JointTrajectoryPoint, PlanAttempt, 
 from common.planning.checks import BadRequest, CheckedRequest, check_collisions, check_request
 from common.planning.collision import CollisionWorld, Pair
 from common.planning.obstacles import BadShape, ObstacleCache
-from common.planning.planners import Plan, load_planner
+from common.planning.planners import Plan, load_planner, planner_names
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result, ToolPath
 from common.planning.retiming import RetimingFailed, TimedPath, stretch
 from common.planning.robot_geometry import RobotGeometry
@@ -44,6 +44,7 @@ class PlanningPipeline:
         self._planners: dict[str, tuple[Plan, Parameters]] = {}
         for entry in pipeline.planners:
             self._planners[entry.name.rpartition(".")[2]] = load_planner(entry.name, entry.options)
+        self._others: dict[str, tuple[Plan, Parameters]] = {}  # of the project; loaded when one is asked for
         self._cache = ObstacleCache(RobotGeometry(robot))
 
     @property
@@ -70,7 +71,7 @@ class PlanningPipeline:
         flag = cancel or Cancel()
         attempts: list[PlanAttempt] = []
         try:
-            names = self._chosen(request)
+            planners = self._chosen(request)
             state = None if current is None else np.asarray(current, dtype=float)
             checked = check_request(self.robot, request, scene, state)
             world = self._world(request, scene, checked)
@@ -80,9 +81,8 @@ class PlanningPipeline:
             return _failed(request, began, CHECKS, failure, attempts)
         problem = self._problem(request, checked, world, began)
         best: tuple[str, Result] | None = None
-        for name in names:
+        for name, (plan, options) in planners.items():
             since = time.monotonic()
-            plan, options = self._planners[name]
             result = plan(problem, options, flag)
             trajectory = None
             if not result.error:
@@ -112,12 +112,19 @@ class PlanningPipeline:
         geometry = ObstacleCache(self._cache.robot)
         return self._make_world(request, scene, np.asarray(start, dtype=float), geometry)
 
-    def _chosen(self, request: PlanRequest) -> list[str]:
-        if not request.planner:
-            return list(self._planners)
-        if request.planner not in self._planners:
-            raise BadRequest("unknown_planner", str(UnknownName("planner", request.planner, self._planners)))
-        return [request.planner]
+    def _chosen(self, request: PlanRequest) -> dict[str, tuple[Plan, Parameters]]:
+        """The pipeline's planners; or the one that is asked for, with its default options if the pipeline lacks it."""
+        name = request.planner
+        if not name:
+            return self._planners
+        if name in self._planners:
+            return {name: self._planners[name]}
+        if name not in self._others:
+            choices = {*planner_names(), *self._planners}
+            if name not in choices:
+                raise BadRequest("unknown_planner", str(UnknownName("planner", name, choices)))
+            self._others[name] = load_planner(name, {})
+        return {name: self._others[name]}
 
     def _world(self, request: PlanRequest, scene: PlanningScene, checked: CheckedRequest) -> CollisionWorld:
         try:

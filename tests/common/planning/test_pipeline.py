@@ -114,7 +114,8 @@ def test_start_in_collision_is_refused_with_the_pair_and_the_next_request_is_ser
         (PlanRequest(id="1", start=list(START), goal=JointGoal(named="hom")), "unknown_pose", "did you mean 'home'"),
         (PlanRequest(id="1", start=list(START), goal=JointGoal()), "bad_goal", "neither"),
         (PlanRequest(id="1", goal=JointGoal(named="home")), "no_state", "joint states"),
-        (to_joints(HOME, START, planner="chomp"), "unknown_planner", "cartesian, joint_move, ompl"),
+        (to_joints(HOME, START, planner="chom"), "unknown_planner",
+         "did you mean 'chomp'?); choices: cartesian, chomp, circ, joint_move, lerp"),
         (to_joints(HOME, START, attach="ball_99"), "unknown_object", "ball_99"),
         (to_joints(HOME, START, attach="ball_0", release=True), "bad_request", "contradict"),
         (to_joints(HOME, START, straight=True), "no_planner", "straight line"),
@@ -210,3 +211,18 @@ def test_path_whose_corners_turn_out_to_collide_is_stopped_at(monkeypatch):
     assert direct.error == "collision"
     assert direct.message == "ompl: validation: waypoint 5 of 9: a collides with b"
     assert [a.error for a in direct.attempts] == ["", "collision"]
+
+
+@pytest.mark.parametrize("planner", ["lerp", "ptp", "trajopt"])
+def test_planner_that_the_pipeline_lacks_can_be_asked_for_by_name(planner):
+    assert planner not in PIPELINE.planners
+    request = to_joints(HOME, START, planner=planner)
+    response = PIPELINE.plan(request, scene([]))
+    assert response.ok and response.planner == planner, response.message
+    assert free_again(request, scene([]), response)
+    assert {a.planner for a in response.attempts} == {planner}
+    assert planner not in PIPELINE.planners, "and is not tried when nobody asks for it"
+
+
+def test_module_that_the_pipeline_does_not_name_is_not_imported_for_a_request():
+    assert PIPELINE.plan(to_joints(HOME, START, planner="os.path"), scene([])).error == "unknown_planner"
