@@ -88,26 +88,43 @@ def _task(command: str, cell: str | None, domain: str | None, connect: str | Non
 
 @task.command()
 def start(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
-    """Start the task of a cell that was told to wait, or start it again."""
+    """Start the task of a cell that was told to wait, or start it again; a robot that is held is let go."""
     _task("start", cell, domain, connect)
 
 
 @task.command()
 def pause(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
-    """Finish the motion under way and wait."""
+    """Bring the robot to rest on its path at once and hold it there."""
     _task("pause", cell, domain, connect)
 
 
 @task.command()
 def resume(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
-    """Carry on after a pause."""
+    """Let the robot go on along its path after a pause."""
     _task("resume", cell, domain, connect)
 
 
 @task.command()
 def stop(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
-    """Stop the robot and the task."""
+    """Stop the robot, give up its motion, and wait for a start."""
     _task("stop", cell, domain, connect)
+
+
+@task.command()
+def home(
+    planner: Annotated[str, typer.Option("--planner", metavar="NAME", help="use only this one")] = "",
+    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+) -> None:
+    """Plan a way home and go there, while no task has the robot; Ctrl-C stops the robot."""
+    from cli.inspection import inspect
+    from cli.rendering import to_json
+    from common.messages import JointGoal
+    from common.transport.operator_motion import OperatorMotion
+
+    async def visit(bus: Bus) -> Message:
+        return await OperatorMotion(bus).move(JointGoal(named="home"), planner=planner)
+
+    typer.echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
 
 
 @task.command()

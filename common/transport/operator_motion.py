@@ -1,0 +1,186 @@
+"""Motions that a person asks for: planned from where the robot is, executed, waited for. Never against a task.
+
+A person moves the robot while no task wants to: it was not started or was stopped, it is idle, or it has ended. A task
+that has begun must be stopped first, also one that is paused, since its motion is only held. Should a task begin at the
+same moment, the executor lets one of the two move the robot, and a task waits for the end of what it did not ask for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import uuid
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+from common import messages as m
+from common import topics
+from common.errors import RequestFailed, ZencellError
+from common.transport.bus import Bus
+from common.transport.reader import Reader
+
+log = logging.getLogger(__name__)
+
+PLANNING_TIME = 5.0  # [s] wall
+PLAN_TIMEOUT = PLANNING_TIME + 15.0  # [s] wall: what is planned for somebody else comes first
+REQUEST_TIMEOUT = 2.0  # [s] wall
+PATIENCE = 10.0  # [s] wall without progress, unless the robot is held
+FIRST_WORD = 0.5  # [s] wall in which a state that there is has arrived
+COME_TO_REST = 1.0  # [s] wall: for a motion that is being stopped
+AT_REST = ("IDLE", "DONE", "ERROR")  # states in which a task does not move the robot
+
+A = TypeVar("A", bound=m.Message)
+
+Goal = m.JointGoal | m.PoseGoal | m.PathGoal | m.ArcGoal | m.SequenceGoal
+
+
+class MotionFailed(ZencellError):
+    """A motion that was refused, or did not get to its end: `code` is for programs, the line for the person."""
+
+    exit_code = 1
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class OperatorMotion:
+    """Moves the robot for a person; any number of these may live in a cell, the executor follows one goal at a time."""
+
+    def __init__(self, bus: Bus, tasks: Sequence[Reader[Any]] | None = None) -> None:
+        """Declare what is asked and heard.
+
+        Args:
+            bus: in the cell.
+            tasks: readers of what the cell's tasks say of themselves (a `TaskReport`); all that there may be if None.
+        """
+        self._bus = bus
+        self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
+        self._stop, self._hold = bus.client(topics.MOTION_STOP), bus.client(topics.MOTION_HOLD)
+        self._motion = bus.reader(topics.MOTION_STATUS)
+        if tasks is None:
+            tasks = [bus.reader(topics.PICK_PLACE_STATUS), bus.reader(topics.OUTLINE_STATUS)]
+        self._tasks = tasks
+
+    async def plan(self, goal: Goal, *, planner: str = "", straight: bool = False) -> m.PlanResponse:
+        """A trajectory from where the robot is, or what is in its way; nothing moves.
+
+        Args:
+            goal: where to.
+            planner: name of the only one to use; else those of the pipeline.
+            straight: only a straight line of the tool will do.
+
+        Raises:
+            RequestFailed: the planner does not answer, or does not know the scene or the robot's state yet.
+        """
+        request = m.PlanRequest(
+            id=_mint(), stage="operator", goal=goal, planner=planner, straight=straight, planning_time=PLANNING_TIME,
+        )
+        return await self._plan.call(request, PLAN_TIMEOUT)
+
+    async def move(
+        self, goal: Goal, *, planner: str = "", straight: bool = False, timeout: float = PATIENCE
+    ) -> m.MotionStatus:
+        """The last status of a motion to the goal, once it has succeeded. When cancelled, the robot is stopped.
+
+        Args:
+            goal: where to.
+            planner: name of the only one to use; else those of the pipeline.
+            straight: only a straight line of the tool will do.
+            timeout: give up and stop after so long without progress, but for the time that the robot is held [s, wall].
+
+        Raises:
+            MotionFailed: a task has the robot, there is no way, or the motion ended otherwise.
+            RequestFailed: planner or executor do not answer.
+        """
+        await self._require_free()
+        response = await self.plan(goal, planner=planner, straight=straight)
+        if not response.ok or response.trajectory is None:
+            raise MotionFailed(response.error, response.message)
+        return await self.follow(response.trajectory, timeout=timeout)
+
+    async def follow(self, trajectory: m.JointTrajectory, *, timeout: float = PATIENCE) -> m.MotionStatus:
+        """The last status of following a trajectory that was planned before; as `move` otherwise."""
+        held = (await self._require_free()).held
+        if held:  # with nothing under way, letting go moves nothing
+            await self._hold.call(m.HoldRequest(hold=False, reason="a person moves the robot"), REQUEST_TIMEOUT)
+        request = m.ExecuteRequest(id=_mint(), trajectory=trajectory)
+        try:
+            answer = await self._execute.call(request, REQUEST_TIMEOUT)
+            if answer.state == "rejected":
+                self._require_no_task()
+                raise MotionFailed(answer.error, f"the motion was refused: {answer.message}")
+            return await self._ended(answer, timeout)
+        except (asyncio.CancelledError, RequestFailed, _Stalled):
+            await self._bring_to_rest(request.id)
+            raise
+
+    async def _require_free(self) -> m.MotionStatus:
+        """The motion status, when nothing and nobody moves the robot."""
+        status = await self._known()
+        self._require_no_task()
+        try:
+            async with asyncio.timeout(COME_TO_REST):
+                while status.state == "active":
+                    status = await self._motion.next()
+        except TimeoutError:
+            raise MotionFailed("busy", f"the robot follows goal {status.id!r}: stop it first") from None
+        return status
+
+    async def _known(self) -> m.MotionStatus:
+        first = [asyncio.create_task(_first(reader)) for reader in self._tasks]
+        try:
+            if first:
+                await asyncio.wait(first, timeout=FIRST_WORD, return_when=asyncio.FIRST_COMPLETED)
+            async with asyncio.timeout(REQUEST_TIMEOUT):
+                return await _first(self._motion)
+        except TimeoutError:
+            raise MotionFailed("no_state", "trajectory_executor does not say how the robot is") from None
+        finally:
+            for waiting in first:
+                waiting.cancel()
+
+    def _require_no_task(self) -> None:
+        for reader in self._tasks:
+            task, name = reader.latest, reader.topic.writer
+            if task is not None and task.paused:
+                raise MotionFailed("task_paused", f"{name} is paused, its motion is only held: stop the task first")
+            if task is not None and task.started and task.state not in AT_REST:
+                raise MotionFailed("task_busy", f"{name} is {task.state} and has the robot: stop the task first")
+
+    async def _ended(self, accepted: m.MotionStatus, patience: float) -> m.MotionStatus:
+        """The status of the goal that was accepted, once it has succeeded."""
+        status: m.MotionStatus | None = accepted
+        while True:
+            if status is not None and status.id == accepted.id and status.state != "active":
+                break
+            if status is not None and status.id != accepted.id and status.header.stamp > accepted.header.stamp:
+                raise MotionFailed("forgotten", "trajectory_executor was restarted and has forgotten the motion")
+            try:
+                async with asyncio.timeout(patience):
+                    status = await self._motion.next()
+            except TimeoutError:
+                if status is None or not status.held:
+                    raise _Stalled("timeout", f"no progress for {patience:g} s: the motion is stopped") from None
+        if status.state != "succeeded":
+            raise MotionFailed(status.error or status.state, f"the motion was {status.state}: {status.message}")
+        return status
+
+    async def _bring_to_rest(self, goal: str) -> None:
+        try:
+            await self._stop.call(m.StopRequest(id=goal, reason="the person who asked for it gave up"), REQUEST_TIMEOUT)
+        except RequestFailed as error:
+            log.warning("the robot may still move: %s", error)
+
+
+class _Stalled(MotionFailed):
+    """Nothing moves on, though nobody holds the robot."""
+
+
+async def _first(reader: Reader[A]) -> A:
+    """The newest message there is; the first to come when there is none yet."""
+    return reader.latest or await reader.next()
+
+
+def _mint() -> str:
+    return f"operator-{uuid.uuid4().hex[:8]}"
