@@ -7,6 +7,8 @@ import re
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import dataclass
+from email.message import Message
 from typing import Any
 
 import msgspec
@@ -42,14 +44,21 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
         close_server(server)
 
 
-def get(server: viser.ViserServer, path: str = "/", **headers: str) -> http.client.HTTPResponse:
-    """The answer to a plain request, read to its end (`answer.text`)."""
+@dataclass(frozen=True)
+class Got:
+    status: int
+    text: str
+    headers: Message
+
+
+def get(server: viser.ViserServer, path: str = "/", **headers: str) -> Got:
+    """The answer to a plain request."""
     connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=PATIENCE)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
-    answer.text = answer.read().decode()  # type: ignore[attr-defined]
+    got = Got(answer.status, answer.read().decode(), answer.headers)
     connection.close()
-    return answer
+    return got
 
 
 def open_page(
@@ -247,7 +256,11 @@ async def test_nobody_can_have_the_page_tunnelled_to_a_public_server(
     monkeypatch.setattr(server, "request_share_url", lambda: asked.append("share"))
     after = asyncio.Event()
     loop = asyncio.get_running_loop()
-    server._websock_server.register_handler(GuiUpdateMessage, lambda *_: loop.call_soon_threadsafe(after.set))
+
+    def noted(*_: object) -> None:
+        loop.call_soon_threadsafe(after.set)
+
+    server._websock_server.register_handler(GuiUpdateMessage, noted)
     async with open_page(server) as connection, asyncio.timeout(PATIENCE):
         await connection.send(msgspec.msgpack.encode({"type": ShareUrlRequest.__name__}))
         await connection.send(msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "none", "updates": {}}))
