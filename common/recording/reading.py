@@ -1,0 +1,184 @@
+"""Reads recordings: what they are about, and their messages in order; finished or not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import msgpack
+from mcap.records import Channel, Message, Schema
+
+from common.recording.layout import DAMAGE, ChunkPlace, Layout, layout_of, records_of
+from common.recording.sample import RecordingError, Sample
+from common.recording.writing import ABOUT, TRACES_SCHEMA
+
+Wanted = Callable[[str], bool]  # is given a topic: the key without the cell
+
+
+def _all(_topic: str) -> bool:
+    return True
+
+
+class Recording:
+    """An open recording; use it in a `with` block."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a file and look where what lies.
+
+        Raises:
+            RecordingError: there is no such file, it can not be read, or is no recording of ours.
+        """
+        self.path = path
+        try:
+            self.file: BinaryIO = path.open("rb")
+        except FileNotFoundError:
+            raise RecordingError(f"{path}: there is no such file") from None
+        except OSError as error:
+            raise RecordingError(f"{path}: can not be read: {error.strerror}") from None
+        try:
+            self.layout: Layout = layout_of(self.file, path)
+            if self.layout.loose_messages:
+                raise RecordingError(f"{path}: has messages outside of chunks, which no recording of zencell has")
+        except BaseException:
+            self.file.close()
+            raise
+        self._schemas: dict[int, Schema] = dict(self.layout.schemas)
+        self._channels: dict[int, Channel] = dict(self.layout.channels)
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.file.close()
+
+    # --- what it is about -----------------------------------------------------------------------------------------
+
+    @property
+    def finished(self) -> bool:
+        """Whether it was closed; if not, `zencell recover` makes it whole."""
+        return self.layout.finished
+
+    @property
+    def start(self) -> int:
+        """Log time of the first message [ns]; 0 without one."""
+        return min((place.start for place in self.layout.chunks), default=0)
+
+    @property
+    def end(self) -> int:
+        """Log time of the last message [ns]; 0 without one."""
+        return max((place.end for place in self.layout.chunks), default=0)
+
+    @property
+    def seconds(self) -> float:
+        """How long it is [s]."""
+        return (self.end - self.start) * 1e-9
+
+    def metadata(self, name: str) -> dict[str, Any]:
+        """What a metadata record says, the newest of that name; empty without one."""
+        for record in reversed(self.layout.metadata):
+            if record.name == name:
+                return {key: _value(text) for key, text in record.metadata.items()}
+        return {}
+
+    @property
+    def cell(self) -> str:
+        """Name of the cell, empty for a file that does not say."""
+        return str(self.metadata(ABOUT).get("cell", ""))
+
+    # --- what is in it --------------------------------------------------------------------------------------------
+
+    def samples(self, wants: Wanted = _all, since: int = 0) -> Iterator[Sample]:
+        """The messages of wanted topics from a log time [ns] on, in the order in which they came.
+
+        Raises:
+            RecordingError: a chunk is damaged; names where.
+        """
+        for place in self.layout.chunks:
+            if self.finished and (place.end < since or not self._may_have(place, wants)):
+                continue
+            yield from self.samples_of(self._records(place), wants, since)
+
+    def states_before(self, time: int, wants: Wanted = _all) -> list[Sample]:
+        """The last value of each wanted state before a log time [ns], oldest first.
+
+        Raises:
+            RecordingError: a chunk is damaged; names where.
+        """
+        def state(channel: Channel) -> bool:
+            return channel.metadata.get("kind") == "state" and wants(_topic(channel.topic))
+
+        found: dict[tuple[str, str], Sample] = {}
+        for place in self.layout.chunks:
+            if place.start >= time:
+                break
+            known = self.finished and place.channels
+            if known and not any(state(self._channels[i]) for i in place.channels if i in self._channels):
+                continue
+            for sample in self.samples_of(self._records(place), wants, 0):
+                if sample.kind == "state" and sample.log_time < time:
+                    found[sample.key, sample.writer] = sample
+        newest: dict[str, Sample] = {}
+        for sample in sorted(found.values(), key=lambda s: s.log_time):
+            newest.pop(sample.key, None)
+            newest[sample.key] = sample
+        return list(newest.values())
+
+    def _may_have(self, place: ChunkPlace, wants: Wanted) -> bool:
+        if not place.channels:
+            return True
+        return any(wants(_topic(self._channels[i].topic)) for i in place.channels if i in self._channels)
+
+    def _records(self, place: ChunkPlace) -> list[Any]:
+        try:
+            return records_of(self.file, place)
+        except DAMAGE:
+            where = f"{self.path}: is damaged at byte {place.offset}"
+            raise RecordingError(f"{where}; keep the rest with: zencell recover {self.path}") from None
+
+    def samples_of(self, records: list[Any], wants: Wanted = _all, since: int = 0) -> Iterator[Sample]:
+        """The wanted messages among the records of a chunk; its schemas and channels are remembered."""
+        messages: list[Message] = []
+        traces: dict[tuple[int, int], str] = {}
+        for record in records:
+            if isinstance(record, Schema):
+                self._schemas[record.id] = record
+            elif isinstance(record, Channel):
+                self._channels[record.id] = record
+            elif isinstance(record, Message) and record.channel_id in self._channels:
+                if self._name(record.channel_id) == TRACES_SCHEMA:
+                    traces |= _traces(record.data)
+                else:
+                    messages.append(record)
+        for message in messages:
+            channel = self._channels[message.channel_id]
+            if message.log_time >= since and wants(_topic(channel.topic)):
+                yield Sample(
+                    channel.topic, message.data, message.log_time, message.publish_time,
+                    self._name(message.channel_id), channel.metadata.get("kind", "stream"),
+                    channel.metadata.get("writer", ""), message.sequence,
+                    traces.get((message.channel_id, message.sequence), ""),
+                )
+
+    def _name(self, channel: int) -> str:
+        schema = self._schemas.get(self._channels[channel].schema_id)
+        return schema.name if schema else ""
+
+
+def _topic(key: str) -> str:
+    return key.partition("/")[2]
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def _traces(data: bytes) -> dict[tuple[int, int], str]:
+    return {(channel, sequence): trace for channel, sequence, trace in msgpack.unpackb(data)["traces"]}

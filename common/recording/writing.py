@@ -1,0 +1,133 @@
+"""Writes samples to one MCAP file, in chunks that are whole on disk a second later at most."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgpack
+from mcap.writer import CompressionType, Writer
+
+from common.recording.appending import AppendedFile
+from common.recording.sample import Sample
+from common.recording.schemas import schema_of
+from common.recording.stamps import stamp_of
+
+CHUNK_BYTES = 512 * 1024  # before compression; a picture has a chunk of its own
+PROFILE = "zencell"
+ABOUT, RUN, ENDED = "zencell", "run", "ended"  # names of metadata records
+TRACES_TOPIC, TRACES_SCHEMA = "recording/traces", "zencell.Traces"
+_OURS_ALONE = 2**62  # chunk size that the library never reaches: where chunks end is decided here
+_TRACES = {
+    "type": "object",
+    "description": "Trace ids of the messages of this chunk: [channel id, sequence number, trace id].",
+    "properties": {"traces": {"type": "array", "items": {"type": "array"}}},
+}
+
+
+class RecordingWriter:
+    """One file. Not thread-safe.
+
+    Trace ids have no place in an MCAP message: those of a chunk are its last message, on a topic of their own.
+    """
+
+    def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
+        """Create the file and write what the recording is about.
+
+        Raises:
+            RecordingError: it is there already, or can not be written.
+        """
+        self.path = path
+        self.messages = 0
+        self._file = AppendedFile(path)
+        self._writer = Writer(self._file, chunk_size=_OURS_ALONE, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        self._channels: dict[tuple[str, str, str, str], int] = {}
+        self._schemas: dict[str, int] = {"": 0}
+        self._traces: list[tuple[int, int, str]] = []
+        self._traces_channel = 0
+        self._waiting = 0  # bytes in the chunk that is not written yet
+        self._newest = 0
+        self._writer.start(profile=PROFILE)
+        self.describe(ABOUT, about)
+
+    @property
+    def size(self) -> int:
+        """Bytes on disk."""
+        return self._file.tell()
+
+    def describe(self, name: str, values: Mapping[str, Any]) -> None:
+        """Write a metadata record; what is not text is written as JSON."""
+        texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in values.items()}
+        self._writer.add_metadata(name, texts)
+
+    def add(self, sample: Sample) -> None:
+        """Write a message. It is on disk after the next `flush`, or when the chunk is full.
+
+        Raises:
+            WritingFailed: the disk takes no more.
+        """
+        channel = self._channel_of(sample)
+        stamp = sample.publish_time or stamp_of(sample.payload) or sample.log_time
+        sequence = sample.sequence & 0xFFFFFFFF
+        self._writer.add_message(channel, sample.log_time, sample.payload, stamp, sequence)
+        if sample.trace:
+            self._traces.append((channel, sequence, sample.trace))
+        self.messages += 1
+        self._newest = max(self._newest, sample.log_time)
+        self._waiting += len(sample.payload)
+        if self._waiting >= CHUNK_BYTES:
+            self.flush()
+
+    def _channel_of(self, sample: Sample) -> int:
+        name = (sample.key, sample.writer, sample.message, sample.kind)
+        if name not in self._channels:
+            self._channels[name] = self._writer.register_channel(
+                sample.key, "msgpack", self._schema_of(sample.message), {"kind": sample.kind, "writer": sample.writer}
+            )
+        return self._channels[name]
+
+    def _schema_of(self, message: str) -> int:
+        if message not in self._schemas:
+            data = schema_of(message)
+            self._schemas[message] = self._writer.register_schema(message, "jsonschema" if data else "", data)
+        return self._schemas[message]
+
+    def flush(self) -> None:
+        """Put everything on disk that was written so far, as one chunk.
+
+        Raises:
+            WritingFailed: the disk takes no more.
+        """
+        self._add_traces()
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._waiting = 0
+
+    def _add_traces(self) -> None:
+        if not self._traces:
+            return
+        if not self._traces_channel:
+            schema = self._writer.register_schema(TRACES_SCHEMA, "jsonschema", json.dumps(_TRACES).encode())
+            self._traces_channel = self._writer.register_channel(TRACES_TOPIC, "msgpack", schema, {"kind": "traces"})
+        payload = msgpack.packb({"traces": self._traces})
+        self._writer.add_message(self._traces_channel, self._newest, payload, self._newest)
+        self._traces = []
+
+    def close(self, ended: Mapping[str, Any] | None = None) -> None:
+        """Write the rest, how it ended and the index, and close the file.
+
+        Raises:
+            WritingFailed: the disk takes no more.
+        """
+        try:
+            self.flush()
+            if ended is not None:
+                self.describe(ENDED, ended)
+            self._writer.finish()  # type: ignore[no-untyped-call]
+        finally:
+            self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is, after a failure."""
+        self._file.close()
