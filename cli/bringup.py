@@ -120,7 +120,7 @@ class Operation:
         Raises:
             ConfigError, UnknownName: one line naming the option, the value and the choices.
         """
-        from common.config import load_cell
+        from common.config import expanded, load_cell
         from common.errors import ConfigError
         from common.supervision.launch import (
             Launch,
@@ -139,7 +139,7 @@ class Operation:
             raise ConfigError("--summary", summary, "is in a folder that does not exist")
         number, endpoint = place_of(domain, connect)
         self.launch = Launch(
-            cell=cell, overrides=tuple(overrides or ()), world=world, seed=options.whole("--seed", seed, 0),
+            cell=cell, overrides=tuple(expanded(overrides or ())), world=world, seed=options.whole("--seed", seed, 0),
             domain=number, connect=endpoint, log_json=log_json, clock=clock_of(options.number("--speed", speed)),
         )
         loaded = load_cell(cell, self.launch.overrides, world=world, seed=self.launch.seed)

@@ -29,7 +29,8 @@ Json = Annotated[bool, typer.Option("--json", help="one JSON object a line")]
 Count = Annotated[str | None, typer.Option("--count", "-n", metavar="N", help="stop after N")]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="PATH=VALUE", help="any value of the cell, as world.count=5; repeatable"),
+    typer.Option("--set", metavar="PATH=VALUE",
+                 help="any value of the cell, as world.count=5, or those of a YAML file, as @FILE; repeatable"),
 ]
 WorldName = Annotated[str | None, typer.Option("--world", metavar="NAME", help="another world, by name or path")]
 Seed = Annotated[str | None, typer.Option("--seed", metavar="N", help="of everything random")]

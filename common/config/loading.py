@@ -7,26 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
 from common.config.basics import Parameters
 from common.config.cell import Cell
 from common.config.checking import check, is_section
 from common.config.files import find_file, made_absolute, names_of, read_robot, read_yaml
+from common.config.overrides import expanded, parse_override
 from common.errors import ConfigError, UnknownName
 
 P = TypeVar("P", bound=Parameters)
-
-
-def parse_override(text: str) -> tuple[list[str], Any]:
-    """The dotted path and the value (as YAML) of `PATH=VALUE`."""
-    path, found, value = text.partition("=")
-    if not found or not path.strip():
-        raise ConfigError("--set", text, "must be PATH=VALUE, for example world.count=5")
-    try:
-        return path.strip().split("."), yaml.safe_load(value)
-    except yaml.YAMLError:
-        raise ConfigError(f"--set {path}", value, "is not a YAML value") from None
 
 
 def _override(tree: dict[str, Any], path: Sequence[str], value: Any) -> None:
@@ -48,7 +36,7 @@ def load_cell(
 
     Args:
         cell: a name, or a path that ends in .yaml.
-        overrides: `PATH=VALUE` each, applied after all files were read.
+        overrides: `PATH=VALUE` each, or `@FILE` for those of a file, applied after all files were read.
         world: name or path of a world that replaces the cell's.
         seed: replaces the cell's seed.
 
@@ -57,7 +45,7 @@ def load_cell(
     """
     path = find_file("cells", cell)
     tree = read_yaml(path)
-    parsed = [parse_override(text) for text in overrides]
+    parsed = [parse_override(text) for text in expanded(overrides)]
     given = {parts[0]: value for parts, value in parsed if len(parts) == 1}  # which file to read may be overridden
     given |= {"world": world} if world is not None else {}
     tree |= {part: given[part] for part in ("robot", "world", "pipeline") if part in given}

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import yaml
 from pydantic import BaseModel, JsonValue
 from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
@@ -18,6 +17,7 @@ from pydantic_core import to_jsonable_python
 from common.config.basics import AtRunTime, Parameters, Section
 from common.config.cell import Cell
 from common.config.checking import check, is_section
+from common.config.overrides import yaml_line
 from common.config.world import Surroundings
 from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Parameter
@@ -57,7 +57,7 @@ class Change:
     value: Any
 
     def __str__(self) -> str:
-        return f"{self.leaf.path}: {shown(self.leaf.value)} -> {shown(self.value)}"
+        return f"{self.leaf.path}: {yaml_line(self.leaf.value)} -> {yaml_line(self.value)}"
 
 
 def is_tunable(info: FieldInfo) -> bool:
@@ -185,12 +185,6 @@ def _limits(info: FieldInfo, *, whole: bool) -> tuple[float | None, float | None
     return low, high
 
 
-def shown(value: Any) -> str:
-    """A value as YAML writes it on one line: what `PATH=VALUE` takes."""
-    text = yaml.safe_dump(to_jsonable_python(value), default_flow_style=True, width=math.inf, allow_unicode=True)
-    return text.removesuffix("\n").removesuffix("\n...")
-
-
 # --- changing it ------------------------------------------------------------------------------------------------
 
 
@@ -206,7 +200,7 @@ def checked(config: Parameters, service: str, values: Mapping[str, Any]) -> list
         if path not in known:
             raise Refused("unknown_parameter", str(UnknownName(f"parameter of {service}", path, known)))
         if not known[path].runtime:
-            raise Refused("needs_restart", f"{path}: needs a restart: zencell up CELL --set {path}={shown(value)}")
+            raise Refused("needs_restart", f"{path}: needs a restart: zencell up CELL --set {path}={yaml_line(value)}")
     try:
         candidate = _candidate(config, service, values)
     except ConfigError as error:

@@ -54,7 +54,10 @@ class Start(Generic[P]):
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that every service process has."""
     parser.add_argument("--cell", help=f"name or YAML file of the cell ({CELL_VARIABLE})")
-    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="override a value of the cell")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="PATH=VALUE",
+        help="override a value of the cell; @FILE: those of a file",
+    )
     parser.add_argument("--world", help="name or YAML file of another world")
     parser.add_argument("--seed", type=int, help="of everything random")
     parser.add_argument("--speed", type=float, help=f"of cell time, 0.1 to 10 ({SPEED_VARIABLE})")

@@ -1,0 +1,61 @@
+"""Values of a cell that are given beside its file: `PATH=VALUE`, and `@FILE` for a YAML file in the shape of a cell."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic_core import to_jsonable_python
+
+from common.config.files import read_yaml
+from common.errors import ConfigError
+
+
+def parse_override(text: str) -> tuple[list[str], Any]:
+    """The dotted path and the value (as YAML) of `PATH=VALUE`."""
+    path, found, value = text.partition("=")
+    if not found or not path.strip():
+        raise ConfigError("--set", text, "must be PATH=VALUE, for example world.count=5, or @FILE.yaml")
+    try:
+        return path.strip().split("."), yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise ConfigError(f"--set {path}", value, "is not a YAML value") from None
+
+
+def expanded(overrides: Sequence[str]) -> list[str]:
+    """The overrides, with `PATH=VALUE` for every value of a file in the place of `@FILE`.
+
+    Raises:
+        ConfigError: a file can not be read, or holds no mapping.
+    """
+    found = []
+    for text in overrides:
+        if text.startswith("@"):
+            tree = read_yaml(Path(text[1:]).expanduser())
+            found += [f"{'.'.join(path)}={yaml_line(value)}" for path, value in _values(tree)]
+        else:
+            found.append(text)
+    return found
+
+
+def _values(tree: Mapping[Any, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every value of a tree with its path; what is empty says nothing."""
+    for key, value in tree.items():
+        name = str(key).rpartition(".")[2] if above == ("services",) else str(key)  # a module goes by its last part
+        if isinstance(value, Mapping):
+            yield from _values(value, (*above, name))
+        elif value is not None:
+            yield (*above, name), value
+
+
+def yaml_line(value: Any) -> str:
+    """A value as YAML writes it on one line: what `PATH=VALUE` takes."""
+    if isinstance(value, str) and not value.isprintable():
+        return json.dumps(value)
+    plain = to_jsonable_python(value)
+    text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf, allow_unicode=True, sort_keys=False)
+    return text.removesuffix("\n").removesuffix("\n...")
