@@ -28,6 +28,9 @@ class SupervisorStatus(Message):
     services: list[ServiceStatus]
     speed: Positive = Field(1.0, description="cell time per wall time")
     epoch: int = Field(0, ge=0, description="when cell time and wall time were equal [ns since the Unix epoch]")
+    seed: int = 0
+    world: str = Field("", description="that replaces the cell's, as it was asked for")
+    overrides: list[str] = Field([], description="PATH=VALUE, as they were asked for; secrets are left out")
 
 
 class LogLine(Message):

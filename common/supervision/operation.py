@@ -24,6 +24,7 @@ T = TypeVar("T")
 NAME = "supervisor"
 CONNECT_TIMEOUT = 5.0  # [s] to reach somebody else's router
 LOOK_TIMEOUT = 1.0  # [s] to hear who is up there
+SECRET = "token"  # in the path of an override: is not told
 STATUS_PERIOD = 0.25  # [s] between looks at the connection to the router
 
 log = logging.getLogger(NAME)
@@ -98,7 +99,7 @@ async def _work(
             await _require_unused(bus, endpoint)
         prepare(bus)
         bus.alive.on_change(supervisor.mark_alive)
-        return await beside(_publish(bus, supervisor), _bring_up_and_work(bus, supervisor, work))
+        return await beside(_publish(bus, cell, launch, supervisor), _bring_up_and_work(bus, supervisor, work))
     finally:
         log.removeHandler(to_topic)
         await connecting.__aexit__(None, None, None)
@@ -120,7 +121,7 @@ async def _require_unused(bus: Bus, endpoint: str) -> None:
         raise ConfigError("--connect", endpoint, f"is where a cell named {bus.cell} is up already")
 
 
-async def _publish(bus: Bus, supervisor: Supervisor) -> None:
+async def _publish(bus: Bus, cell: Cell, launch: Launch, supervisor: Supervisor) -> None:
     """Say on supervisor/status whenever something has changed; take note of a router that is back."""
     out = bus.writer(topics.SUPERVISOR_STATUS)
     while True:
@@ -129,7 +130,8 @@ async def _publish(bus: Bus, supervisor: Supervisor) -> None:
             supervisor.changed.clear()
             out.put(SupervisorStatus(
                 header=bus.header(), cell=bus.cell, services=supervisor.statuses, speed=bus.clock.speed,
-                epoch=bus.clock.epoch_ns,
+                epoch=bus.clock.epoch_ns, seed=cell.run.seed, world=launch.world or "",
+                overrides=[text for text in launch.overrides if SECRET not in text.partition("=")[0]],
             ))
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(STATUS_PERIOD):  # wait_for can swallow a cancellation before Python 3.12
