@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import typer
 
-from cli import bringup, catalogue, commands, doctor, node, outlining, robot, tf, top, topic
+from cli import bringup, catalogue, commands, doctor, node, outlining, recording, robot, tf, top, topic
 from common.errors import RequestFailed, ZencellError
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -80,6 +80,9 @@ app.add_typer(commands.world, name="world")
 app.command()(outlining.snapshot)
 app.command()(outlining.outline)
 app.add_typer(robot.app, name="robot")
+app.command()(recording.record)
+app.command()(recording.info)
+app.command()(recording.recover)
 app.command()(doctor.doctor)
 
 

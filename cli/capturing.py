@@ -1,0 +1,102 @@
+"""Takes what travels in a cell from the network to a recording."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+from common import topics
+from common.errors import DecodeError
+from common.messages import SupervisorStatus
+from common.recording.sample import Sample, message_of
+from common.recording.sequences import Sequences
+from common.recording.writing import RUN
+from common.transport.codec import decode, decode_attachment
+
+if TYPE_CHECKING:
+    from common.recording.selection import Selection
+    from common.recording.sink import Sink
+    from common.transport.bus import Bus
+    from common.transport.session import Declared, RawSample
+
+ASK_TIMEOUT = 1.0  # [s] for the values of states
+
+
+class Capture:
+    """Hands every wanted message to a sink, repetitions left out and gaps counted."""
+
+    def __init__(self, bus: Bus, selection: Selection, sink: Sink) -> None:
+        """Take nothing yet."""
+        self.sequences = Sequences()
+        self._bus = bus
+        self._selection = selection
+        self._sink = sink
+        self._lock = threading.Lock()
+        self._ahead = time.time_ns() - time.monotonic_ns()  # a step of the system clock must not turn messages round
+        self._kinds = {topic.key: str(topic.kind) for topic in topics.all_topics().values()}
+        self._run_known = False
+        self._declared: list[Declared] = []
+
+    async def begin(self) -> None:
+        """Listen from now on; returns when the values of all states that were there are in the recording."""
+        wanted = [f"{self._bus.cell}/{key}" for key in self._keys()]
+        status = f"{self._bus.cell}/{topics.SUPERVISOR_STATUS.key}"
+        self._declared = [self._bus.raw_subscriber(key, self.on_sample) for key in wanted]
+        if not self._selection.everything and status not in wanted:
+            self._declared.append(self._bus.raw_subscriber(status, self._on_status))
+            for sample in await self._bus.raw_get(status, ASK_TIMEOUT):
+                self._on_status(sample)
+        for key in wanted:
+            for sample in await self._bus.raw_get(key, ASK_TIMEOUT):
+                self.on_sample(sample, kind="state")
+
+    def _keys(self) -> tuple[str, ...]:
+        if self._selection.everything or any("*" in key for key in self._selection.keys):
+            return ("**",)
+        return self._selection.keys
+
+    def end(self) -> None:
+        """Listen no more."""
+        while self._declared:
+            self._declared.pop().undeclare()
+
+    def on_sample(self, raw: RawSample, kind: str = "") -> None:
+        """Take one message; on any thread. `kind` is what a key that is not ours is then known to be."""
+        topic = raw.key.partition("/")[2]
+        if topic == topics.SUPERVISOR_STATUS.key:
+            self._on_status(raw)
+        if not self._selection.wants(topic):
+            return
+        writer, sequence, trace = _origin(raw)
+        with self._lock:  # the order of times is the order in the file
+            if writer and not self.sequences.is_new(raw.key, writer, sequence):
+                return
+            self._sink.offer(Sample(
+                raw.key, raw.payload, time.monotonic_ns() + self._ahead, message=message_of(raw.encoding),
+                kind=self._kinds.get(topic) or kind or "stream", writer=writer, sequence=sequence, trace=trace,
+            ))
+
+    def _on_status(self, raw: RawSample) -> None:
+        if self._run_known:
+            return
+        try:
+            status = decode(SupervisorStatus, raw.payload)
+        except DecodeError:
+            return  # somebody else's
+        self._run_known = True
+        self._sink.describe(RUN, run_of(status))
+
+
+def run_of(status: SupervisorStatus) -> dict[str, Any]:
+    """What a recording says of the run, from what the supervisor says."""
+    return status.model_dump(include={"speed", "epoch", "seed", "world", "overrides"})
+
+
+def _origin(raw: RawSample) -> tuple[str, int, str]:
+    """Writer id, sequence number and trace id of a message; empty for a sender that does not say."""
+    try:
+        attachment = decode_attachment(raw.attachment)
+    except DecodeError:
+        attachment = None
+    return (attachment.writer, attachment.sequence, attachment.trace) if attachment else ("", 0, "")
