@@ -1,0 +1,81 @@
+"""A marker to pull about: where the tool centre point is to go."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+import viser
+
+from common.messages import Pose
+from common.robot.model import RobotModel
+from common.robot.transforms import invert
+from common.viewer.poses import matrix_wxyz, pose_from, position_of, wxyz_of
+from common.viewer.robot_meshes import Piece
+
+HAND = (255, 170, 60)
+_SIZE = 0.18  # of the gizmo [m]
+
+
+class GoalMarker:
+    """A gizmo with the gripper in it."""
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        name: str,
+        robot: RobotModel,
+        pieces: Iterable[Piece],
+        moved: Callable[[Pose], None],
+    ) -> None:
+        """Put it, hidden, where the tool is at home.
+
+        Args:
+            scene: to which it is added.
+            name: of its node.
+            robot: whose tool it is for.
+            pieces: meshes of the robot; those that move with the tool are shown.
+            moved: called with its pose when it was let go.
+        """
+        links = robot.link_poses(robot.named("home"))
+        T_world_tcp = links[robot.config.tcp_link]
+        self._node = scene.add_transform_controls(
+            name, scale=_SIZE, depth_test=False, opacity=0.9, visible=False, position=T_world_tcp[:3, 3],
+            wxyz=matrix_wxyz(T_world_tcp), line_width=3.0,
+        )
+        for number, piece in enumerate(piece for piece in pieces if piece.link in _hand(robot)):
+            T_tcp_link = invert(T_world_tcp) @ links[piece.link]
+            scene.add_mesh_simple(
+                f"{name}/{number}", piece.vertices, piece.faces, color=HAND, opacity=0.45, cast_shadow=False,
+                position=T_tcp_link[:3, 3], wxyz=matrix_wxyz(T_tcp_link), receive_shadow=False,
+            )
+
+        @self._node.on_update
+        async def _(event: viser.TransformControlsEvent) -> None:
+            if event.phase == "end":
+                moved(self.pose)
+
+    @property
+    def visible(self) -> bool:
+        """Whether it is shown."""
+        return self._node.visible
+
+    @visible.setter
+    def visible(self, on: bool) -> None:
+        self._node.visible = on
+
+    @property
+    def pose(self) -> Pose:
+        """Where it is, in world."""
+        return pose_from(np.array(self._node.position), np.array(self._node.wxyz))
+
+    @pose.setter
+    def pose(self, pose: Pose) -> None:
+        self._node.position, self._node.wxyz = position_of(pose), wxyz_of(pose)
+
+
+def _hand(robot: RobotModel) -> set[str]:
+    """Links that hang on the last joint of the arm, with those that hang on them."""
+    model = robot.full_model
+    last = model.getJointId(robot.joint_names[-1])
+    return {f.name for f in model.frames if f.name in robot.link_names and last in list(model.supports[f.parentJoint])}

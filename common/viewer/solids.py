@@ -1,0 +1,71 @@
+"""Solids of the planning scene and of the simulated world as nodes of the scene."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from common.messages import CollisionObject, WorldObject
+from common.planning.prism import convex_hull
+from common.sim.solids import object_mesh, upright
+from common.viewer.poses import Rgb, position_of, rgb_of, wxyz_of
+
+Solid = viser.BoxHandle | viser.IcosphereHandle | viser.CylinderHandle | viser.MeshHandle
+
+
+def add_solid(scene: viser.SceneApi, name: str, solid: CollisionObject) -> Solid:
+    """The node of a solid of the planning scene, in its colour, at its pose in the node above it."""
+    color, opacity = rgb_of(solid.color), solid.color.a if solid.color.a < 1 else None
+    position, wxyz = position_of(solid.pose), wxyz_of(solid.pose)
+    sizes = solid.dimensions
+    if solid.shape == "box":
+        return scene.add_box(
+            name, color, (sizes[0], sizes[1], sizes[2]), opacity=opacity, position=position, wxyz=wxyz,
+            cast_shadow=False, receive_shadow=False,
+        )
+    if solid.shape == "sphere":
+        return scene.add_icosphere(
+            name, sizes[0], color, opacity=opacity, position=position, wxyz=wxyz, cast_shadow=False,
+            receive_shadow=False,
+        )
+    if solid.shape == "cylinder":
+        return scene.add_cylinder(
+            name, sizes[0], sizes[1], color, opacity=opacity, position=position, wxyz=wxyz, cast_shadow=False,
+            receive_shadow=False,
+        )
+    hull = convex_hull(np.array(solid.outline))
+    triangles = upright(hull, np.empty((0, 2)), -sizes[0] / 2, sizes[0] / 2)
+    return add_triangles(scene, name, triangles, color, opacity=opacity, position=position, wxyz=wxyz)
+
+
+def add_triangles(
+    scene: viser.SceneApi,
+    name: str,
+    triangles: NDArray[np.float64],
+    color: Rgb,
+    *,
+    opacity: float | None = None,
+    wireframe: bool = False,
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+) -> viser.MeshHandle:
+    """A node of triangles (n, 3, 3) [m], seen from both sides."""
+    return scene.add_mesh_simple(
+        name, triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), color=color, opacity=opacity,
+        wireframe=wireframe, side="double", position=position, wxyz=wxyz, cast_shadow=False, receive_shadow=False,
+    )
+
+
+def centre_of(thing: WorldObject) -> tuple[float, float, float]:
+    """Middle [m] of the box about an object of the simulated world."""
+    outline = np.array(thing.outline)
+    x, y = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    return float(x), float(y), thing.base + thing.height / 2
+
+
+def add_world_object(scene: viser.SceneApi, name: str, thing: WorldObject, color: Rgb) -> viser.MeshHandle:
+    """An object of the simulated world as a wireframe, its node at its centre."""
+    centre = centre_of(thing)
+    triangles = object_mesh(thing).corners - np.array(centre)
+    return add_triangles(scene, name, triangles, color, wireframe=True, position=centre)
