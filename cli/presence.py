@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from common.errors import DecodeError
@@ -20,11 +21,15 @@ CONNECT_TIMEOUT = 1.0  # [s]
 
 async def supervisor_status(bus: Bus) -> SupervisorStatus | None:
     """What the cell's supervisor says now; None without one, as in containers."""
+    return await _status(bus, bus.cell)
+
+
+async def _status(bus: Bus, cell: str) -> SupervisorStatus | None:
     from common import topics
     from common.messages import SupervisorStatus
     from common.transport.codec import decode
 
-    for sample in await bus.raw_get(f"{bus.cell}/{topics.SUPERVISOR_STATUS.key}", ASK_TIMEOUT):
+    for sample in await bus.raw_get(f"{cell}/{topics.SUPERVISOR_STATUS.key}", ASK_TIMEOUT):
         try:
             return decode(SupervisorStatus, sample.payload)
         except DecodeError as error:
@@ -40,27 +45,37 @@ async def cell_clock(bus: Bus) -> Clock:
     return Clock(status.speed, status.epoch) if status is not None and status.epoch else bus.clock
 
 
-def look(cell: str, domain: str | None, connect: str | None) -> tuple[set[str], SupervisorStatus | None]:
-    """Services of a cell that are ready, and what its supervisor says; nothing when no cell is up there."""
-    return asyncio.run(_look(cell, domain, connect))
+@dataclass(frozen=True)
+class Presence:
+    """What there is of a cell that is up."""
+
+    ready: frozenset[str]  # services
+    status: SupervisorStatus | None  # what its supervisor says, where there is one
 
 
-async def _look(cell: str, domain: str | None, connect: str | None) -> tuple[set[str], SupervisorStatus | None]:
+def look(domain: str | None, connect: str | None) -> dict[str, Presence]:
+    """The cells that are up, by name; none when nothing is up there."""
+    return asyncio.run(_look(domain, connect))
+
+
+async def _look(domain: str | None, connect: str | None) -> dict[str, Presence]:
     from common.transport.endpoint import endpoint_of
 
     endpoint = endpoint_of(domain, connect)
     if not await asyncio.to_thread(somebody_listens, endpoint):  # Zenoh itself would try for longer
-        return set(), None
+        return {}
     from cli.inspection import TOOL, alive
     from common.errors import NoRouter
     from common.transport.connect import connect as connect_to
 
+    ready: dict[str, set[str]] = {}
     try:
-        async with connect_to(cell=cell, service=TOOL, endpoint=endpoint, timeout=CONNECT_TIMEOUT) as bus:
-            ready = {service for name, service in await alive(bus) if name == cell}
-            return ready, await supervisor_status(bus) if ready else None
+        async with connect_to(cell="_", service=TOOL, endpoint=endpoint, timeout=CONNECT_TIMEOUT) as bus:
+            for cell, service in await alive(bus):
+                ready.setdefault(cell, set()).add(service)
+            return {cell: Presence(frozenset(names), await _status(bus, cell)) for cell, names in ready.items()}
     except NoRouter:
-        return set(), None
+        return {}
 
 
 def somebody_listens(endpoint: str) -> bool:
