@@ -1,7 +1,8 @@
 """Where the page of a cell is to be, from what a person asked for."""
 
+import hashlib
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from common.config import Cell, load_cell
 from common.errors import ConfigError
 from common.viewer.access import TOKEN_VARIABLE
 from common.viewer.listening import FIRST_PORT
-from tests.cli.conftest import ask
+from tests.cli.conftest import Zencell, ask
 
 OPTIONS = (("--viewer-port", "9000"), ("--viewer-host", "0.0.0.0"))
 
@@ -109,3 +110,43 @@ def test_token_that_a_person_gave_is_not_shown(cell: Cell, monkeypatch: pytest.M
     monkeypatch.setenv(TOKEN_VARIABLE, "correct-horse-battery")
     page = page_of(cell, "0.0.0.0", None)
     assert page is not None and "token" not in page.address and not page.environment
+
+
+VIEWER = '''"""Says the fingerprint of the token that it was given, and serves nothing."""
+import asyncio, hashlib, os
+from common.config import Parameters
+from common.transport.service import main
+from common.viewer.access import TOKEN_VARIABLE
+
+class Config(Parameters):
+    """Where."""
+    host: str = ""
+    port: int = 0
+
+async def run(bus, config):
+    bus.log.info("told %s", hashlib.sha256(os.environ.get(TOKEN_VARIABLE, "").encode()).hexdigest())
+    await bus.ready()
+    await asyncio.Event().wait()
+
+if __name__ == "__main__":
+    main(run, Config)
+'''
+
+
+def test_token_is_said_once_and_is_in_no_command_line_and_no_summary(
+    folder: Path, zencell: Callable[..., Zencell]
+) -> None:
+    (folder / "fakes" / "viewer.py").write_text(VIEWER)
+    (folder / "viewed.yaml").write_text((folder / "tiny.yaml").read_text() + "  fakes.viewer: {}\n")
+    command = zencell("up", "viewed.yaml", "--viewer-host", "0.0.0.0", "--summary", "out.json")
+    address = command.until("Open ").removeprefix("Open ")
+    token = address.partition("/?token=")[2]
+    command.until("zenoh --mode client")
+    shown = [" ".join(process.cmdline()) for process in command.children().values()]
+    assert any("services.viewer.host=0.0.0.0" in line for line in shown)
+    command.interrupt()
+    assert command.end() == 0
+    assert any(hashlib.sha256(token.encode()).hexdigest() in line for line in command.lines)
+    assert [line for line in command.lines if token in line] == [f"Open {address}"]
+    assert not any(token in line for line in shown)
+    assert token not in (folder / "out.json").read_text()

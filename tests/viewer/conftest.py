@@ -1,0 +1,165 @@
+"""Real cells with their page, and a real browser that opens it.
+
+Tests that use the browser share its event loop: `pytestmark = IN_BROWSER`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import shutil
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+import pytest
+import pytest_asyncio
+
+from benchmarks.runs import RunningCell
+
+if TYPE_CHECKING:
+    from playwright.async_api import Browser, BrowserContext, Page
+
+IN_BROWSER = [
+    pytest.mark.browser, pytest.mark.cell, pytest.mark.timeout(240), pytest.mark.asyncio(loop_scope="session"),
+]
+PATIENCE = 60.0  # [s] until a test gives up waiting for an event; a busy machine without a GPU is slow
+NAMES = ("chromium", "chromium-browser", "google-chrome-stable", "google-chrome")
+ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+SMALL = {"width": 320, "height": 240}  # [pixels] for pages that are only to be there: the CPU draws them
+USUAL = {"width": 1280, "height": 800}
+
+
+@dataclass
+class Watched:
+    """A page, and everything of it that a test should not overlook."""
+
+    page: Page
+    hosts: set[str] = field(default_factory=set)  # that it asked for anything
+    errors: list[str] = field(default_factory=list)  # of its console and its scripts
+    failed: list[str] = field(default_factory=list)  # requests
+
+    def __post_init__(self) -> None:
+        self.page.set_default_timeout(PATIENCE * 1e3)
+        self.page.on("request", lambda request: self._asked(request.url))
+        self.page.on("websocket", lambda opened: self._asked(opened.url))
+        self.page.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("requestfailed", lambda request: self.failed.append(f"{request.url}: {request.failure}"))
+
+    def _asked(self, url: str) -> None:
+        host = urlsplit(url.removeprefix("blob:")).hostname
+        if host is not None:  # nobody is asked for data: and about:
+            self.hosts.add(host)
+
+    async def open(self, address: str) -> Page:
+        """The page, once it is connected and shows its scene."""
+        async with self.page.expect_event("websocket"):
+            await self.page.goto(address)
+        await self.page.locator("canvas").first.wait_for()
+        return self.page
+
+
+class Viewed(RunningCell):
+    """A `zencell run` or `up` whose page is served."""
+
+    def __init__(self, folder: Path, verb: str, cell: str, *arguments: str) -> None:
+        """Start it; `address` is there after `served`."""
+        super().__init__(folder, verb, cell, *arguments, "--viewer-port", str(free_port()))
+        self.address = ""
+
+    async def served(self) -> Viewed:
+        """Itself, once it has printed where its page is."""
+        async with asyncio.timeout(PATIENCE):
+            while not (found := re.search(r"^Open (http\S+)$", self.text, re.MULTILINE)):
+                if self.process.poll() is not None:
+                    pytest.fail(f"the cell ended before its page was served:\n{self.tail()}")
+                await asyncio.sleep(0.05)
+        self.address = found[1]
+        return self
+
+
+def free_port() -> int:
+    """A TCP port of this machine that is free."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port: int = probe.getsockname()[1]
+        return port
+
+
+Bring = Callable[..., Awaitable[Viewed]]
+Opened = Callable[..., AbstractAsyncContextManager[Watched]]
+
+
+@pytest_asyncio.fixture(scope="session", loop_scope="session")
+async def bring(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Bring]:
+    """Brings a cell up with its page: `await bring("up", "panda", "--set", "autostart=false")`.
+
+    Who asks for the cell that is up already, in the same words, gets that one; another ends it first. So tests share
+    a cell, should leave it as they found it, and are best put in an order in which few are needed.
+    """
+    current: dict[tuple[str, ...], Viewed] = {}
+
+    def end() -> None:
+        for viewed in current.values():
+            viewed.__exit__()
+        current.clear()
+
+    async def up(*words: str) -> Viewed:
+        if words not in current or current[words].process.poll() is not None:
+            end()
+            current[words] = Viewed(tmp_path_factory.mktemp("viewed"), *words)
+            await current[words].served()
+        return current[words]
+
+    yield up
+    end()
+
+
+@pytest_asyncio.fixture(scope="session", loop_scope="session")
+async def browser() -> AsyncIterator[Browser]:
+    """One Chromium for all tests."""
+    program = next((path for name in NAMES if (path := shutil.which(name))), None)
+    if program is None:
+        missing("Chromium is not installed: apt install chromium")
+    try:
+        from playwright.async_api import async_playwright
+    except ImportError:
+        missing("playwright is not installed: pip install -c constraints.txt -e '.[dev]'")
+    async with async_playwright() as playwright:
+        started = await playwright.chromium.launch(executable_path=program, args=list(ARGUMENTS))
+        yield started
+        await started.close()
+
+
+def missing(what: str) -> None:
+    """Skip a test for what is missing here; where everything should be, in CI, that is a failure."""
+    if os.environ.get("CI", "").lower() in ("true", "1"):
+        pytest.fail(what, pytrace=False)
+    pytest.skip(what)
+
+
+@pytest_asyncio.fixture(loop_scope="session")
+async def opened(browser: Browser) -> Opened:
+    """A browser of its own, without cookies, that is closed after the block: `async with opened() as watched`."""
+
+    @asynccontextmanager
+    async def block(viewport: dict[str, int] = USUAL) -> AsyncIterator[Watched]:
+        context: BrowserContext = await browser.new_context(viewport=viewport)  # type: ignore[arg-type]
+        try:
+            yield Watched(await context.new_page())
+        finally:
+            await context.close()
+
+    return block
+
+
+@pytest_asyncio.fixture(loop_scope="session")
+async def watched(opened: Opened) -> AsyncIterator[Watched]:
+    """One page that is not open yet: `await watched.open(cell.address)`."""
+    async with opened() as one:
+        yield one
