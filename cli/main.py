@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import typer
 
-from cli import bringup, catalogue, commands, doctor, node, outlining, recording, robot, tf, top, topic
+from cli import bringup, catalogue, commands, doctor, graph, node, outlining, recording, robot, tf, top, topic
 from common.errors import RequestFailed, ZencellError
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -75,6 +75,7 @@ app.add_typer(topic.app, name="topic")
 app.command(context_settings={"ignore_unknown_options": True})(commands.call)
 app.add_typer(node.app, name="node")
 app.add_typer(tf.app, name="tf")
+app.command()(graph.graph)
 app.add_typer(commands.task, name="task")
 app.add_typer(commands.world, name="world")
 app.command()(outlining.snapshot)

@@ -1,0 +1,115 @@
+"""Services and topics of a cell as a picture: DOT and Mermaid as text, SVG drawn here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli import options
+from common.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cli.wired import Wired
+    from common.config import Cell
+
+FORMATS = (".svg", ".dot", ".mmd")
+OUTSIDE = "zencell, you"  # who sends the requests that no service of the cell sends
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A cell as services with the keys between them. `alive` is None while the cell is not up."""
+
+    cell: str
+    services: list[Wired]  # in start order
+    kinds: dict[str, str]  # by key: stream, event, state, request; in the order of their writers or callers
+    alive: frozenset[str] | None = None
+    outside: list[str] = field(default_factory=list)  # requests that no service of the cell sends
+
+    def is_lit(self, service: str) -> bool:
+        """Whether a service is ready; while the cell is not up, all look the same."""
+        return self.alive is None or service in self.alive
+
+
+def graph(
+    cell: Annotated[str, typer.Argument(metavar="[CELL]", help="name or path of the cell file")] = "panda",
+    output: Annotated[
+        str, typer.Option("-o", "--output", metavar="FILE", help="*.svg, *.dot or *.mmd; without it Mermaid on stdout")
+    ] = "",
+    overrides: options.Overrides = None,
+    domain: options.Domain = None,
+    connect: options.Connect = None,
+) -> None:
+    """Draw services and topics of a cell, up or not; while it is up, what is not alive is dashed."""
+    from cli.presence import look
+    from common.config import load_cell
+
+    path = Path(output).expanduser() if output else None
+    write = _writer_of(path)
+    loaded = load_cell(cell, overrides or ())
+    presence = look(domain, connect).get(loaded.name)
+    made = graph_of(loaded.name, _wired_services(loaded), presence.ready if presence else None)
+    text = write(made)
+    if path is None:
+        typer.echo(text, nl=False)
+        return
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError("--output", output, f"can not be written: {error.strerror or error}") from None
+    typer.echo(f"{path}: {len(made.services)} services, {len(made.kinds)} keys"
+               f"{'' if made.alive is None else f', {sum(map(made.is_lit, names(made)))} services alive'}")
+
+
+def _writer_of(path: Path | None) -> Callable[[Graph], str]:
+    from cli.graph_svg import svg
+    from cli.graph_text import dot, mermaid
+
+    writers = dict(zip(FORMATS, (svg, dot, mermaid), strict=True))
+    if path is None:
+        return mermaid
+    if path.suffix not in writers:
+        raise ConfigError("--output", str(path), f"must end in {', '.join(FORMATS)}")
+    return writers[path.suffix]
+
+
+def _wired_services(cell: Cell) -> list[Wired]:
+    """The services of a cell in start order; one that can not be wired is drawn without its keys."""
+    from cli.wired import Unwired, Wired, wired
+
+    found = []
+    for entry in cell.services.values():
+        try:
+            found.append(wired(cell, entry))
+        except Unwired as error:
+            typer.echo(f"zencell: {error}", err=True)
+            found.append(Wired(entry.name, ""))
+    return found
+
+
+def graph_of(cell: str, services: list[Wired], alive: frozenset[str] | None = None) -> Graph:
+    """The graph of a cell's wired services.
+
+    Args:
+        cell: its name.
+        services: in start order.
+        alive: the services that are ready, when the cell is up.
+    """
+    from common.topics import all_topics
+
+    topics = all_topics()
+    called = {key for service in services for key in service.calls}
+    outside = [key for service in services for key in service.serves if key not in called]
+    keys = [key for service in services for key in (*service.writes, *service.calls)] + outside
+    keys += [key for service in services for key in service.reads]  # written by nobody in this cell
+    kinds: dict[str, str] = {key: topics[key].kind if key in topics else "event" for key in keys}
+    return Graph(cell, services, kinds, alive, outside)
+
+
+def names(graph: Graph) -> list[str]:
+    """The services of a graph."""
+    return [service.name for service in graph.services]
