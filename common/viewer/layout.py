@@ -1,0 +1,90 @@
+"""How the page opens: a file of the project, which "Save layout" on the page writes."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+import yaml
+from pydantic import Field
+
+from common.config import Section, check, config_root, read_yaml
+from common.config.basics import Coordinate
+
+FILE = "viewer.yaml"
+Tab = Literal["Cameras", "Health", "Plots", "Log", "Tuning", "Move", "View"]
+TABS: tuple[Tab, ...] = get_args(Tab)
+LogLevel = Literal["debug", "info", "warning", "error"]
+HEADER = '# How the operator\'s page opens. "Save layout" on the page writes this file.\n'
+View3D = tuple[Coordinate, Coordinate, Coordinate]
+
+
+class Viewpoint(Section):
+    """From where the scene is seen."""
+
+    position: View3D = Field((1.9, -1.5, 1.4), description="of the eye in world [m]")
+    look_at: View3D = Field((0.35, 0.0, 0.3), description="what is in the middle, in world [m]")
+
+
+class Layout(Section):
+    """What is on when the page opens."""
+
+    dark: bool = Field(True, description="light letters on a dark ground")
+    panel_width: Annotated[int, Field(ge=280, le=1200)] = Field(440, description="[px]")
+    tabs: list[Tab] = Field([*TABS], description="in order; the first is open")
+    layers: dict[str, bool] = Field({}, description="layers of the scene that are other than usual")
+    viewpoints: dict[str, Viewpoint] = Field({}, description="by cell")
+    live_image: bool = Field(True, description="the picture as the camera sends it")
+    annotated_image: bool = Field(True, description="the picture with what was found in it")
+    log_level: LogLevel = Field("info", description="lines below it are not shown")
+    edit_world: bool = Field(False, description="objects of the simulated world can be dragged")
+    goal_marker: bool = Field(False, description="the marker that tells a goal for the tool is shown")
+    planner: str = Field("pipeline", description="which planner a motion is asked of")
+
+    def viewpoint(self, cell: str) -> Viewpoint:
+        """From where the scene of a cell is seen."""
+        return self.viewpoints.get(cell, Viewpoint())
+
+
+def layout_file(given: str) -> Path:
+    """The file of the layout: the one that was given, or that of the project."""
+    return Path(given).expanduser() if given else config_root() / FILE
+
+
+def load_layout(given: str) -> Layout:
+    """The layout in a file; without a file of its own the project's, or what is usual where there is none.
+
+    Raises:
+        ConfigError: the file that was given is not there, does not parse, or names something unknown.
+    """
+    path = layout_file(given)
+    if not given and not path.is_file():
+        return Layout()
+    return check(Layout, read_yaml(path), str(path))
+
+
+def save_layout(given: str, layout: Layout) -> Path:
+    """Write the file, all of it or nothing; returns where it is.
+
+    Raises:
+        OSError: it can not be written.
+    """
+    path = layout_file(given)
+    values = layout.model_dump(mode="json")
+    body = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
+    if path.exists() and not os.access(path, os.W_OK):  # a rename would not ask
+        raise PermissionError(13, "it is read-only", str(path))
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(HEADER + body)
+        Path(name).chmod(path.stat().st_mode if path.exists() else 0o644)
+        Path(name).replace(path)
+    except BaseException:
+        with contextlib.suppress(FileNotFoundError):
+            Path(name).unlink()
+        raise
+    return path

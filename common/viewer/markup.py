@@ -1,0 +1,76 @@
+"""Text of the page: pieces of HTML whose every value is escaped, and the one style sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from html import escape
+
+GOOD, BUSY, BAD, OFF = "good", "busy", "bad", "off"  # how something is, as a colour beside the word
+
+STYLE = """<style>
+.zc { padding: 0 0.75em 0.4em; font-size: 0.8125em; line-height: 1.5; overflow-wrap: anywhere; }
+.zc table { width: 100%; border-collapse: collapse; font-variant-numeric: tabular-nums; }
+.zc td, .zc th { padding: 0.12em 0.4em; text-align: left; vertical-align: baseline; }
+.zc th { font-weight: 500; opacity: 0.6; white-space: nowrap; }
+.zc tr + tr td { border-top: 1px solid rgba(128, 128, 128, 0.18); }
+.zc td.number, .zc th.number { text-align: right; white-space: nowrap; }
+.zc .dim { opacity: 0.6; }
+.zc .big { font-size: 1.3em; font-weight: 600; }
+.zc .good { color: #2fb344; } .zc .busy { color: #f59f00; } .zc .bad { color: #fa5252; } .zc .off { color: #868e96; }
+.zc .dot { font-size: 1.1em; }
+.zc .log td { border: none; padding-top: 0; padding-bottom: 0; }
+.zc .log td:first-child, .zc .log td:nth-child(2) { white-space: nowrap; opacity: 0.6; }
+.zc .fields { display: grid; grid-template-columns: repeat(auto-fit, minmax(4.6em, 1fr)); gap: 0.2em 0.6em; }
+.zc .fields b { display: block; font-size: 1.25em; font-weight: 600; font-variant-numeric: tabular-nums; }
+</style>"""
+
+
+def text(value: object) -> str:
+    """The value as text that HTML can not mistake for anything else."""
+    return escape(str(value), quote=True)
+
+
+def span(value: object, kind: str) -> str:
+    """Text of a kind: dim, big, good, busy, bad or off."""
+    return f'<span class="{text(kind)}">{text(value)}</span>'
+
+
+def block(inner: str, name: str, **data: object) -> str:
+    """A part of a panel, found by its name; `data` become attributes that say in one word how it is.
+
+    Args:
+        inner: HTML, already escaped.
+        name: of the part.
+        data: attributes.
+    """
+    attributes = "".join(f' data-{key.replace("_", "-")}="{text(value)}"' for key, value in data.items())
+    return f'<div class="zc" data-part="{text(name)}"{attributes}>{inner}</div>'
+
+
+def fields(values: Mapping[str, object]) -> str:
+    """Numbers with their names below them, side by side."""
+    cells = (
+        f'<div data-field="{text(name)}"><b>{text(value)}</b><span class="dim">{text(name)}</span></div>'
+        for name, value in values.items()
+    )
+    return f'<div class="fields">{"".join(cells)}</div>'
+
+
+def table(head: Iterable[str], rows: Iterable[str], kind: str = "") -> str:
+    """A table of rows made by `row`; head names that end in a space belong to columns of numbers."""
+    heads = "".join(
+        f'<th class="number">{text(name.strip())}</th>' if name.endswith(" ") else f"<th>{text(name)}</th>"
+        for name in head
+    )
+    shown = f"<tr>{heads}</tr>" if heads else ""
+    return f'<table class="{text(kind)}">{shown}{"".join(rows)}</table>'
+
+
+def row(*cells: str, **data: object) -> str:
+    """A row of HTML cells; those that begin with a digit or a dash are numbers."""
+    attributes = "".join(f' data-{key}="{text(value)}"' for key, value in data.items())
+    made = "".join(
+        f'<td class="number">{cell}</td>' if cell[:1].isdigit() or cell[:1] == "–" else f"<td>{cell}</td>"
+        for cell in cells
+    )
+    return f"<tr{attributes}>{made}</tr>"

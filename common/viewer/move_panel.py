@@ -1,0 +1,116 @@
+"""The panel on which a person has the arm planned and moved to a goal of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any, Protocol
+
+import viser
+
+from common.errors import ZencellError
+from common.messages import JointGoal, MotionStatus, PlanResponse, Pose, PoseGoal
+from common.viewer.desk import Desk, assign
+from common.viewer.markup import block, span, text
+from common.viewer.words import plan, problem
+
+PIPELINE = "pipeline"
+PLAN, GO = "Plan here", "Go there"
+
+
+class Motions(Protocol):
+    """Plans and moves for a person; with no planner named, by the cell's pipeline."""
+
+    async def plan(self, goal: PoseGoal | JointGoal, *, planner: str = "") -> PlanResponse:
+        """A plan to a goal; nothing moves."""
+
+    async def move(self, goal: PoseGoal | JointGoal, *, planner: str = "") -> MotionStatus:
+        """The end of a motion to a goal."""
+
+
+class Goal(Protocol):
+    """Where the goal marker is in the scene."""
+
+    def goal_marker(self, on: bool) -> None:
+        """Show or hide it."""
+
+    @property
+    def goal_pose(self) -> Pose:
+        """Its pose in world."""
+
+
+class MovePanel:
+    """A tick for the goal marker, a list of planners, buttons to plan, go and go home, and how it went."""
+
+    def __init__(
+        self, gui: viser.GuiApi, desk: Desk, motions: Motions, goal: Callable[[], Goal | None],
+        planners: Sequence[str], *, planner: str, marker: bool,
+    ) -> None:
+        """Lay the panel out where the GUI stands.
+
+        Args:
+            gui: of the server.
+            desk: takes the orders.
+            motions: carry them out.
+            goal: the goal marker, once there is one.
+            planners: that may be asked.
+            planner: that is asked at first.
+            marker: whether the goal marker is shown at first.
+        """
+        self._motions, self._goal = motions, goal
+        self.planner = planner if planner in planners else PIPELINE
+        self.marker = marker
+        self._tick = gui.add_checkbox("Goal marker", marker, hint="drag it in the scene to where the tool should be")
+        desk.on_change(self._tick, self.set_marker)
+        names = gui.add_dropdown("Planner", [PIPELINE, *planners], initial_value=self.planner,
+                                 hint="pipeline: the cell's planners, in their order")
+        desk.on_change(names, self._set_planner)
+        desk.on_choice(gui.add_button_group("Goal", (PLAN, GO)), self._go)
+        desk.on_choice(gui.add_button_group("Arm", ("Go home",)), lambda _: self.go_home())
+        self._html = gui.add_html("")
+        self._tell("Show the goal marker, drag it, then plan or go there.", "dim")
+
+    def set_marker(self, on: bool) -> None:
+        """Show or hide the goal marker."""
+        self.marker = on
+        assign(self._tick, on)
+        goal = self._goal()
+        if goal is not None:
+            goal.goal_marker(on)
+
+    async def go_home(self) -> None:
+        """Have the arm go home."""
+        await self._do(self._move(JointGoal(named="home"), "", "At home"), "Going home …")
+
+    async def _go(self, chosen: str) -> None:
+        goal = self._goal()
+        if goal is None or not self.marker:
+            self.set_marker(True)
+            self._tell("Drag the goal marker to where the tool should be, then try again.", "busy")
+            return
+        planner = "" if self.planner == PIPELINE else self.planner
+        there = PoseGoal(pose=goal.goal_pose)
+        if chosen == PLAN:
+            await self._do(self._plan(there, planner), "Planning …")
+        elif chosen == GO:
+            await self._do(self._move(there, planner, "There"), "Planning and going there …")
+
+    async def _do(self, doing: Coroutine[Any, Any, None], line: str) -> None:
+        self._tell(line, "busy")
+        try:
+            await doing
+        except ZencellError as error:
+            self._tell(problem(error), "bad")
+
+    async def _plan(self, goal: PoseGoal, planner: str) -> None:
+        response = await self._motions.plan(goal, planner=planner)
+        self._tell(plan(response), "good" if response.ok else "bad")
+
+    async def _move(self, goal: PoseGoal | JointGoal, planner: str, there: str) -> None:
+        await self._motions.move(goal, planner=planner)
+        self._tell(there, "good")
+
+    def _set_planner(self, name: str) -> None:
+        self.planner = name
+
+    def _tell(self, line: str, kind: str) -> None:
+        self._html.content = block(f"{span('●', kind + ' dot')} {text(line)}", "move", kind=kind)

@@ -1,0 +1,320 @@
+"""The operator's page: panels around the scene, fed with what the cell says while somebody looks."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from typing import Any
+
+import viser
+
+from common import topics
+from common.config import Members
+from common.errors import ZencellError
+from common.messages import Contours, Image, OutlineSelect
+from common.topics import Topic
+from common.viewer.desk import Desk
+from common.viewer.feeds import Feeds
+from common.viewer.health import HealthPanel
+from common.viewer.layers import layers_shown
+from common.viewer.layout import TABS, Layout, Tab, Viewpoint, save_layout
+from common.viewer.log_panel import LogPanel
+from common.viewer.move_panel import Motions, MovePanel
+from common.viewer.pictures import ANNOTATED, LIVE, PicturePanel
+from common.viewer.plots import Limits, PlotPanel
+from common.viewer.requests import Requests
+from common.viewer.scene_view import SceneView
+from common.viewer.task_panel import TaskPanel
+from common.viewer.tuning import TuningPanel
+from common.viewer.view_panel import ViewPanel
+from common.viewer.words import gripper
+
+OUTLINER = "contour_tracer"
+IMAGES: dict[str, tuple[Topic[Image], ...]] = {
+    LIVE: (topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
+    ANNOTATED: (topics.DETECTION_IMAGE, topics.CONTOUR_IMAGE),
+}
+TRUTH: tuple[Topic[Any], ...] = (topics.SCENE_BALLS, topics.SCENE_OBJECTS)
+ICONS: dict[Tab, viser.IconName] = {
+    "Cameras": viser.Icon.CAMERA, "Health": viser.Icon.HEARTBEAT, "Plots": viser.Icon.CHART_LINE,
+    "Log": viser.Icon.LIST, "Tuning": viser.Icon.ADJUSTMENTS, "Move": viser.Icon.ARROWS_MOVE, "View": viser.Icon.EYE,
+}
+
+
+@dataclass(frozen=True)
+class Periods:
+    """Wall time between two looks at a part of the page [s]."""
+
+    picture: float = 0.1
+    task: float = 0.2
+    health: float = 0.5
+    frustum: float = 0.5
+    contours: float = 0.5
+
+
+class Page:
+    """Everything that a browser shows. Used on the loop of the service.
+
+    Attributes:
+        desk: carries out what persons do.
+        pages: how many browsers look.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, feeds: Feeds, requests: Requests, motions: Motions, members: Members, *,
+        cell: str, limits: Limits, planners: list[str], layout: Layout, layout_file: str, periods: Periods,
+    ) -> None:
+        """Lay the page out; on the running loop.
+
+        Args:
+            server: that serves it.
+            feeds: what the cell says.
+            requests: to the cell.
+            motions: for the person.
+            members: of the cell.
+            cell: its name.
+            limits: of the joints.
+            planners: that may be asked.
+            layout: what is on.
+            layout_file: where the layout is kept; empty for the project's file.
+            periods: of the parts.
+        """
+        self._server, self._feeds, self._requests = server, feeds, requests
+        self._cell, self._members, self._limits = cell, members, limits
+        self._layout, self._layout_file, self._periods = layout, layout_file, periods
+        self._layers = layers_shown(layout.layers)
+        self._editing = layout.edit_world
+        self._due: dict[str, float] = {}
+        self._scene: SceneView | None = None
+        self.pages = 0
+        self.desk = Desk(asyncio.get_running_loop(), self._tell)
+        gui = server.gui
+        gui.configure_theme(dark_mode=layout.dark, show_logo=False, show_share_button=False)
+        gui.set_panel_label(f"zencell · {cell}")
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(layout.panel_width)
+        self._task = TaskPanel(gui, self.desk, requests, outlines=members.task == OUTLINER, home=self._home)
+        panel = gui.add_panel()
+        tabs = {name: panel.add_tab(name, ICONS[name]) for name in layout.tabs}
+        panel.dock_below(gui.main_panel)
+        hidden = gui.add_folder(None, visible=False)  # holds the panels that have no tab
+        place: dict[Tab, viser.GuiTabHandle | viser.GuiFolderHandle] = {tab: tabs.get(tab, hidden) for tab in TABS}
+        with place["Cameras"]:
+            self._pictures = PicturePanel(
+                gui, self.desk, {LIVE: layout.live_image, ANNOTATED: layout.annotated_image})
+        with place["Health"]:
+            self._health = HealthPanel(gui, members.services)
+        with place["Plots"]:
+            seen = "Picture to targets" if topics.VALIDATED_TARGETS in feeds else "Picture to path"
+            self._plots = PlotPanel(gui, limits, seen)
+        with place["Log"]:
+            self._log = LogPanel(gui, self.desk, layout.log_level)
+        self._tuning = TuningPanel(gui, place["Tuning"], self.desk, requests)
+        with place["Move"]:
+            self._move = MovePanel(gui, self.desk, motions, lambda: self._scene, planners, planner=layout.planner,
+                                   marker=layout.goal_marker)
+        with place["View"]:
+            self._view = ViewPanel(gui, self.desk, self._layers, self._editing, on_layer=self._set_layer,
+                                   on_editing=self._set_editing, on_save=self._save)
+        viewpoint = layout.viewpoint(cell)
+        server.initial_camera.position = viewpoint.position
+        server.initial_camera.look_at = viewpoint.look_at
+
+        async def count(_client: viser.ClientHandle) -> None:
+            self.desk.put(self._count)
+
+        server.on_client_connect(count)
+        server.on_client_disconnect(count)
+
+    def _tell(self, line: str) -> None:
+        self._task.tell(line)
+
+    # --- what is shown --------------------------------------------------------------------------------------------
+
+    @property
+    def layers(self) -> dict[str, bool]:
+        """Whether each layer of the scene is shown."""
+        return dict(self._layers)
+
+    def set_scene(self, scene: SceneView) -> None:
+        """Show what the cell says in a scene, from now on."""
+        self._scene = scene
+        scene.on_select = lambda index: self.desk.put(lambda: self._select(index))
+        scene.on_object_dragged = lambda name, x, y: self.desk.put(lambda: self._requests.move(name, x, y))
+        for name, on in self._layers.items():
+            scene.set_visible(name, on)
+        if self._editing:
+            scene.set_editing(True)
+        if self._move.marker:
+            scene.goal_marker(True)
+
+    def refresh(self, now: float, alive: frozenset[str]) -> None:
+        """Show what is new at a wall time [s], monotonic; without a browser only what plots need is kept.
+
+        Args:
+            now: wall time.
+            alive: the services that are ready.
+        """
+        state = self._feeds.fresh(topics.JOINT_STATES)
+        if state is not None:
+            self._sample(state, now)
+        if not self.pages:
+            return
+        if self._is_due("task", self._periods.task, now):
+            task = self._feeds.latest(topics.OUTLINE_STATUS) or self._feeds.latest(topics.PICK_PLACE_STATUS)
+            holding = self._feeds.latest(topics.GRIPPER_STATE)
+            self._task.show(task, self._feeds.latest(topics.MOTION_STATUS), gripper(holding))
+            self._log.show()
+        if self._is_due("health", self._periods.health, now):
+            self._health.show(self._feeds.latest(topics.SUPERVISOR_STATUS), alive)
+            self._plots.show(now)
+        if self._is_due("picture", self._periods.picture, now):
+            self._show_pictures(now)
+        contours = None
+        if self._is_due("contours", self._periods.contours, now):
+            contours = self._feeds.fresh(topics.CONTOURS)
+            if contours is not None:
+                self._task.show_contours(contours)
+        if self._scene is not None:
+            if state is not None:
+                self._scene.show_joints(state)
+            self._show_scene(self._scene, contours)
+
+    def _is_due(self, part: str, period: float, now: float) -> bool:
+        if now < self._due.get(part, 0.0):
+            return False
+        self._due[part] = now + period
+        return True
+
+    def _sample(self, state: Any, now: float) -> None:
+        at = {name: index for index, name in enumerate(state.name)}
+        if not all(name in at for name in self._limits.names):
+            return
+        order = [at[name] for name in self._limits.names]
+        speeds = [state.velocity[i] for i in order] if state.velocity else None
+        self._plots.joints([state.position[i] for i in order], speeds, now)
+
+    def _show_pictures(self, now: float) -> None:
+        for name, sources in IMAGES.items():
+            for topic in sources:
+                image = self._feeds.fresh(topic) if self._pictures.shown[name] else None
+                rgb = self._pictures.show(name, image) if image is not None else None
+                if rgb is not None and name == LIVE and self._scene is not None and self._layers["camera"] and (
+                        self._is_due("frustum", self._periods.frustum, now)):
+                    self._scene.show_picture(rgb)
+
+    def _show_scene(self, scene: SceneView, contours: Contours | None) -> None:
+        shows: list[tuple[Topic[Any], Callable[[Any], None]]] = [
+            (topics.PLANNING_SCENE, scene.show_scene), (topics.VALIDATED_TARGETS, scene.show_targets),
+            (topics.WORKSPACE_MARKERS, scene.show_workspace), (topics.TF_STATIC, scene.show_transforms),
+            (topics.TF, scene.show_transforms), (topics.CAMERA_INFO, scene.show_camera),
+            (topics.DEPTH_CAMERA_INFO, scene.show_camera), (topics.DISPLAY_TRAJECTORY, scene.show_plan),
+            (topics.CONTOUR_PATH, scene.show_outline),
+        ]
+        for topic, show in shows:
+            if (message := self._feeds.fresh(topic)) is not None:
+                show(message)
+        if contours is not None:
+            scene.show_contours(contours)
+        balls, objects = self._feeds.fresh(topics.SCENE_BALLS), self._feeds.fresh(topics.SCENE_OBJECTS)
+        if balls is not None or objects is not None:
+            scene.show_truth(balls, objects)
+
+    # --- what goes on beside ------------------------------------------------------------------------------------------
+
+    def activities(self, age_ms: Callable[[int], float]) -> list[Coroutine[Any, Any, None]]:
+        """What has to run beside `refresh`, until cancelled.
+
+        Args:
+            age_ms: wall time [ms] since a stamp was taken.
+        """
+        return [self.desk.run(), self._follow_log(), self._follow_counters(), self._follow_rejected(),
+                self._follow_latency(age_ms), self._follow_parameters()]
+
+    async def _follow_log(self) -> None:
+        if (reader := self._feeds.reader(topics.LOG)) is not None:
+            async for line in reader:
+                self._log.add(line)
+
+    async def _follow_counters(self) -> None:
+        if (reader := self._feeds.reader(topics.COUNTERS)) is not None:
+            async for counters in reader:
+                self._health.count(counters, asyncio.get_running_loop().time())
+
+    async def _follow_rejected(self) -> None:
+        if (reader := self._feeds.reader(topics.REJECTED_TARGETS)) is not None:
+            async for rejections in reader:
+                if self._scene is not None:
+                    self._scene.show_rejected(rejections)
+
+    async def _follow_latency(self, age_ms: Callable[[int], float]) -> None:
+        stamped: tuple[Topic[Any], ...] = (topics.VALIDATED_TARGETS, topics.CONTOUR_PATH)
+        for reader in filter(None, map(self._feeds.reader, stamped)):  # a cell has one of them
+            async for message in reader:
+                self._plots.latency(age_ms(message.header.stamp), asyncio.get_running_loop().time())
+
+    async def _follow_parameters(self) -> None:
+        while True:
+            if self.pages:
+                self._tuning.show(await self._requests.parameters())
+            await asyncio.sleep(1.0)
+
+    # --- what persons do ------------------------------------------------------------------------------------------
+
+    def _count(self) -> None:
+        before, self.pages = self.pages, len(self._server.get_clients())
+        if self.pages and not before:
+            self._due.clear()
+        self._listen()
+
+    def _listen(self) -> None:
+        wanted: list[Topic[Any]] = []
+        if self.pages:
+            wanted.append(topics.CONTOURS)
+            for name, sources in IMAGES.items():
+                wanted += sources if self._pictures.shown[name] else ()
+            wanted += TRUTH if self._layers["truth"] or self._editing else ()
+            wanted += [topics.TF] if self._layers["frames"] else []
+        self._feeds.listen(wanted)
+
+    async def _home(self) -> None:
+        await self._move.go_home()
+
+    async def _select(self, index: int) -> None:
+        await self._task.choose(OutlineSelect(rule="index", index=index))
+
+    def _set_layer(self, name: str, on: bool) -> None:
+        self._layers[name] = on
+        if self._scene is not None:
+            self._scene.set_visible(name, on)
+        self._listen()
+
+    def _set_editing(self, on: bool) -> None:
+        self._editing = on
+        if self._scene is not None:
+            self._scene.set_editing(on)
+        self._listen()
+
+    def _save(self, client: viser.ClientHandle | None) -> None:
+        usual = layers_shown({})
+        viewpoints = dict(self._layout.viewpoints)
+        if client is not None:
+            eye, middle = (tuple(round(float(v), 3) for v in p) for p in (client.camera.position,
+                                                                          client.camera.look_at))
+            viewpoints[self._cell] = Viewpoint.model_validate({"position": eye, "look_at": middle})
+        layout = self._layout.model_copy(update={
+            "layers": {name: on for name, on in self._layers.items() if on != usual[name]},
+            "viewpoints": viewpoints, "live_image": self._pictures.shown[LIVE],
+            "annotated_image": self._pictures.shown[ANNOTATED], "log_level": self._log.level,
+            "edit_world": self._editing, "goal_marker": self._move.marker, "planner": self._move.planner,
+        })
+        try:
+            path = save_layout(self._layout_file, layout)
+        except OSError as error:
+            self._view.tell(f"{error.filename or 'the layout'} can not be written: {error.strerror}", "bad")
+        except ZencellError as error:
+            self._view.tell(str(error), "bad")
+        else:
+            self._layout = layout
+            self._view.tell(f"Saved in {path}", "good")

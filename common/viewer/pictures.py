@@ -1,0 +1,87 @@
+"""The panel with the pictures of the camera: as it sends them, and with what was found in them."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from common.messages import Image
+from common.perception.image import ImageError, image_to_array
+from common.viewer.desk import Desk
+from common.viewer.markup import block, span
+
+WIDEST = 640  # [px] that are sent: more than the panel shows
+QUALITY = 75
+LIVE, ANNOTATED = "live", "annotated"
+LABELS = {LIVE: "As the camera sends it", ANNOTATED: "With what was found in it"}
+
+Picture = NDArray[np.uint8]
+
+
+def rgb_picture(image: Image, widest: int = WIDEST) -> Picture:
+    """The picture of a message as (height, width, 3) RGB, at most `widest` pixels wide.
+
+    Raises:
+        ImageError: the message contradicts itself, or is no picture to look at.
+    """
+    array: NDArray[Any] = image_to_array(image)
+    if array.dtype != np.uint8:
+        raise ImageError("encoding", f"{image.encoding} is no picture to look at")
+    if array.shape[1] > widest:
+        height = max(1, round(array.shape[0] * widest / array.shape[1]))
+        array = cv2.resize(array, (widest, height), interpolation=cv2.INTER_AREA)
+    if array.ndim == 2:
+        return np.asarray(cv2.cvtColor(array, cv2.COLOR_GRAY2RGB), np.uint8)
+    return np.asarray(array[:, :, ::-1] if image.encoding == "bgr8" else array, np.uint8)
+
+
+class PicturePanel:
+    """Two pictures, each with a tick: what is not ticked is not even asked for."""
+
+    def __init__(self, gui: viser.GuiApi, desk: Desk, shown: dict[str, bool]) -> None:
+        """Lay the panel out where the GUI stands.
+
+        Args:
+            gui: of the server.
+            desk: takes changes of the ticks.
+            shown: whether the live and the annotated picture are ticked.
+        """
+        self._gui = gui
+        self.shown = dict(shown)
+        self._ticks = {name: gui.add_checkbox(label, shown[name]) for name, label in LABELS.items()}
+        self._folders = {name: gui.add_folder(None) for name in LABELS}
+        self._images: dict[str, viser.GuiImageHandle] = {}
+        self._notes: dict[str, viser.GuiHtmlHandle] = {}
+        for name, tick in self._ticks.items():
+            desk.on_change(tick, partial(self._set_shown, name))
+            with self._folders[name]:
+                self._notes[name] = gui.add_html(block(span("No picture yet", "dim"), f"{name} picture", pictures=0))
+        self._count = dict.fromkeys(LABELS, 0)
+
+    def show(self, name: str, image: Image) -> Picture | None:
+        """Show a message as the live or the annotated picture; the picture, or None when it is none."""
+        try:
+            rgb = rgb_picture(image)
+        except ImageError as error:
+            self._notes[name].content = block(span(error, "bad"), f"{name} picture", pictures=self._count[name])
+            return None
+        self._count[name] += 1
+        if name in self._images:
+            self._images[name].image = rgb
+            return rgb
+        self._notes[name].content = ""
+        with self._folders[name]:
+            self._images[name] = self._gui.add_image(rgb, format="jpeg", jpeg_quality=QUALITY,
+                                                     visible=self.shown[name])
+        return rgb
+
+    def _set_shown(self, name: str, on: bool) -> None:
+        self.shown[name] = on
+        self._folders[name].visible = on
+        if name in self._images:
+            self._images[name].visible = on

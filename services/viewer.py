@@ -1,0 +1,73 @@
+"""Serves the operator's page: a 3D scene, panels and controls in the browser."""
+
+from __future__ import annotations
+
+import asyncio
+
+from pydantic import Field
+
+from common import topics
+from common.config import Members, Parameters, RobotConfig, Run, Surroundings
+from common.planning.planners import planner_names
+from common.robot.model import RobotModel
+from common.transport.bus import Bus
+from common.transport.operator_motion import OperatorMotion
+from common.transport.service import main
+from common.viewer.feeds import Feeds
+from common.viewer.guard import close_server, make_server
+from common.viewer.layout import load_layout
+from common.viewer.page import Page, Periods
+from common.viewer.plots import Limits
+from common.viewer.requests import Requests
+from common.viewer.scene_view import SceneView
+
+IDLE_PERIOD = 0.1  # [s] wall: without a browser
+
+
+class Config(Parameters):
+    """Where the page is served and how often it is brought up to date."""
+
+    robot: RobotConfig
+    world: Surroundings
+    run: Run
+    members: Members
+    host: str = Field("127.0.0.1", min_length=1, description="address to listen at; others than this need a token")
+    port: int = Field(8080, ge=0, le=65535, description="TCP port; 0: any that is free")
+    token: str = Field("", description="that a browser has to bring: http://HOST:PORT/?token=TOKEN")
+    layout: str = Field("", description="file of the layout; empty: config/viewer.yaml")
+    rate: float = Field(30.0, ge=1, le=60, description="of the moving robot, wall time [Hz]")
+    picture_rate: float = Field(10.0, gt=0, le=30, description="of each camera picture at most, wall time [Hz]")
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Show the cell to whoever looks, until cancelled."""
+    layout = load_layout(config.layout)
+    robot = RobotModel.load(config.robot)
+    feeds = Feeds(bus, config.members)
+    requests = Requests(bus, config.members, feeds)
+    tasks = [feeds.reader(topic) for topic in (topics.PICK_PLACE_STATUS, topics.OUTLINE_STATUS)]
+    motions = OperatorMotion(bus, [reader for reader in tasks if reader is not None])
+    alive = bus.alive
+    server = make_server(config.host, config.port, config.token)
+    try:
+        page = Page(
+            server, feeds, requests, motions, config.members, cell=config.run.cell,
+            limits=Limits(robot.joint_names, robot.lower, robot.upper, robot.velocity), planners=planner_names(),
+            layout=layout, layout_file=config.layout, periods=Periods(picture=1 / config.picture_rate),
+        )
+        await bus.ready()
+        loop = asyncio.get_running_loop()
+        async with asyncio.TaskGroup() as group:
+            for activity in page.activities(bus.clock.age_ms):
+                group.create_task(activity)
+            # Meshes take a second to read and pack.
+            page.set_scene(await asyncio.to_thread(SceneView, server, robot, config.world, visible=page.layers))
+            while True:
+                page.refresh(loop.time(), alive.names)
+                await asyncio.sleep(1 / config.rate if page.pages else IDLE_PERIOD)
+    finally:
+        close_server(server)
+
+
+if __name__ == "__main__":
+    main(run, Config)
