@@ -35,12 +35,12 @@ def call(
 ) -> None:
     """Send a request and print the answer as JSON; exit 1 with one line if there is none."""
     from common.config import check
-    from common.topics import Request, all_topics
+    from common.topics import Request, all_topics, find_topic
 
-    requests = {name: topic for name, topic in all_topics().items() if isinstance(topic, Request)}
-    if key not in requests:
+    request = find_topic(key)
+    if not isinstance(request, Request):
+        requests = [name for name, topic in all_topics().items() if isinstance(topic, Request)]
         raise UnknownName("request", key, requests)
-    request = requests[key]
     message = check(request.message, _parse(key, body), key)
     seconds = options.number("--timeout", timeout)
     if seconds <= 0:

@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import typer
 
-from cli import bringup, catalogue, commands, doctor, graph, node, outlining, recording, robot, tf, top, topic
+from cli import bringup, catalogue, commands, doctor, graph, node, outlining, param, recording, robot, tf, top, topic
 from common.errors import RequestFailed, ZencellError
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -74,6 +74,7 @@ app.command()(top.top)
 app.add_typer(topic.app, name="topic")
 app.command(context_settings={"ignore_unknown_options": True})(commands.call)
 app.add_typer(node.app, name="node")
+app.add_typer(param.app, name="param")
 app.add_typer(tf.app, name="tf")
 app.command()(graph.graph)
 app.add_typer(commands.task, name="task")

@@ -193,12 +193,12 @@ def topic_of(key: str) -> AnyTopic:
     Raises:
         UnknownName: with the keys that there are.
     """
-    from common.topics import all_topics
+    from common.topics import all_topics, find_topic
 
-    topics = all_topics()
-    if key not in topics:
-        raise UnknownName("key", key, topics)
-    return topics[key]
+    topic = find_topic(key)
+    if topic is None:
+        raise UnknownName("key", key, all_topics())
+    return topic
 
 
 def published(key: str) -> Topic[Any]:
@@ -221,6 +221,6 @@ def published_or_foreign(key: str) -> Topic[Any] | None:
     Raises:
         UnknownName: with the keys that are published, for one that is requested.
     """
-    from common.topics import all_topics
+    from common.topics import find_topic
 
-    return published(key) if key in all_topics() else None
+    return published(key) if find_topic(key) else None
