@@ -5,6 +5,7 @@ import pytest
 
 from common.hardware.interface import Limits
 from common.messages import JointTrajectory, JointTrajectoryPoint
+from tests.common.hardware.rig import Rig
 
 Make = Callable[..., JointTrajectory]
 
@@ -34,3 +35,8 @@ def rest_to_rest(limits: Limits) -> Make:
         return JointTrajectory(joint_names=list(limits.names), points=samples)
 
     return make
+
+
+@pytest.fixture
+def rig(limits: Limits) -> Rig:
+    return Rig(limits)

@@ -1,0 +1,246 @@
+"""Held, let go, slowed down and sped up: the robot stays on its path and within its limits all the while."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.hardware.interface import Limits
+from common.hardware.lag import LagHardware
+from common.messages import JointTrajectory, JointTrajectoryPoint
+from tests.common.hardware.rig import START, STEP, T0, Rig
+
+LIMITS = Limits(("shoulder", "elbow"), -3 * np.ones(2), 3 * np.ones(2), 2 * np.ones(2), np.array([10.0, 5.0]))
+
+
+def winding(swings: int, share: float, points: int = 400) -> JointTrajectory:
+    """The shoulder goes from 0 to 1 while the elbow swings; at a share of what velocity or acceleration limits allow.
+
+    Time runs through the geometry as 10 u^3 - 15 u^4 + 6 u^5.
+    """
+    u = np.linspace(0.0, 1.0, points)
+    s, ds, dds = 10 * u**3 - 15 * u**4 + 6 * u**5, 30 * u**2 * (1 - u) ** 2, 60 * u - 180 * u**2 + 120 * u**3
+    k = np.pi * swings
+    q = np.stack([s, 0.3 * np.sin(k * s)], axis=1)
+    dq = np.stack([ds, 0.3 * k * np.cos(k * s) * ds], axis=1)
+    ddq = np.stack([dds, 0.3 * k * (np.cos(k * s) * dds - k * np.sin(k * s) * ds**2)], axis=1)
+    duration = max(np.abs(dq / LIMITS.velocity).max(), np.sqrt(np.abs(ddq / LIMITS.acceleration).max())) / share
+    samples = [
+        JointTrajectoryPoint(time_from_start=float(t), positions=a.tolist(), velocities=b.tolist(),
+                             accelerations=c.tolist())
+        for t, a, b, c in zip(u * duration, q, dq / duration, ddq / duration**2, strict=True)
+    ]
+    return JointTrajectory(joint_names=list(LIMITS.names), points=samples)
+
+
+def assert_on_path(rig: Rig, swings: int) -> None:
+    positions = np.array(rig.positions)
+    assert np.allclose(positions[:, 1], 0.3 * np.sin(np.pi * swings * positions[:, 0]), atol=1e-5)
+    assert np.all(np.diff(positions[:, 0]) >= -1e-12), "never back"
+
+
+def assert_within(rig: Rig, limits: Limits, acceleration: np.ndarray) -> None:
+    velocities, steps = np.array(rig.velocities), np.array(rig.steps)[:, None]
+    assert np.all(np.abs(velocities) <= limits.velocity * 1.001)
+    assert np.all(np.abs(np.diff(velocities, axis=0)) <= steps * acceleration * 1.01)
+
+
+class Timed(Rig):
+    """A rig that remembers how long its steps were."""
+
+    def __init__(self, *args, **tolerances):
+        super().__init__(*args, **tolerances)
+        self.steps = []
+
+    def step(self, seconds=STEP):
+        self.steps.append(seconds)
+        return super().step(seconds)
+
+    @property
+    def at_rest(self):
+        return not self.velocities[-1].any()
+
+
+DEEDS = st.one_of(
+    st.tuples(st.just("hold"), st.booleans()),
+    st.tuples(st.just("scale"), st.floats(0.05, 1.0)),
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    swings=st.integers(0, 6), share=st.sampled_from([0.5, 0.9, 0.999]), cycle=st.sampled_from([0.004, 0.01, 0.04]),
+    deeds=st.lists(st.tuples(st.floats(0.0, 1.0), DEEDS), max_size=8), jitter=st.randoms(use_true_random=False),
+)
+def test_whatever_is_held_and_scaled_the_arm_stays_on_its_path_and_within_limits(swings, share, cycle, deeds, jitter):
+    rig = Timed(LIMITS)
+    assert rig.accept("a", winding(swings, share)).state == "active"
+    for wait, (deed, value) in deeds:
+        begin = rig.now
+        while rig.now - begin < wait:
+            rig.step(cycle * jitter.uniform(0.5, 1.5))
+        if deed == "hold":
+            assert rig.controller.hold(value, "tested").held == value
+        else:
+            rig.controller.speed_scaling = value
+    rig.controller.hold(False, "")
+    rig.controller.speed_scaling = 1.0
+    status = rig.until_over()
+    assert status.state == "succeeded" and np.allclose(rig.q, [1, 0.3 * np.sin(np.pi * swings)], atol=2e-3)
+    assert_on_path(rig, swings)
+    assert_within(rig, LIMITS, LIMITS.acceleration)
+
+
+@settings(max_examples=10, deadline=None)
+@given(swings=st.integers(0, 6), share=st.sampled_from([0.5, 0.9]), when=st.floats(0.02, 0.98),
+       deed=st.sampled_from(["hold", "stop"]))
+def test_robot_that_may_brake_harder_does_so_and_stays_on_its_path(swings, share, when, deed):
+    hard = replace(LIMITS, deceleration=3 * LIMITS.acceleration)
+    took = []
+    for limits in (LIMITS, hard):
+        rig = Timed(limits)
+        trajectory = winding(swings, share)
+        rig.accept("a", trajectory)
+        while rig.now - T0 < when * trajectory.points[-1].time_from_start:
+            rig.step()
+        before = rig.now
+        if deed == "hold":
+            rig.controller.hold(True, "")
+        else:
+            rig.controller.cancel("a", "tested", rig.now)
+        while not rig.at_rest:
+            rig.step()
+        took.append(rig.now - before)
+        assert_on_path(rig, swings)
+        assert_within(rig, limits, limits.braking)
+    assert took[1] <= took[0] + 1e-6
+
+
+@settings(max_examples=10, deadline=None)
+@given(share=st.floats(0.2, 0.5), when=st.floats(0.05, 0.95))
+def test_hold_takes_no_longer_than_braking_at_the_limit(share, when):
+    rig = Timed(LIMITS)
+    trajectory = winding(0, share)
+    rig.accept("a", trajectory)
+    while rig.now - T0 < when * trajectory.points[-1].time_from_start:
+        rig.step()
+    fastest, before = np.abs(rig.velocities[-1][0]), rig.now
+    rig.controller.hold(True, "")
+    while not rig.at_rest:
+        rig.step()
+    # The trajectory takes up a share^2 of the acceleration itself; 30 ms are the least that a hold takes.
+    assert rig.now - before <= max(0.03, fastest / (LIMITS.acceleration[0] * (1 - share**2))) + 3 * STEP
+
+
+def test_held_goal_stays_active_without_progress_and_says_why(limits, rest_to_rest):
+    rig = Timed(limits, goal_time=0.1)
+    rig.accept("a", rest_to_rest([0, 0], [1, -0.5]))
+    for _ in range(40):
+        rig.step()
+    answer = rig.controller.hold(True, "somebody is near")
+    assert (answer.id, answer.state, answer.held) == ("a", "active", True)
+    assert answer.message == "coming to rest: somebody is near"
+    while not rig.at_rest:
+        rig.step()
+    there = rig.q
+    for _ in range(1000):
+        status = rig.step(0.1)
+    assert (status.state, status.held, status.message) == ("active", True, "held: somebody is near")
+    assert np.array_equal(rig.q, there) and 0.3 < status.progress < 0.6
+    answer = rig.controller.hold(False, "gone")
+    assert (answer.held, answer.message) == (False, "")
+    assert rig.until_over().state == "succeeded"
+
+
+@pytest.mark.parametrize("hardware", [None, LagHardware(START, 0.03, None)])
+def test_held_arm_that_lags_or_not_breaks_no_tolerance(limits, rest_to_rest, hardware):
+    rig = Rig(limits, hardware, goal_time=0.05, path=0.2)
+    rig.accept("a", rest_to_rest([0, 0], [1, -0.5]))
+    for number in range(12):
+        rig.controller.hold(number % 2 == 0, "")
+        for _ in range(40):
+            assert rig.step().state == "active" or number > 5
+    rig.controller.hold(False, "")
+    assert rig.until_over().state == "succeeded"
+
+
+def test_goal_that_comes_while_held_waits_at_its_start_and_is_done_once(rig, rest_to_rest):
+    rig.controller.hold(True, "paused")
+    there = rest_to_rest([0, 0], [1, 1])
+    answer = rig.accept("a", there)
+    assert (answer.state, answer.held, answer.message) == ("active", True, "held: paused")
+    for _ in range(100):
+        rig.step()
+    assert np.array_equal(rig.q, START)
+    assert rig.accept("a", there).state == "active", "asked again, done once"
+    assert rig.accept("b", there).error == "busy"
+    rig.controller.hold(False, "")
+    assert rig.until_over().state == "succeeded" and np.allclose(rig.q, [1, 1])
+
+
+def test_goal_that_is_refused_while_held_changes_nothing(rig, rest_to_rest):
+    rig.controller.hold(True, "paused")
+    refused = rig.accept("a", rest_to_rest([0.5, 0], [1, 1]))
+    assert (refused.state, refused.error, refused.held) == ("rejected", "start_mismatch", True)
+    assert "starts with shoulder" in refused.message
+
+
+@pytest.mark.parametrize("wait", [1, 100])
+def test_stop_while_held_cancels_and_the_robot_stays_held(rig, rest_to_rest, wait):
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    for _ in range(40):
+        rig.step()
+    rig.controller.hold(True, "paused")
+    for _ in range(wait):
+        rig.step()
+    rig.controller.cancel("a", "given up", rig.now)
+    status = rig.until_over()
+    assert (status.state, status.held, status.message) == ("cancelled", True, "given up")
+    there = rig.q
+    assert not rig.controller.hold(False, "").held
+    for _ in range(10):
+        rig.step()
+    assert np.array_equal(rig.q, there)
+    assert rig.accept("b", rest_to_rest(there.tolist(), [1, 1])).state == "active"
+    assert rig.until_over().state == "succeeded"
+
+
+def test_let_go_while_stopping_does_not_end_the_stop(rig, rest_to_rest):
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    for _ in range(40):
+        rig.step()
+    rig.controller.cancel("a", "given up", rig.now)
+    rig.step()
+    answer = rig.controller.hold(False, "")
+    assert answer.state == "active" and "stopping" in answer.message
+    assert rig.until_over().state == "cancelled"
+
+
+def test_robot_that_is_held_with_nothing_to_do_says_so(rig, rest_to_rest):
+    assert rig.controller.hold(True, "lunch").message == "held: lunch"
+    assert rig.controller.status.state == "none"
+    assert rig.controller.hold(False, "").message == ""
+
+
+def test_times_stretch_with_the_speed(limits, rest_to_rest):
+    took = []
+    for scaling in (1.0, 0.5, 0.05):
+        rig = Timed(limits)
+        rig.controller.speed_scaling = scaling
+        rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+        status = rig.until_over(30)
+        assert status.state == "succeeded" and status.speed_scaling == scaling
+        took.append(rig.now - T0)
+    assert took == pytest.approx([1.0, 2.0, 20.0], abs=0.05)
+
+
+def test_fault_while_held_ends_the_goal_and_the_robot_stays_held(rig, rest_to_rest):
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    for _ in range(40):
+        rig.step()
+    rig.controller.hold(True, "paused")
+    rig.controller.fault("bus is off")
+    status = rig.controller.status
+    assert (status.state, status.error, status.held) == ("aborted", "hardware_fault", True)
