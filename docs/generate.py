@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 
 from common import config as c
 from common import topics
+from common.config.tunables import bounds_of, is_tunable
 from common.planning.planners import load_planner
 from common.transport.wiring import wiring
 from docs.seed_parameters import CAMERA, CONTROLLER, VALIDATOR, SeedParameter
@@ -27,15 +27,6 @@ ROOT = Path(__file__).resolve().parent.parent
 def first_line(text: str | None) -> str:
     """The first line of a docstring."""
     return (text or "").strip().splitlines()[0] if text else ""
-
-
-def bounds_of(info: FieldInfo) -> str:
-    """Bounds of a field as people write them."""
-    low = next((f">= {m.ge:g}" if hasattr(m, "ge") else f"> {m.gt:g}" for m in info.metadata
-                if hasattr(m, "ge") or hasattr(m, "gt")), "")
-    high = next((f"<= {m.le:g}" if hasattr(m, "le") else f"< {m.lt:g}" for m in info.metadata
-                 if hasattr(m, "le") or hasattr(m, "lt")), "")
-    return ", ".join(part for part in (low, high) if part)
 
 
 def shown(value: object) -> str:
@@ -55,7 +46,8 @@ def rows_of(model: type[BaseModel], prefix: str, values: BaseModel | None = None
         if isinstance(value, BaseModel):
             rows += rows_of(type(value), f"{prefix}.{name}", value)
             continue
-        rows.append(f"| `{prefix}.{name}` | {shown(value)} | {bounds_of(info)} | {info.description or ''} |")
+        live = "yes" if is_tunable(info) else ""
+        rows.append(f"| `{prefix}.{name}` | {shown(value)} | {bounds_of(info)} | {live} | {info.description or ''} |")
     return rows
 
 
@@ -88,11 +80,13 @@ def seed_table(cell: c.Cell, rows: list[SeedParameter]) -> list[str]:
 def parameters() -> str:
     """The text of docs/parameters.md."""
     cell = c.load_cell("panda")
-    head = ["| parameter | default | bounds | meaning |", "|---|---|---|---|"]
+    head = ["| parameter | default | bounds | at run time | meaning |", "|---|---|---|---|---|"]
     lines = [
         "# Parameters", "",
         "Made by `python -m docs.generate`; a test keeps it current. Every value can be set in the cell file or with",
-        "`--set PATH=VALUE`, for example `--set world.count=5 --set services.camera_simulator.noise_std=8`.", "",
+        "`--set PATH=VALUE`, for example `--set world.count=5 --set services.camera_simulator.noise_std=8`.",
+        "What says *yes* under *at run time* can also be changed while the cell is up, with",
+        "`zencell param set PATH=VALUE`; the rest needs a restart.", "",
         "## The seed's numbers and ours", "",
         "The seed's controller declares 28 parameters; its document names 25 (some in pairs), and gives three more numbers",
         "in its text, marked so. *Kept*: same number, same meaning. *Re-framed*: same meaning, for the tool centre point",
@@ -101,7 +95,7 @@ def parameters() -> str:
         *seed_table(cell, VALIDATOR), "", "### Camera and detector", "", *seed_table(cell, CAMERA), "", "## The cell", "",
         *head, *rows_of(c.Motion, "motion", cell.motion), *rows_of(c.Grasp, "grasp", cell.grasp),
         *rows_of(c.World, "world", cell.world), *rows_of(c.RobotConfig, "robot", cell.robot),
-        f"| `pipeline.validation_step` | {cell.pipeline.validation_step:g} | > 0, <= 0.2 | "
+        f"| `pipeline.validation_step` | {cell.pipeline.validation_step:g} | > 0, <= 0.2 | yes | "
         f"{c.Pipeline.model_fields['validation_step'].description} |", "",
         "## Planners", "", "Set in the pipeline file, under `options` of the planner.", "", *head,
     ]
@@ -129,15 +123,20 @@ def topic_table() -> str:
 
 def service_table(cell_name: str) -> str:
     """The services of a cell in start order, with what each reads, writes, serves and asks."""
-    cell = c.load_cell(cell_name)
+    cell = c.load_cell(cell_name, ["services.viewer.port=0"])  # it listens while it is looked at
     lines = ["| | service | what it does | reads | writes | serves | asks |", "|---|---|---|---|---|---|---|"]
     for number, name in enumerate(cell.services, 1):
         module = importlib.import_module(f"services.{name}")
         wired = asyncio.run(wiring(module.run, c.service_config(cell, name, module.Config)))
-        keys = [", ".join(sorted(f"`{t.key}`" for t in side if t.key not in ("log", "counters")))
+        keys = [", ".join(sorted({f"`{shown_key(t)}`" for t in side if t.key not in ("log", "counters")}))
                 for side in (wired.reads, wired.writes, wired.serves, wired.calls)]
         lines.append(f"| {number} | {name} | {first_line(module.__doc__)} | {' | '.join(keys)} |")
     return "\n".join(lines)
+
+
+def shown_key(topic: topics.AnyTopic) -> str:
+    """The key of a topic; one for the parameters of all services."""
+    return topics.PARAMETERS.key if topic.key.startswith("param/") else topic.key
 
 
 def readme(text: str) -> str:
