@@ -83,7 +83,10 @@ def section_path(kind: type[Section]) -> str:
 
 
 def leaves(config: Parameters, service: str) -> dict[str, Leaf]:
-    """All parameters of a service by path: its own, nested ones too, and sections of the cell that it can change."""
+    """All parameters of a service by path: its own, nested ones too, and sections of the cell that it can change.
+
+    A field with `repr=False`, such as a password, is left out.
+    """
     found = {leaf.path: leaf for leaf in _leaves(config, f"services.{service}", None)}
     sections = tunable_sections(type(config))
     for name, info in type(config).model_fields.items():
@@ -95,8 +98,8 @@ def leaves(config: Parameters, service: str) -> dict[str, Leaf]:
 
 def _leaves(model: BaseModel, prefix: str, defaults: BaseModel | None) -> Iterator[Leaf]:
     for name, info in type(model).model_fields.items():
-        if is_section(info.annotation) and not isinstance(model, Section):
-            continue
+        if (is_section(info.annotation) and not isinstance(model, Section)) or not info.repr:
+            continue  # what is not to be shown, such as a password, is nobody's business
         default = getattr(defaults, name) if defaults is not None else info.get_default(call_default_factory=True)
         if info.is_required() and defaults is None:
             default = ...
