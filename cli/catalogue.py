@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from cli import options
+from cli import completing, options
 from common.errors import UnknownName
 
 
@@ -39,8 +39,13 @@ def _first_line(path: Path) -> str:
 
 
 def service(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="of `zencell services`, of the cell, or a module")],
-    cell: Annotated[str, typer.Option("--cell", metavar="CELL", help="the cell that it belongs to")] = "panda",
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="of `zencell services`, of the cell, or a module",
+                            autocompletion=completing.services)
+    ],
+    cell: Annotated[
+        str, typer.Option("--cell", metavar="CELL", help="the cell that it belongs to", autocompletion=completing.cells)
+    ] = "panda",
     overrides: options.Overrides = None,
     world: options.WorldName = None,
     seed: options.Seed = None,

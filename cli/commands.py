@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import options
+from cli import completing, options
 from common.errors import ConfigError, UnknownName
 
 if TYPE_CHECKING:
@@ -26,7 +26,10 @@ NEGATIVE_NUMBERS = {"ignore_unknown_options": True}  # -0.2 is a coordinate, not
 
 
 def call(
-    key: Annotated[str, typer.Argument(metavar="KEY", help="of a request, as in `zencell topic list`")],
+    key: Annotated[
+        str, typer.Argument(metavar="KEY", help="of a request, as in `zencell topic list`",
+                            autocompletion=completing.requests)
+    ],
     body: Annotated[str, typer.Argument(metavar="JSON", help="its fields; `zencell topic info KEY` has an example")],
     cell: options.CellName = None,
     timeout: Annotated[str, typer.Option("--timeout", metavar="S", help="[s]")] = f"{TIMEOUT:g}",
@@ -112,7 +115,9 @@ def stop(cell: options.CellName = None, domain: options.Domain = None, connect: 
 
 @task.command()
 def home(
-    planner: Annotated[str, typer.Option("--planner", metavar="NAME", help="use only this one")] = "",
+    planner: Annotated[
+        str, typer.Option("--planner", metavar="NAME", help="use only this one", autocompletion=completing.planners)
+    ] = "",
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Plan a way home and go there, while no task has the robot; Ctrl-C stops the robot."""

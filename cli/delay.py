@@ -6,7 +6,7 @@ import asyncio
 import json
 from collections.abc import AsyncIterator
 from contextlib import aclosing
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -30,7 +30,7 @@ class NoStamp(RequestFailed):
 
 
 def delay(
-    key: Annotated[str, typer.Argument(metavar="KEY", help="as in `zencell topic list`, without the cell")],
+    key: options.PublishedKey,
     cell: options.CellName = None,
     count: options.Count = None,
     as_json: options.Json = False,

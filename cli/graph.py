@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli import options
+from cli import completing, options
 from common.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -36,7 +36,9 @@ class Graph:
 
 
 def graph(
-    cell: Annotated[str, typer.Argument(metavar="[CELL]", help="name or path of the cell file")] = "panda",
+    cell: Annotated[
+        str, typer.Argument(metavar="[CELL]", help="name or path of the cell file", autocompletion=completing.cells)
+    ] = "panda",
     output: Annotated[
         str, typer.Option("-o", "--output", metavar="FILE", help="*.svg, *.dot or *.mmd; without it Mermaid on stdout")
     ] = "",

@@ -14,7 +14,22 @@ from typing import Any, NoReturn
 
 import typer
 
-from cli import bringup, catalogue, commands, doctor, graph, node, outlining, param, recording, robot, tf, top, topic
+from cli import (
+    bringup,
+    catalogue,
+    commands,
+    completion,
+    doctor,
+    graph,
+    node,
+    outlining,
+    param,
+    recording,
+    robot,
+    tf,
+    top,
+    topic,
+)
 from common.errors import RequestFailed, ZencellError
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -30,6 +45,7 @@ class CommandLine(typer.Typer):
 
     def execute(self, arguments: Sequence[str]) -> int:
         """Exit code of a verb, which is run; an error is shown."""
+        completion.prepare()
         try:
             code = typer.main.get_command(self)(list(arguments), standalone_mode=False, prog_name="zencell")
         except typer.TyperException as error:
@@ -61,10 +77,11 @@ def _leave(code: int) -> NoReturn:
 app = CommandLine(
     help="Robot work cells as a mesh of processes over Zenoh.",
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=False,  # our own options below take the name of the shell
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+app.callback()(completion.root)
 app.command()(bringup.run)
 app.command()(bringup.up)
 app.command()(catalogue.cells)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import options
+from cli import completing, options
 from common.errors import UnknownName
 
 if TYPE_CHECKING:
@@ -52,8 +52,13 @@ SIDES = ("reads", "writes", "serves", "calls")
 
 @app.command()
 def info(
-    service: Annotated[str, typer.Argument(metavar="SERVICE", help="as in the cell file")],
-    cell: Annotated[str | None, typer.Option("--cell", metavar="CELL", help="name or YAML file of its cell")] = None,
+    service: Annotated[
+        str, typer.Argument(metavar="SERVICE", help="as in the cell file", autocompletion=completing.services)
+    ],
+    cell: Annotated[
+        str | None, typer.Option("--cell", metavar="CELL", help="name or YAML file of its cell",
+                                 autocompletion=completing.cells)
+    ] = None,
     as_json: options.Json = False,
     domain: options.Domain = None,
     connect: options.Connect = None,

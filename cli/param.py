@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import options
+from cli import completing, options
 from common.errors import ConfigError, NoResponder, RemoteError, RequestFailed, UnknownName, ZencellError
 
 if TYPE_CHECKING:
@@ -26,16 +26,21 @@ LONGEST_VALUE = 28  # characters of a value in a table
 BAD_INPUT = ("unknown_parameter", "bad_value")  # codes of a refusal that is the fault of what was typed
 
 PathArgument = Annotated[
-    str, typer.Argument(metavar="PATH", help="as in `zencell param list`; services. may be left out")
+    str, typer.Argument(metavar="PATH", help="as in `zencell param list`; services. may be left out",
+                        autocompletion=completing.parameters)
 ]
 Assignments = Annotated[
-    list[str], typer.Argument(metavar="PATH=VALUE...", help="values as YAML; @FILE: all of a file of `param dump`")
+    list[str], typer.Argument(metavar="PATH=VALUE...", help="values as YAML; @FILE: all of a file of `param dump`",
+                              autocompletion=completing.overrides)
 ]
 
 
 @app.command("list")
 def list_(
-    service: Annotated[str | None, typer.Argument(metavar="SERVICE", help="of one; of all if not given")] = None,
+    service: Annotated[
+        str | None, typer.Argument(metavar="SERVICE", help="of one; of all if not given",
+                                   autocompletion=completing.services)
+    ] = None,
     cell: options.CellName = None,
     as_json: options.Json = False,
     domain: options.Domain = None,
@@ -121,7 +126,10 @@ def set_(
 
 @app.command()
 def dump(
-    services: Annotated[list[str] | None, typer.Argument(metavar="SERVICE...", help="all if none is given")] = None,
+    services: Annotated[
+        list[str] | None, typer.Argument(metavar="SERVICE...", help="all if none is given",
+                                         autocompletion=completing.services)
+    ] = None,
     everything: Annotated[bool, typer.Option("--all", help="what is as by default, too")] = False,
     output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="write there, not here")] = "",
     cell: options.CellName = None,

@@ -29,7 +29,7 @@ Once = Annotated[bool, typer.Option("--once", help="one message, then end")]
 
 
 def pub(
-    key: Annotated[str, typer.Argument(metavar="KEY", help="as in `zencell topic list`, without the cell")],
+    key: options.PublishedKey,
     body: Annotated[str, typer.Argument(metavar="JSON", help="its fields; `zencell topic info KEY` shows them")],
     rate: Rate = DEFAULT_RATE,
     once: Once = False,
@@ -66,9 +66,9 @@ def _publishable(key: str) -> Topic[Any] | None:
     Raises:
         ConfigError: it is a request.
     """
-    from common.topics import Topic, all_topics
+    from common.topics import Topic, find_topic
 
-    topic = all_topics().get(key)
+    topic = find_topic(key)
     if topic is None or isinstance(topic, Topic):
         return topic
     raise ConfigError("KEY", key, f"is a request, which is not published: zencell call {key} JSON")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cli import options
+from cli import completing, options
 from common.errors import ConfigError
 
 app = typer.Typer(help="Prepare a robot.", no_args_is_help=True)
@@ -21,7 +21,10 @@ def robot() -> None:
 
 @app.command()
 def collisions(
-    name: Annotated[str, typer.Argument(metavar="ROBOT", help="a name of config/robots, or the path of a YAML file")],
+    name: Annotated[
+        str, typer.Argument(metavar="ROBOT", help="a name of config/robots, or the path of a YAML file",
+                            autocompletion=completing.robots)
+    ],
     samples: Annotated[str, typer.Option("--samples", metavar="N", help="random configurations")] = "10000",
     margin: Annotated[str, typer.Option("--margin", metavar="M", help="pairs that come this close are checked [m]")]
     = "0.005",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import delay, options, publishing
+from cli import completing, delay, options, publishing
 from common.errors import UnknownName
 
 if TYPE_CHECKING:
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Topics: what there is, what it carries, what comes and how often.", no_args_is_help=True)
 
-Key = Annotated[str, typer.Argument(metavar="KEY", help="as in `zencell topic list`, without the cell")]
+AnyKey = Annotated[
+    str, typer.Argument(metavar="KEY", help="as in `zencell topic list`", autocompletion=completing.keys)
+]
 
 
 @app.command("list")
@@ -37,7 +39,7 @@ def list_(as_json: options.Json = False) -> None:
 
 
 @app.command()
-def info(key: Key, as_json: options.Json = False) -> None:
+def info(key: AnyKey, as_json: options.Json = False) -> None:
     """Show what a topic carries, field by field; for a request also the answer and an example to call it with."""
     from cli.schema import example_of, fields_of
 
@@ -67,7 +69,7 @@ def info(key: Key, as_json: options.Json = False) -> None:
 
 @app.command()
 def echo(
-    key: Key,
+    key: options.PublishedKey,
     cell: options.CellName = None,
     count: options.Count = None,
     as_json: options.Json = False,
@@ -135,7 +137,7 @@ def visit_topic(
 
 @app.command()
 def hz(
-    key: Key,
+    key: options.PublishedKey,
     cell: options.CellName = None,
     count: options.Count = None,
     as_json: options.Json = False,
@@ -148,7 +150,7 @@ def hz(
 
 @app.command()
 def bw(
-    key: Key,
+    key: options.PublishedKey,
     cell: options.CellName = None,
     count: options.Count = None,
     as_json: options.Json = False,

@@ -55,8 +55,10 @@ def wired(cell: Cell, entry: ServiceEntry) -> Wired:
     except Exception as error:  # whatever a person's own module does
         raise Unwired(entry.name, error) from error
     config = service_config(cell, entry.name, module.Config)
+    # A service that listens at a port of its own may be up: another copy must not want the same one.
+    apart = config.model_copy(update={"port": 0}) if "port" in module.Config.model_fields else config
     try:
-        found = asyncio.run(wiring(module.run, config))
+        found = asyncio.run(wiring(module.run, apart))
     except ZencellError:
         raise
     except Exception as error:

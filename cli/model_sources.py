@@ -1,0 +1,92 @@
+"""Fields of the models of the configuration, read from their sources without importing anything."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@dataclass(frozen=True)
+class Model:
+    """A class, and the file in which the names that it uses mean something."""
+
+    path: Path
+    node: ast.ClassDef
+
+
+@dataclass(frozen=True)
+class ModelField:
+    """A field of a model; `model` is its type where that is a model too."""
+
+    name: str
+    description: str
+    model: Model | None
+
+
+@cache
+def tree_of(path: Path) -> ast.Module:
+    """The syntax tree of a file."""
+    return ast.parse(path.read_text(encoding="utf-8"), str(path))
+
+
+@cache
+def find_model(path: Path, name: str) -> Model | None:
+    """The class that a name means in a file of the project, also where it was imported from; None for another's."""
+    for node in tree_of(path).body:
+        if isinstance(node, ast.ClassDef) and node.name == name:
+            return Model(path, node)
+        if isinstance(node, ast.ImportFrom) and name in [alias.asname or alias.name for alias in node.names]:
+            source = _file_of(node.module or "")
+            return find_model(source, name) if source else None
+    return None
+
+
+def _file_of(module: str) -> Path | None:
+    base = ROOT.joinpath(*module.split("."))
+    for path in (base.with_suffix(".py"), base / "__init__.py"):
+        if path.is_file():
+            return path
+    return None
+
+
+def fields_of(model: Model) -> Iterator[ModelField]:
+    """The fields of a model, inherited ones first."""
+    for base in model.node.bases:
+        inherited = find_model(model.path, base.id) if isinstance(base, ast.Name) else None
+        if inherited is not None:
+            yield from fields_of(inherited)
+    for node in model.node.body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            kind = _type_name(node.annotation)
+            yield ModelField(node.target.id, _description(node.value), find_model(model.path, kind) if kind else None)
+
+
+def is_section(model: Model) -> bool:
+    """Whether a model is a part of the cell that services share."""
+    bases = [base.id for base in model.node.bases if isinstance(base, ast.Name)]
+    return "Section" in bases or any(
+        is_section(inherited) for base in bases if (inherited := find_model(model.path, base))
+    )
+
+
+def _type_name(annotation: ast.expr) -> str:
+    """The name of a field's type, without `| None` and `Tunable`; empty for what has none."""
+    match annotation:
+        case ast.BinOp(left=left, right=ast.Constant(value=None)):
+            return _type_name(left)
+        case ast.Subscript(value=ast.Name(id="Tunable"), slice=inner):
+            return _type_name(inner)
+    return annotation.id if isinstance(annotation, ast.Name) else ""
+
+
+def _description(value: ast.expr | None) -> str:
+    if isinstance(value, ast.Call):
+        for keyword in value.keywords:
+            if keyword.arg == "description" and isinstance(keyword.value, ast.Constant):
+                return str(keyword.value.value)
+    return ""
