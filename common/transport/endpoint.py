@@ -19,6 +19,8 @@ DOMAIN_VARIABLE = "ZENCELL_DOMAIN"
 CONNECT_VARIABLE = "ZENCELL_CONNECT"
 LEASE_MS = 2000  # a frozen process or cut link is noticed after this
 STUCK_MS = 1000  # so is a link that takes nothing
+STREAM_BATCHES = 16  # of 64 kB that may wait in a link: a whole picture, so that what comes after it need not be dropped
+STREAM_WAIT_US = 5000  # that a stream's message waits for room before it is dropped, once until there is room again
 
 
 def parse_domain(value: object, field: str = "--domain") -> int:
@@ -99,6 +101,9 @@ def _config(**values: Any) -> zenoh.Config:
         # A message that must arrive and that a link does not take for so long ends the link. By default it is 5 s, and
         # Zenoh does not see meanwhile that the lease of a frozen router has run out, nor that it is back.
         "transport__link__tx__queue__congestion_control__block__wait_before_close": STUCK_MS * 1000,
+        # By default two batches and 1 ms: on a busy machine every hundredth joint state fell victim to a picture.
+        "transport__link__tx__queue__size__data": STREAM_BATCHES,
+        "transport__link__tx__queue__congestion_control__drop__wait_before_drop": STREAM_WAIT_US,
         # Shared memory goes round the size limits of a link, and queries over it were lost when a receiver stalled.
         "transport__shared_memory__enabled": False,
     }
