@@ -15,7 +15,6 @@ from common.clock import MAX_SPEED, MIN_SPEED, Clock
 from common.config import Cell, ServiceEntry
 from common.errors import ConfigError
 
-ROUTER = "router"
 ROUTER_MODULE = "services.router"
 PROJECT_ROOT = Path(__file__).resolve().parent.parent.parent
 

@@ -17,6 +17,7 @@ DEFAULT_DOMAIN = 42
 MAX_DOMAIN = 232
 DOMAIN_VARIABLE = "ZENCELL_DOMAIN"
 CONNECT_VARIABLE = "ZENCELL_CONNECT"
+LISTEN_VARIABLE = "ZENCELL_LISTEN"
 LEASE_MS = 2000  # a frozen process or cut link is noticed after this
 STUCK_MS = 1000  # so is a link that takes nothing
 STREAM_BATCHES = 16  # of 64 kB that may wait in a link: a whole picture, so that what comes after it need not be dropped
@@ -71,6 +72,12 @@ def _checked_endpoint(field: str, endpoint: str) -> str:
     if not (known and slash and colon and host and port.isdigit() and 0 < int(port) < 65536):
         raise ConfigError(field, endpoint, "must be an endpoint such as tcp/192.168.1.10:7447")
     return endpoint
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Whether an endpoint is reached from its own host only."""
+    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    return host in {"localhost", "::1"} or host.startswith("127.")
 
 
 def client_config(endpoint: str, *, connect_ms: int) -> zenoh.Config:

@@ -12,7 +12,15 @@ import psutil
 import zenoh
 
 from common.errors import ConfigError, ZencellError
-from common.transport.endpoint import DEFAULT_DOMAIN, DOMAIN_VARIABLE, endpoint_of, port_of, router_config
+from common.transport.endpoint import (
+    DEFAULT_DOMAIN,
+    DOMAIN_VARIABLE,
+    LISTEN_VARIABLE,
+    endpoint_of,
+    is_loopback,
+    port_of,
+    router_config,
+)
 from common.transport.lifeline import Lifeline, fail, leave
 from common.transport.log import log_to_stderr
 from common.transport.service import add_process_options
@@ -73,6 +81,7 @@ def main() -> NoReturn:
     """Be the router until SIGINT, SIGTERM or the end of the supervisor; exit 2 when it can not listen."""
     parser = _Parser(prog="router")
     parser.add_argument("--domain", help="0 to 232 (ZENCELL_DOMAIN, 42)")
+    parser.add_argument("--listen", metavar="ENDPOINT", help="instead of 127.0.0.1 (ZENCELL_LISTEN)")
     add_process_options(parser)
     options = parser.parse_args()
     lifeline = Lifeline(gate=options.gate)
@@ -87,11 +96,14 @@ def main() -> NoReturn:
             leave(0)
     try:
         domain = options.domain if options.domain is not None else os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN)
-        endpoint = endpoint_of(domain)
+        listen = options.listen or os.environ.get(LISTEN_VARIABLE)
+        endpoint = endpoint_of(connect=listen) if listen else endpoint_of(domain)
         session = open_router(endpoint)
     except ZencellError as error:
         fail(error)
     log.info("listening at %s", endpoint)
+    if not is_loopback(endpoint):
+        log.warning("whoever reaches %s can read and command every cell behind it: see docs/security.md", endpoint)
     stop.wait()
     log.info("stopped: %s", lifeline.reason)
     closing = threading.Thread(target=session.close, daemon=True)

@@ -11,16 +11,6 @@ from common.transport.session import Session
 _OVERLAP_SECONDS = 1.0  # in which the watch has surely reported what the first question found
 
 
-def alive_key(cell: str, service: str = "*") -> str:
-    """Key of the token with which a service says that it is ready."""
-    return f"{cell}/alive/{service}"
-
-
-def serves_key(cell: str, key: str, service: str = "*") -> str:
-    """Key of the token with which a service says that it serves a request key."""
-    return f"{cell}/serves/{key}/{service}"
-
-
 class TokenWatch:
     """The tokens under a key expression; services are named by the last part of their tokens."""
 

@@ -1,0 +1,29 @@
+# One image for every service: `docker build -t zencell .`; what runs in a container is its command (compose.yaml).
+FROM python:3.11-slim AS build
+WORKDIR /src
+COPY pyproject.toml constraints.txt ./
+# The packages first: they change less often than the code. An index of your own: --secret id=pip,src=pip.conf
+RUN --mount=type=cache,target=/root/.cache/pip --mount=type=secret,id=pip,target=/etc/pip.conf \
+    python -m venv /opt/zencell \
+ && mkdir common && touch common/__init__.py README.md \
+ && /opt/zencell/bin/python -m pip install --disable-pip-version-check -c constraints.txt . \
+ && /opt/zencell/bin/python -m pip uninstall --yes --quiet zencell
+COPY deploy/slim.py deploy/slim.py
+COPY config config
+# What only builds other programs, and the robots that no file of config/robots names.
+RUN /usr/local/bin/python deploy/slim.py /opt/zencell config/robots
+
+FROM python:3.11-slim
+RUN apt-get update -q && apt-get install -q -y --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/* /var/cache/apt/*.bin
+RUN useradd --uid 10001 --create-home zencell && mkdir -p /data && chown zencell /data
+COPY --from=build /opt/zencell /opt/zencell
+ENV PATH=/opt/zencell/bin:$PATH PYTHONPATH=/app PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
+WORKDIR /app
+COPY --chmod=755 deploy/zencell /opt/zencell/bin/zencell
+COPY common common
+COPY services services
+COPY cli cli
+COPY config config
+USER zencell
+HEALTHCHECK --interval=3s --timeout=3s --start-period=30s --retries=3 CMD ["python", "-m", "common.transport.health"]
+CMD ["zencell", "--help"]

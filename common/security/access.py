@@ -1,0 +1,116 @@
+"""Who may do what on a cell's keys, found from what its services declare; all else is denied.
+
+The rules are those of Zenoh's access control: a message is looked at where it enters the router (ingress) and where
+it leaves it (egress), and a process is known by the common name of its certificate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, parameters_of
+from common.transport.keys import alive_key, serves_key
+
+SUPERVISOR, OPERATOR, OBSERVER = "supervisor", "operator", "observer"
+TOOLS = {
+    SUPERVISOR: "starts the cell, watches it and writes the summary",
+    OPERATOR: "a person's tools: reads everything, sends every request",
+    OBSERVER: "reads everything and sends nothing: for recorders and dashboards",
+}
+
+
+class Declares(Protocol):
+    """What a service has declared (common.transport.wiring)."""
+
+    reads: set[Topic[Any]]
+    writes: set[Topic[Any]]
+    serves: set[Request[Any, Any]]
+    calls: set[Request[Any, Any]]
+
+
+@dataclass
+class Rights:
+    """Key expressions, without the cell, and what may be done with them."""
+
+    write: set[str] = field(default_factory=set)  # streams and events
+    keep: set[str] = field(default_factory=set)  # states: written, and answered for
+    read: set[str] = field(default_factory=set)
+    get: set[str] = field(default_factory=set)  # states that are asked for
+    serve: set[str] = field(default_factory=set)
+    call: set[str] = field(default_factory=set)
+
+
+def common_name(cell: str, process: str) -> str:
+    """The name in the certificate of a process."""
+    return f"{cell}.{process}"
+
+
+def rights_of(service: str, declared: Declares) -> Rights:
+    """What a service may do: what it declares, and what every service does."""
+    rights = Rights(write={LOG.key, COUNTERS.key}, serve={parameters_of(service).key})
+    for topic in declared.writes:
+        (rights.keep if topic.kind == "state" else rights.write).add(topic.key)
+    for topic in declared.reads:
+        rights.read.add(topic.key)
+        if topic.kind == "state":
+            rights.get.add(topic.key)
+    rights.serve |= {request.key for request in declared.serves}
+    for request in declared.calls:
+        rights.call.add(request.key.replace("<service>", "*"))
+    return rights
+
+
+def rights_of_tools() -> dict[str, Rights]:
+    """What the supervisor and people's tools may do."""
+    return {
+        SUPERVISOR: Rights(write={LOG.key, COUNTERS.key}, keep={SUPERVISOR_STATUS.key}, read={"**"}, get={"**"},
+                           call={"**"}),
+        OPERATOR: Rights(read={"**"}, get={"**"}, call={"**"}),
+        OBSERVER: Rights(read={"**"}, get={"**"}),
+    }
+
+
+def access_control(cells: Mapping[str, Mapping[str, Rights]]) -> dict[str, Any]:
+    """The `access_control` section of a router's configuration.
+
+    Args:
+        cells: for each cell the rights of each of its processes.
+    """
+    rules: list[dict[str, Any]] = []
+    subjects, policies = [], []
+    for cell, processes in cells.items():
+        for process, rights in processes.items():
+            name = common_name(cell, process)
+            own = list(_rules(cell, process, rights))
+            for rule in own:
+                rule["id"] = f"{name} {rule['id']}"
+            rules += own
+            subjects.append({"id": name, "cert_common_names": [name]})
+            policies.append({"id": name, "rules": [rule["id"] for rule in own], "subjects": [name]})
+    return {
+        "enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies,
+    }
+
+
+def _rules(cell: str, process: str, rights: Rights) -> Iterable[dict[str, Any]]:
+    in_cell = {kind: sorted(f"{cell}/{key}" for key in getattr(rights, kind)) for kind in Rights.__dataclass_fields__}
+    written, answered = in_cell["write"] + in_cell["keep"], in_cell["keep"] + in_cell["serve"]
+    asked = sorted({*in_cell["get"], *in_cell["call"]})
+    own = [alive_key(cell, process), *(serves_key(cell, key, process) for key in sorted(rights.serve))]
+    everyone = [f"{cell}/alive/*", f"{cell}/serves/**"]
+    for name, flow, messages, keys in (
+        ("writes", "ingress", ["put", "delete"], written),
+        ("answers", "ingress", ["declare_queryable", "reply"], answered),
+        ("is asked", "egress", ["query"], answered),
+        ("reads", "ingress", ["declare_subscriber"], in_cell["read"]),
+        ("is told", "egress", ["put", "delete"], in_cell["read"]),
+        ("asks", "ingress", ["query"], asked),
+        ("is answered", "egress", ["reply"], asked),
+        ("is there", "ingress", ["liveliness_token"], own),
+        ("watches", "ingress", ["liveliness_query", "declare_liveliness_subscriber"], everyone),
+        ("sees who is there", "egress", ["liveliness_token", "reply"], everyone),
+    ):
+        if keys:
+            yield {"id": name, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys}

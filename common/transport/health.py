@@ -1,0 +1,59 @@
+"""Whether the service of a container is ready: `python -m common.transport.health`, exit code 0 or 1.
+
+It asks the router for the service's readiness token, which also vanishes when the process is frozen or cut off. It
+imports nothing but Zenoh, because it is started every few seconds beside every service.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import zenoh
+
+from common.transport.endpoint import client_config, endpoint_of
+from common.transport.keys import ROUTER, alive_key
+
+TIMEOUT = 1.0  # [s]
+FIRST_PROCESS = Path("/proc/1/cmdline")
+
+
+def first_service() -> str:
+    """Name of the service that is the container's first process; empty when it is something else."""
+    words = FIRST_PROCESS.read_bytes().decode(errors="replace").split("\0")
+    modules = [module for flag, module in pairwise(words) if flag == "-m"]
+    return modules[0].rpartition(".")[2] if modules else ""
+
+
+def is_ready(endpoint: str, cell: str, service: str) -> bool:
+    """Whether the router is there and, for another service than the router, its token too."""
+    try:
+        session = zenoh.open(client_config(endpoint, connect_ms=int(TIMEOUT * 1000)))
+    except zenoh.ZError:
+        return False
+    with session:
+        if service == ROUTER:
+            return True
+        replies = session.liveliness().get(alive_key(cell, service), timeout=TIMEOUT)
+        return any(reply.ok is not None for reply in replies)
+
+
+def main() -> int:
+    """Exit code: 0 when it is ready."""
+    parser = argparse.ArgumentParser(prog="health", description=__doc__.splitlines()[0])
+    parser.add_argument("--cell", default=os.environ.get("ZENCELL_CELL", ""), help="first part of its keys")
+    parser.add_argument("--service", help="that of the container's first process if not given")
+    options = parser.parse_args()
+    service = options.service or first_service()
+    endpoint = endpoint_of()
+    if is_ready(endpoint, options.cell, service):
+        return 0
+    sys.stderr.write(f"{options.cell}/{service} is not ready at {endpoint}\n")
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
