@@ -55,7 +55,6 @@ def service(
     """Run one service of a cell in the foreground, beside a cell that is up or its own router."""
     from common.config import ServiceEntry, load_cell, service_names
     from common.supervision.launch import (
-        ROUTER,
         ROUTER_MODULE,
         Launch,
         place_of,
@@ -63,6 +62,7 @@ def service(
         python_path,
         require_module,
     )
+    from common.transport.keys import ROUTER
 
     number, endpoint = place_of(domain, connect)
     launch = Launch(cell, tuple(overrides or ()), world, options.whole("--seed", seed, 0), number, endpoint)

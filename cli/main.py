@@ -26,6 +26,7 @@ from cli import (
     param,
     recording,
     robot,
+    secure,
     tf,
     top,
     topic,
@@ -102,6 +103,7 @@ app.add_typer(robot.app, name="robot")
 app.command()(recording.record)
 app.command()(recording.info)
 app.command()(recording.recover)
+app.add_typer(secure.app, name="secure")
 app.command()(doctor.doctor)
 
 

@@ -10,15 +10,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from common.security.credentials import OBSERVER, OPERATOR, common_name
 from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, parameters_of
 from common.transport.keys import alive_key, serves_key
-
-SUPERVISOR, OPERATOR, OBSERVER = "supervisor", "operator", "observer"
-TOOLS = {
-    SUPERVISOR: "starts the cell, watches it and writes the summary",
-    OPERATOR: "a person's tools: reads everything, sends every request",
-    OBSERVER: "reads everything and sends nothing: for recorders and dashboards",
-}
 
 
 class Declares(Protocol):
@@ -42,11 +36,6 @@ class Rights:
     call: set[str] = field(default_factory=set)
 
 
-def common_name(cell: str, process: str) -> str:
-    """The name in the certificate of a process."""
-    return f"{cell}.{process}"
-
-
 def rights_of(service: str, declared: Declares) -> Rights:
     """What a service may do: what it declares, and what every service does."""
     rights = Rights(write={LOG.key, COUNTERS.key}, serve={parameters_of(service).key})
@@ -62,11 +51,14 @@ def rights_of(service: str, declared: Declares) -> Rights:
     return rights
 
 
+def rights_of_supervisor() -> Rights:
+    """What the supervisor of a cell may do: it writes the summary from all that it hears."""
+    return Rights(write={LOG.key, COUNTERS.key}, keep={SUPERVISOR_STATUS.key}, read={"**"}, get={"**"}, call={"**"})
+
+
 def rights_of_tools() -> dict[str, Rights]:
-    """What the supervisor and people's tools may do."""
+    """What people's tools may do, in all cells behind a router."""
     return {
-        SUPERVISOR: Rights(write={LOG.key, COUNTERS.key}, keep={SUPERVISOR_STATUS.key}, read={"**"}, get={"**"},
-                           call={"**"}),
         OPERATOR: Rights(read={"**"}, get={"**"}, call={"**"}),
         OBSERVER: Rights(read={"**"}, get={"**"}),
     }
@@ -80,7 +72,7 @@ def access_control(cells: Mapping[str, Mapping[str, Rights]]) -> dict[str, Any]:
     """
     rules: list[dict[str, Any]] = []
     subjects, policies = [], []
-    for cell, processes in cells.items():
+    for cell, processes in {**cells, "*": rights_of_tools()}.items():
         for process, rights in processes.items():
             name = common_name(cell, process)
             own = list(_rules(cell, process, rights))
@@ -102,12 +94,14 @@ def _rules(cell: str, process: str, rights: Rights) -> Iterable[dict[str, Any]]:
     everyone = [f"{cell}/alive/*", f"{cell}/serves/**"]
     for name, flow, messages, keys in (
         ("writes", "ingress", ["put", "delete"], written),
+        ("hears of readers", "egress", ["declare_subscriber"], written),
         ("answers", "ingress", ["declare_queryable", "reply"], answered),
         ("is asked", "egress", ["query"], answered),
         ("reads", "ingress", ["declare_subscriber"], in_cell["read"]),
         ("is told", "egress", ["put", "delete"], in_cell["read"]),
         ("asks", "ingress", ["query"], asked),
         ("is answered", "egress", ["reply"], asked),
+        ("hears of servers", "egress", ["declare_queryable"], asked),
         ("is there", "ingress", ["liveliness_token"], own),
         ("watches", "ingress", ["liveliness_query", "declare_liveliness_subscriber"], everyone),
         ("sees who is there", "egress", ["liveliness_token", "reply"], everyone),

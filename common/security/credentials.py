@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from common.errors import ConfigError
+from common.transport.endpoint import SECURE_VARIABLE
 
-SECURE_VARIABLE = "ZENCELL_SECURE"
 AUTHORITY, ROUTER_NAME, ACCESS = "ca", "router", "access.json5"
+SUPERVISOR, OPERATOR, OBSERVER = "supervisor", "operator", "observer"  # the last two are tools, for all cells
 REMEDY = "make it with `zencell secure init`"
 
 
@@ -33,6 +34,11 @@ class Credentials:
         if listens:
             section |= {"listen_certificate": str(self.certificate), "listen_private_key": str(self.key)}
         return section
+
+
+def common_name(cell: str, process: str) -> str:
+    """The name in the certificate of a process, by which access is controlled; a tool's is that of no one cell."""
+    return process if process in (OPERATOR, OBSERVER) else f"{cell}.{process}"
 
 
 def secure_folder(environ: Mapping[str, str] = os.environ) -> Path | None:

@@ -12,6 +12,7 @@ from common import topics
 from common.config import Cell
 from common.errors import ConfigError, ZencellError
 from common.messages import SupervisorStatus
+from common.security.credentials import SUPERVISOR
 from common.supervision.interrupts import Interrupts
 from common.supervision.launch import Launch
 from common.supervision.supervisor import Supervisor
@@ -90,7 +91,8 @@ async def _work(
     from common.transport.log import BusLog
 
     timeout = CONNECT_TIMEOUT if launch.connect else None  # our own router is watched by the supervisor
-    connecting = connect(cell=cell.name, service=NAME, endpoint=endpoint, clock=launch.clock, timeout=timeout)
+    connecting = connect(cell=cell.name, service=NAME, endpoint=endpoint, clock=launch.clock, timeout=timeout,
+                         identity=SUPERVISOR)
     bus = await supervisor.reach_router(connecting.__aenter__())
     to_topic = BusLog(bus)
     log.addHandler(to_topic)

@@ -16,7 +16,8 @@ from common.errors import ZencellError
 from common.messages import ServiceStatus
 from common.supervision.backoff import Backoff
 from common.supervision.child import Child, describe_exit
-from common.supervision.launch import ROUTER, Launch
+from common.supervision.launch import Launch
+from common.transport.keys import ROUTER
 
 T = TypeVar("T")
 

@@ -8,6 +8,7 @@ from contextlib import asynccontextmanager
 
 from common.clock import Clock
 from common.errors import NoRouter
+from common.security.credentials import OPERATOR, common_name, credentials_of, secure_folder
 from common.transport.bus import Bus
 from common.transport.zenoh_session import close_bounded, open_zenoh
 
@@ -17,6 +18,7 @@ _CLOSE_SECONDS = 0.5
 @asynccontextmanager
 async def connect(
     *, cell: str, service: str, endpoint: str, clock: Clock | None = None, timeout: float | None = 3.0,
+    identity: str = OPERATOR,
 ) -> AsyncIterator[Bus]:
     """A bus at the router of an endpoint.
 
@@ -26,13 +28,16 @@ async def connect(
         endpoint: of the router, from `endpoint_of`.
         clock: the cell's clock; one at speed 1 when not given.
         timeout: how long to wait for the router [s]; None waits for ever.
+        identity: whose certificate it shows in a secured cell.
 
     Raises:
         NoRouter: no router was there in time.
     """
+    folder = secure_folder()
+    credentials = credentials_of(common_name(cell, identity), folder) if folder else None
     try:
         async with asyncio.timeout(timeout):
-            session = await open_zenoh(endpoint)
+            session = await open_zenoh(endpoint, credentials)
     except TimeoutError:
         raise NoRouter(endpoint) from None
     bus = Bus(session, service=service, cell=cell, clock=clock or Clock())

@@ -12,12 +12,15 @@ from common.errors import ConfigError
 if TYPE_CHECKING:
     import zenoh
 
+    from common.security.credentials import Credentials
+
 BASE_PORT = 7447
 DEFAULT_DOMAIN = 42
 MAX_DOMAIN = 232
 DOMAIN_VARIABLE = "ZENCELL_DOMAIN"
 CONNECT_VARIABLE = "ZENCELL_CONNECT"
 LISTEN_VARIABLE = "ZENCELL_LISTEN"
+SECURE_VARIABLE = "ZENCELL_SECURE"  # folder of certificates, as `zencell secure init` makes it
 LEASE_MS = 2000  # a frozen process or cut link is noticed after this
 STUCK_MS = 1000  # so is a link that takes nothing
 STREAM_BATCHES = 16  # of 64 kB that may wait in a link: a whole picture, so that what comes after it need not be dropped
@@ -60,9 +63,12 @@ def endpoint_of(domain: int | str | None = None, connect: str | None = None,
     given = connect or ("" if domain is not None else environ.get(CONNECT_VARIABLE, ""))
     if given:
         return _checked_endpoint(field, given)
+    protocol = "tls" if environ.get(SECURE_VARIABLE) else "tcp"
     if domain is None:
-        return f"tcp/127.0.0.1:{port_of(parse_domain(environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN), DOMAIN_VARIABLE))}"
-    return f"tcp/127.0.0.1:{port_of(parse_domain(domain))}"
+        number = parse_domain(environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN), DOMAIN_VARIABLE)
+    else:
+        number = parse_domain(domain)
+    return f"{protocol}/127.0.0.1:{port_of(number)}"
 
 
 def _checked_endpoint(field: str, endpoint: str) -> str:
@@ -80,9 +86,10 @@ def is_loopback(endpoint: str) -> bool:
     return host in {"localhost", "::1"} or host.startswith("127.")
 
 
-def client_config(endpoint: str, *, connect_ms: int) -> zenoh.Config:
+def client_config(endpoint: str, *, connect_ms: int, credentials: Credentials | None = None) -> zenoh.Config:
     """Configuration of a client of the router at an endpoint, which tries for `connect_ms` to reach it at first."""
     return _config(
+        **({"transport__link__tls": credentials.tls()} if credentials else {}),
         mode="client",
         listen__endpoints=[],
         connect__endpoints=[endpoint],
@@ -91,9 +98,19 @@ def client_config(endpoint: str, *, connect_ms: int) -> zenoh.Config:
     )
 
 
-def router_config(endpoint: str) -> zenoh.Config:
-    """Configuration of a router that listens at one endpoint only."""
-    return _config(mode="router", listen__endpoints=[endpoint], connect__endpoints=[])
+def router_config(
+    endpoint: str, credentials: Credentials | None = None, access: dict[str, Any] | None = None
+) -> zenoh.Config:
+    """Configuration of a router that listens at one endpoint only.
+
+    Args:
+        endpoint: where.
+        credentials: with which it proves itself; without them everybody is let in.
+        access: who may do what.
+    """
+    secure = {"transport__link__tls": credentials.tls(listens=True)} if credentials else {}
+    controlled = {"access_control": access} if access else {}
+    return _config(mode="router", listen__endpoints=[endpoint], connect__endpoints=[], **secure, **controlled)
 
 
 def _config(**values: Any) -> zenoh.Config:

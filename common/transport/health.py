@@ -14,6 +14,7 @@ from pathlib import Path
 
 import zenoh
 
+from common.security.credentials import ROUTER_NAME, common_name, credentials_of, secure_folder
 from common.transport.endpoint import client_config, endpoint_of
 from common.transport.keys import ROUTER, alive_key
 
@@ -30,8 +31,11 @@ def first_service() -> str:
 
 def is_ready(endpoint: str, cell: str, service: str) -> bool:
     """Whether the router is there and, for another service than the router, its token too."""
+    folder = secure_folder()
+    name = ROUTER_NAME if service == ROUTER else common_name(cell, service)
+    credentials = credentials_of(name, folder) if folder else None
     try:
-        session = zenoh.open(client_config(endpoint, connect_ms=int(TIMEOUT * 1000)))
+        session = zenoh.open(client_config(endpoint, connect_ms=int(TIMEOUT * 1000), credentials=credentials))
     except zenoh.ZError:
         return False
     with session:

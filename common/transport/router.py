@@ -6,12 +6,14 @@ import argparse
 import logging
 import os
 import threading
+from pathlib import Path
 from typing import NoReturn
 
 import psutil
 import zenoh
 
 from common.errors import ConfigError, ZencellError
+from common.security.credentials import ROUTER_NAME, credentials_of, read_access, secure_folder
 from common.transport.endpoint import (
     DEFAULT_DOMAIN,
     DOMAIN_VARIABLE,
@@ -55,15 +57,21 @@ def holder_of(port: int) -> str:
     return "another process"
 
 
-def open_router(endpoint: str) -> zenoh.Session:
+def open_router(endpoint: str, secured: Path | None = None) -> zenoh.Session:
     """A session that routes for everybody who connects to the endpoint, and listens nowhere else.
+
+    Args:
+        endpoint: where.
+        secured: folder of certificates and rules; without one everybody may do everything.
 
     Raises:
         PortInUse: names the port, the domain and the process that holds it.
         ConfigError: the router can not listen there for another reason.
     """
     try:
-        return zenoh.open(router_config(endpoint))
+        if secured is None:
+            return zenoh.open(router_config(endpoint))
+        return zenoh.open(router_config(endpoint, credentials_of(ROUTER_NAME, secured), read_access(secured)))
     except zenoh.ZError as error:
         text = str(error)
         if "os error 98" in text or "in use" in text:
@@ -98,11 +106,12 @@ def main() -> NoReturn:
         domain = options.domain if options.domain is not None else os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN)
         listen = options.listen or os.environ.get(LISTEN_VARIABLE)
         endpoint = endpoint_of(connect=listen) if listen else endpoint_of(domain)
-        session = open_router(endpoint)
+        secured = secure_folder()
+        session = open_router(endpoint, secured)
     except ZencellError as error:
         fail(error)
     log.info("listening at %s", endpoint)
-    if not is_loopback(endpoint):
+    if secured is None and not is_loopback(endpoint):
         log.warning("whoever reaches %s can read and command every cell behind it: see docs/security.md", endpoint)
     stop.wait()
     log.info("stopped: %s", lifeline.reason)

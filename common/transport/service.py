@@ -15,6 +15,7 @@ from typing import Any, Generic, NoReturn, TypeVar
 from common.clock import EPOCH_VARIABLE, SPEED_VARIABLE, Clock
 from common.config import Parameters, load_cell, service_config
 from common.errors import ConfigError, UnknownName, ZencellError
+from common.security.credentials import Credentials, common_name, credentials_of, secure_folder
 from common.transport.bus import Bus
 from common.transport.endpoint import endpoint_of
 from common.transport.handoff import call_on_loop
@@ -49,6 +50,7 @@ class Start(Generic[P]):
     config: P
     clock: Clock
     endpoint: str
+    credentials: Credentials | None = None
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -99,7 +101,9 @@ def prepare(name: str, config: type[P], options: argparse.Namespace) -> Start[P]
         raise ConfigError("--cell", "", f"must name a cell, also as {CELL_VARIABLE}")
     endpoint = endpoint_of(options.domain, options.connect)
     cell = load_cell(chosen, options.set, world=options.world, seed=options.seed)
-    return Start(name, cell.name, service_config(cell, name, config), clock_from(options.speed), endpoint)
+    folder = secure_folder()
+    credentials = credentials_of(common_name(cell.name, name), folder) if folder else None
+    return Start(name, cell.name, service_config(cell, name, config), clock_from(options.speed), endpoint, credentials)
 
 
 def own_name() -> str:
@@ -168,7 +172,7 @@ async def _live(run: Run[P], start: Start[P], lifeline: Lifeline) -> int:
 
 
 async def _connected(start: Start[P]) -> ZenohSession:
-    opening = asyncio.ensure_future(open_zenoh(start.endpoint))
+    opening = asyncio.ensure_future(open_zenoh(start.endpoint, start.credentials))
     try:
         done, _ = await asyncio.wait({opening}, timeout=_PATIENCE_SECONDS)
         if not done:

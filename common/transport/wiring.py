@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from common.clock import Clock
+from common.config import Cell, ServiceEntry, service_config
 from common.messages import Message
 from common.topics import Request, Topic
 from common.transport.bus import Bus
@@ -86,3 +88,14 @@ async def wiring(run: Callable[[Bus, C], Coroutine[Any, Any, None]], config: C, 
         await asyncio.wait({task})
         await recorder.close()
     return recorder.wiring
+
+
+async def wiring_of(cell: Cell, entry: ServiceEntry) -> Wiring:
+    """What a service of the cell declares with the configuration that it has there.
+
+    Raises:
+        RuntimeError: as `wiring`.
+        ConfigError: it can not be configured so.
+    """
+    module = importlib.import_module(entry.module)
+    return await wiring(module.run, service_config(cell, entry.name, module.Config))

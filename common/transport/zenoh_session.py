@@ -10,6 +10,7 @@ from typing import Any
 
 import zenoh
 
+from common.security.credentials import Credentials
 from common.transport.endpoint import client_config
 from common.transport.outbox import Outbox
 from common.transport.session import Declared, OnQuery, OnReply, OnSample, OnToken, RawReply, RawSample
@@ -250,7 +251,7 @@ class ZenohSession:
         self._session.close()  # type: ignore[no-untyped-call]
 
 
-async def open_zenoh(endpoint: str) -> ZenohSession:
+async def open_zenoh(endpoint: str, credentials: Credentials | None = None) -> ZenohSession:
     """A session with the router at the endpoint, for which it waits as long as it takes; may be cancelled at once."""
     loop = asyncio.get_running_loop()
     opened: asyncio.Future[ZenohSession] = loop.create_future()
@@ -265,7 +266,7 @@ async def open_zenoh(endpoint: str) -> ZenohSession:
     def work() -> None:
         while not stop.is_set():
             try:
-                session = zenoh.open(client_config(endpoint, connect_ms=_CONNECT_MS))
+                session = zenoh.open(client_config(endpoint, connect_ms=_CONNECT_MS, credentials=credentials))
             except zenoh.ZError as error:
                 log.debug("no router yet: %s", error)
                 stop.wait(0.02)

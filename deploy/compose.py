@@ -1,0 +1,95 @@
+"""The text of compose.yaml: one container for each service of each cell, and the router."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+from deploy.containers import (
+    CONFIG,
+    DATA,
+    IMAGE,
+    ROUTER,
+    USUAL_MEMORY,
+    VIEWER_PORT,
+    Container,
+    cells,
+    containers_of,
+    router,
+)
+
+HEAD = """\
+# Made by `make deploy` from config/cells: change those, not this file.
+#   docker compose up                      the Panda (COMPOSE_PROFILES in .env)
+#   docker compose --profile ur5 up        the UR5
+#   docker compose logs panda-viewer       the address of the operator's page
+name: zencell
+"""
+
+# YAML can say it once for all services, but a YAML writer does not.
+SHARED = f"""
+x-service: &service
+  image: {IMAGE}
+  build: .
+  restart: unless-stopped
+  read_only: true
+  tmpfs: [/tmp]
+  cap_drop: [ALL]
+  security_opt: [no-new-privileges:true]
+  mem_limit: {USUAL_MEMORY}m
+  networks: [cell]
+  volumes:
+    - ./config:{CONFIG}:ro
+    - data:{DATA}
+  depends_on:
+    {ROUTER}: {{condition: service_healthy}}
+
+services:
+"""
+
+TAIL = """
+networks:
+  cell: {internal: true}   # nothing in it reaches the outside, nor is reached from there
+  page: {}
+volumes:
+  data: {}                 # recordings and stages
+"""
+
+
+def compose() -> str:
+    """The text of compose.yaml."""
+    all_cells = cells()
+    blocks = [_block(ROUTER, {"profiles": list(all_cells), **_what_it_runs(router()), "depends_on": {}})]
+    for file, cell in all_cells.items():
+        before = [ROUTER]
+        for container in containers_of(file, cell):
+            name = f"{file}-{container.name}"
+            blocks.append(_block(name, {"profiles": [file], **_what_it_runs(container), **_extras(container, before)}))
+            before.append(name)
+    return HEAD + SHARED + "\n".join(blocks) + TAIL
+
+
+def _what_it_runs(container: Container) -> dict[str, Any]:
+    return {"command": [*container.command, *container.arguments], "environment": container.environment}
+
+
+def _extras(container: Container, before: list[str]) -> dict[str, Any]:
+    extras: dict[str, Any] = {}
+    if container.memory != USUAL_MEMORY:
+        extras["mem_limit"] = f"{container.memory}m"
+    if container.page:
+        published = f"127.0.0.1:${{ZENCELL_PAGE:-{VIEWER_PORT}}}:{VIEWER_PORT}"
+        extras |= {"networks": ["cell", "page"], "ports": [published]}
+    if container.is_task:
+        extras["depends_on"] = {name: {"condition": "service_healthy"} for name in before}
+    return extras
+
+
+def _block(name: str, container: dict[str, Any]) -> str:
+    """A service that takes over what is shared, indented as an entry of `services`."""
+    lines = [f"{name}:", "  <<: *service"]
+    for key, value in container.items():
+        text = yaml.dump(value, default_flow_style=True, width=10_000, sort_keys=False).removesuffix("...\n").strip()
+        lines.append(f"  {key}: {text}")
+    return "".join(f"  {line}\n" for line in lines)

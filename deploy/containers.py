@@ -1,0 +1,54 @@
+"""The containers of each cell, said once for compose.yaml and for Kubernetes: what they run and what they need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from common.config import Cell, load_cell, names_of
+
+IMAGE = "zencell"
+ROUTER, ROUTER_PORT = "router", 7447
+VIEWER, VIEWER_PORT = "viewer", 8080
+CONFIG = "/app/config"
+DATA = "/data"
+USER = 10001  # as in the Dockerfile
+# About twice what a service takes in a whole run [MB]: benchmarks/resources.py prints that.
+MEMORY = {"motion_planner": 768, VIEWER: 768}
+USUAL_MEMORY = 384
+
+
+@dataclass(frozen=True)
+class Container:
+    """One service of a cell."""
+
+    name: str
+    command: list[str]
+    environment: dict[str, str]
+    memory: int = USUAL_MEMORY  # [MB]
+    is_task: bool = False  # is started when all the others are ready
+    page: bool = False  # has a port for people
+    arguments: list[str] = field(default_factory=list)
+
+
+def cells() -> dict[str, Cell]:
+    """The cells of config/cells by the names of their files."""
+    return {name: load_cell(name) for name in names_of("cells")}
+
+
+def router() -> Container:
+    """The router, which all cells share."""
+    environment = {"ZENCELL_CONNECT": f"tcp/127.0.0.1:{ROUTER_PORT}", "ZENCELL_LISTEN": f"tcp/0.0.0.0:{ROUTER_PORT}"}
+    return Container(ROUTER, ["python", "-m", "services.router"], environment)
+
+
+def containers_of(file: str, cell: Cell) -> list[Container]:
+    """The services of a cell, in start order."""
+    environment = {"ZENCELL_CONNECT": f"tcp/{ROUTER}:{ROUTER_PORT}", "ZENCELL_CELL": file}
+    return [
+        Container(
+            entry.name, ["python", "-m", entry.module], environment, MEMORY.get(entry.name, USUAL_MEMORY),
+            is_task=entry.name == cell.task, page=entry.name == VIEWER,
+            arguments=["--set", "services.viewer.host=0.0.0.0"] if entry.name == VIEWER else [],
+        )
+        for entry in cell.services.values()
+    ]
