@@ -87,7 +87,7 @@ def _find(service: str, cell: str | None, cells: dict[str, Presence]) -> tuple[C
         ConfigError, UnknownName: there is none.
     """
     from common.config import ServiceEntry, load_cell, names_of, service_names
-    from common.supervision.launch import ROUTER
+    from common.transport.keys import ROUTER
 
     names = [cell] if cell else sorted(names_of("cells"), key=lambda name: (name not in cells, name))
     choices = {name for name in service_names() if name != ROUTER}

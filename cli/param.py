@@ -182,7 +182,7 @@ async def serving(bus: Bus) -> list[str]:
         NoResponder: there is none.
     """
     from cli.inspection import LOOK_TIMEOUT
-    from common.transport.tokens import serves_key
+    from common.transport.keys import serves_key
 
     names = [token.rpartition("/")[2] for token in await bus.raw_tokens(serves_key(bus.cell, "param/*"), LOOK_TIMEOUT)]
     if not names:
