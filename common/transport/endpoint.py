@@ -23,7 +23,7 @@ LISTEN_VARIABLE = "ZENCELL_LISTEN"
 SECURE_VARIABLE = "ZENCELL_SECURE"  # folder of certificates, as `zencell secure init` makes it
 LEASE_MS = 2000  # a frozen process or cut link is noticed after this
 STUCK_MS = 1000  # so is a link that takes nothing
-STREAM_BATCHES = 16  # of 64 kB that may wait in a link: a whole picture, so that what comes after it need not be dropped
+STREAM_BATCHES = 16  # of 64 kB that may wait in a link: a whole picture, so that what follows it is not dropped
 STREAM_WAIT_US = 5000  # that a stream's message waits for room before it is dropped, once until there is room again
 
 
