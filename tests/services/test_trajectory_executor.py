@@ -14,6 +14,7 @@ from common.errors import ConfigError, RemoteError, UnknownName
 from common.messages import (
     ExecuteRequest,
     GripperCommand,
+    HoldRequest,
     JointTrajectory,
     JointTrajectoryPoint,
     StopRequest,
@@ -54,6 +55,7 @@ class Person:
         self.updates = self.bus.reader(topics.SCENE_OBJECT_UPDATES)
         self.execute = self.bus.client(topics.MOTION_EXECUTE)
         self.stop = self.bus.client(topics.MOTION_STOP)
+        self.hold = self.bus.client(topics.MOTION_HOLD)
         self.command = self.bus.client(topics.GRIPPER_COMMAND)
         self.edit = self.bus.client(topics.WORLD_EDIT)
 
@@ -176,6 +178,46 @@ async def test_stop_brings_the_arm_to_rest(robot: RobotModel) -> None:
         assert not any(state.velocity)
 
 
+async def test_held_arm_stands_still_whoever_asked_for_it_and_goes_on_when_let_go(robot: RobotModel) -> None:
+    home = robot.named("home")
+    async with executor() as person:
+        await person.execute.call(ExecuteRequest(id="a", trajectory=move(robot, home, home + 0.5, 0.02)))
+        await person.see(person.motion, lambda m: m.progress > 0.2)
+        asking = asyncio.create_task(person.hold.call(HoldRequest(hold=True, reason="tested")))
+        status = await person.see(person.motion, lambda m: m.message == "held: tested")
+        asking.cancel()
+        assert (status.id, status.state, status.held) == ("a", "active", True) and status.progress < 0.9
+        first = await person.see(person.joints, lambda s: s.header.stamp > status.header.stamp)
+        later = await person.see(person.joints, lambda s: s.header.stamp > first.header.stamp + 5_000_000_000)
+        assert first.position == later.position and not any(later.velocity)
+        assert (await person.grip("g", 0.02)).state == "succeeded", "the fingers are not held"
+        assert not (await person.hold.call(HoldRequest(hold=False))).held
+        assert (await person.see(person.motion, lambda m: m.state != "active")).state == "succeeded"
+
+
+async def test_restarted_executor_holds_nothing() -> None:
+    async with executor() as person:
+        assert (await person.hold.call(HoldRequest(hold=True))).held
+    async with executor() as person:
+        assert not (await person.see(person.motion, lambda m: True)).held
+
+
+async def test_speed_scaling_that_is_set_while_it_moves_slows_the_arm_down(robot: RobotModel) -> None:
+    home = robot.named("home")
+    net, clock, given = LocalNetwork(), Clock(SPEED), config()
+    async with net.running(trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
+        person = Person(net, clock)
+        trajectory = move(robot, home, home + 0.5, 0.02)
+        await person.execute.call(ExecuteRequest(id="a", trajectory=trajectory))
+        began = clock.now()
+        await person.see(person.motion, lambda m: m.progress > 0.1)
+        given.speed_scaling = 0.2
+        await person.see(person.motion, lambda m: m.speed_scaling == 0.2 and m.state == "active")
+        status = await person.see(person.motion, lambda m: m.state != "active")
+        assert status.state == "succeeded"
+        assert status.header.stamp * 1e-9 - began > 2 * trajectory.points[-1].time_from_start
+
+
 async def test_world_edits_show_in_the_truth_and_bad_ones_are_refused() -> None:
     async with executor("world.count=2") as person:
         reply = await person.edit.call(WorldEdit(op="add", position=Vector3(x=0.4, y=0.2)))
@@ -233,6 +275,12 @@ async def test_unknown_backend_stops_it_with_the_choices() -> None:
     with pytest.raises(UnknownName, match="choices: lag, mock"):
         async with executor("robot.hardware.backend=gazebo"):
             pass
+
+
+@pytest.mark.parametrize("value", ["0", "0.04", "1.1"])
+def test_speed_scaling_out_of_bounds_is_refused(value: str) -> None:
+    with pytest.raises(ConfigError, match=r"services\.trajectory_executor\.speed_scaling"):
+        config(f"services.trajectory_executor.speed_scaling={value}")
 
 
 async def test_impossible_layout_stops_it_with_the_place() -> None:

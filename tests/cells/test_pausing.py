@@ -1,0 +1,135 @@
+"""Pause, resume and stop in whole cells: the joints really stand still, and what was begun is ended."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from benchmarks.runs import RunningCell, until
+from common import topics
+from common.config import load_cell
+from common.messages import JointGoal, JointState, MotionStatus, TaskCommand
+from common.transport.bus import Bus, Reader
+from common.transport.operator_motion import MotionFailed, OperatorMotion
+
+pytestmark = pytest.mark.cell
+
+PATIENT = ("--set", "services.contour_tracer.selection_timeout=40")  # wall time: machines may be busy
+STATUS = {"panda": topics.PICK_PLACE_STATUS, "ur5": topics.OUTLINE_STATUS}
+STILL = 30  # joint states in a row
+
+
+async def tell(bus: Bus, command: str) -> None:
+    await bus.client(topics.TASK_COMMAND).call(TaskCommand.model_validate({"command": command}), 10.0)
+
+
+def moves(cell: str, state: JointState) -> bool:
+    joints = load_cell(cell).robot.joints
+    speed = dict(zip(state.name, state.velocity, strict=True))
+    return any(abs(speed[name]) > 0.02 for name in joints)
+
+
+async def held(motion: Reader[MotionStatus]) -> MotionStatus:
+    return await until(motion, lambda m: m.held and not m.message.startswith("coming to rest"))
+
+
+async def assert_still(cell: str, joints: Reader[JointState], after: int) -> list[float]:
+    """The positions of the arm, which do not change from a time [ns] on."""
+    count, seen = len(load_cell(cell).robot.joints), set()
+    await until(joints, lambda s: s.header.stamp > after)
+    for _ in range(STILL):
+        seen.add(tuple((await joints.next()).position[:count]))
+    assert len(seen) == 1
+    return list(seen.pop())
+
+
+async def pause_in_motion(cell: RunningCell, stage: str) -> None:
+    """Pause while the arm moves in a stage, look, and resume."""
+    async with cell.listen() as bus:
+        joints, motion, status = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS), bus.reader(
+            STATUS[cell.name])
+        await until(status, lambda s: s.stage == stage, 90)
+        await until(joints, lambda s: moves(cell.name, s))
+        await tell(bus, "pause")
+        at_rest = await held(motion)
+        assert at_rest.state == "active" and 0 < at_rest.progress < 1, at_rest
+        assert (await until(status, lambda s: s.paused)).stage == stage
+        await assert_still(cell.name, joints, at_rest.header.stamp)
+        with pytest.raises(MotionFailed, match=r"is paused.*stop the task first"):
+            await OperatorMotion(bus, [status]).move(JointGoal(named="home"))
+        await tell(bus, "resume")
+        ended = await until(motion, lambda m: m.id != at_rest.id or m.state != "active")
+        assert ended.id != at_rest.id or ended.state == "succeeded", "the same motion goes on"
+
+
+def test_panda_paused_on_its_way_goes_on_and_puts_every_ball_in_the_box(tmp_path: Path) -> None:
+    with RunningCell(tmp_path, "run", "panda", "--no-viewer", "--speed", "4", "--set", "world.count=3") as cell:
+        asyncio.run(pause_in_motion(cell, "across"))
+        assert asyncio.run(cell.ended(120)) == 0, cell.tail()
+        summary = cell.summary
+    assert summary["state"] == "DONE" and summary["truth"] == {"in_box": 3, "on_table": 0, "elsewhere": 0}
+    assert (summary["failures"], summary["retries"]) == (0, 0)
+    assert summary["seconds"]["moving"] < summary["seconds"]["task"]
+
+
+def test_ur5_paused_in_mid_trace_goes_on_with_the_same_trace(tmp_path: Path) -> None:
+    with RunningCell(tmp_path, "run", "ur5", "--no-viewer", "--world", "w2", "--speed", "4", *PATIENT) as cell:
+        asyncio.run(pause_in_motion(cell, "trace"))
+        assert asyncio.run(cell.ended(120)) == 0, cell.tail()
+        summary = cell.summary
+    outline = summary["outline"]
+    assert outline["fraction"] == 1.0 and outline["closed"]
+    assert outline["deviation_mm"]["max"] < 0.5 and outline["deviation_mm"]["mean"] < 0.2
+    assert outline["tracking_mm"]["max"] < 0.15
+    assert summary["failures"] == 0 and len(summary["plans"]) == 5, "nothing was planned again"
+
+
+def test_task_service_that_dies_while_paused_leaves_the_robot_held_until_somebody_says_resume(tmp_path: Path) -> None:
+    async def kill_and_resume(cell: RunningCell) -> None:
+        async with cell.listen() as bus:
+            joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
+            status = bus.reader(topics.PICK_PLACE_STATUS)
+            await until(status, lambda s: s.stage == "across", 90)
+            await tell(bus, "pause")
+            at_rest = await held(motion)
+            cell.processes()["smart_pick_place"].kill()
+            found = await until(status, lambda s: s.paused and "found held" in s.message)
+            assert found.stage == "" and found.started
+            await assert_still("panda", joints, at_rest.header.stamp)
+            await tell(bus, "resume")
+            ended = await until(motion, lambda m: m.state != "active")
+            assert (ended.id, ended.state) == (at_rest.id, "succeeded")
+
+    with RunningCell(tmp_path, "run", "panda", "--no-viewer", "--speed", "4", "--set", "world.count=1") as cell:
+        asyncio.run(kill_and_resume(cell))
+        assert asyncio.run(cell.ended(120)) == 0, cell.tail()
+        summary = cell.summary
+    assert summary["truth"]["in_box"] == 1 and summary["restarts"]["smart_pick_place"] == 1
+
+
+def test_stopped_robot_is_brought_home_by_a_person_and_the_task_starts_again(tmp_path: Path) -> None:
+    async def stop_and_go_home(cell: RunningCell) -> None:
+        async with cell.listen() as bus:
+            joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
+            status = bus.reader(topics.PICK_PLACE_STATUS)
+            person = OperatorMotion(bus, [status])
+            await until(status, lambda s: s.stage == "pre-grasp", 90)
+            with pytest.raises(MotionFailed, match=r"smart_pick_place is GRASPING .*stop the task first"):
+                await person.move(JointGoal(named="home"))
+            await tell(bus, "pause")
+            await held(motion)
+            await tell(bus, "stop")
+            stopped = await until(motion, lambda m: m.state == "cancelled")
+            assert stopped.held, "until the next start"
+            home = await asyncio.to_thread(cell.tell, "task", "home")
+            assert home.returncode == 0, home.stderr
+            there = await assert_still("panda", joints, stopped.header.stamp)
+            assert there == pytest.approx(load_cell("panda").robot.named_poses["home"], abs=1e-3)
+            await tell(bus, "start")
+
+    with RunningCell(tmp_path, "run", "panda", "--no-viewer", "--speed", "3", "--set", "world.count=1") as cell:
+        asyncio.run(stop_and_go_home(cell))
+        assert asyncio.run(cell.ended(120)) == 0, cell.tail()
+        assert cell.summary["truth"]["in_box"] == 1
