@@ -16,6 +16,8 @@ from common.transport.bus import Bus
 from common.transport.pace import Pace
 from common.transport.service import main
 
+MOST_DOUBLINGS = 30  # of a wait, which has long reached its limit then
+
 
 class Config(Parameters):
     """Where pictures come from. The pose of the camera is that of the world's camera."""
@@ -61,7 +63,7 @@ async def run(bus: Bus, config: Config) -> None:
                 await pace.wait()
         return count
 
-    wait = config.reopen_after
+    misses = 0  # in a row
     while True:
         source = await asyncio.to_thread(open_source, config.source, i, config.rate, loop=config.loop)
         if source is not None:
@@ -70,10 +72,11 @@ async def run(bus: Bus, config: Config) -> None:
             source.close()
             if not source.live:
                 break
-            wait = config.reopen_after if sent else wait
+            misses = 0 if sent else misses
+        wait = min(config.reopen_after * 2 ** min(misses, MOST_DOUBLINGS), config.reopen_at_most)
         bus.log.error("camera %s gives no picture; it is opened again in %g s", config.source, wait)
         await asyncio.sleep(wait)
-        wait = min(2 * wait, config.reopen_at_most)
+        misses += 1
     bus.log.info("%s has come to its end", config.source)
     await asyncio.Event().wait()  # other services still look at the last picture
 
