@@ -90,6 +90,18 @@ class Recording:
         """Name of the cell, empty for a file that does not say."""
         return str(self.metadata(ABOUT).get("cell", ""))
 
+    def topics(self) -> dict[str, tuple[str, str]]:
+        """Message class and kind of each topic that has messages; reads all of a recording that is not finished.
+
+        Raises:
+            RecordingError: a chunk is damaged; names where.
+        """
+        if not self.finished or not all(place.channels for place in self.layout.chunks):
+            return {sample.topic: (sample.message, sample.kind) for sample in self.samples()}
+        used = sorted(set().union(*(place.channels for place in self.layout.chunks)))
+        found = [(self._channels[i], self._name(i)) for i in used if self._name(i) != TRACES_SCHEMA]
+        return {_topic(channel.topic): (name, channel.metadata.get("kind", "stream")) for channel, name in found}
+
     # --- what is in it --------------------------------------------------------------------------------------------
 
     def samples(self, wants: Wanted = _all, since: int = 0) -> Iterator[Sample]:

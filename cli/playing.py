@@ -1,0 +1,225 @@
+"""Play a recording: what was recorded travels again, with or without the cell that it came from."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import socket
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli import options
+from cli.recording import Exclude, File
+from common.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cli.player import Player
+    from common.recording.reading import Recording
+    from common.recording.selection import Selection
+    from common.transport.bus import Bus
+
+Topics = dict[str, tuple[str, str]]  # message class and kind by topic
+
+TOOL = "player"
+SHOW_PERIOD = 0.2  # [s]
+PROBE_TIMEOUT = 0.5  # [s]
+LINGER = 0.5  # [s] that a router of our own stays, so that what was sent last arrives
+MOST_RATE = 1000.0
+HELP = "space pauses, right steps a message, down a picture, left goes back 5 s, q quits"
+
+
+def play(
+    file: File,
+    keys: Annotated[list[str] | None, typer.Argument(metavar="KEY", help="only these; * and ** as wildcards")] = None,
+    topics: Annotated[
+        list[str] | None, typer.Option("--topics", metavar="KEY", help="only these: the same as naming them after FILE")
+    ] = None,
+    exclude: Exclude = None,
+    remap: Annotated[
+        list[str] | None, typer.Option("--remap", metavar="FROM:=TO", help="publish under another key; repeatable")
+    ] = None,
+    rate: Annotated[str, typer.Option("--rate", metavar="X", help="times as fast")] = "1",
+    loop: Annotated[bool, typer.Option("--loop", help="begin again at the end, until Ctrl-C")] = False,
+    start_offset: Annotated[str, typer.Option("--start-offset", metavar="S", help="begin there [s]")] = "0",
+    start_paused: Annotated[bool, typer.Option("--start-paused", help="wait for space at the start")] = False,
+    stamp_now: Annotated[
+        bool, typer.Option("--stamp-now", help="move stamps to the present; else they stay as recorded")
+    ] = False,
+    wait: Annotated[
+        list[str] | None, typer.Option("--wait", metavar="SERVICE", help="begin when it is ready; repeatable")
+    ] = None,
+    cell: Annotated[str | None, typer.Option("--cell", metavar="NAME", help="play as this cell")] = None,
+    domain: options.Domain = None,
+    connect: options.Connect = None,
+) -> None:
+    """Publish what was recorded, in its own time; starts a router if none is there.
+
+    On a terminal space pauses, right steps one message, down one picture, left goes back 5 s, q quits.
+    """
+    from common.recording.reading import Recording
+    from common.recording.selection import Selection
+
+    selection = Selection.of([*(keys or ()), *(topics or ())], None, exclude)
+    renamed = _renaming(remap or [])
+    speed, offset = options.number("--rate", rate), options.number("--start-offset", start_offset)
+    if not 0 < speed <= MOST_RATE:
+        raise ConfigError("--rate", rate, f"must be more than 0 and at most {MOST_RATE:g}")
+    if start_paused and not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise ConfigError("--start-paused", ..., "needs a terminal, where space goes on; --wait SERVICE needs none")
+    with Recording(Path(file)) as recording:
+        if not 0 <= offset <= recording.seconds:
+            raise ConfigError("--start-offset", start_offset, f"must be 0 to {recording.seconds:.1f}, its length [s]")
+        played = _played(recording, selection)
+        if loop and recording.seconds == 0:
+            raise ConfigError("--loop", ..., f"needs a recording with a length, which {file} has not")
+
+        def make() -> Player:
+            from cli.player import Player
+
+            return Player(recording, selection.wants, renamed, rate=speed, offset=offset, loop=loop,
+                          paused=start_paused, stamp_now=stamp_now)
+
+        name = cell or recording.cell
+        if not name:
+            raise ConfigError("--cell", ..., f"{file} does not say of which cell it is: name one")
+        code = asyncio.run(_play(make, recording, played, name, wait or [], domain, connect))
+    raise typer.Exit(code)
+
+
+def _renaming(pairs: list[str]) -> Callable[[str], str]:
+    """What maps a topic to the one under which it is published.
+
+    Raises:
+        ConfigError: a pair is none.
+    """
+    table: dict[str, str] = {}
+    for pair in pairs:
+        if not (match := re.fullmatch(r"([^:=#?*$]+):=([^:=#?*$]+)", pair)) or any(
+            part.startswith("/") or part.endswith("/") or "//" in part for part in match.groups()
+        ):
+            raise ConfigError("--remap", pair, "must be FROM:=TO, such as camera/image_raw:=test/image")
+        table[match[1]] = match[2]
+    return lambda topic: table.get(topic, topic)
+
+
+def _played(recording: Recording, selection: Selection) -> Topics:
+    """The topics that are played, with message class and kind.
+
+    Raises:
+        ConfigError: one is not in the recording, or there is none.
+    """
+    every = recording.topics()
+    for key in selection.keys:
+        if "*" not in key and key not in every:
+            raise ConfigError("KEY", key, f"is not in {recording.path}; choices: {', '.join(sorted(every)) or 'none'}")
+    wanted = {topic: what for topic, what in every.items() if selection.wants(topic)}
+    if not wanted:
+        raise ConfigError(str(recording.path), ..., "has no message that is to be played")
+    return wanted
+
+
+async def _play(
+    make: Callable[[], Player], recording: Recording, played: Topics, cell: str, wait: list[str],
+    domain: str | None, connect: str | None,
+) -> int:
+    from cli.keys import Keys
+    from common.clock import Clock
+    from common.supervision.interrupts import Interrupts
+    from common.transport.connect import connect as connect_to
+    from common.transport.endpoint import endpoint_of
+
+    interrupts = Interrupts()
+    interrupts.install()
+    endpoint = endpoint_of(domain, connect)
+    async with (
+        _router(endpoint, may_start=connect is None) as own,
+        connect_to(cell=cell, service=TOOL, endpoint=endpoint, clock=Clock.from_environment()) as bus,
+    ):
+        player = make()
+        player.declare(bus, played)
+        with Keys(player.on_key) as terminal:
+            playing = asyncio.create_task(_wait_and_run(player, bus, wait))
+            showing = asyncio.create_task(_show(player, recording)) if terminal.on_terminal else None
+            stopped = asyncio.create_task(interrupts.stop.wait())
+            _greet(player, recording, cell, endpoint, own=own, live=showing is not None)
+            await _warn_of_others(bus, played)
+            try:
+                await asyncio.wait({playing, stopped}, return_when=asyncio.FIRST_COMPLETED)
+                if playing.done():
+                    playing.result()
+            finally:
+                for task in (playing, stopped, showing):
+                    if task is not None:
+                        task.cancel()
+                await asyncio.gather(*(t for t in (playing, stopped, showing) if t), return_exceptions=True)
+                if terminal.on_terminal:
+                    sys.stderr.write("\r\x1b[K")
+                    sys.stderr.flush()
+        typer.echo(f"played {player.published:,} messages")
+        if own and not interrupts.stop.is_set():
+            await asyncio.sleep(LINGER)
+    return 128 + interrupts.signal if interrupts.signal else 0
+
+
+@asynccontextmanager
+async def _router(endpoint: str, *, may_start: bool) -> AsyncIterator[bool]:
+    """A router at the endpoint during the block; whether it is our own."""
+    from common.transport.router import open_router
+    from common.transport.zenoh_session import close_bounded
+
+    if not may_start or await asyncio.to_thread(_listens, endpoint):
+        yield False
+        return
+    session = await asyncio.to_thread(open_router, endpoint)
+    try:
+        yield True
+    finally:
+        await close_bounded(session, LINGER)
+
+
+def _listens(endpoint: str) -> bool:
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    with socket.socket() as probe:
+        probe.settimeout(PROBE_TIMEOUT)
+        return probe.connect_ex((host, int(port))) == 0
+
+
+async def _wait_and_run(player: Player, bus: Bus, wait: list[str]) -> None:
+    for name in wait:
+        await bus.alive.wait(name)
+    await player.run()
+
+
+def _greet(player: Player, recording: Recording, cell: str, endpoint: str, *, own: bool, live: bool) -> None:
+    where = f"{endpoint}{', a router of its own' if own else ''}"
+    typer.echo(f"playing {recording.path} ({recording.seconds:.1f} s) as {cell} at {where}")
+    if live:
+        typer.echo(HELP)
+    if not recording.finished:
+        typer.echo(f"it is not finished; zencell recover {recording.path} makes it whole", err=True)
+
+
+async def _warn_of_others(bus: Bus, played: Topics) -> None:
+    """Say which services that are up write what is played too."""
+    from common.topics import all_topics
+
+    up = await bus.alive.known()
+    known = all_topics()
+    for topic in played:
+        both = sorted(set(known[topic].writers) & up) if topic in known else []
+        for name in both:
+            typer.echo(f"{name} is up and writes {topic} too: whoever reads it hears both", err=True)
+
+
+async def _show(player: Player, recording: Recording) -> None:
+    while True:
+        state = "paused" if player.head.paused else f"x{player.head.rate:g}"
+        line = f"{player.position:7.1f} / {recording.seconds:.1f} s  {state}  {player.published:,} messages"
+        sys.stderr.write(f"\r\x1b[K{line}")
+        sys.stderr.flush()
+        await asyncio.sleep(SHOW_PERIOD)
