@@ -24,6 +24,7 @@ from cli import (
     node,
     outlining,
     param,
+    playing,
     recording,
     robot,
     secure,
@@ -102,6 +103,7 @@ app.command()(outlining.outline)
 app.add_typer(robot.app, name="robot")
 app.command()(recording.record)
 app.command()(recording.info)
+app.command()(playing.play)
 app.command()(recording.recover)
 app.add_typer(secure.app, name="secure")
 app.command()(doctor.doctor)
