@@ -1,0 +1,110 @@
+"""Export a recording to what other programs read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.recording import Exclude, File, in_bytes, require_new
+from common.errors import ConfigError
+
+if TYPE_CHECKING:
+    from common.recording.decoding import Decoder
+    from common.recording.reading import Recording
+    from common.recording.selection import Selection
+
+
+def export(
+    file: File,
+    foxglove: Annotated[
+        str | None, typer.Option("--foxglove", metavar="OUT.mcap", help="for Foxglove: JSON with its own schemas")
+    ] = None,
+    csv: Annotated[str | None, typer.Option("--csv", metavar="DIR", help="a table for each topic")] = None,
+    images: Annotated[str | None, typer.Option("--images", metavar="DIR", help="a PNG for each picture")] = None,
+    video: Annotated[
+        str | None, typer.Option("--video", metavar="OUT.mp4", help="of one topic: name it with --topics")
+    ] = None,
+    topics: Annotated[list[str] | None, typer.Option("--topics", metavar="KEY", help="only these; repeatable")] = None,
+    exclude: Exclude = None,
+) -> None:
+    """Write a recording as what other programs read: Foxglove, tables, pictures, a video."""
+    from common.recording.decoding import Decoder
+    from common.recording.reading import Recording
+    from common.recording.selection import Selection
+
+    if not (foxglove or csv or images or video):
+        raise ConfigError("export", ..., "needs one or more of --foxglove OUT.mcap, --csv DIR, --images DIR, "
+                                         "--video OUT.mp4")
+    selection = Selection.of(topics or (), None, exclude)
+    if foxglove:
+        require_new(Path(foxglove), "--foxglove")
+    for option, folder in (("--csv", csv), ("--images", images)):
+        if folder and Path(folder).exists() and not Path(folder).is_dir():
+            raise ConfigError(option, folder, "must be a folder")
+    if video:
+        _require_video(Path(video))
+    decoder = Decoder()
+    with Recording(Path(file)) as recording:
+        _require_topics(recording, selection)
+        if foxglove:
+            _foxglove(recording, Path(foxglove), selection, decoder)
+        if csv:
+            _tables(recording, Path(csv), selection, decoder)
+        if images:
+            _images(recording, Path(images), selection, decoder)
+        if video:
+            _video(recording, Path(video), selection, decoder)
+    for topic, count in sorted(decoder.skipped.items()):
+        typer.echo(f"{topic}: {count} messages left out, which are none that this version knows", err=True)
+
+
+def _require_video(path: Path) -> None:
+    if path.suffix != ".mp4":
+        raise ConfigError("--video", str(path), "must end in .mp4")
+    if not path.absolute().parent.is_dir():
+        raise ConfigError("--video", str(path), "is in a folder that does not exist")
+    if path.exists():
+        raise ConfigError("--video", str(path), "is there already; choose another name")
+
+
+def _require_topics(recording: Recording, selection: Selection) -> None:
+    every = recording.topics()
+    for key in selection.keys:
+        if "*" not in key and key not in every:
+            raise ConfigError("--topics", key, f"is not in {recording.path}; choices: {', '.join(sorted(every))}")
+
+
+def _foxglove(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:
+    from common.recording.foxglove import export as export_foxglove
+
+    count = export_foxglove(recording, target, selection.wants, decoder)
+    typer.echo(f"{target}: {count:,} messages, {in_bytes(target.stat().st_size)}, for Foxglove")
+
+
+def _tables(recording: Recording, folder: Path, selection: Selection, decoder: Decoder) -> None:
+    from common.recording.tables import export as export_tables
+
+    for name, count in export_tables(recording, folder, selection.wants, decoder).items():
+        typer.echo(f"{folder / name}: {count:,} rows")
+
+
+def _images(recording: Recording, folder: Path, selection: Selection, decoder: Decoder) -> None:
+    from common.recording.pictures import export_images, image_topics
+
+    if not image_topics(recording, selection.wants):
+        raise ConfigError("--images", str(recording.path), "has no pictures among what is to be exported")
+    for topic, count in export_images(recording, folder, selection.wants, decoder).items():
+        typer.echo(f"{folder / topic.replace('/', '_')}: {count:,} pictures")
+
+
+def _video(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:
+    from common.recording.pictures import export_video, image_topics
+
+    choices = image_topics(recording, selection.wants)
+    if len(choices) != 1:
+        named = ", ".join(choices) or "none"
+        raise ConfigError("--video", str(target), f"needs one topic with pictures, by --topics KEY; choices: {named}")
+    count, rate = export_video(recording, target, choices[0], decoder)
+    typer.echo(f"{target}: {count:,} pictures of {choices[0]} at {rate:g} Hz")

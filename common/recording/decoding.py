@@ -1,0 +1,31 @@
+"""Recorded payloads as messages; what is none is counted."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import msgpack
+from pydantic import ValidationError
+
+from common.messages import Message
+from common.recording.sample import Sample
+from common.recording.schemas import message_class
+
+
+class Decoder:
+    """Turns samples into messages and counts, by topic, what could not be: somebody else's, or of another version."""
+
+    def __init__(self) -> None:
+        """Nothing was skipped yet."""
+        self.skipped: Counter[str] = Counter()
+
+    def message(self, sample: Sample) -> Message | None:
+        """The message that a sample holds, or None for one that can not be told."""
+        model = message_class(sample.message)
+        if model is not None:
+            try:
+                return model.model_validate(msgpack.unpackb(sample.payload, raw=False, strict_map_key=True))
+            except (ValidationError, ValueError, TypeError, msgpack.UnpackException, RecursionError):
+                pass
+        self.skipped[sample.topic] += 1
+        return None

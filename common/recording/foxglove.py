@@ -1,0 +1,172 @@
+"""Recordings for Foxglove: MCAP with JSON messages of its own schemas, where it has one for what was recorded."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from common.messages import (
+    CameraInfo,
+    Image,
+    JointState,
+    LogLine,
+    MarkerArray,
+    Message,
+    OutlinePoints,
+    PlanningScene,
+    PointCloud2,
+    Pose,
+    PoseArray,
+    TFMessage,
+    WorldObjects,
+)
+from common.perception.image import image_to_array
+from common.recording.appending import AppendedFile
+from common.recording.decoding import Decoder
+from common.recording.foxglove_scene import of_markers, of_outline, of_scene, of_world, time_of
+from common.recording.foxglove_schemas import SCHEMAS
+from common.recording.reading import Recording, Wanted
+from common.recording.schemas import schema_of
+
+JPEG_QUALITY = 90
+LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "critical": 5}
+FLOAT32, UINT8 = 7, 1
+CHUNK_BYTES = 1024 * 1024
+
+
+def export(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) -> int:
+    """Number of messages that were written to a new file.
+
+    Colour pictures become JPEG. What Foxglove has no schema for is written as JSON of its own.
+
+    Raises:
+        RecordingError: the target is there already or can not be written, or the recording is damaged.
+    """
+    file = AppendedFile(target)
+    count = 0
+    try:
+        writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        writer.start()
+        schemas: dict[str, int] = {}
+        channels: dict[str, int] = {}
+        for sample in recording.samples(wants):
+            message = decoder.message(sample)
+            if message is None:
+                continue
+            name, value = convert(message)
+            if name not in schemas:
+                text = json.dumps(SCHEMAS[name]).encode() if name in SCHEMAS else schema_of(name)
+                schemas[name] = writer.register_schema(name, "jsonschema", text)
+            if sample.topic not in channels:
+                channels[sample.topic] = writer.register_channel(sample.topic, "json", schemas[name])
+            data = json.dumps(value, separators=(",", ":")).encode()
+            writer.add_message(channels[sample.topic], sample.log_time, data, sample.publish_time, sample.sequence)
+            count += 1
+        writer.finish()  # type: ignore[no-untyped-call]
+    finally:
+        file.close()
+    return count
+
+
+def convert(message: Message) -> tuple[str, dict[str, Any]]:
+    """Name of the schema, and the message as a JSON object of it."""
+    if isinstance(message, Image):
+        return image(message)
+    for kind, name, make in _KINDS:
+        if isinstance(message, kind):
+            return name, make(message)
+    return type(message).__name__, message.model_dump(mode="json")
+
+
+def image(message: Image) -> tuple[str, dict[str, Any]]:
+    """A picture: JPEG of colours, depth as it is."""
+    header = {"timestamp": time_of(message.header.stamp), "frame_id": message.header.frame_id}
+    if message.encoding not in ("bgr8", "rgb8", "mono8"):
+        return "foxglove.RawImage", {
+            **header, "width": message.width, "height": message.height, "encoding": message.encoding,
+            "step": message.step or len(message.data) // message.height, "data": _base64(message.data),
+        }
+    pixels = image_to_array(message)
+    if message.encoding == "rgb8":
+        pixels = np.ascontiguousarray(pixels[:, :, ::-1])
+    _, packed = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return "foxglove.CompressedImage", {**header, "data": _base64(packed.tobytes()), "format": "jpeg"}
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+def _calibration(message: CameraInfo) -> dict[str, Any]:
+    k = message.k
+    return {
+        "timestamp": time_of(message.header.stamp), "frame_id": message.header.frame_id, "width": message.width,
+        "height": message.height, "distortion_model": message.distortion_model, "D": message.d, "K": k,
+        "R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "P": [*k[0:3], 0, *k[3:6], 0, *k[6:9], 0],
+    }
+
+
+def _transforms(message: TFMessage) -> dict[str, Any]:
+    return {"transforms": [
+        {
+            "timestamp": time_of(t.header.stamp), "parent_frame_id": t.header.frame_id,
+            "child_frame_id": t.child_frame_id, "translation": t.transform.position.model_dump(),
+            "rotation": t.transform.orientation.model_dump(),
+        }
+        for t in message.transforms
+    ]}
+
+
+def _poses(message: PoseArray) -> dict[str, Any]:
+    return {
+        "timestamp": time_of(message.header.stamp), "frame_id": message.header.frame_id,
+        "poses": [pose.model_dump() for pose in message.poses],
+    }
+
+
+def _joints(message: JointState) -> dict[str, Any]:
+    columns = {"position": message.position, "velocity": message.velocity, "effort": message.effort}
+    return {"timestamp": time_of(message.header.stamp), "joints": [
+        {"name": name, **{field: values[i] for field, values in columns.items() if values}}
+        for i, name in enumerate(message.name)
+    ]}
+
+
+def _log(message: LogLine) -> dict[str, Any]:
+    return {
+        "timestamp": time_of(message.header.stamp), "level": LEVELS[message.level], "message": message.message,
+        "name": message.service, "file": "", "line": 0,
+    }
+
+
+def _cloud(message: PointCloud2) -> dict[str, Any]:
+    # The packed colour is 0x00RRGGBB, little-endian: blue comes first.
+    fields = [(name, 4 * i, FLOAT32) for i, name in enumerate("xyz")]
+    fields += [(name, 12 + i, UINT8) for i, name in enumerate(("blue", "green", "red"))]
+    return {
+        "timestamp": time_of(message.header.stamp), "frame_id": message.header.frame_id, "pose": Pose().model_dump(),
+        "point_stride": message.point_step, "data": _base64(message.data),
+        "fields": [{"name": name, "offset": offset, "type": kind} for name, offset, kind in fields],
+    }
+
+
+# The first that fits: an outline is a PoseArray too.
+_KINDS: list[tuple[type[Message], str, Callable[[Any], dict[str, Any]]]] = [
+    (CameraInfo, "foxglove.CameraCalibration", _calibration),
+    (TFMessage, "foxglove.FrameTransforms", _transforms),
+    (OutlinePoints, "foxglove.SceneUpdate", of_outline),
+    (PoseArray, "foxglove.PosesInFrame", _poses),
+    (MarkerArray, "foxglove.SceneUpdate", of_markers),
+    (PlanningScene, "foxglove.SceneUpdate", of_scene),
+    (WorldObjects, "foxglove.SceneUpdate", of_world),
+    (JointState, "foxglove.JointStates", _joints),
+    (LogLine, "foxglove.Log", _log),
+    (PointCloud2, "foxglove.PointCloud", _cloud),
+]

@@ -1,0 +1,118 @@
+"""What can be seen in a scene, as Foxglove's scene entities."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from common.messages import (
+    CollisionObject,
+    Color,
+    MarkerArray,
+    OutlinePoints,
+    PlanningScene,
+    Pose,
+    Vector3,
+    WorldObject,
+    WorldObjects,
+)
+
+LINE_LOOP = 1
+DELETE_ALL = 1
+THICKNESS = 0.004  # of lines [m]
+OUTLINE_COLOR = Color(r=0.1, g=0.9, b=0.3)
+
+Entity = dict[str, Any]
+
+
+def time_of(stamp: int) -> dict[str, int]:
+    """A stamp [ns] as Foxglove has it."""
+    return {"sec": stamp // 1_000_000_000, "nsec": stamp % 1_000_000_000}
+
+
+def update(stamp: int, entities: list[Entity]) -> dict[str, Any]:
+    """A scene that replaces the one before on its topic."""
+    return {
+        "deletions": [{"timestamp": time_of(stamp), "type": DELETE_ALL, "id": ""}],
+        "entities": entities,
+    }
+
+
+def entity(name: str, frame: str, stamp: int, **primitives: list[dict[str, Any]]) -> Entity:
+    """A thing in a scene, which stays until it is replaced or deleted."""
+    return {
+        "timestamp": time_of(stamp), "frame_id": frame, "id": name, "lifetime": {"sec": 0, "nsec": 0},
+        "frame_locked": True, **primitives,
+    }
+
+
+def of_markers(message: MarkerArray) -> dict[str, Any]:
+    """Markers as a scene."""
+    stamp, frame = message.header.stamp, message.header.frame_id
+    entities = []
+    for marker in message.markers:
+        shape = _shape(marker.type, marker.pose, marker.scale, marker.color, marker.text)
+        entities.append(entity(f"{marker.ns}_{marker.id}", frame, stamp, **shape))
+    return update(stamp, entities)
+
+
+def of_scene(message: PlanningScene) -> dict[str, Any]:
+    """Objects of a planning scene; attached ones move with their link."""
+    stamp = message.header.stamp
+    entities = [entity(solid.id, message.header.frame_id, stamp, **_solid(solid)) for solid in message.objects]
+    for held in message.attached:
+        entities.append(entity(held.object.id, held.link, stamp, **_solid(held.object)))
+    return update(stamp, entities)
+
+
+def of_world(message: WorldObjects) -> dict[str, Any]:
+    """The solids of the simulated world by the edges of their top and base."""
+    stamp = message.header.stamp
+    return update(stamp, [entity(solid.id, "world", stamp, lines=_edges(solid)) for solid in message.objects])
+
+
+def of_outline(message: OutlinePoints) -> dict[str, Any]:
+    """An outline as a closed line."""
+    points = [pose.position for pose in message.poses]
+    lines = [_loop([(p.x, p.y, p.z) for p in points], OUTLINE_COLOR)] if points else []
+    stamp = message.header.stamp
+    return update(stamp, [entity(message.object or "outline", message.header.frame_id, stamp, lines=lines)])
+
+
+def _shape(kind: str, pose: Pose, size: Vector3, color: Color, text: str) -> dict[str, list[dict[str, Any]]]:
+    shape = {"pose": pose.model_dump(), "size": size.model_dump(), "color": color.model_dump()}
+    if kind == "box":
+        return {"cubes": [shape]}
+    if kind == "sphere":
+        return {"spheres": [shape]}
+    if kind == "cylinder":
+        return {"cylinders": [{**shape, "bottom_scale": 1.0, "top_scale": 1.0}]}
+    return {"texts": [{
+        "pose": shape["pose"], "billboard": True, "font_size": size.z, "scale_invariant": False,
+        "color": shape["color"], "text": text,
+    }]}
+
+
+def _solid(solid: CollisionObject) -> dict[str, list[dict[str, Any]]]:
+    d = solid.dimensions
+    if solid.shape == "box":
+        return _shape("box", solid.pose, Vector3(x=d[0], y=d[1], z=d[2]), solid.color, "")
+    if solid.shape == "sphere":
+        return _shape("sphere", solid.pose, Vector3(x=2 * d[0], y=2 * d[0], z=2 * d[0]), solid.color, "")
+    if solid.shape == "cylinder":
+        return _shape("cylinder", solid.pose, Vector3(x=2 * d[0], y=2 * d[0], z=d[1]), solid.color, "")
+    edges = [_loop([(x, y, z) for x, y in solid.outline], solid.color) for z in (-d[0] / 2, d[0] / 2)]
+    return {"lines": [{**edge, "pose": solid.pose.model_dump()} for edge in edges]}
+
+
+def _edges(solid: WorldObject) -> list[dict[str, Any]]:
+    loops = [solid.outline, *([solid.hole] if solid.hole else [])]
+    heights = (solid.base, solid.base + solid.height)
+    return [_loop([(x, y, z) for x, y in loop], solid.color) for loop in loops for z in heights]
+
+
+def _loop(points: Sequence[tuple[float, float, float]], color: Color) -> dict[str, Any]:
+    return {
+        "type": LINE_LOOP, "pose": Pose().model_dump(), "thickness": THICKNESS, "scale_invariant": False,
+        "points": [{"x": x, "y": y, "z": z} for x, y, z in points], "color": color.model_dump(),
+    }
