@@ -20,6 +20,7 @@ from cli import (
     commands,
     completion,
     doctor,
+    exporting,
     graph,
     node,
     outlining,
@@ -105,6 +106,7 @@ app.command()(recording.record)
 app.command()(recording.info)
 app.command()(playing.play)
 app.command()(recording.recover)
+app.command()(exporting.export)
 app.add_typer(secure.app, name="secure")
 app.command()(doctor.doctor)
 
