@@ -9,9 +9,12 @@ from pydantic import Field
 
 from common import topics
 from common.config import Parameters, Surroundings, Tunable
+from common.errors import ConfigError
 from common.messages import CameraInfo
+from common.perception.calibration_file import CameraFile
 from common.perception.image import array_to_image
-from common.perception.sources import Intrinsics, Rectifier, Source, open_source
+from common.perception.rectification import Rectifier, require_size
+from common.perception.sources import Source, open_source
 from common.transport.bus import Bus
 from common.transport.pace import Pace
 from common.transport.service import main
@@ -25,8 +28,11 @@ class Config(Parameters):
     world: Surroundings
     source: str | int = Field("/dev/video0", description="device number or path, video file, or folder of images")
     intrinsics: str = Field(
-        "", description="YAML file with width, height, fx, fy, cx, cy [px] and distortion d; empty: the world's camera"
+        "", description="YAML file with width, height, fx, fy, cx, cy [px] and distortion d, for a camera at the pose "
+                        "of the world's; empty: the world's camera, which may itself be a file of `zencell calibrate`"
     )
+    rectify: bool = Field(True, description="take the distortion of the lens out; false sends pictures as they come, "
+                                            "and d in camera_info, for recording: the detectors refuse them")
     rate: Tunable[float] = Field(10.0, gt=0, le=250, description="pictures per second of wall time at most [Hz]")
     loop: bool = Field(True, description="begin a file or folder again at its end")
     reopen_after: Tunable[float] = Field(
@@ -35,12 +41,28 @@ class Config(Parameters):
     reopen_at_most: Tunable[float] = Field(10.0, gt=0, le=600, description="longest of these waits [s]")
 
 
+def calibrated(config: Config) -> CameraFile:
+    """The camera's intrinsics.
+
+    Raises:
+        ConfigError: their file can not be used, or knows of another pose than the rest of the cell.
+    """
+    world = CameraFile.of(config.world.camera)
+    if not config.intrinsics:
+        return world
+    camera = CameraFile.load(config.intrinsics)
+    if (camera.position or world.position, camera.rpy or world.rpy) != (world.position, world.rpy):
+        raise ConfigError("intrinsics", config.intrinsics, "holds another pose than the world's camera has: "
+                          f"let world.camera be the file, as in --set world.camera={config.intrinsics}")
+    return camera
+
+
 async def run(bus: Bus, config: Config) -> None:
     """Send pictures; a device that vanishes is opened again. Pictures of another size end the service with one line."""
     images, infos = bus.writer(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_INFO)
     frame = config.world.camera.frame
-    i = Intrinsics.load(config.intrinsics, config.world.camera)
-    rectify = Rectifier(i)
+    i = calibrated(config)
+    rectify, d = Rectifier(i), [0.0] * 5 if config.rectify else i.distortion.tolist()
     k = [i.fx, 0.0, i.cx, 0.0, i.fy, i.cy, 0.0, 0.0, 1.0]
     pace = Pace(bus, lambda: config.rate)
     await bus.ready()
@@ -51,13 +73,17 @@ async def run(bus: Bus, config: Config) -> None:
         while (picture := await asyncio.to_thread(source.read)) is not None:
             header = bus.header(frame)
             if not count:
-                infos.put(CameraInfo(header=header, height=i.height, width=i.width, d=[0.0] * 5, k=k))
+                infos.put(CameraInfo(header=header, height=i.height, width=i.width, d=d, k=k,
+                                     distortion_model="plumb_bob" if config.rectify else i.distortion_model))
             since = (loop.time() - last) * config.rate  # periods since the last picture was due
             if source.live and since < 0.5:
                 continue  # a device is read at its own pace, or its buffer would fill with old pictures
             last = last + 1 / config.rate if since < 2 else loop.time()
-            straight = await asyncio.to_thread(rectify, picture, str(config.source))
-            images.put(array_to_image(straight, "bgr8", header))
+            if config.rectify:
+                picture = await asyncio.to_thread(rectify, picture, str(config.source))
+            else:
+                require_size(picture, i, str(config.source))
+            images.put(array_to_image(picture, "bgr8", header))
             count += 1
             if not source.live:
                 await pace.wait()
@@ -65,7 +91,7 @@ async def run(bus: Bus, config: Config) -> None:
 
     misses = 0  # in a row
     while True:
-        source = await asyncio.to_thread(open_source, config.source, i, config.rate, loop=config.loop)
+        source = await asyncio.to_thread(open_source, config.source, (i.width, i.height), config.rate, loop=config.loop)
         if source is not None:
             # Not closed when this is cancelled: a thread may still be waiting for a picture in there.
             sent = await send(source)

@@ -68,6 +68,37 @@ def read_robot(path: Path) -> dict[str, Any]:
     return made_absolute(read_yaml(path), path.parent)
 
 
+def read_world(path: Path) -> dict[str, Any]:
+    """A world file; when its camera is the path of a file of `zencell calibrate`, relative to it, that one's values.
+
+    Raises:
+        ConfigError: as `read_yaml` and `read_camera`.
+    """
+    return with_camera(read_yaml(path), path.parent)
+
+
+def with_camera(world: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The world; when its camera is the path of a file, relative to the folder, with the values of that file."""
+    if isinstance(world.get("camera"), str):
+        world["camera"] = read_camera(folder / Path(world["camera"]).expanduser())
+    return world
+
+
+def read_camera(path: Path) -> dict[str, Any]:
+    """Intrinsics and pose from a file of `zencell calibrate`, without the record of how they came about.
+
+    Raises:
+        ConfigError: as `read_yaml`, or one of them is missing in the file.
+    """
+    camera = read_yaml(path)
+    camera.pop("calibration", None)
+    for fields, verb in ((("width", "height", "fx", "fy", "cx", "cy"), "intrinsics"), (("position", "rpy"), "pose")):
+        missing = [field for field in fields if field not in camera]
+        if missing:
+            raise ConfigError("world.camera", str(path), f"has no {missing[0]}: `zencell calibrate {verb}` writes it")
+    return camera
+
+
 def made_absolute(robot: dict[str, Any], folder: Path) -> dict[str, Any]:
     """The robot, whose descriptions and folders of descriptions are absolute where they lie in a folder."""
     attachments = robot.get("attachments")

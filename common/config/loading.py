@@ -10,7 +10,16 @@ from typing import Any, TypeVar
 from common.config.basics import Parameters
 from common.config.cell import Cell
 from common.config.checking import check, is_section
-from common.config.files import find_file, made_absolute, names_of, read_robot, read_yaml
+from common.config.files import (
+    find_file,
+    made_absolute,
+    names_of,
+    read_camera,
+    read_robot,
+    read_world,
+    read_yaml,
+    with_camera,
+)
 from common.config.overrides import expanded, parse_override
 from common.errors import ConfigError, UnknownName
 
@@ -54,10 +63,12 @@ def load_cell(
         if isinstance(value, str):
             # A path in the cell is relative to it; one that a person gives, to where the person stands.
             here = part in given and Path(value).expanduser().is_file()
-            read = read_robot if part == "robot" else read_yaml
+            read = {"robot": read_robot, "world": read_world}.get(part, read_yaml)
             tree[part] = read(find_file(f"{part}s", value, None if here else path.parent))
         elif part == "robot" and isinstance(value, dict):
             tree[part] = made_absolute(value, path.parent)
+        elif part == "world" and isinstance(value, dict):
+            tree[part] = with_camera(value, path.parent)
         elif not isinstance(value, dict):
             raise ConfigError(part, value, f"must be a name or a mapping; choices: {', '.join(names_of(part + 's'))}")
     services = tree.get("services")
@@ -69,7 +80,11 @@ def load_cell(
             if parts[1] not in by_name:
                 raise UnknownName("service", parts[1], by_name)
             parts[1] = by_name[parts[1]]
-        if len(parts) > 1 or parts[0] not in ("robot", "world", "pipeline"):
+        if parts == ["world", "camera"] and isinstance(value, str):
+            before = tree["world"].get("camera")
+            camera = {**(before if isinstance(before, dict) else {}), **read_camera(Path(value).expanduser())}
+            _override(tree, parts, camera)
+        elif len(parts) > 1 or parts[0] not in ("robot", "world", "pipeline"):
             _override(tree, parts, value)
     run = {"cell": tree.pop("cell", path.stem), "autostart": tree.pop("autostart", True), "seed": tree.pop("seed", 0)}
     if seed is not None:

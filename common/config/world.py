@@ -37,7 +37,10 @@ class Container(Section):
 
 
 class CameraConfig(Section):
-    """A pinhole camera. +Z looks forward, +X is to the right in the picture, +Y is down."""
+    """A pinhole camera. +Z looks forward, +X is to the right in the picture, +Y is down.
+
+    A world may name a file of `zencell calibrate` in its place.
+    """
 
     frame: str = "camera_optical_frame"
     width: int = Field(640, ge=16, le=4096, description="[px]")
@@ -46,6 +49,9 @@ class CameraConfig(Section):
     fy: float = Field(520.0, gt=1, le=1e5, description="focal length [px]")
     cx: float = Field(320.0, ge=0, le=4096, description="principal point [px]")
     cy: float = Field(240.0, ge=0, le=4096, description="principal point [px]")
+    d: list[Number] = Field(
+        [], max_length=8, description="distortion of a real lens: k1, k2, p1, p2, k3, ...; camera_opencv takes it out"
+    )
     position: Point = Field((0.40, 0.0, 0.80), description="optical centre in world [m]")
     rpy: tuple[Number, Number, Number] = Field(
         (math.pi, 0.0, -math.pi / 2), description="of the optical frame in world [rad], R = Rz Ry Rx"

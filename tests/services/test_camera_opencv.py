@@ -10,12 +10,14 @@ from common import topics
 from common.config import Surroundings
 from common.errors import ConfigError
 from common.perception import sources
+from common.perception.calibration_file import CameraFile
 from common.perception.image import image_to_array
-from common.perception.sources import Intrinsics, Rectifier, Video, open_source
+from common.perception.rectification import Rectifier
+from common.perception.sources import Video, open_source
 from common.transport.local import LocalNetwork
 from common.transport.wiring import wiring
 from services import camera_opencv
-from services.camera_opencv import Config, run
+from services.camera_opencv import Config, calibrated, run
 
 around = Surroundings()
 SMALL = {"width": 64, "height": 48, "fx": 50.0, "fy": 51.0, "cx": 32.0, "cy": 24.0}
@@ -152,18 +154,18 @@ async def test_a_device_that_vanishes_is_told_and_opened_again(monkeypatch, intr
 )
 def test_a_source_that_is_nothing_is_named_with_the_choices(tmp_path, make, told):
     with pytest.raises(ConfigError, match=told):
-        open_source(str(make(tmp_path)), Intrinsics(**SMALL), 10, loop=True)
+        open_source(str(make(tmp_path)), (64, 48), 10, loop=True)
 
 
 def test_a_file_in_the_folder_that_is_no_image_is_named(tmp_path):
     (tmp_path / "a.png").write_bytes(b"not a picture")
-    source = open_source(str(tmp_path), Intrinsics(**SMALL), 10, loop=True)
+    source = open_source(str(tmp_path), (64, 48), 10, loop=True)
     with pytest.raises(ConfigError, match=r"a\.png' is no image"):
         source.read()
 
 
 def test_a_device_that_is_not_there_is_none():
-    assert open_source("/dev/zencell-has-no-such-camera", Intrinsics(**SMALL), 10, loop=True) is None
+    assert open_source("/dev/zencell-has-no-such-camera", (64, 48), 10, loop=True) is None
 
 
 @pytest.mark.parametrize(
@@ -180,16 +182,16 @@ def test_intrinsics_that_do_not_fit_are_named(tmp_path, text, told):
     path = tmp_path / "camera.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=told):
-        Intrinsics.load(str(path), around.camera)
+        CameraFile.load(str(path))
 
 
 def test_without_a_file_the_intrinsics_are_those_of_the_worlds_camera():
-    i = Intrinsics.load("", around.camera)
+    i = calibrated(config(source=0))
     assert (i.width, i.height, i.fx, i.fy, i.cx, i.cy, i.d) == (640, 480, 520, 520, 320, 240, [])
 
 
 def test_distortion_is_taken_out():
-    i = Intrinsics(width=320, height=240, fx=250, fy=250, cx=160, cy=120, d=[-0.3, 0.08])
+    i = CameraFile(width=320, height=240, fx=250, fy=250, cx=160, cy=120, d=[-0.3, 0.08])
     k = np.array([[250, 0, 160], [0, 250, 120], [0, 0, 1.0]])
     spot = np.array([[[0.4, 0.3, 1.0]]])
     (u, v), = cv2.projectPoints(spot, np.zeros(3), np.zeros(3), k, np.array([-0.3, 0.08, 0, 0]))[0][0]
