@@ -16,6 +16,7 @@ import typer
 
 from cli import (
     bringup,
+    calibrate,
     catalogue,
     commands,
     completion,
@@ -102,6 +103,7 @@ app.add_typer(commands.world, name="world")
 app.command()(outlining.snapshot)
 app.command()(outlining.outline)
 app.add_typer(robot.app, name="robot")
+app.add_typer(calibrate.app, name="calibrate")
 app.command()(recording.record)
 app.command()(recording.info)
 app.command()(playing.play)

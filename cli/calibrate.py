@@ -1,0 +1,294 @@
+"""Calibrate a real camera: print a board, find the lens from views of it, and the pose from where it lies."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cli import options
+from common.errors import ConfigError, UnknownName
+
+if TYPE_CHECKING:
+    from common.perception.calibration import IntrinsicCalibration, ViewResidual
+    from common.perception.calibration_board import Board, Picture, Sighting
+    from common.perception.calibration_file import CameraFile
+    from common.perception.calibration_pose import PoseCalibration
+
+app = typer.Typer(help="Calibrate a real camera with a ChArUco board.", no_args_is_help=True)
+
+BOARD_FORMATS = (".png", ".pdf")
+_MOST_LISTED = 12  # views of which the residuals are shown
+SOURCE_HELP = "device number or path, video file, or folder of images"
+
+Squares = Annotated[str, typer.Option("--squares", metavar="COLUMNSxROWS", help="of the board")]
+Square = Annotated[str, typer.Option("--square", metavar="M", help="measured length of a square [m]")]
+Marker = Annotated[str, typer.Option("--marker", metavar="M", help="length of a marker [m]; 0: 3/4 of a square")]
+Dictionary = Annotated[str, typer.Option("--dictionary", metavar="NAME", help="of markers: 4x4_50, 5x5_50, ...")]
+Size = Annotated[str, typer.Option("--size", metavar="WxH", help="size that a device is asked for [px]")]
+Seconds = Annotated[str, typer.Option("--seconds", metavar="S", help="how long a device is looked at")]
+
+
+@app.callback()
+def calibrate() -> None:
+    """Calibrate a real camera with a ChArUco board."""
+
+
+@app.command(name="board")
+def board_command(
+    output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="a .png or .pdf file")],
+    squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
+) -> None:
+    """Write a board to print at 100 %; a line on it tells whether the printer did."""
+    suffix = Path(output).suffix.lower()
+    if suffix not in BOARD_FORMATS:
+        raise ConfigError("--output", output, f"must end in {' or '.join(BOARD_FORMATS)}")
+    board = board_of(squares, square, marker, dictionary)
+    import matplotlib.image
+
+    page, density = board.page()
+    try:
+        matplotlib.image.imsave(Path(output).expanduser(), page, format=suffix[1:], cmap="gray", vmin=0, vmax=255,
+                                dpi=density * 0.0254)
+    except OSError as error:
+        raise ConfigError("--output", output, f"can not be written: {error.strerror}") from None
+    width, height = (1e3 * pixels / density for pixels in reversed(page.shape))
+    typer.echo(f"{output}: {board.options}; {width:.1f} x {height:.1f} mm. Print it at 100 %, measure the line on it, "
+               "fix it to something flat.")
+
+
+@app.command()
+def intrinsics(
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help=SOURCE_HELP)],
+    output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="YAML file to write")] = "camera.yaml",
+    squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
+    views: Annotated[str, typer.Option("--views", metavar="N", help="distinct views that are needed")] = "8",
+    k_coefficients: Annotated[
+        str, typer.Option("--k-coefficients", metavar="N", help="radial ones: 0 no lens, 3 wide, above 3 rational")
+    ] = "2",
+    size: Size = "", seconds: Seconds = "60",
+) -> None:
+    """Find focal lengths, centre and distortion from views of the board all over the picture, tilted to each side."""
+    from common.config import check
+    from common.perception.calibration import CollectingOptions, ViewCollector, calibrate_intrinsics
+
+    least = options.whole("--views", views, 3) or 3
+    settings = check(CollectingOptions, {"least_views": least, "most_views": max(60, least),
+                                         "k_coefficients": options.whole("--k-coefficients", k_coefficients, 0)})
+    collector = ViewCollector(board_of(squares, square, marker, dictionary), settings)
+    terminal = sys.stderr.isatty()
+    for name, picture in pictures(source, parse_size(size), options.number("--seconds", seconds)):
+        reason = collector.add(picture, name)
+        if terminal:
+            part, unseen = collector.coverage()
+            typer.echo(f"{name}: {reason or f'view {len(collector.views)}'}; {100 * part:.0f} % of the picture covered"
+                       + (f", nothing {unseen[0]}" if unseen else ""), err=True)
+        if collector.complete:
+            break
+    collector.require_enough()
+    found = calibrate_intrinsics(collector.views, settings)
+    camera = _camera_of(found, source, str(collector.board.options))
+    old = Path(output).expanduser()
+    if old.is_file() and "position:" in old.read_text(encoding="utf-8", errors="replace"):
+        typer.echo(f"{output} had a pose, which was found with other intrinsics and is gone: calibrate it again")
+    camera.save(output)
+    typer.echo(_told(found))
+    typer.echo(f"{output} holds the intrinsics; next: zencell calibrate pose SOURCE --intrinsics {output} ...")
+
+
+@app.command()
+def pose(
+    sources: Annotated[list[str], typer.Argument(metavar="SOURCE...", help=f"{SOURCE_HELP}; one for each place")],
+    intrinsics_file: Annotated[
+        str, typer.Option("--intrinsics", metavar="FILE", help="YAML file of `zencell calibrate intrinsics`")
+    ],
+    board_position: Annotated[
+        list[str], typer.Option("--board-position", metavar="X,Y,Z", help="lower left corner of the squares in world "
+                                                                          "[m]; once for each SOURCE")
+    ],
+    board_rpy: Annotated[
+        list[str] | None, typer.Option("--board-rpy", metavar="R,P,Y", help="of the board in world [rad]; 0,0,0: face "
+                                                                            "up, x along x; once, or for each SOURCE")
+    ] = None,
+    output: Annotated[
+        str, typer.Option("-o", "--output", metavar="FILE", help="YAML file to write; left out: that of --intrinsics")
+    ] = "",
+    squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
+    pictures_of_each: Annotated[
+        str, typer.Option("--pictures", metavar="N", help="of each place, at most")
+    ] = "20",
+    seconds: Seconds = "10",
+) -> None:
+    """Find where the camera is, from pictures of a board that lies where it was measured; the camera stays still.
+
+    Several places, far apart in the picture, make it much more precise: give a SOURCE and a --board-position for each.
+    """
+    from common.perception.calibration import CalibrationFailed
+    from common.perception.calibration_file import CameraFile
+    from common.perception.calibration_pose import calibrate_pose, sightings_of
+    from common.robot.transforms import rpy_to_matrix, transform
+
+    rotations = board_rpy or ["0,0,0"]
+    if len(board_position) != len(sources):
+        raise ConfigError("--board-position", len(board_position), f"times for {len(sources)} places")
+    if len(rotations) not in (1, len(sources)):
+        raise ConfigError("--board-rpy", len(rotations), f"times for {len(sources)} places; once does for all of them")
+    rotations = rotations * len(sources) if len(rotations) == 1 else rotations
+    positions = [_three("--board-position", text) for text in board_position]
+    angles = [_three("--board-rpy", text) for text in rotations]
+    camera, board = CameraFile.load(intrinsics_file), board_of(squares, square, marker, dictionary)
+    most, limit = options.whole("--pictures", pictures_of_each, 1) or 1, options.number("--seconds", seconds)
+    places: list[tuple[Any, list[Sighting]]] = []
+    for source, position, rpy in zip(sources, positions, angles, strict=True):
+        seen: list[Sighting] = []
+        why: list[str] = []
+        for name, picture in pictures(source, (camera.width, camera.height), limit):
+            found, reasons = sightings_of(board, [(f"{source}: {name}", picture)], camera)
+            seen, why = seen + found, why + reasons
+            if len(seen) >= most:
+                break
+        if not seen:
+            raise CalibrationFailed(f"{source}: the board ({board.options}) is in none of {len(why)} pictures: "
+                                    f"{max(set(why), key=why.count)}")
+        places.append((transform(rpy_to_matrix(*rpy), position), seen))
+    result = calibrate_pose(places, camera)
+    record = _pose_record(result, sources, positions, angles)
+    camera = camera.model_copy(update={"position": result.position, "rpy": result.rpy,
+                                       "calibration": {**camera.calibration, "pose": record}})
+    file = output or intrinsics_file
+    camera.save(file)
+    typer.echo(_pose_told(result))
+    typer.echo(f"{file} holds intrinsics and pose; a cell takes both with --set world.camera={file}")
+
+
+def board_of(squares: str, square: str, marker: str, dictionary: str) -> Board:
+    """The board that options describe.
+
+    Raises:
+        ConfigError: one of them does not fit.
+    """
+    from typing import get_args
+
+    from common.config import check
+    from common.perception import calibration_board as b
+
+    columns, rows = _two("--squares", squares)
+    if dictionary not in get_args(b.Dictionary):
+        raise UnknownName("dictionary", dictionary, get_args(b.Dictionary))
+    side = options.number("--square", square)
+    given = options.number("--marker", marker)
+    return b.Board(check(b.BoardOptions, {"columns": columns, "rows": rows, "square": side,
+                                          "marker": given or round(0.75 * side, 6), "dictionary": dictionary}, "board"))
+
+
+def pictures(source: str, size: tuple[int, int] | None, seconds: float) -> Iterator[tuple[str, Picture]]:
+    """Pictures of a source with their names: all of a file or folder, those of so many seconds of a device.
+
+    Raises:
+        ConfigError: it is nothing that pictures can be read from.
+    """
+    from common.perception.sources import open_source
+
+    opened = open_source(source, size, None, loop=False)
+    if opened is None:
+        raise ConfigError("SOURCE", source, "is a device that can not be opened")
+    until = time.monotonic() + seconds
+    try:
+        while (picture := opened.read()) is not None and (not opened.live or time.monotonic() < until):
+            yield opened.name, picture
+    finally:
+        opened.close()
+
+
+def parse_size(text: str) -> tuple[int, int] | None:
+    """Width and height of `WxH` [px]; None for nothing.
+
+    Raises:
+        ConfigError: it is not of that form.
+    """
+    return _two("--size", text) if text else None
+
+
+def _two(option: str, text: str) -> tuple[int, int]:
+    first, found, second = text.lower().partition("x")
+    if not found or not first.isdecimal() or not second.isdecimal():
+        raise ConfigError(option, text, "must be two whole numbers, as 7x5")
+    return int(first), int(second)
+
+
+def _three(option: str, text: str) -> tuple[float, float, float]:
+    parts = text.split(",")
+    if len(parts) != 3:
+        raise ConfigError(option, text, "must be three numbers, as 0.3,-0.1,0")
+    x, y, z = (options.number(option, part) for part in parts)
+    return x, y, z
+
+
+def _today() -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S")
+
+
+def _camera_of(found: IntrinsicCalibration, source: str, board: str) -> CameraFile:
+    from common.perception.calibration_file import CameraFile
+
+    names = ("fx", "fy", "cx", "cy")
+    camera = CameraFile(width=found.size[0], height=found.size[1], d=found.d, **dict(zip(names, found.k, strict=True)))
+    record = {"date": _today(), "source": source, "board": board, "distortion_model": camera.distortion_model,
+              "views": len(found.views), "corners": found.corners, "rms_px": found.rms,
+              "std_px": dict(zip(names, found.k_std, strict=True)), "coverage": found.coverage}
+    return camera.model_copy(update={"calibration": {"intrinsics": record}})
+
+
+def _told(found: IntrinsicCalibration) -> str:
+    lines = [
+        f"{len(found.views)} views, {found.corners} corners, {100 * found.coverage:.0f} % of the picture covered",
+        f"residual {found.rms:.3f} px rms; {_per_view(found.views)}",
+        *(f"{name} {value:8.2f} +- {std:.2f} px" for name, value, std in
+          zip(("fx", "fy", "cx", "cy"), found.k, found.k_std, strict=True)),
+        f"distortion {', '.join(f'{value:.4f}' for value in found.d) or 'none'}",
+    ]
+    if found.dropped:
+        lines.append(f"dropped, since they do not fit: {_per_view(found.dropped)}")
+    if found.unseen:
+        lines.append(f"no corner was seen in these parts of the picture: {', '.join(found.unseen)}; "
+                     "views with the board there make the distortion better")
+    return "\n".join(lines)
+
+
+def _pose_record(
+    result: PoseCalibration, sources: list[str], positions: list[tuple[float, float, float]],
+    angles: list[tuple[float, float, float]],
+) -> dict[str, Any]:
+    places = [{"source": source, "board_position": list(position), "board_rpy": list(rpy)}
+              for source, position, rpy in zip(sources, positions, angles, strict=True)]
+    return {"date": _today(), "places": places, "pictures": len(result.pictures), "rms_px": result.rms,
+            "rms_mm": 1e3 * result.rms_on_board, "position_std_mm": [1e3 * value for value in result.position_std],
+            "rotation_std_deg": math.degrees(result.rotation_std), "place_std_mm": 1e3 * result.place_std}
+
+
+def _pose_told(result: PoseCalibration) -> str:
+    position, rpy = result.position, result.rpy
+    std = max(result.position_std)
+    lines = [
+        f"{len(result.pictures)} pictures, residual {result.rms:.3f} px rms, "
+        f"{1e3 * result.rms_on_board:.3f} mm on the board; {_per_view(result.pictures)}",
+        f"position {position[0]:.5f}, {position[1]:.5f}, {position[2]:.5f} m +- {1e3 * std:.2f} mm",
+        f"rpy      {rpy[0]:.5f}, {rpy[1]:.5f}, {rpy[2]:.5f} rad +- {math.degrees(result.rotation_std):.3f} degrees",
+        f"places on the board's plane +- {1e3 * result.place_std:.2f} mm where it is worst in the picture",
+    ]
+    if result.dropped:
+        lines.append(f"dropped, since they do not fit: {_per_view(result.dropped)}")
+    return "\n".join(lines)
+
+
+def _per_view(views: list[ViewResidual]) -> str:
+    """Residuals of views [px], in their order; of many only the worst."""
+    if len(views) <= _MOST_LISTED:
+        return ", ".join(f"{view.name} {view.rms:.3f}" for view in views)
+    worst = sorted(views, key=lambda view: -view.rms)[:_MOST_LISTED]
+    return "worst: " + ", ".join(f"{view.name} {view.rms:.3f}" for view in worst)
