@@ -13,6 +13,7 @@ from pathlib import Path
 
 from cli.model_sources import ROOT, Model, ModelField, fields_of, find_model, is_section, tree_of
 
+LONGEST_DOC = 60  # [characters]
 SHELLS = ("bash", "zsh", "fish")
 
 Offer = tuple[str, str]  # a word, and what it is
@@ -69,7 +70,13 @@ def overrides(incomplete: str) -> list[Offer]:
 
 
 def _starting(incomplete: str, offers: Iterator[Offer]) -> list[Offer]:
-    return sorted({word: (word, doc) for word, doc in offers if word.startswith(incomplete)}.values())
+    return sorted({word: (word, _short(doc)) for word, doc in offers if word.startswith(incomplete)}.values())
+
+
+def _short(doc: str) -> str:
+    """A description that fits on a line beside its word; brackets would be taken for markup on the way."""
+    text = doc.replace("[", "(").replace("]", ")")
+    return text if len(text) <= LONGEST_DOC else f"{text[: LONGEST_DOC - 3].rstrip()}..."
 
 
 # --- files ------------------------------------------------------------------------------------------------------

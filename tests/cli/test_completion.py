@@ -1,0 +1,125 @@
+import importlib
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from cli import completing
+from common.config import load_cell, service_config, service_names
+from common.planning.planners import planner_names
+from common.topics import Topic, all_topics
+from tests.cli.conftest import PATIENCE, ask, command_line, environment
+
+
+def offered(line: str, folder: Path, shell: str = "bash", **more: str) -> list[str]:
+    """What the shell's own protocol answers for the last word of a line."""
+    words = line.split(" ")
+    asked = {"COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)} if shell == "bash" else {
+        "_TYPER_COMPLETE_ARGS": line, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+    done = subprocess.run(
+        command_line(), cwd=folder, env=environment() | {"_ZENCELL_COMPLETE": f"complete_{shell}"} | asked | more,
+        capture_output=True, text=True, timeout=PATIENCE, check=False,
+    )
+    assert done.stderr == ""
+    return done.stdout.split("\n")[:-1]
+
+
+@pytest.mark.parametrize(("line", "wanted"), [
+    ("zencell run p", ["panda"]),
+    ("zencell run panda --world w", ["w1", "w2", "w3", "w4", "w5", "w6"]),
+    ("zencell topic echo camera/", ["camera/camera_info", "camera/image_raw"]),
+    ("zencell call gripper", ["gripper/command"]),
+    ("zencell node info vision", ["vision_detector"]),
+    ("zencell up panda --set motion.vel", ["motion.velocity_scaling="]),
+    ("zencell task home --planner lin", ["lin"]),
+    ("zencell gra", ["graph"]),
+    ("zencell --install-completion z", ["zsh"]),
+])
+def test_a_word_is_completed(line: str, wanted: list[str], tmp_path: Path) -> None:
+    assert offered(line, tmp_path) == wanted
+
+
+def test_fish_and_zsh_are_told_what_each_word_is(tmp_path: Path) -> None:
+    (line,) = offered("zencell run u", tmp_path, "fish")
+    word, _, about = line.partition("\t")
+    assert word == "ur5"
+    assert about.startswith("A UR5 ")
+    assert '"ur5":' in "".join(offered("zencell run u", tmp_path, "zsh"))
+
+
+def test_cells_of_a_configuration_of_ones_own_are_completed(tmp_path: Path) -> None:
+    (tmp_path / "cells").mkdir()
+    (tmp_path / "cells" / "mine.yaml").write_text("# A cell of mine.\ncell: mine\n")
+    assert offered("zencell run m", tmp_path, ZENCELL_CONFIG=str(tmp_path)) == ["mine"]
+
+
+@pytest.mark.parametrize("shell", completing.SHELLS)
+def test_what_a_shell_needs_is_shown_and_asks_us(shell: str, tmp_path: Path) -> None:
+    done = ask(tmp_path, "--show-completion", shell)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"_ZENCELL_COMPLETE=complete_{shell}" in done.stdout
+
+
+def test_bash_itself_completes_after_installing(tmp_path: Path) -> None:
+    home = {"HOME": str(tmp_path)}
+    done = subprocess.run(command_line("--install-completion", "bash"), env=environment() | home, capture_output=True,
+                          text=True, timeout=PATIENCE, check=True)
+    assert "bash completion installed" in done.stdout
+    # The name of the command, as it would be on the PATH.
+    program = tmp_path / "zencell"
+    program.write_text('#!/bin/sh\nexec ' + " ".join(command_line()) + ' "$@"\n')
+    program.chmod(0o755)
+    script = (
+        f'source "{tmp_path}/.bash_completions/zencell.sh"; COMP_WORDS=(zencell run p); COMP_CWORD=2; '
+        f'_zencell_completion "{program}"; echo "${{COMPREPLY[@]}}"'
+    )
+    done = subprocess.run(["bash", "--norc", "-c", script], env=environment() | home, capture_output=True, text=True,
+                          timeout=PATIENCE, check=True)
+    assert done.stdout.strip() == "panda"
+
+
+def test_unknown_shell_is_one_line(tmp_path: Path) -> None:
+    done = ask(tmp_path, "--install-completion", "tcsh")
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == ["zencell: unknown shell 'tcsh'; choices: bash, fish, zsh"]
+    assert not os.listdir(tmp_path)
+
+
+# What is read from the sources is what the code itself says.
+
+
+def words(offers: list[tuple[str, str]]) -> set[str]:
+    return {word for word, _ in offers}
+
+
+def test_keys_are_those_of_the_topic_table() -> None:
+    topics = all_topics()
+    assert words(completing.keys("")) == set(topics)
+    assert words(completing.published("")) == {key for key, topic in topics.items() if isinstance(topic, Topic)}
+    assert dict(completing.keys("tf")) == {key: topics[key].doc for key in ("tf", "tf_static")}
+    for _, about in (*completing.parameters(""), *completing.keys(""), *completing.services("")):
+        assert len(about) <= completing.LONGEST_DOC and "[" not in about
+
+
+def test_services_and_planners_are_those_that_there_are() -> None:
+    assert words(completing.services("")) == set(service_names()) - {"router"}
+    assert words(completing.planners("")) == set(planner_names())
+
+
+def test_parameters_are_those_of_the_models() -> None:
+    from common.config.tunables import leaves
+
+    cell = load_cell("panda")
+    offers = words(completing.parameters("services."))
+    names = [name for name in service_names() if name != "router"]
+    wanted: set[str] = set()
+    for name in names:
+        config = service_config(cell, name, importlib.import_module(f"services.{name}").Config)
+        wanted |= {path for path in leaves(config, name) if path.startswith("services.")}
+    assert offers == wanted
+    assert {"motion.velocity_scaling", "world.count", "robot.hardware.backend"} <= words(completing.parameters(""))
+
+
+def test_every_override_can_be_completed_further() -> None:
+    assert all(word.endswith("=") for word in words(completing.overrides("world.")))

@@ -1,0 +1,54 @@
+import pytest
+
+from cli.publishing import checked, stamped
+from common import topics
+from common.clock import Clock
+from common.errors import ConfigError
+
+CLOCK = Clock(2.0, 1_000)
+
+
+def test_header_that_is_left_out_gets_the_time_of_the_cell() -> None:
+    message = checked(topics.GRIPPER_STATE, "gripper/state", '{"width": 0.04}')
+    before = CLOCK.now_ns()
+    first, second = stamped(message, CLOCK), stamped(message, CLOCK)
+    assert before <= first.header.stamp < second.header.stamp <= CLOCK.now_ns()
+    assert message.header.stamp == 0
+
+
+def test_header_that_must_be_there_may_be_left_out_too() -> None:
+    message = checked(topics.JOINT_STATES, "joint_states", '{"name": ["a"], "position": [1]}')
+    assert stamped(message, CLOCK).header.stamp > 0
+
+
+def test_stamp_and_frame_that_are_given_are_kept() -> None:
+    message = checked(topics.GRIPPER_STATE, "gripper/state", '{"header": {"stamp": 7, "frame_id": "x"}, "width": 0}')
+    assert stamped(message, CLOCK).header == message.header
+    message = checked(topics.GRIPPER_STATE, "gripper/state", '{"header": {"frame_id": "x"}, "width": 0}')
+    assert stamped(message, CLOCK).header.frame_id == "x"
+    assert stamped(message, CLOCK).header.stamp > 7
+
+
+def test_headers_within_a_message_are_stamped_as_well() -> None:
+    message = checked(topics.TF, "tf", '{"transforms": [{"header": {"frame_id": "a"}, "child_frame_id": "b",'
+                                       ' "transform": {"position": {"x": 1}}}]}')
+    (transform,) = stamped(message, CLOCK).transforms
+    assert transform.header.stamp > 0
+    assert transform.header.frame_id == "a"
+    assert transform.transform.position.x == 1
+
+
+def test_key_of_ones_own_takes_any_json() -> None:
+    assert checked(None, "my/key", "[1, null, {\"a\": {\"base64\": \"AAE=\"}}]") == [1, None, {"a": b"\x00\x01"}]
+
+
+@pytest.mark.parametrize(("body", "wanted"), [
+    ("{", "gripper/state: '{' is not JSON"),
+    ("[1]", "must be a JSON object, a GripperState"),
+    ('{"widht": 1}', r"gripper/state.widht: 1 is not a parameter; choices: .*width"),
+    ('{"width": "wide"}', r"gripper/state.width: 'wide' must be a valid number"),
+    ('{"header": 3, "width": 1}', r"gripper/state.header: 3"),
+])
+def test_what_is_no_message_names_the_field_and_what_would_do(body: str, wanted: str) -> None:
+    with pytest.raises(ConfigError, match=wanted):
+        checked(topics.GRIPPER_STATE, "gripper/state", body)
