@@ -64,10 +64,10 @@ def export(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) 
             if name not in schemas:
                 text = json.dumps(SCHEMAS[name]).encode() if name in SCHEMAS else schema_of(name)
                 schemas[name] = writer.register_schema(name, "jsonschema", text)
-            if sample.topic not in channels:
-                channels[sample.topic] = writer.register_channel(sample.topic, "json", schemas[name])
+            if sample.key not in channels:
+                channels[sample.key] = writer.register_channel(sample.key, "json", schemas[name])
             data = json.dumps(value, separators=(",", ":")).encode()
-            writer.add_message(channels[sample.topic], sample.log_time, data, sample.publish_time, sample.sequence)
+            writer.add_message(channels[sample.key], sample.log_time, data, sample.publish_time, sample.sequence)
             count += 1
         writer.finish()  # type: ignore[no-untyped-call]
     finally:
