@@ -13,6 +13,7 @@ from common.robot.model import RobotModel
 from common.transport.bus import Bus
 from common.transport.operator_motion import OperatorMotion
 from common.transport.service import main
+from common.viewer.access import address_of
 from common.viewer.feeds import Feeds
 from common.viewer.guard import close_server, make_server
 from common.viewer.layout import load_layout
@@ -56,6 +57,7 @@ async def run(bus: Bus, config: Config) -> None:
             layout=layout, layout_file=config.layout, periods=Periods(picture=1 / config.picture_rate),
         )
         await bus.ready()
+        bus.log.info("the page is at %s", address_of(config.host, server.get_port()))
         loop = asyncio.get_running_loop()
         async with asyncio.TaskGroup() as group:
             for activity in page.activities(bus.clock.age_ms):

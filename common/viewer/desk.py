@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 from collections.abc import Callable, Coroutine
 from typing import Any, Protocol, TypeVar
 
@@ -31,6 +32,13 @@ class Field(Protocol[V_co]):
 def assign(handle: Field[V], value: V) -> None:
     """Show a value in a field of the page, in every browser."""
     handle.value = value  # type: ignore[misc]  # it has a setter, behind a decorator
+
+
+def can_be_given(handle: object, value: object) -> bool:
+    """Whether a browser can give that value: whoever has the page open may send what no field of it takes."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return False
+    return not isinstance(handle, viser.GuiDropdownHandle) or value in handle.options
 
 
 class Desk:
@@ -91,7 +99,8 @@ class Desk:
 
         async def clicked(event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
             chosen = event.target.value
-            self.put(lambda: act(chosen))
+            if chosen in event.target.options:
+                self.put(lambda: act(chosen))
 
         buttons.on_click(clicked)
 
@@ -101,8 +110,8 @@ class Desk:
         """Do something with the value that a person gave; not with one that the service sets itself."""
 
         async def changed(event: viser.GuiEvent[viser.GuiInputHandle[V]]) -> None:
-            if event.client_id is not None:
-                value = event.target.value
+            value = event.target.value
+            if event.client_id is not None and can_be_given(event.target, value):
                 self.put(lambda: act(value))
 
         handle.on_update(changed)

@@ -24,7 +24,7 @@ ALWAYS: tuple[Topic[Any], ...] = (  # small or seldom
 )
 ON_DEMAND: tuple[Topic[Any], ...] = (  # large, or made only for who listens
     topics.CAMERA_IMAGE, topics.DETECTION_IMAGE, topics.DEPTH_CAMERA_IMAGE, topics.CONTOUR_IMAGE, topics.CONTOURS,
-    topics.SCENE_BALLS, topics.SCENE_OBJECTS, topics.TF,
+    topics.SCENE_BALLS, topics.SCENE_OBJECTS, topics.TF, topics.DETECTED_OBJECTS,
 )
 _OF_NO_SERVICE = ("supervisor", "everyone")
 _LOG_SIZE = 2000  # lines that may wait

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import tempfile
 from pathlib import Path
@@ -75,8 +76,8 @@ def save_layout(given: str, layout: Layout) -> Path:
     path = layout_file(given)
     values = layout.model_dump(mode="json")
     body = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
-    if path.exists() and not os.access(path, os.W_OK):  # a rename would not ask
-        raise PermissionError(13, "it is read-only", str(path))
+    if path.exists() and not path.stat().st_mode & 0o222:  # a rename would not ask
+        raise PermissionError(errno.EACCES, "it is read-only", str(path))
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as file:

@@ -12,7 +12,7 @@ import viser
 from common import topics
 from common.config import Members
 from common.errors import ZencellError
-from common.messages import Contours, Image, OutlineSelect
+from common.messages import Contours, Image, OutlineSelect, Rejections
 from common.topics import Topic
 from common.viewer.desk import Desk
 from common.viewer.feeds import Feeds
@@ -36,10 +36,6 @@ IMAGES: dict[str, tuple[Topic[Image], ...]] = {
     ANNOTATED: (topics.DETECTION_IMAGE, topics.CONTOUR_IMAGE),
 }
 TRUTH: tuple[Topic[Any], ...] = (topics.SCENE_BALLS, topics.SCENE_OBJECTS)
-ICONS: dict[Tab, viser.IconName] = {
-    "Cameras": viser.Icon.CAMERA, "Health": viser.Icon.HEARTBEAT, "Plots": viser.Icon.CHART_LINE,
-    "Log": viser.Icon.LIST, "Tuning": viser.Icon.ADJUSTMENTS, "Move": viser.Icon.ARROWS_MOVE, "View": viser.Icon.EYE,
-}
 
 
 @dataclass(frozen=True)
@@ -51,6 +47,7 @@ class Periods:
     health: float = 0.5
     frustum: float = 0.5
     contours: float = 0.5
+    detected: float = 0.5
 
 
 class Page:
@@ -87,6 +84,7 @@ class Page:
         self._editing = layout.edit_world
         self._due: dict[str, float] = {}
         self._scene: SceneView | None = None
+        self._rejected: list[Rejections] = []  # before there is a scene
         self.pages = 0
         self.desk = Desk(asyncio.get_running_loop(), self._tell)
         gui = server.gui
@@ -96,13 +94,13 @@ class Page:
         gui.main_panel.set_width(layout.panel_width)
         self._task = TaskPanel(gui, self.desk, requests, outlines=members.task == OUTLINER, home=self._home)
         panel = gui.add_panel()
-        tabs = {name: panel.add_tab(name, ICONS[name]) for name in layout.tabs}
+        tabs = {name: panel.add_tab(name) for name in layout.tabs}
         panel.dock_below(gui.main_panel)
         hidden = gui.add_folder(None, visible=False)  # holds the panels that have no tab
         place: dict[Tab, viser.GuiTabHandle | viser.GuiFolderHandle] = {tab: tabs.get(tab, hidden) for tab in TABS}
         with place["Cameras"]:
             self._pictures = PicturePanel(
-                gui, self.desk, {LIVE: layout.live_image, ANNOTATED: layout.annotated_image})
+                gui, self.desk, {LIVE: layout.live_image, ANNOTATED: layout.annotated_image}, self._listen)
         with place["Health"]:
             self._health = HealthPanel(gui, members.services)
         with place["Plots"]:
@@ -140,6 +138,8 @@ class Page:
     def set_scene(self, scene: SceneView) -> None:
         """Show what the cell says in a scene, from now on."""
         self._scene = scene
+        for rejections in self._rejected:
+            scene.show_rejected(rejections)
         scene.on_select = lambda index: self.desk.put(lambda: self._select(index))
         scene.on_object_dragged = lambda name, x, y: self.desk.put(lambda: self._requests.move(name, x, y))
         for name, on in self._layers.items():
@@ -179,7 +179,7 @@ class Page:
         if self._scene is not None:
             if state is not None:
                 self._scene.show_joints(state)
-            self._show_scene(self._scene, contours)
+            self._show_scene(self._scene, contours, now)
 
     def _is_due(self, part: str, period: float, now: float) -> bool:
         if now < self._due.get(part, 0.0):
@@ -204,7 +204,7 @@ class Page:
                         self._is_due("frustum", self._periods.frustum, now)):
                     self._scene.show_picture(rgb)
 
-    def _show_scene(self, scene: SceneView, contours: Contours | None) -> None:
+    def _show_scene(self, scene: SceneView, contours: Contours | None, now: float) -> None:
         shows: list[tuple[Topic[Any], Callable[[Any], None]]] = [
             (topics.PLANNING_SCENE, scene.show_scene), (topics.VALIDATED_TARGETS, scene.show_targets),
             (topics.WORKSPACE_MARKERS, scene.show_workspace), (topics.TF_STATIC, scene.show_transforms),
@@ -217,6 +217,9 @@ class Page:
                 show(message)
         if contours is not None:
             scene.show_contours(contours)
+        if self._is_due("detected", self._periods.detected, now) and (
+                detected := self._feeds.fresh(topics.DETECTED_OBJECTS)) is not None:
+            scene.show_detected(detected)
         balls, objects = self._feeds.fresh(topics.SCENE_BALLS), self._feeds.fresh(topics.SCENE_OBJECTS)
         if balls is not None or objects is not None:
             scene.show_truth(balls, objects)
@@ -247,6 +250,8 @@ class Page:
             async for rejections in reader:
                 if self._scene is not None:
                     self._scene.show_rejected(rejections)
+                else:
+                    self._rejected.append(rejections)  # each is said only once
 
     async def _follow_latency(self, age_ms: Callable[[int], float]) -> None:
         stamped: tuple[Topic[Any], ...] = (topics.VALIDATED_TARGETS, topics.CONTOUR_PATH)
@@ -276,6 +281,7 @@ class Page:
                 wanted += sources if self._pictures.shown[name] else ()
             wanted += TRUTH if self._layers["truth"] or self._editing else ()
             wanted += [topics.TF] if self._layers["frames"] else []
+            wanted += [topics.DETECTED_OBJECTS] if self._layers["rejected"] else []
         self._feeds.listen(wanted)
 
     async def _home(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -18,7 +19,7 @@ from common.viewer.markup import block, span
 WIDEST = 640  # [px] that are sent: more than the panel shows
 QUALITY = 75
 LIVE, ANNOTATED = "live", "annotated"
-LABELS = {LIVE: "As the camera sends it", ANNOTATED: "With what was found in it"}
+LABELS = {LIVE: "Live picture", ANNOTATED: "With findings"}
 
 Picture = NDArray[np.uint8]
 
@@ -43,16 +44,20 @@ def rgb_picture(image: Image, widest: int = WIDEST) -> Picture:
 class PicturePanel:
     """Two pictures, each with a tick: what is not ticked is not even asked for."""
 
-    def __init__(self, gui: viser.GuiApi, desk: Desk, shown: dict[str, bool]) -> None:
+    def __init__(
+        self, gui: viser.GuiApi, desk: Desk, shown: dict[str, bool], on_shown: Callable[[], None]
+    ) -> None:
         """Lay the panel out where the GUI stands.
 
         Args:
             gui: of the server.
             desk: takes changes of the ticks.
             shown: whether the live and the annotated picture are ticked.
+            on_shown: called when that has changed.
         """
         self._gui = gui
         self.shown = dict(shown)
+        self._on_shown = on_shown
         self._ticks = {name: gui.add_checkbox(label, shown[name]) for name, label in LABELS.items()}
         self._folders = {name: gui.add_folder(None) for name in LABELS}
         self._images: dict[str, viser.GuiImageHandle] = {}
@@ -85,3 +90,4 @@ class PicturePanel:
         self._folders[name].visible = on
         if name in self._images:
             self._images[name].visible = on
+        self._on_shown()

@@ -1,0 +1,109 @@
+"""A page without a browser: speaks viser's protocol, knows what is shown, and clicks."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any
+
+import msgspec
+import viser
+import zstandard
+from websockets import Subprotocol
+from websockets.asyncio.client import ClientConnection, connect
+
+PATIENCE = 20.0  # [s]
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [1.0, 2.0, 3.0], "fov": 1.0, "near": 0.1,
+    "far": 100.0, "image_height": 600, "image_width": 800, "look_at": [0.0, 0.0, 0.5], "up_direction": [0.0, 0.0, 1.0],
+}
+
+
+class BrowserDouble:
+    """What a browser would show: `parts` are the fields and texts of the panels by their uuid."""
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self._connection = connection
+        self.parts: dict[str, dict[str, Any]] = {}
+        self.values: dict[str, Any] = {}
+        self._changed = asyncio.Event()
+
+    @property
+    def text(self) -> str:
+        """Everything that the panels say, as HTML."""
+        return "\n".join(str(part.get("content", "")) for part in self.parts.values())
+
+    def label(self, label: str) -> str:
+        """The uuid of the one field that is called so."""
+        found = [uuid for uuid, part in self.parts.items()
+                 if label == part.get("label") or label in (part.get("options") or ())]
+        if len(found) != 1:
+            raise LookupError(f"{label!r}: {len(found)} fields are called so")
+        return found[0]
+
+    async def listen(self) -> None:
+        """Take in what the server says."""
+        async for data in self._connection:
+            assert isinstance(data, bytes)
+            size = int.from_bytes(data[8:16], "little")
+            batch = msgspec.msgpack.decode(zstandard.decompress(data[16 : 16 + size]))
+            for message in batch["messages"]:
+                self._take(message)
+            self._changed.set()
+
+    def _take(self, message: dict[str, Any]) -> None:
+        uuid = message.get("uuid")
+        if "props" in message and str(message["type"]).startswith("Gui"):
+            self.parts[uuid] = message["props"]
+            self.values[uuid] = message.get("value")
+        elif message["type"] == "GuiUpdateMessage" and uuid in self.parts:
+            self.parts[uuid].update(message["updates"])
+            self.values[uuid] = message["updates"].get("value", self.values[uuid])
+        elif message["type"] == "GuiRemoveMessage":
+            self.parts.pop(uuid, None)
+
+    async def until(self, condition: Callable[[], object]) -> None:
+        """Return as soon as what is shown fulfils a condition."""
+        async with asyncio.timeout(PATIENCE):
+            while True:
+                self._changed.clear()
+                try:
+                    if condition():
+                        return
+                except LookupError:
+                    pass
+                await self._changed.wait()
+
+    async def set(self, label: str, value: Any) -> None:
+        """Give a field a value, or click a button."""
+        await self.until(lambda: self.label(label))
+        uuid = self.label(label)
+        await self.say({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
+
+    async def click(self, label: str) -> None:
+        """Click a button, also one of a group."""
+        await self.until(lambda: self.label(label))
+        grouped = "options" in self.parts[self.label(label)]
+        await self.set(label, label if grouped else True)
+
+    async def say(self, message: dict[str, Any]) -> None:
+        """Send a message as it is."""
+        await self._connection.send(msgspec.msgpack.encode(message))
+
+
+@asynccontextmanager
+async def opened(port: int) -> AsyncIterator[BrowserDouble]:
+    """A page that is open inside the block."""
+    async with connect(
+        f"ws://127.0.0.1:{port}/", proxy=None, max_size=None, open_timeout=PATIENCE,
+        subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
+    ) as connection:
+        browser = BrowserDouble(connection)
+        listening = asyncio.create_task(browser.listen())
+        await browser.say(CAMERA)
+        try:
+            yield browser
+        finally:
+            listening.cancel()
+            await asyncio.wait({listening})

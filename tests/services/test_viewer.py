@@ -1,0 +1,371 @@
+"""The page as its browser sees it, with services that are played."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import threading
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+import yaml
+
+from common import messages as m
+from common import topics
+from common.clock import Clock
+from common.config import Cell, load_cell, service_config
+from common.errors import Refused
+from common.transport.bus import Bus
+from common.transport.local import LocalNetwork
+from common.viewer.layout import Layout
+from services import viewer
+from tests.common.viewer.browser_double import PATIENCE, BrowserDouble, opened
+
+MIN_AREA = "services.vision_detector.min_area"
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(PATIENCE):
+        while not condition():  # noqa: ASYNC110  # nobody tells
+            await asyncio.sleep(0.005)
+
+
+class SceneDouble:
+    """Stands for the 3D scene, whose meshes take seconds to read."""
+
+    made: ClassVar[list[SceneDouble]] = []
+
+    def __init__(self, *_: object, visible: Mapping[str, bool]) -> None:
+        self.on_select: Callable[[int], None] = lambda _: None
+        self.on_object_dragged: Callable[[str, float, float], None] = lambda *_: None
+        self.goal_pose = m.Pose(position=m.Vector3(x=0.4, z=0.5))
+        self.calls: list[tuple[str, tuple[Any, ...]]] = []
+        self.visible = dict(visible)
+        SceneDouble.made.append(self)
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *arguments: self.calls.append((name, arguments))
+
+    def set_visible(self, layer: str, on: bool) -> None:
+        self.visible[layer] = on
+
+    def shown(self, name: str) -> list[tuple[Any, ...]]:
+        return [arguments for called, arguments in self.calls if called == name]
+
+
+@pytest.fixture(autouse=True)
+def scenes(monkeypatch: pytest.MonkeyPatch) -> list[SceneDouble]:
+    monkeypatch.setattr(viewer, "SceneView", SceneDouble)
+    monkeypatch.setattr(SceneDouble, "made", [])
+    return SceneDouble.made
+
+
+@dataclass
+class Played:
+    """The services that the page asks, and what they were asked."""
+
+    net: LocalNetwork
+    bus: Bus
+    port: int = 0
+    commands: list[str] = field(default_factory=list)
+    stops: list[str] = field(default_factory=list)
+    sets: list[tuple[dict[str, object], str]] = field(default_factory=list)
+    selects: list[m.OutlineSelect] = field(default_factory=list)
+    area: float = 60.0
+
+    async def command(self, request: m.TaskCommand) -> m.TaskStatus:
+        self.commands.append(request.command)
+        return m.TaskStatus()
+
+    async def stop(self, request: m.StopRequest) -> m.MotionStatus:
+        self.stops.append(request.reason)
+        return m.MotionStatus()
+
+    async def select(self, request: m.OutlineSelect) -> m.OutlineSelection:
+        self.selects.append(request)
+        return m.OutlineSelection(index=request.index or 0, label=f"Object_{request.index or 0}")
+
+    async def parameters(self, request: m.ParameterRequest) -> m.ParameterReply:
+        for path, value in request.set.items():
+            self.sets.append((request.set, request.by))
+            if not isinstance(value, int | float) or value > 500:
+                raise Refused("bad_value", f"{path}: {value!r} must be less than or equal to 500")
+            self.area = value
+        return m.ParameterReply(service="vision_detector", parameters=[
+            m.Parameter(path=MIN_AREA, value=self.area, default=60.0, type="number", minimum=0, maximum=1000,
+                        unit="px^2", description="least area [px^2]", runtime=True),
+            m.Parameter(path="services.vision_detector.fixed", value=1, type="integer"),
+        ])
+
+    def serve(self) -> None:
+        self.bus.serve(topics.TASK_COMMAND, self.command)
+        self.bus.serve(topics.MOTION_STOP, self.stop)
+        self.bus.serve(topics.OUTLINE_SELECT, self.select)
+        self.bus.serve(topics.parameters_of("vision_detector"), self.parameters)
+
+
+def config_of(cell: Cell, **changes: object) -> viewer.Config:
+    return service_config(cell, "viewer", viewer.Config).model_copy(update={"port": 0, **changes})
+
+
+@asynccontextmanager
+async def page_of(cell: str, serve: bool = True, **changes: object) -> AsyncIterator[Played]:
+    """A viewer among played services."""
+    net = LocalNetwork()
+    played = Played(net, net.bus("played", cell="test", clock=Clock()))
+    if serve:
+        played.serve()
+    await played.bus.ready()
+    lines = played.bus.reader(topics.LOG)
+    async with net.running(viewer.run, config_of(load_cell(cell), **changes), name="viewer"):
+        async with asyncio.timeout(PATIENCE):
+            while (found := re.search(r"page is at http://127\.0\.0\.1:(\d+)", (await lines.next()).message)) is None:
+                pass
+        played.port = int(found[1])
+        yield played
+
+
+@pytest.fixture
+async def panda() -> AsyncIterator[Played]:
+    async with page_of("panda") as played:
+        yield played
+
+
+@pytest.fixture
+async def page(panda: Played) -> AsyncIterator[BrowserDouble]:
+    async with opened(panda.port) as browser:
+        yield browser
+
+
+async def test_stop_stops_the_arm_and_the_task(panda: Played, page: BrowserDouble) -> None:
+    await page.click("STOP")
+    await until(lambda: panda.stops and panda.commands)
+    assert (panda.stops, panda.commands) == (["stopped on the page"], ["stop"])
+    await page.until(lambda: ">Stopped<" in page.text)
+
+
+async def test_arm_is_stopped_though_no_task_answers_and_that_is_told(panda: Played) -> None:
+    async with page_of("panda", serve=False) as alone:
+        alone.bus.serve(topics.MOTION_STOP, alone.stop)
+        async with opened(alone.port) as page:
+            await page.click("STOP")
+            await until(lambda: alone.stops)
+            await page.until(lambda: "nobody answers task/command now" in page.text)
+
+
+@pytest.mark.parametrize("command", ["Start", "Pause", "Resume"])
+async def test_task_is_told_what_is_clicked(panda: Played, page: BrowserDouble, command: str) -> None:
+    await page.click(command)
+    await until(lambda: panda.commands)
+    assert panda.commands == [command.lower()]
+
+
+async def test_state_and_counters_are_shown_in_words(panda: Played, page: BrowserDouble) -> None:
+    status = m.PickPlaceStatus(state="GRASPING", started=True, target="track_4", placed=2, targets=7, stage="pre_grasp")
+    panda.bus.writer(topics.PICK_PLACE_STATUS).put(status)
+    panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(state="active", progress=0.5, held=True))
+    await page.until(lambda: "Taking track_4" in page.text and "pre grasp" in page.text)
+    await page.until(lambda: 'data-held="True"' in page.text and "held on its path" in page.text)
+    assert '<div data-field="placed"><b>2</b>' in page.text and '<div data-field="targets"><b>7</b>' in page.text
+
+
+async def test_pictures_and_truth_are_read_only_while_a_page_that_shows_them_is_open(panda: Played) -> None:
+    writers = {topic: panda.bus.writer(topic) for topic in (topics.CAMERA_IMAGE, topics.DETECTION_IMAGE)}
+    balls = panda.bus.writer(topics.SCENE_BALLS)
+    assert not any(writer.matched for writer in writers.values()) and not balls.matched
+    async with opened(panda.port) as page:
+        await until(lambda: all(writer.matched for writer in writers.values()))
+        assert not balls.matched
+        await page.set("Truth (simulated hardware)", True)
+        await until(lambda: balls.matched)
+        await page.set("With findings", False)
+        await until(lambda: not writers[topics.DETECTION_IMAGE].matched)
+        assert writers[topics.CAMERA_IMAGE].matched
+    await until(lambda: not writers[topics.CAMERA_IMAGE].matched and not balls.matched)
+
+
+async def test_parameter_changed_on_the_page_is_changed_by_the_page(panda: Played, page: BrowserDouble) -> None:
+    await page.set("min area [px^2]", 300.0)
+    await until(lambda: panda.sets)
+    assert panda.sets == [({MIN_AREA: 300.0}, "page")]
+    await page.until(lambda: f"{MIN_AREA} is 300.0 now" in page.text)
+    with pytest.raises(LookupError):
+        page.label("fixed")
+
+
+async def test_parameter_changed_elsewhere_is_shown(panda: Played, page: BrowserDouble) -> None:
+    await page.until(lambda: page.values[page.label("min area [px^2]")] == 60.0)
+    panda.area = 120.0
+    await page.until(lambda: page.values[page.label("min area [px^2]")] == 120.0)
+
+
+async def test_refused_parameter_is_told_and_goes_back(panda: Played, page: BrowserDouble) -> None:
+    await page.set("min area [px^2]", 900.0)
+    await page.until(lambda: "900.0 must be less than or equal to 500" in page.text)
+    await page.until(lambda: page.values[page.label("min area [px^2]")] == 60.0)
+    assert panda.area == 60.0
+
+
+async def test_dead_service_is_red_and_its_return_is_green(panda: Played, page: BrowserDouble) -> None:
+    supervisor = panda.bus.writer(topics.SUPERVISOR_STATUS)
+
+    def say(**status: object) -> None:
+        service = m.ServiceStatus.model_validate({"name": "vision_detector", **status})
+        supervisor.put(m.SupervisorStatus(cell="test", services=[service]))
+
+    say(state="ready", pid=41)
+    await page.until(lambda: 'data-service="vision_detector" data-state="ready" data-pid="41"' in page.text)
+    say(state="restarting", restarts=1, message="killed by SIGKILL")
+    await page.until(lambda: 'class="bad">died, starts again' in page.text and "killed by SIGKILL" in page.text)
+    say(state="ready", pid=42, restarts=1)
+    await page.until(lambda: 'data-state="ready" data-pid="42" data-restarts="1"' in page.text)
+
+
+async def test_log_lines_are_text_whatever_is_in_them(panda: Played, page: BrowserDouble) -> None:
+    log = panda.bus.writer(topics.LOG)
+    await until(lambda: log.matched)
+    log.put(m.LogLine(service="<b>x", level="warning", message="<script>alert(1)</script>"))
+    await page.until(lambda: "&lt;script&gt;alert(1)&lt;/script&gt;" in page.text and "&lt;b&gt;x" in page.text)
+    assert "<script>" not in page.text
+    log.put(m.LogLine(service="y", level="info", message="a quiet line"))
+    await page.until(lambda: "a quiet line" in page.text)
+    await page.set("Show", "warning")
+    await page.until(lambda: "a quiet line" not in page.text)
+
+
+async def test_odd_messages_leave_the_page_and_the_service_as_they_are(
+    panda: Played, page: BrowserDouble, capfd: pytest.CaptureFixture[str]
+) -> None:
+    await page.until(lambda: page.label("Speed [%]"))
+    speed = page.label("Speed [%]")
+    for value in ("fast", None, [1], float("nan"), 1e300):
+        await page.say({"type": "GuiUpdateMessage", "uuid": speed, "updates": {"value": value}})
+    await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Start"), "updates": {"value": "Explode"}})
+    await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Show"), "updates": {"value": "nothing"}})
+    panda.bus.writer(topics.DETECTION_IMAGE).put(m.Image(
+        header=m.Header(), height=4, width=4, encoding="bgr8", data=b"short"))
+    await page.click("Pause")
+    await until(lambda: panda.commands)
+    assert panda.commands == ["pause"]
+    capfd.readouterr()  # viser prints what it could not convert
+
+
+async def test_saved_layout_opens_with_what_was_on(tmp_path: Path) -> None:
+    file = tmp_path / "layout.yaml"
+    file.write_text("tabs: [Log, View]\n")
+    async with page_of("panda", layout=str(file)) as played, opened(played.port) as page:
+        await page.set("Frames", True)
+        await page.set("Show", "error")
+        await page.click("Save layout")
+        await page.until(lambda: f"Saved in {file}" in page.text)
+        saved = Layout.model_validate(yaml.safe_load(file.read_text()))
+        assert saved.layers == {"frames": True} and saved.log_level == "error" and saved.tabs == ["Log", "View"]
+        assert saved.viewpoint("panda").position == (1.0, 2.0, 3.0)
+        file.chmod(0o444)
+        await page.click("Save layout")
+        await page.until(lambda: f"{file} can not be written: it is read-only" in page.text)
+        assert [path.name for path in tmp_path.iterdir()] == [file.name]  # noqa: ASYNC240
+
+
+async def test_chosen_object_is_traced_once_its_path_is_known() -> None:
+    async with page_of("ur5") as played, opened(played.port) as page:
+        played.bus.writer(topics.OUTLINE_STATUS).put(m.OutlineStatus(state="DONE", started=True))
+        contours = [m.Contour(index=i, label=f"Object_{i}", pixels=[(1.0, 1.0), (2.0, 1.0), (2.0, 2.0)])
+                    for i in range(2)]
+        played.bus.writer(topics.CONTOURS).put(
+            m.Contours(header=m.Header(), width=4, height=4, contours=contours, selected=0))
+        await page.until(lambda: page.label("● Object_0"))
+        await page.click("Object_1")
+        await until(lambda: played.selects)
+        assert played.selects == [m.OutlineSelect(rule="index", index=1)] and played.commands == []
+        played.bus.writer(topics.CONTOUR_PATH).put(m.OutlinePoints(object="Object_1"))
+        await until(lambda: played.commands)
+        assert played.commands == ["start"]
+        await page.until(lambda: "Object_1 is chosen" in page.text)
+
+
+async def test_contour_that_is_clicked_in_the_scene_is_chosen(scenes: list[SceneDouble]) -> None:
+    async with page_of("ur5") as played:
+        await until(lambda: scenes)
+        await asyncio.to_thread(lambda: scenes[0].on_select(1))  # as viser does
+        await until(lambda: played.selects)
+        assert played.selects == [m.OutlineSelect(rule="index", index=1)]
+
+
+async def test_object_that_is_dragged_is_moved_in_the_world_and_a_refusal_is_told(
+    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+) -> None:
+    moved: list[m.WorldEdit] = []
+
+    async def edit(request: m.WorldEdit) -> m.WorldEditReply:
+        moved.append(request)
+        raise Refused("not_free", "ball_1 lies there")
+
+    panda.bus.serve(topics.WORLD_EDIT, edit)
+    await page.set("Edit the simulated world", True)
+    await until(lambda: scenes and scenes[0].shown("set_editing"))
+    await asyncio.to_thread(lambda: scenes[0].on_object_dragged("ball_2", 0.5, 0.1))
+    await page.until(lambda: "ball_1 lies there" in page.text)
+    assert moved == [m.WorldEdit(op="move", id="ball_2", position=m.Vector3(x=0.5, y=0.1))]
+
+
+async def test_layers_are_shown_as_ticked_also_before_the_scene_is_there(
+    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+) -> None:
+    await until(lambda: scenes)
+    assert scenes[0].visible["targets"] and not scenes[0].visible["truth"]
+    await page.set("Targets", False)
+    await until(lambda: not scenes[0].visible["targets"])
+
+
+async def test_scene_is_told_what_the_cell_says_while_somebody_looks(panda: Played, scenes: list[SceneDouble]) -> None:
+    scene = m.PlanningScene(header=m.Header())
+    panda.bus.writer(topics.PLANNING_SCENE).put(scene)
+    await until(lambda: scenes)
+    assert not scenes[0].shown("show_scene")
+    async with opened(panda.port):
+        await until(lambda: scenes[0].shown("show_scene") == [(scene,)])
+
+
+async def test_plan_to_the_marker_tells_what_is_in_the_way(
+    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+) -> None:
+    asked: list[m.PlanRequest] = []
+
+    async def plan(request: m.PlanRequest) -> m.PlanResponse:
+        asked.append(request)
+        return m.PlanResponse(id=request.id, ok=False, error="collision", message="operator: the goal collides",
+                              colliding=("panda_hand", "table"))
+
+    panda.bus.serve(topics.MOTION_PLAN, plan)
+    await until(lambda: scenes)
+    await page.click("Plan here")
+    await page.until(lambda: "Drag the goal marker" in page.text)
+    await until(lambda: scenes[0].shown("goal_marker") == [(True,)])
+    await page.set("Planner", "chomp")
+    await page.click("Plan here")
+    await page.until(lambda: "the goal collides; panda_hand would touch table" in page.text)
+    assert (asked[0].planner, asked[0].goal) == ("chomp", m.PoseGoal(pose=scenes[0].goal_pose))
+
+
+async def test_rejection_that_came_before_the_scene_is_shown_in_it(
+    scenes: list[SceneDouble], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go = threading.Event()
+
+    def slow(*arguments: object, **options: Any) -> SceneDouble:
+        assert go.wait(PATIENCE)
+        return SceneDouble(*arguments, **options)
+
+    monkeypatch.setattr(viewer, "SceneView", slow)
+    async with page_of("panda") as played, opened(played.port) as page:
+        rejected = m.Rejections(header=m.Header(), rejected=[m.Rejection(position=m.Vector3(x=1.0), reason="too far")])
+        played.bus.writer(topics.REJECTED_TARGETS).put(rejected)
+        await page.click("Pause")  # the page is there before the scene is
+        await until(lambda: played.commands)
+        go.set()
+        await until(lambda: scenes and scenes[0].shown("show_rejected") == [(rejected,)])
