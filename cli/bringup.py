@@ -31,6 +31,7 @@ Speed = Annotated[str, typer.Option("--speed", metavar="X", help="cell time per 
 NoViewer = Annotated[bool, typer.Option("--no-viewer", help="without the operator's page")]
 SummaryFile = Annotated[str | None, typer.Option("--summary", metavar="FILE.json", help="write the figures there")]
 LogJson = Annotated[bool, typer.Option("--log-json", help="log lines as JSON objects")]
+Record = Annotated[str | None, typer.Option("--record", metavar="FILE.mcap", help="record all of it there")]
 Ask = Annotated[bool, typer.Option("--ask", help="outlining: ask at the terminal which object")]
 From = Annotated[str | None, typer.Option("--from", metavar="DIR", help="outlining: trace coordinates stored there")]
 
@@ -48,6 +49,7 @@ def run(
     viewer_port: viewing.Port = None,
     summary: SummaryFile = None,
     log_json: LogJson = False,
+    record: Record = None,
     ask: Ask = False,
     source: From = None,
 ) -> None:
@@ -55,6 +57,7 @@ def run(
     chosen = choices(cell, overrides, world, ask=ask, source=source)
     operation = Operation(cell, chosen, world, seed, speed, domain, connect, no_viewer, summary, log_json)
     operation.serve_page(viewer_host, viewer_port)
+    operation.record_to(record)
     operation.ask = ask
     raise typer.Exit(operation.run_to_end())
 
@@ -72,10 +75,12 @@ def up(
     viewer_port: viewing.Port = None,
     summary: SummaryFile = None,
     log_json: LogJson = False,
+    record: Record = None,
 ) -> None:
     """Bring a cell up and stay until Ctrl-C; the task starts by itself unless the cell says `autostart: false`."""
     operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json)
     operation.serve_page(viewer_host, viewer_port)
+    operation.record_to(record)
     raise typer.Exit(operation.stay())
 
 
@@ -155,6 +160,7 @@ class Operation:
         self._collector: Collector | None = None
         self._screen: Screen | None = None
         self._page = ""  # address
+        self._watchers: dict[str, list[str]] = {}  # commands by name
         self.ask = False  # the person at the terminal which object is to be outlined
 
     def serve_page(self, host: str | None, port: str | None) -> None:
@@ -168,6 +174,24 @@ class Operation:
             overrides = (*self.launch.overrides, *page.overrides)
             self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
             self._page = page.address
+
+    def record_to(self, file: str | None) -> None:
+        """Have a process beside the services record all that travels, from before they are ready to after their end.
+
+        Raises:
+            ConfigError: no recording can be made there.
+        """
+        if file is None:
+            return
+        from cli.recording import NAME, require_new
+        from common.supervision.launch import python_module
+
+        path = Path(file).absolute()
+        require_new(path, "--record")
+        place = ["--connect", self.launch.connect] if self.launch.connect else ["--domain", str(self.launch.domain)]
+        self._watchers[NAME] = [
+            *python_module("cli.main"), "record", "--cell", self.cell.name, "-o", str(path), *place, "--gate",
+        ]
 
     def leave_out(self, name: str) -> None:
         """Do not start a service."""
@@ -227,7 +251,7 @@ class Operation:
             else:
                 self._screen.line(name, text)
 
-        self._supervisor = Supervisor(self.cell, self.launch, show)
+        self._supervisor = Supervisor(self.cell, self.launch, show, self._watchers)
         self._supervisor.begin()  # before the rest of our own imports, which take as long as theirs
         try:
             self._open_screen(early)

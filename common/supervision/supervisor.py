@@ -8,7 +8,7 @@ import json
 import logging
 import re
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from common.config import Cell
@@ -44,8 +44,9 @@ class BadConfiguration(ZencellError):
 class Watched:
     """A child, whether it may start and has done so, and how often it died."""
 
-    def __init__(self, child: Child) -> None:
+    def __init__(self, child: Child, *, again: bool = True) -> None:
         self.child = child
+        self.again = again  # is started again when it ends
         self.admitted = False
         self.backoff = Backoff()
         self.ready = asyncio.Event()
@@ -60,16 +61,23 @@ class Supervisor:
     processes, the router, provides.
     """
 
-    def __init__(self, cell: Cell, launch: Launch, on_line: Callable[[str, str], None]) -> None:
+    def __init__(
+        self, cell: Cell, launch: Launch, on_line: Callable[[str, str], None],
+        watchers: Mapping[str, Sequence[str]] = {},
+    ) -> None:
         """Prepare the processes without starting any; on the running loop.
 
         Args:
             cell: the resolved cell; its services are started in their order.
             launch: how the cell was asked for.
             on_line: called with the name of a process and each line that it writes.
+            watchers: commands, by name, of processes that look on: ready before all services and ended after them,
+                not started again when they end, without which the cell goes on.
         """
         environment = launch.environment()
         self._services = [
+            Watched(Child(name, command, environment, on_line), again=False) for name, command in watchers.items()
+        ] + [
             Watched(Child(entry.name, launch.service_command(entry), environment, on_line))
             for entry in cell.services.values()
         ]
@@ -178,6 +186,12 @@ class Supervisor:
                 if code == CONFIG_EXIT and not self._up:
                     self._set(watched, state="failed", message=describe_exit(code))
                     raise BadConfiguration(_last_message(child) or f"{child.name}: {describe_exit(code)}")
+                if not watched.again:
+                    self._set(watched, state="failed", message=describe_exit(code))
+                    if not self._up:
+                        raise StartFailed(_last_message(child) or f"{child.name}: {describe_exit(code)}")
+                    log.error("%s ended (%s)", child.name, describe_exit(code))
+                    break
                 delay = watched.backoff.after(child.alive_seconds)
                 message = describe_exit(code)
                 log.warning("%s ended (%s); starting it again in %.1f s", child.name, message, delay)
