@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -54,8 +53,15 @@ def _values(tree: Mapping[Any, Any], above: tuple[str, ...] = ()) -> Iterator[tu
 
 def yaml_line(value: Any) -> str:
     """A value as YAML writes it on one line: what `PATH=VALUE` takes."""
-    if isinstance(value, str) and not value.isprintable():
-        return json.dumps(value)
     plain = to_jsonable_python(value)
-    text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf, allow_unicode=True, sort_keys=False)
+    text = _flow(plain)
+    # A text with line breaks, of which Unicode has several, is spread over lines unless it is quoted and escaped.
+    return text if len(text.splitlines()) <= 1 else _flow(plain, quoted=True)
+
+
+def _flow(value: Any, *, quoted: bool = False) -> str:
+    text: str = yaml.safe_dump(
+        value, default_flow_style=True, default_style='"' if quoted else None, allow_unicode=not quoted, width=math.inf,
+        sort_keys=False,
+    )
     return text.removesuffix("\n").removesuffix("\n...")
