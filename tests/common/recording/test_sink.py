@@ -1,0 +1,110 @@
+"""Between network and disk: nothing blocks, what is dropped is counted, a full disk ends it with one line."""
+
+import errno
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from common.recording import appending
+from common.recording.appending import WritingFailed
+from common.recording.reading import Recording
+from common.recording.sink import Sink
+from common.recording.splitting import SplitWriter
+from tests.common.recording.samples import joints, status
+
+
+def test_everything_offered_is_in_the_file_with_how_it_ended(tmp_path: Path) -> None:
+    writer = SplitWriter(tmp_path / "a.mcap", {"cell": "panda"})
+    sink = Sink(writer)
+    sink.describe("run", {"seed": 7})
+    for number in range(100):
+        sink.offer(joints(number))
+    figures = sink.close({"reason": "test"})
+    assert (figures.messages, figures.dropped, figures.size) == (100, {}, (tmp_path / "a.mcap").stat().st_size)
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert len(list(recording.samples())) == 100
+        assert recording.metadata("run") == {"seed": 7}
+        assert recording.metadata("ended") == {"reason": "test", "dropped": {}}
+
+
+def test_what_does_not_fit_while_the_disk_stalls_is_dropped_and_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk, writing = threading.Event(), threading.Event()
+
+    class Stalled(SplitWriter):
+        def add(self, sample):
+            writing.set()
+            disk.wait()
+            super().add(sample)
+
+    size = len(joints(0).payload)
+    sink = Sink(Stalled(tmp_path / "a.mcap", {}), most_bytes=3 * size + 1)
+    sink.offer(joints(0))
+    assert writing.wait(10)  # the first is on its way to the disk and still counts
+    for number in range(1, 6):
+        sink.offer(joints(number))
+    assert sink.figures.dropped == {"panda/joint_states": 3}
+    disk.set()
+    assert sink.close({}).messages == 3
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert recording.metadata("ended")["dropped"] == {"panda/joint_states": 3}
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
+def test_full_disk_ends_it_with_one_line_and_keeps_whole_chunks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    writer = SplitWriter(tmp_path / "a.mcap", {"cell": "panda"})
+    failed = threading.Event()
+    sink = Sink(writer, on_failure=failed.set)
+    real, room = os.write, 40_000
+
+    def write(file: int, data: memoryview) -> int:
+        nonlocal room
+        if room == 0:
+            raise OSError(number, os.strerror(number))
+        taken = min(room, len(data))
+        room -= taken
+        return real(file, data[:taken])  # a disk that fills takes the part that still fits
+
+    monkeypatch.setattr(appending.os, "write", write)
+    offered = 0
+    while not failed.wait(0.001):
+        for _ in range(10):
+            sink.offer(joints(offered, payload=os.urandom(5000)))
+            offered += 1
+    with pytest.raises(WritingFailed, match=r"a.mcap: recording stopped, the disk is full; .*zencell recover") as error:
+        sink.close({})
+    assert error.value.exit_code == 1 and "\n" not in str(error.value)
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert not recording.finished
+        assert recording.layout.whole == recording.layout.size <= 40_000
+    sink.offer(joints(0))  # what still comes is let go
+
+
+def test_failure_while_closing_is_told_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sink = Sink(SplitWriter(tmp_path / "a.mcap", {}))
+    sink.offer(status(0))
+
+    def write(file: int, data: memoryview) -> int:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(appending.os, "write", write)
+    with pytest.raises(WritingFailed, match="Input/output error"):
+        sink.close({})
+
+
+def test_a_bug_while_writing_is_not_hidden(tmp_path: Path) -> None:
+    class Broken(SplitWriter):
+        def add(self, sample):
+            raise RuntimeError("a bug")
+
+    failed = threading.Event()
+    sink = Sink(Broken(tmp_path / "a.mcap", {}), on_failure=failed.set)
+    sink.offer(joints(0))
+    assert failed.wait(10)
+    with pytest.raises(RuntimeError, match="a bug"):
+        sink.close({})
