@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import importlib
+import sys
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -58,7 +60,8 @@ def wired(cell: Cell, entry: ServiceEntry) -> Wired:
     # A service that listens at a port of its own may be up: another copy must not want the same one.
     apart = config.model_copy(update={"port": 0}) if "port" in module.Config.model_fields else config
     try:
-        found = asyncio.run(wiring(module.run, apart))
+        with redirect_stdout(sys.stderr):  # stdout is for what was asked
+            found = asyncio.run(wiring(module.run, apart, service=entry.name))
     except ZencellError:
         raise
     except Exception as error:

@@ -67,13 +67,15 @@ class Recorder(Bus):
         await asyncio.get_running_loop().create_future()
 
 
-async def wiring(run: Callable[[Bus, C], Coroutine[Any, Any, None]], config: C, *, timeout: float = 30.0) -> Wiring:
-    """What `run` declares before it says that it is ready.
+async def wiring(
+    run: Callable[[Bus, C], Coroutine[Any, Any, None]], config: C, *, service: str = "recorded", timeout: float = 30.0
+) -> Wiring:
+    """What `run` declares, under a service's name, before it says that it is ready.
 
     Raises:
         RuntimeError: it ended, or `timeout` seconds passed, before it was ready. What it raises itself is raised.
     """
-    recorder = Recorder()
+    recorder = Recorder(service)
     task = asyncio.create_task(recorder.run(run(recorder, config)))
     is_ready = asyncio.create_task(recorder.ready_event.wait())
     try:

@@ -1,5 +1,6 @@
 import pytest
 
+from cli.main import app
 from cli.publishing import checked, stamped
 from common import topics
 from common.clock import Clock
@@ -52,3 +53,21 @@ def test_key_of_ones_own_takes_any_json() -> None:
 def test_what_is_no_message_names_the_field_and_what_would_do(body: str, wanted: str) -> None:
     with pytest.raises(ConfigError, match=wanted):
         checked(topics.GRIPPER_STATE, "gripper/state", body)
+
+
+@pytest.mark.parametrize(("arguments", "wanted"), [
+    (["pub", "motion/stop", "{}"], "'motion/stop' is a request, which is not published: zencell call motion/stop JSON"),
+    (["pub", "param/vision_detector", "{}"], "is a request"),
+    (["pub", "pick_place_status", '{"state": "FLY"}'], "pick_place_status.state: 'FLY' must be 'IDLE', 'GRASPING'"),
+    (["pub", "tf", "{}", "--rate", "0"], "--rate: '0' must be more than 0 and at most 1000 [Hz]"),
+    (["pub", "tf", "{}", "--count", "0"], "--count: '0'"),
+    (["delay", "motion/stop"], "unknown published key 'motion/stop'"),
+])
+def test_what_can_not_be_asked_for_is_one_line(
+    arguments: list[str], wanted: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert app.execute(["topic", *arguments]) == 2
+    shown = capsys.readouterr()
+    (line,) = shown.err.splitlines()
+    assert wanted in line
+    assert shown.out == ""
