@@ -19,6 +19,7 @@ from common.messages import (
 
 LINE_LOOP = 1
 DELETE_ALL = 1
+PRIMITIVES = ("arrows", "cubes", "spheres", "cylinders", "lines", "triangles", "texts", "models")  # all are required
 THICKNESS = 0.004  # of lines [m]
 OUTLINE_COLOR = Color(r=0.1, g=0.9, b=0.3)
 
@@ -42,7 +43,7 @@ def entity(name: str, frame: str, stamp: int, **primitives: list[dict[str, Any]]
     """A thing in a scene, which stays until it is replaced or deleted."""
     return {
         "timestamp": time_of(stamp), "frame_id": frame, "id": name, "lifetime": {"sec": 0, "nsec": 0},
-        "frame_locked": True, **primitives,
+        "frame_locked": True, "metadata": [], **dict.fromkeys(PRIMITIVES, []), **primitives,
     }
 
 
@@ -115,4 +116,5 @@ def _loop(points: Sequence[tuple[float, float, float]], color: Color) -> dict[st
     return {
         "type": LINE_LOOP, "pose": Pose().model_dump(), "thickness": THICKNESS, "scale_invariant": False,
         "points": [{"x": x, "y": y, "z": z} for x, y, z in points], "color": color.model_dump(),
+        "colors": [], "indices": [],
     }

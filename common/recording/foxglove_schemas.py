@@ -1,4 +1,4 @@
-"""The schemas that Foxglove shows as what they are, as JSON schema; only the fields that are written here.
+"""The schemas that Foxglove shows as what they are, as JSON schema: the fields that are written here.
 
 Names and fields: https://docs.foxglove.dev/docs/sdk/schemas
 """
@@ -58,13 +58,17 @@ SCHEMAS: dict[str, Schema] = {
                 deletions=_list(_object("foxglove.SceneEntityDeletion", timestamp=TIME, type=INTEGER, id=TEXT)),
                 entities=_list(_object(
                     "foxglove.SceneEntity", timestamp=TIME, frame_id=TEXT, id=TEXT, lifetime=_time("duration"),
-                    frame_locked=FLAG,
+                    frame_locked=FLAG, metadata=_list(_object("foxglove.KeyValuePair", key=TEXT, value=TEXT)),
+                    arrows=_list(_object("foxglove.ArrowPrimitive")),
+                    triangles=_list(_object("foxglove.TriangleListPrimitive")),
+                    models=_list(_object("foxglove.ModelPrimitive")),
                     cubes=_list(_object("foxglove.CubePrimitive", **_SHAPE)),
                     spheres=_list(_object("foxglove.SpherePrimitive", **_SHAPE)),
                     cylinders=_list(_object("foxglove.CylinderPrimitive", **_SHAPE, bottom_scale=NUMBER,
                                             top_scale=NUMBER)),
                     lines=_list(_object("foxglove.LinePrimitive", type=INTEGER, pose=POSE, thickness=NUMBER,
-                                        scale_invariant=FLAG, points=_list(POINT3), color=COLOR)),
+                                        scale_invariant=FLAG, points=_list(POINT3), color=COLOR, colors=_list(COLOR),
+                                        indices=_list(INTEGER))),
                     texts=_list(_object("foxglove.TextPrimitive", pose=POSE, billboard=FLAG, font_size=NUMBER,
                                         scale_invariant=FLAG, color=COLOR, text=TEXT))))),
     )
