@@ -1,0 +1,166 @@
+"""Every service answers for its parameters, without doing anything for it."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+from collections.abc import AsyncIterator
+
+import pytest
+from pydantic import Field
+
+from common import topics
+from common.config import Motion, Parameters, Tunable, load_cell, service_config
+from common.errors import NoResponder, RemoteError
+from common.messages import ParameterReply, ParameterRequest
+from common.topics import find_topic, parameters_of
+from common.transport.bus import Bus, Client
+from common.transport.local import LocalNetwork
+from common.transport.pace import Pace
+from common.transport.wiring import wiring
+
+PATIENCE = 20.0
+CELLS = {name: load_cell(name) for name in ("panda", "ur5")}
+
+
+class Config(Parameters):
+    motion: Motion
+    rate: Tunable[float] = Field(10.0, gt=0, le=1000, description="turns [Hz]")
+    size: Tunable[int] = Field(3, ge=1, le=5)
+    file: str = ""
+
+
+async def service(bus: Bus, config: Config) -> None:
+    bus.on_parameters(lambda: bus.log.info("now at %g Hz", config.rate))
+    await bus.ready()
+    await asyncio.Event().wait()
+
+
+class Rig:
+    def __init__(self) -> None:
+        self.net, self.config = LocalNetwork(), Config(motion=Motion())
+        self.bus = self.net.bus("tester")
+        self.log = self.bus.reader(topics.LOG)
+        self.client: Client[ParameterRequest, ParameterReply] = self.bus.client(parameters_of("toy"))
+
+    async def ask(self, *, dry_run: bool = False, by: str = "", **values: object) -> dict[str, object]:
+        full = {path.replace("__", "."): value for path, value in values.items()}
+        reply = await self.client.call(ParameterRequest.model_validate({"set": full, "dry_run": dry_run, "by": by}))
+        assert reply.service == "toy"
+        return {p.path: p.value for p in reply.parameters}
+
+    async def refusal(self, **values: object) -> RemoteError:
+        before = await self.ask()
+        with pytest.raises(RemoteError) as caught:
+            await self.ask(**values)
+        assert await self.ask() == before
+        return caught.value
+
+    async def lines(self, count: int) -> list[str]:
+        async with asyncio.timeout(PATIENCE):
+            return [(await self.log.next()).message for _ in range(count)]
+
+
+@pytest.fixture
+async def rig() -> AsyncIterator[Rig]:
+    made = Rig()
+    async with made.net.running(service, made.config, name="toy"):
+        yield made
+
+
+async def test_nothing_to_set_asks_what_there_is(rig: Rig) -> None:
+    values = await rig.ask()
+    assert values["services.toy.rate"] == 10.0 and values["motion.velocity_scaling"] == 0.2
+    assert values["services.toy.file"] == ""
+
+
+async def test_a_change_is_made_logged_with_who_made_it_and_told_to_the_service(rig: Rig) -> None:
+    values = await rig.ask(services__toy__rate=20, motion__velocity_scaling=0.5, by="ann@desk/7")
+    assert (values["services.toy.rate"], values["motion.velocity_scaling"]) == (20.0, 0.5)
+    assert (rig.config.rate, rig.config.motion.velocity_scaling) == (20.0, 0.5)
+    lines = await rig.lines(3)
+    assert sorted(lines[:2]) == ["motion.velocity_scaling: 0.2 -> 0.5 (by ann@desk/7)",
+                                 "services.toy.rate: 10.0 -> 20.0 (by ann@desk/7)"]
+    assert lines[2] == "now at 20 Hz"
+
+
+async def test_a_dry_run_and_what_is_so_already_change_and_log_nothing(rig: Rig) -> None:
+    assert (await rig.ask(services__toy__rate=20, dry_run=True))["services.toy.rate"] == 10.0
+    await rig.ask(services__toy__rate=10)
+    await rig.ask(services__toy__size=4)
+    assert await rig.lines(2) == ["services.toy.size: 3 -> 4 (by somebody)", "now at 10 Hz"]
+
+
+async def test_a_dry_run_is_refused_as_the_change_would_be(rig: Rig) -> None:
+    with pytest.raises(RemoteError, match="size: 6"):
+        await rig.ask(services__toy__size=6, dry_run=True)
+
+
+@pytest.mark.parametrize(("values", "code", "said"), [
+    ({"services__toy__rate": 20, "services__toy__size": 9}, "bad_value", "services.toy.size: 9 must be"),
+    ({"services__toy__rate": 20, "services__toy__fiel": ""}, "unknown_parameter", "did you mean 'services.toy.file'"),
+    ({"services__toy__rate": 20, "services__toy__file": "x"}, "needs_restart", "--set services.toy.file=x"),
+    ({"services__toy__rate": float("inf")}, "bad_value", "services.toy.rate: inf"),
+])
+async def test_all_or_nothing(rig: Rig, values: dict[str, object], code: str, said: str) -> None:
+    refusal = await rig.refusal(**values)
+    assert refusal.code == code and said in refusal.message
+
+
+async def test_a_bad_request_leaves_the_service_running(rig: Rig) -> None:
+    for values in ({"services__toy__rate": None}, {"services__toy__rate": [1]}, {"services__toy__rate": {"a": 1}}):
+        assert (await rig.refusal(**values)).code == "bad_value"
+    assert (await rig.ask())["services.toy.rate"] == 10.0
+
+
+async def test_a_service_that_is_gone_does_not_answer() -> None:
+    rig = Rig()
+    async with rig.net.running(service, rig.config, name="toy"):
+        await rig.bus.alive.wait("toy", PATIENCE)
+        await rig.ask()
+    await rig.bus.alive.wait("toy", PATIENCE, there=False)
+    with pytest.raises(NoResponder):
+        await rig.ask()
+
+
+@pytest.mark.parametrize(("cell", "name"), [(cell, name) for cell in CELLS for name in CELLS[cell].services])
+async def test_the_wiring_of_a_service_does_not_tell_of_what_everybody_serves(cell: str, name: str) -> None:
+    module = importlib.import_module(f"services.{name}")
+    found = await wiring(module.run, service_config(CELLS[cell], name, module.Config))
+    assert parameters_of(name) not in found.serves
+
+
+def test_the_request_of_any_service_is_found_by_its_key() -> None:
+    assert find_topic("param/vision_detector") == parameters_of("vision_detector")
+    assert find_topic("camera/image_raw") is topics.CAMERA_IMAGE
+    assert find_topic("param/<service>") is topics.PARAMETERS
+    assert find_topic("param/") is find_topic("param/a/b") is find_topic("nothing") is None
+
+
+async def test_a_pace_that_waits_for_long_goes_on_when_its_rate_is_raised() -> None:
+    rate = 1e-6
+    bus = LocalNetwork().bus("toy")
+    pace = Pace(bus, lambda: rate)
+    waiting = asyncio.create_task(pace.wait())
+    await asyncio.sleep(0)
+    bus.parameters_changed()  # of something else
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    rate = 1000.0
+    bus.parameters_changed()
+    async with asyncio.timeout(PATIENCE):
+        await waiting
+
+
+async def test_turns_of_a_pace_lie_on_a_grid_and_those_that_were_missed_are_left_out() -> None:
+    loop = asyncio.get_running_loop()
+    pace = Pace(LocalNetwork().bus("toy"), lambda: 1000.0)
+    await pace.wait()
+    first = pace.due
+    for _ in range(5):
+        await asyncio.sleep(0.0035)  # more than three turns
+        await pace.wait()
+        assert pace.due <= loop.time()
+        turns = (pace.due - first) * 1000.0
+        assert turns == pytest.approx(round(turns), abs=1e-3) and turns > 3
+        first = pace.due
