@@ -17,7 +17,8 @@ from common.viewer.access import address_of
 from common.viewer.feeds import Feeds
 from common.viewer.guard import close_server, make_server
 from common.viewer.layout import load_layout
-from common.viewer.page import Page, Periods
+from common.viewer.page import Page
+from common.viewer.periods import Periods
 from common.viewer.plots import Limits
 from common.viewer.requests import Requests
 from common.viewer.scene_view import SceneView

@@ -12,7 +12,9 @@ from common.supervision.rates import Rates
 from common.viewer import words
 from common.viewer.markup import block, row, span, table, text
 
-HEAD = ("Service", "State", "PID ", "Restarts ", "Busiest topic", "Hz ", "Lost ")
+HEAD = ("Service", "State", "PID ", "Restarts ", "Busiest topic", "Skipped ", "Lost ")
+SKIPPED, LOST = "Skipped: a newer one came before it was read.", "Lost: refused, or one too many."
+LEGEND = f"<div>{span(f'{SKIPPED} {LOST}', 'dim small')}</div>"
 
 
 class HealthPanel:
@@ -41,7 +43,7 @@ class HealthPanel:
             rows = [self._row(s.name, s.state, s.pid, s.restarts, s.message) for s in supervisor.services]
         else:
             rows = [self._row(name, "ready" if name in alive else "gone", None, 0, "") for name in self._services]
-        content = block(table(HEAD, rows), "health")
+        content = block(table(HEAD, rows, "small") + LEGEND, "health")
         if content != self._html.content:
             self._html.content = content
 
@@ -49,14 +51,15 @@ class HealthPanel:
         word, kind = words.SERVICE_STATES[state]
         busiest = self._rates.busiest_of(name) if kind == "good" else None
         counted = self._counters.get(name)
+        skipped = sum(counted.dropped.values()) if counted else 0
         lost = sum(counted.overflow.values()) + sum(counted.invalid.values()) if counted else 0
         return row(
-            text(name),
-            f'{span("●", kind + " dot")} {span(word, kind)} {span(message, "dim") if message else ""}',
+            span(name, "tight"),
+            f'{span(f"● {word}", kind)} {span(message, "dim") if message else ""}',
             text(pid if pid is not None else "–"),
             str(restarts),
-            text(busiest[0]) if busiest else span("", "dim"),
-            f"{busiest[1]:.0f}" if busiest else "–",
-            str(lost),
+            span(f"{busiest[0]} {busiest[1]:.0f} Hz", "tight") if busiest else span("–", "dim"),
+            str(skipped),
+            span(lost, "bad") if lost else "0",
             service=name, state=state, pid=pid or "", restarts=restarts,
         )

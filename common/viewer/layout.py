@@ -13,14 +13,14 @@ import yaml
 from pydantic import Field
 
 from common.config import Section, check, config_root, read_yaml
-from common.config.basics import Coordinate
 
 FILE = "viewer.yaml"
 Tab = Literal["Cameras", "Health", "Plots", "Log", "Tuning", "Move", "View"]
 TABS: tuple[Tab, ...] = get_args(Tab)
 LogLevel = Literal["debug", "info", "warning", "error"]
 HEADER = '# How the operator\'s page opens. "Save layout" on the page writes this file.\n'
-View3D = tuple[Coordinate, Coordinate, Coordinate]
+Far = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]
+View3D = tuple[Far, Far, Far]
 
 
 class Viewpoint(Section):
@@ -34,7 +34,7 @@ class Layout(Section):
     """What is on when the page opens."""
 
     dark: bool = Field(True, description="light letters on a dark ground")
-    panel_width: Annotated[int, Field(ge=280, le=1200)] = Field(440, description="[px]")
+    panel_width: Annotated[int, Field(ge=280, le=1200)] = Field(470, description="[px]")
     tabs: list[Tab] = Field([*TABS], description="in order; the first is open")
     layers: dict[str, bool] = Field({}, description="layers of the scene that are other than usual")
     viewpoints: dict[str, Viewpoint] = Field({}, description="by cell")

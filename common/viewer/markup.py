@@ -18,10 +18,17 @@ STYLE = """<style>
 .zc .big { font-size: 1.3em; font-weight: 600; }
 .zc .good { color: #2fb344; } .zc .busy { color: #f59f00; } .zc .bad { color: #fa5252; } .zc .off { color: #868e96; }
 .zc .dot { font-size: 1.1em; }
+.zc .small { font-size: 0.875em; }
+.zc .small td, .zc .small th { padding: 0.2em 0.3em; }
+.zc .tight { white-space: nowrap; }
 .zc .log td { border: none; padding-top: 0; padding-bottom: 0; }
 .zc .log td:first-child, .zc .log td:nth-child(2) { white-space: nowrap; opacity: 0.6; }
 .zc .fields { display: grid; grid-template-columns: repeat(auto-fit, minmax(4.6em, 1fr)); gap: 0.2em 0.6em; }
 .zc .fields b { display: block; font-size: 1.25em; font-weight: 600; font-variant-numeric: tabular-nums; }
+/* A tick stands before its words, which then need not wrap. */
+.mantine-Flex-root:has(> div input[type="checkbox"]) { flex-direction: row-reverse; justify-content: flex-end; }
+.mantine-Flex-root:has(> div input[type="checkbox"]) > div { flex-grow: 0 !important; }
+.mantine-Flex-root:has(> div input[type="checkbox"]) > div:first-child { width: auto !important; padding-left: 0.6em; }
 </style>"""
 
 

@@ -39,11 +39,11 @@ class Goal(Protocol):
 
 
 class MovePanel:
-    """A tick for the goal marker, a list of planners, buttons to plan, go and go home, and how it went."""
+    """A tick for the goal marker, a list of planners, buttons to plan and go, and how it went."""
 
     def __init__(
         self, gui: viser.GuiApi, desk: Desk, motions: Motions, goal: Callable[[], Goal | None],
-        planners: Sequence[str], *, planner: str, marker: bool,
+        planners: Sequence[str], *, planner: str, marker: bool, tell: Callable[[str, str], None],
     ) -> None:
         """Lay the panel out where the GUI stands.
 
@@ -55,8 +55,9 @@ class MovePanel:
             planners: that may be asked.
             planner: that is asked at first.
             marker: whether the goal marker is shown at first.
+            tell: called with a line about how it went, and whether that is good, busy or bad.
         """
-        self._motions, self._goal = motions, goal
+        self._motions, self._goal, self._tell_all = motions, goal, tell
         self.planner = planner if planner in planners else PIPELINE
         self.marker = marker
         self._tick = gui.add_checkbox("Goal marker", marker, hint="drag it in the scene to where the tool should be")
@@ -65,9 +66,7 @@ class MovePanel:
                                  hint="pipeline: the cell's planners, in their order")
         desk.on_change(names, self._set_planner)
         desk.on_choice(gui.add_button_group("Goal", (PLAN, GO)), self._go)
-        desk.on_choice(gui.add_button_group("Arm", ("Go home",)), lambda _: self.go_home())
-        self._html = gui.add_html("")
-        self._tell("Show the goal marker, drag it, then plan or go there.", "dim")
+        self._html = gui.add_html(_line("Show the goal marker, drag it, then plan or go there.", "dim"))
 
     def set_marker(self, on: bool) -> None:
         """Show or hide the goal marker."""
@@ -113,4 +112,9 @@ class MovePanel:
         self.planner = name
 
     def _tell(self, line: str, kind: str) -> None:
-        self._html.content = block(f"{span('●', kind + ' dot')} {text(line)}", "move", kind=kind)
+        self._html.content = _line(line, kind)
+        self._tell_all(line, kind)
+
+
+def _line(line: str, kind: str) -> str:
+    return block(f"{span('●', kind + ' dot')} {text(line)}", "move", kind=kind)

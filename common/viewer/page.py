@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass
 from typing import Any
 
 import viser
 
 from common import topics
-from common.config import Members
+from common.config import Members, check
 from common.errors import ZencellError
-from common.messages import Contours, Image, OutlineSelect, Rejections
+from common.messages import Image, JointState, OutlineSelect
 from common.topics import Topic
 from common.viewer.desk import Desk
 from common.viewer.feeds import Feeds
@@ -21,9 +20,11 @@ from common.viewer.layers import layers_shown
 from common.viewer.layout import TABS, Layout, Tab, Viewpoint, save_layout
 from common.viewer.log_panel import LogPanel
 from common.viewer.move_panel import Motions, MovePanel
+from common.viewer.periods import Periods
 from common.viewer.pictures import ANNOTATED, LIVE, PicturePanel
 from common.viewer.plots import Limits, PlotPanel
 from common.viewer.requests import Requests
+from common.viewer.scene_feed import SceneFeed
 from common.viewer.scene_view import SceneView
 from common.viewer.task_panel import TaskPanel
 from common.viewer.tuning import TuningPanel
@@ -35,19 +36,7 @@ IMAGES: dict[str, tuple[Topic[Image], ...]] = {
     LIVE: (topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
     ANNOTATED: (topics.DETECTION_IMAGE, topics.CONTOUR_IMAGE),
 }
-TRUTH: tuple[Topic[Any], ...] = (topics.SCENE_BALLS, topics.SCENE_OBJECTS)
-
-
-@dataclass(frozen=True)
-class Periods:
-    """Wall time between two looks at a part of the page [s]."""
-
-    picture: float = 0.1
-    task: float = 0.2
-    health: float = 0.5
-    frustum: float = 0.5
-    contours: float = 0.5
-    detected: float = 0.5
+STAMPED: tuple[Topic[Any], ...] = (topics.VALIDATED_TARGETS, topics.CONTOUR_PATH)  # with when the picture was taken
 
 
 class Page:
@@ -80,11 +69,7 @@ class Page:
         self._server, self._feeds, self._requests = server, feeds, requests
         self._cell, self._members, self._limits = cell, members, limits
         self._layout, self._layout_file, self._periods = layout, layout_file, periods
-        self._layers = layers_shown(layout.layers)
-        self._editing = layout.edit_world
-        self._due: dict[str, float] = {}
-        self._scene: SceneView | None = None
-        self._rejected: list[Rejections] = []  # before there is a scene
+        self._scene = SceneFeed(feeds, periods, layout.layers, layout.edit_world)
         self.pages = 0
         self.desk = Desk(asyncio.get_running_loop(), self._tell)
         gui = server.gui
@@ -110,10 +95,10 @@ class Page:
             self._log = LogPanel(gui, self.desk, layout.log_level)
         self._tuning = TuningPanel(gui, place["Tuning"], self.desk, requests)
         with place["Move"]:
-            self._move = MovePanel(gui, self.desk, motions, lambda: self._scene, planners, planner=layout.planner,
-                                   marker=layout.goal_marker)
+            self._move = MovePanel(gui, self.desk, motions, lambda: self._scene.scene, planners, planner=layout.planner,
+                                   marker=layout.goal_marker, tell=self._task.tell)
         with place["View"]:
-            self._view = ViewPanel(gui, self.desk, self._layers, self._editing, on_layer=self._set_layer,
+            self._view = ViewPanel(gui, self.desk, self._scene.layers, self._scene.editing, on_layer=self._set_layer,
                                    on_editing=self._set_editing, on_save=self._save)
         viewpoint = layout.viewpoint(cell)
         server.initial_camera.position = viewpoint.position
@@ -133,19 +118,13 @@ class Page:
     @property
     def layers(self) -> dict[str, bool]:
         """Whether each layer of the scene is shown."""
-        return dict(self._layers)
+        return dict(self._scene.layers)
 
     def set_scene(self, scene: SceneView) -> None:
         """Show what the cell says in a scene, from now on."""
-        self._scene = scene
-        for rejections in self._rejected:
-            scene.show_rejected(rejections)
         scene.on_select = lambda index: self.desk.put(lambda: self._select(index))
         scene.on_object_dragged = lambda name, x, y: self.desk.put(lambda: self._requests.move(name, x, y))
-        for name, on in self._layers.items():
-            scene.set_visible(name, on)
-        if self._editing:
-            scene.set_editing(True)
+        self._scene.begin(scene)
         if self._move.marker:
             scene.goal_marker(True)
 
@@ -161,33 +140,22 @@ class Page:
             self._sample(state, now)
         if not self.pages:
             return
-        if self._is_due("task", self._periods.task, now):
+        if self._periods.due("task", now):
             task = self._feeds.latest(topics.OUTLINE_STATUS) or self._feeds.latest(topics.PICK_PLACE_STATUS)
             holding = self._feeds.latest(topics.GRIPPER_STATE)
             self._task.show(task, self._feeds.latest(topics.MOTION_STATUS), gripper(holding))
             self._log.show()
-        if self._is_due("health", self._periods.health, now):
+        if self._periods.due("health", now):
             self._health.show(self._feeds.latest(topics.SUPERVISOR_STATUS), alive)
             self._plots.show(now)
-        if self._is_due("picture", self._periods.picture, now):
+        if self._periods.due("picture", now):
             self._show_pictures(now)
-        contours = None
-        if self._is_due("contours", self._periods.contours, now):
-            contours = self._feeds.fresh(topics.CONTOURS)
-            if contours is not None:
-                self._task.show_contours(contours)
-        if self._scene is not None:
-            if state is not None:
-                self._scene.show_joints(state)
-            self._show_scene(self._scene, contours, now)
+        contours = self._feeds.fresh(topics.CONTOURS) if self._periods.due("contours", now) else None
+        if contours is not None:
+            self._task.show_contours(contours)
+        self._scene.show(state, contours, now)
 
-    def _is_due(self, part: str, period: float, now: float) -> bool:
-        if now < self._due.get(part, 0.0):
-            return False
-        self._due[part] = now + period
-        return True
-
-    def _sample(self, state: Any, now: float) -> None:
+    def _sample(self, state: JointState, now: float) -> None:
         at = {name: index for index, name in enumerate(state.name)}
         if not all(name in at for name in self._limits.names):
             return
@@ -200,29 +168,8 @@ class Page:
             for topic in sources:
                 image = self._feeds.fresh(topic) if self._pictures.shown[name] else None
                 rgb = self._pictures.show(name, image) if image is not None else None
-                if rgb is not None and name == LIVE and self._scene is not None and self._layers["camera"] and (
-                        self._is_due("frustum", self._periods.frustum, now)):
-                    self._scene.show_picture(rgb)
-
-    def _show_scene(self, scene: SceneView, contours: Contours | None, now: float) -> None:
-        shows: list[tuple[Topic[Any], Callable[[Any], None]]] = [
-            (topics.PLANNING_SCENE, scene.show_scene), (topics.VALIDATED_TARGETS, scene.show_targets),
-            (topics.WORKSPACE_MARKERS, scene.show_workspace), (topics.TF_STATIC, scene.show_transforms),
-            (topics.TF, scene.show_transforms), (topics.CAMERA_INFO, scene.show_camera),
-            (topics.DEPTH_CAMERA_INFO, scene.show_camera), (topics.DISPLAY_TRAJECTORY, scene.show_plan),
-            (topics.CONTOUR_PATH, scene.show_outline),
-        ]
-        for topic, show in shows:
-            if (message := self._feeds.fresh(topic)) is not None:
-                show(message)
-        if contours is not None:
-            scene.show_contours(contours)
-        if self._is_due("detected", self._periods.detected, now) and (
-                detected := self._feeds.fresh(topics.DETECTED_OBJECTS)) is not None:
-            scene.show_detected(detected)
-        balls, objects = self._feeds.fresh(topics.SCENE_BALLS), self._feeds.fresh(topics.SCENE_OBJECTS)
-        if balls is not None or objects is not None:
-            scene.show_truth(balls, objects)
+                if rgb is not None and name == LIVE:
+                    self._scene.picture(rgb, now)
 
     # --- what goes on beside ------------------------------------------------------------------------------------------
 
@@ -233,7 +180,7 @@ class Page:
             age_ms: wall time [ms] since a stamp was taken.
         """
         return [self.desk.run(), self._follow_log(), self._follow_counters(), self._follow_rejected(),
-                self._follow_latency(age_ms), self._follow_parameters()]
+                self._follow_parameters(), *(self._follow_latency(topic, age_ms) for topic in STAMPED)]
 
     async def _follow_log(self) -> None:
         if (reader := self._feeds.reader(topics.LOG)) is not None:
@@ -248,14 +195,10 @@ class Page:
     async def _follow_rejected(self) -> None:
         if (reader := self._feeds.reader(topics.REJECTED_TARGETS)) is not None:
             async for rejections in reader:
-                if self._scene is not None:
-                    self._scene.show_rejected(rejections)
-                else:
-                    self._rejected.append(rejections)  # each is said only once
+                self._scene.reject(rejections)
 
-    async def _follow_latency(self, age_ms: Callable[[int], float]) -> None:
-        stamped: tuple[Topic[Any], ...] = (topics.VALIDATED_TARGETS, topics.CONTOUR_PATH)
-        for reader in filter(None, map(self._feeds.reader, stamped)):  # a cell has one of them
+    async def _follow_latency(self, topic: Topic[Any], age_ms: Callable[[int], float]) -> None:
+        if (reader := self._feeds.reader(topic)) is not None:
             async for message in reader:
                 self._plots.latency(age_ms(message.header.stamp), asyncio.get_running_loop().time())
 
@@ -270,18 +213,15 @@ class Page:
     def _count(self) -> None:
         before, self.pages = self.pages, len(self._server.get_clients())
         if self.pages and not before:
-            self._due.clear()
+            self._periods.hurry()
         self._listen()
 
     def _listen(self) -> None:
         wanted: list[Topic[Any]] = []
         if self.pages:
-            wanted.append(topics.CONTOURS)
+            wanted += self._scene.wanted()
             for name, sources in IMAGES.items():
                 wanted += sources if self._pictures.shown[name] else ()
-            wanted += TRUTH if self._layers["truth"] or self._editing else ()
-            wanted += [topics.TF] if self._layers["frames"] else []
-            wanted += [topics.DETECTED_OBJECTS] if self._layers["rejected"] else []
         self._feeds.listen(wanted)
 
     async def _home(self) -> None:
@@ -291,31 +231,27 @@ class Page:
         await self._task.choose(OutlineSelect(rule="index", index=index))
 
     def _set_layer(self, name: str, on: bool) -> None:
-        self._layers[name] = on
-        if self._scene is not None:
-            self._scene.set_visible(name, on)
+        self._scene.set_layer(name, on)
         self._listen()
 
     def _set_editing(self, on: bool) -> None:
-        self._editing = on
-        if self._scene is not None:
-            self._scene.set_editing(on)
+        self._scene.set_editing(on)
         self._listen()
 
     def _save(self, client: viser.ClientHandle | None) -> None:
         usual = layers_shown({})
         viewpoints = dict(self._layout.viewpoints)
-        if client is not None:
-            eye, middle = (tuple(round(float(v), 3) for v in p) for p in (client.camera.position,
-                                                                          client.camera.look_at))
-            viewpoints[self._cell] = Viewpoint.model_validate({"position": eye, "look_at": middle})
-        layout = self._layout.model_copy(update={
-            "layers": {name: on for name, on in self._layers.items() if on != usual[name]},
-            "viewpoints": viewpoints, "live_image": self._pictures.shown[LIVE],
-            "annotated_image": self._pictures.shown[ANNOTATED], "log_level": self._log.level,
-            "edit_world": self._editing, "goal_marker": self._move.marker, "planner": self._move.planner,
-        })
         try:
+            if client is not None:
+                seen = {"position": client.camera.position, "look_at": client.camera.look_at}
+                viewpoints[self._cell] = check(Viewpoint, {name: [round(float(v), 3) for v in point]
+                                                           for name, point in seen.items()}, "viewpoint")
+            layout = self._layout.model_copy(update={
+                "layers": {name: on for name, on in self._scene.layers.items() if on != usual[name]},
+                "viewpoints": viewpoints, "live_image": self._pictures.shown[LIVE],
+                "annotated_image": self._pictures.shown[ANNOTATED], "log_level": self._log.level,
+                "edit_world": self._scene.editing, "goal_marker": self._move.marker, "planner": self._move.planner,
+            })
             path = save_layout(self._layout_file, layout)
         except OSError as error:
             self._view.tell(f"{error.filename or 'the layout'} can not be written: {error.strerror}", "bad")

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Coroutine
 from typing import Any
 
 import viser
 
+from common.errors import ZencellError
 from common.messages import Contours, MotionStatus, OutlineSelect, OutlineStatus, TaskReport
 from common.viewer import words
 from common.viewer.desk import Desk, assign
+from common.viewer.knobs import SLIDING
 from common.viewer.markup import STYLE, block, fields, span, text
 from common.viewer.requests import Requests
 
@@ -40,7 +43,7 @@ class TaskPanel:
             home: has the arm go home.
         """
         self._gui, self._desk, self._requests = gui, desk, requests
-        self._speed_told = 100
+        self._speed_told = self._speed_heard = 100  # [%]
         self._contours: list[str] = []
         gui.add_html(STYLE + STOP_STYLE)
         stop = gui.add_button("STOP", color="red", icon=viser.Icon.HAND_STOP)
@@ -83,8 +86,8 @@ class TaskPanel:
         if content != self._state.content:
             self._state.content = content
         assign(self._progress, round(100 * self._done(task, motion), 1))
-        if motion is not None and (percent := round(100 * motion.speed_scaling)) != self._speed_told:
-            self._speed_told = percent
+        if motion is not None and (percent := round(100 * motion.speed_scaling)) != self._speed_heard:
+            self._speed_heard = self._speed_told = percent  # what a person is just setting is heard of when it is set
             assign(self._speed, max(SLOWEST, percent))
 
     def show_contours(self, contours: Contours) -> None:
@@ -115,7 +118,13 @@ class TaskPanel:
 
     async def _set_speed(self, percent: float) -> None:
         self._speed_told = round(percent)
-        await self._requests.set_speed(percent / 100)
+        await asyncio.sleep(SLIDING)
+        if self._speed_told == round(percent):  # the slider came to rest there
+            try:
+                await self._requests.set_speed(percent / 100)
+            except ZencellError:
+                assign(self._speed, max(SLOWEST, self._speed_heard))
+                raise
 
     async def _choose(self, chosen: str) -> None:
         self.tell("")
