@@ -21,6 +21,7 @@ REJECTED = (255, 90, 200)
 _STILL = 1e-3  # [m] detections tremble by less
 _SAME_PLACE = 0.03  # [m] a rejection this near to another, or to a target, is of the same thing
 _FORGET_AFTER = 3_000_000_000  # [ns, cell time] without a detection there; the validator takes 2 s
+_SIDES = 72  # of a cylinder
 _MOST = 60  # rejections that are kept
 
 
@@ -28,6 +29,20 @@ def ring(radius: float) -> trimesh.Trimesh:
     """A flat ring about the z axis [m]."""
     mesh: trimesh.Trimesh = trimesh.creation.torus(radius, 0.06 * radius, major_sections=32, minor_sections=6)
     return mesh
+
+
+def tube(radius: float, height: float) -> tuple[trimesh.Trimesh, Array]:
+    """The wall of a cylinder about the z axis [m], and its two rims as segments (n, 2, 3) [m].
+
+    Lids would veil everything below them, and a browser without a graphics card draws them slowly.
+    """
+    angles = np.linspace(0, 2 * np.pi, _SIDES, endpoint=False)
+    circle = radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    low, high = (np.column_stack([circle, np.full(_SIDES, z)]) for z in (-height / 2, height / 2))
+    i, j = np.arange(_SIDES), np.roll(np.arange(_SIDES), -1)
+    faces = np.concatenate([np.column_stack([i, j, j + _SIDES]), np.column_stack([i, j + _SIDES, i + _SIDES])])
+    rims = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in (low, high)]
+    return trimesh.Trimesh(np.concatenate([low, high]), faces, process=False), np.concatenate(rims)
 
 
 class Targets:
@@ -144,7 +159,9 @@ class Workspace:
         self._shown = m
         for node in self._nodes:
             node.remove()
-        self._nodes = [self._add(index) for index in range(len(m.markers))]
+        self._nodes = []
+        for index in range(len(m.markers)):
+            self._nodes.append(self._add(index))
 
     def _add(self, index: int) -> Any:
         assert self._shown is not None
@@ -156,9 +173,11 @@ class Workspace:
         }
         size = (marker.scale.x, marker.scale.y, marker.scale.z)
         if marker.type == "cylinder":
-            return self._scene.add_cylinder(
-                name, size[0] / 2, size[2], radial_segments=64, **look, **place,
-            )
+            wall, rims = tube(size[0] / 2, size[2])
+            self._nodes.append(self._scene.add_line_segments(
+                f"{name}_rims", rims, look["color"], thickness=1.5, thickness_units="screen", **place
+            ))
+            return self._scene.add_mesh_simple(name, wall.vertices, wall.faces, **look | {"side": "back"}, **place)
         if marker.type == "box":
             return self._scene.add_box(name, dimensions=size, **look, **place)
         if marker.type == "sphere":

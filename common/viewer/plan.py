@@ -21,6 +21,8 @@ GHOST = (90, 200, 255)
 PATH = (255, 200, 60)
 _SAMPLES = 120  # points of the line
 _THERE = 0.01  # [rad] the robot is where the plan ends, or has left where it stood
+_APART = 0.01  # [m] links no farther than this from the robot's, nor turned by more than 0.03 rad, lie in them
+_TURNED = 0.9999  # cosine of half the angle
 _REST = 1.0  # [s] at the end, before the ghost begins again
 
 
@@ -89,15 +91,23 @@ class Plan:
                 self.ghost.move(self._names, self._positions[-1].tolist())
             else:
                 self._step(self._clock() - since)
+            self._part(robot)
             return
         end = self._positions[-1][[self._names.index(name) for name in known]]
         if np.abs(now - end).max(initial=0.0) < _THERE:
             self.ghost.root.visible = False
+        self._part(robot)
 
     @property
     def playing(self) -> bool:
         """Whether the ghost moves."""
         return self._playing is not None
+
+    def _part(self, robot: LinkPoses) -> None:
+        """Hide those links of the ghost that lie in the robot's: neither could be seen well."""
+        for link, node in self.ghost.links.items():
+            (p, q), (p_robot, q_robot) = self.ghost.poses.pose(link), robot.pose(link)
+            node.visible = bool(np.abs(p - p_robot).max() > _APART or abs(q @ q_robot) < _TURNED)
 
     def _step(self, elapsed: float) -> None:
         time_from_start = elapsed % (self._times[-1] + _REST)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import coal
+import fast_simplification
 import numpy as np
 import pinocchio as pin
 import trimesh
@@ -17,10 +18,10 @@ from numpy.typing import NDArray
 from common.errors import ConfigError
 from common.robot.model import RobotModel
 
-Array = NDArray[np.float64]
 Rgb = tuple[int, int, int]
 
-_SHARP = 0.52  # [rad] triangles that meet at more than this have an edge between them
+_FEW = 150  # triangles of a piece that are always kept
+_SHARP = 0.6  # [rad] triangles that meet at more than this have an edge between them
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,45 +37,51 @@ class Piece:
     faces: NDArray[np.uint32]  # (m, 3)
 
 
-def visual_pieces(robot: RobotModel) -> list[Piece]:
-    """The visual shapes of all links, in the order of the links.
+def visual_pieces(robot: RobotModel, triangles: int = 25_000) -> list[Piece]:
+    """The visual shapes of all links with about so many triangles in all, in the order of the links.
+
+    Descriptions come with 100 000 and more, which a browser without a graphics card draws once a second.
 
     Raises:
         ConfigError: a mesh is not there or can not be read.
     """
-    found: dict[tuple[str, Rgb], list[tuple[Array, NDArray[np.int64]]]] = defaultdict(list)
+    found: dict[tuple[str, Rgb], list[trimesh.Trimesh]] = defaultdict(list)
     for item in robot.full_geometry(pin.GeometryType.VISUAL).geometryObjects:
         frame = robot.full_model.frames[item.parentFrame]
         T_link_shape = (frame.placement.inverse() * item.placement).homogeneous
         for color, mesh in _coloured(item):
-            points = trimesh.transformations.transform_points(mesh.vertices, T_link_shape)
-            found[frame.name, color].append((points, np.asarray(mesh.faces)))
-    return [Piece(link, color, *_joined(parts)) for (link, color), parts in found.items()]
+            found[frame.name, color].append(mesh.apply_transform(T_link_shape))
+    joined = [_merged(trimesh.util.concatenate(meshes)) for meshes in found.values()]
+    kept = triangles / max(1, sum(len(mesh.faces) for mesh in joined))
+    return [_piece(link, color, _simplified(mesh, kept)) for (link, color), mesh in zip(found, joined, strict=True)]
 
 
-def coarse(pieces: Iterable[Piece], cell: float) -> list[Piece]:
-    """The same links with few triangles, one colour each: vertices within the same cube of side `cell` [m] are one."""
-    by_link: dict[str, list[Piece]] = defaultdict(list)
-    for piece in pieces:
-        by_link[piece.link].append(piece)
-    result = []
-    for link, parts in by_link.items():
-        points, faces = _joined([(part.vertices, part.faces) for part in parts])
-        _, cluster = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_inverse=True)
-        cluster = cluster.reshape(-1)
-        counts = np.bincount(cluster)
-        centres = np.stack([np.bincount(cluster, points[:, axis]) / counts for axis in range(3)], axis=1)
-        corners = cluster[faces]
-        distinct = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
-        corners = np.unique(corners[distinct], axis=0)
-        result.append(Piece(link, parts[0].color, centres.astype(np.float32), corners.astype(np.uint32)))
-    return result
+def coarse(pieces: Iterable[Piece], kept: float) -> list[Piece]:
+    """The same pieces with a share of their triangles."""
+    meshes = [(p, _merged(trimesh.Trimesh(p.vertices, p.faces, process=False))) for p in pieces]
+    return [_piece(piece.link, piece.color, _simplified(mesh, kept)) for piece, mesh in meshes]
 
 
-def _joined(parts: Sequence[tuple[Any, Any]]) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    offsets = np.cumsum([0, *(len(points) for points, _ in parts[:-1])])
-    faces = np.concatenate([faces + offset for (_, faces), offset in zip(parts, offsets, strict=True)])
-    return np.concatenate([points for points, _ in parts]).astype(np.float32), faces.astype(np.uint32)
+def _merged(mesh: Any) -> trimesh.Trimesh:
+    """The same triangles with one vertex at each place: exporters like to give each triangle its own."""
+    mesh.merge_vertices(merge_norm=True, merge_tex=True)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+def _simplified(mesh: trimesh.Trimesh, kept: float) -> trimesh.Trimesh:
+    """About that share of the triangles, by quadric error; shapes of few triangles stay as they are."""
+    count = max(_FEW, round(kept * len(mesh.faces)))
+    if len(mesh.faces) <= count:
+        return mesh
+    vertices, faces = fast_simplification.simplify(
+        np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32), target_count=count
+    )
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def _piece(link: str, color: Rgb, mesh: trimesh.Trimesh) -> Piece:
+    smooth = trimesh.graph.smooth_shade(mesh, angle=_SHARP)
+    return Piece(link, color, np.asarray(smooth.vertices, dtype=np.float32), np.asarray(smooth.faces, dtype=np.uint32))
 
 
 def _coloured(item: Any) -> list[tuple[Rgb, trimesh.Trimesh]]:
@@ -92,16 +99,8 @@ def _coloured(item: Any) -> list[tuple[Rgb, trimesh.Trimesh]]:
         if isinstance(mesh, trimesh.Trimesh):
             own = None if item.overrideMaterial else _own_color(mesh)
             mesh.vertices = mesh.vertices * item.meshScale
-            meshes.append((own or given, _smoothed(mesh)))
+            meshes.append((own or given, _merged(mesh)))
     return meshes
-
-
-def _smoothed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The same triangles, with vertices shared wherever no edge is: exporters like to give each triangle its own."""
-    mesh.merge_vertices(merge_norm=True, merge_tex=True)
-    merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    smoothed: trimesh.Trimesh = trimesh.graph.smooth_shade(merged, angle=_SHARP)
-    return smoothed
 
 
 def _own_color(mesh: trimesh.Trimesh) -> Rgb | None:
@@ -113,7 +112,7 @@ def _own_color(mesh: trimesh.Trimesh) -> Rgb | None:
     return _rgb(look.main_color[:3]) if look.defined else None
 
 
-def _primitive(shape: coal.CollisionGeometry) -> trimesh.Trimesh:
+def _primitive(shape: coal.CollisionGeometry) -> Any:
     """A shape that the URDF describes by its dimensions [m]."""
     if isinstance(shape, coal.Box):
         mesh = trimesh.creation.box(extents=2 * np.array(shape.halfSide))
@@ -126,7 +125,7 @@ def _primitive(shape: coal.CollisionGeometry) -> trimesh.Trimesh:
         mesh = trimesh.creation.icosphere(subdivisions=3, radius=shape.radius)
     else:
         raise ConfigError("robot.urdf", type(shape).__name__, "is a visual shape that is not known")
-    return _smoothed(mesh)
+    return mesh
 
 
 def _rgb(values: Iterable[float]) -> Rgb:

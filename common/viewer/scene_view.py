@@ -45,7 +45,7 @@ from common.viewer.scene_objects import SceneObjects
 from common.viewer.surface import furnish
 from common.viewer.truth import Truth
 
-_GHOST_CELL = 0.006  # [m] details of the ghost that are smaller than this are left out
+_GHOST = 0.3  # share of the robot's triangles that its ghost has
 _TF_PERIOD = 0.1  # [s] frames are moved so often
 
 # Which layers a message is for: while none of them is shown, it waits.
@@ -122,7 +122,7 @@ class SceneView:
 
     def _build(self, scene: viser.SceneApi, robot: RobotModel, around: Surroundings) -> None:
         pieces = visual_pieces(robot)
-        rough = coarse(pieces, _GHOST_CELL)
+        rough = coarse(pieces, _GHOST)
         root = {name: f"/{name}" for name in LAYERS}
         self._roots = {
             name: scene.add_frame(path, show_axes=False, visible=self._shown[name]) for name, path in root.items()

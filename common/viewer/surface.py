@@ -16,6 +16,8 @@ def furnish(server: viser.ViserServer, around: Surroundings, robot: RobotModel) 
     scene, view = server.scene, server.initial_camera
     scene.set_up_direction("+z")
     scene.configure_default_lights(cast_shadow=False)
+    scene.configure_environment_map(hdri=None)  # a browser without a graphics card needs seconds to prepare one
+    scene.add_light_hemisphere("/sky", sky_color=(255, 255, 255), ground_color=(120, 115, 110), intensity=2.0)
     scene.world_axes.visible = False
     base = robot.config.base_position
     at = np.array([(base[0] + around.camera.position[0]) / 2, base[1], base[2] + 0.25])
