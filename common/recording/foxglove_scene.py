@@ -43,7 +43,7 @@ def entity(name: str, frame: str, stamp: int, **primitives: list[dict[str, Any]]
     """A thing in a scene, which stays until it is replaced or deleted."""
     return {
         "timestamp": time_of(stamp), "frame_id": frame, "id": name, "lifetime": {"sec": 0, "nsec": 0},
-        "frame_locked": True, "metadata": [], **dict.fromkeys(PRIMITIVES, []), **primitives,
+        "frame_locked": True, "metadata": [], **{key: [] for key in PRIMITIVES}, **primitives,
     }
 
 
