@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 FORMATS = (".svg", ".dot", ".mmd")
 OUTSIDE = "zencell, you"  # who sends the requests that no service of the cell sends
+SUPERVISOR, VIEWER = "supervisor", "viewer"
+PARAMETERS = "param/"  # served by every service, and so no news
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,9 @@ def graph(
         str, typer.Option("-o", "--output", metavar="FILE", help="*.svg, *.dot or *.mmd; without it Mermaid on stdout")
     ] = "",
     overrides: options.Overrides = None,
+    no_viewer: Annotated[
+        bool, typer.Option("--no-viewer", help="without the operator's page, which reads nearly everything")
+    ] = False,
     domain: options.Domain = None,
     connect: options.Connect = None,
 ) -> None:
@@ -54,7 +59,8 @@ def graph(
     write = _writer_of(path)
     loaded = load_cell(cell, overrides or ())
     presence = look(domain, connect).get(loaded.name)
-    made = graph_of(loaded.name, _wired_services(loaded), presence.ready if presence else None)
+    services = [each for each in _wired_services(loaded) if not (no_viewer and each.name == VIEWER)]
+    made = graph_of(loaded.name, services, presence.ready if presence else None)
     text = write(made)
     if path is None:
         typer.echo(text, nl=False)
@@ -101,14 +107,20 @@ def graph_of(cell: str, services: list[Wired], alive: frozenset[str] | None = No
         services: in start order.
         alive: the services that are ready, when the cell is up.
     """
-    from common.topics import all_topics
+    from cli.wired import Wired
+    from common.topics import SUPERVISOR_STATUS, find_topic
 
-    topics = all_topics()
+    services = [replace(each, calls=[key for key in each.calls if not key.startswith(PARAMETERS)]) for each in services]
+    if any(SUPERVISOR_STATUS.key in each.reads for each in services):
+        services.append(Wired(SUPERVISOR, "", writes=[SUPERVISOR_STATUS.key]))
     called = {key for service in services for key in service.calls}
     outside = [key for service in services for key in service.serves if key not in called]
     keys = [key for service in services for key in (*service.writes, *service.calls)] + outside
     keys += [key for service in services for key in service.reads]  # written by nobody in this cell
-    kinds: dict[str, str] = {key: topics[key].kind if key in topics else "event" for key in keys}
+    kinds: dict[str, str] = {}
+    for key in keys:
+        topic = find_topic(key)
+        kinds[key] = topic.kind if topic else "event"
     return Graph(cell, services, kinds, alive, outside)
 
 

@@ -145,17 +145,16 @@ def _described(
 
 
 def _lines(described: dict[str, Any]) -> Iterator[str]:
-    from common.topics import all_topics
+    from common.topics import find_topic
 
     yield f"{described['cell']}/{described['service']}: {described['doc']}"
     yield f"state: {described['state']}" + (
         f", pid {described['pid']}, {described['restarts']} restarts" if described["pid"] else ""
     )
-    topics = all_topics()
     for side in SIDES:
         yield f"{side}:" if described[side] else f"{side}: nothing"
         for key in described[side]:
-            topic = topics.get(key)
+            topic = find_topic(key)
             answer = getattr(topic, "answer", None)
             carries = f"{topic.kind:<8} {topic.message.__name__}" if topic else ""
             yield f"  {key:<28} {carries}{f' -> {answer.__name__}' if answer else ''}".rstrip()

@@ -37,6 +37,14 @@ def test_request_that_nobody_in_the_cell_sends_comes_from_outside() -> None:
     assert (OUTSIDE, "key world/edit", True, True) in edges(drawn())
 
 
+def test_what_the_supervisor_says_comes_from_it_and_parameters_are_left_out() -> None:
+    page = Wired("viewer", "", reads=["supervisor/status"], calls=["param/task", "motion/stop"])
+    made = graph_of("tiny", [page])
+    assert ("supervisor", "key supervisor/status", False, True) in edges(made)
+    assert set(made.kinds) == {"motion/stop", "supervisor/status"}
+    assert page.calls == ["param/task", "motion/stop"]
+
+
 def test_edges_run_from_writers_and_callers_to_readers_and_servers() -> None:
     found = {(start, end) for start, end, _, _ in edges(drawn())}
     assert ("executor", "key joint_states") in found
@@ -105,7 +113,10 @@ def test_cell_is_drawn_without_being_up(suffix: str, tmp_path: Path, capsys: pyt
     path = tmp_path / f"it{suffix}"
     assert app.execute(["graph", "ur5", "-o", str(path), "--connect", "tcp/127.0.0.1:1"]) == 0
     assert capsys.readouterr().out.startswith(f"{path}: ")
+    assert "viewer" in path.read_text()
+    assert app.execute(["graph", "ur5", "-o", str(path), "--no-viewer", "--connect", "tcp/127.0.0.1:1"]) == 0
     text = path.read_text()
+    assert "viewer" not in text
     for name in ("contour_tracer", "depth_camera/image_raw", "outline/select"):
         assert name in text
 
