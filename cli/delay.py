@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import typer
 
 from cli import options
-from cli.stamps import DelayFigures
 from common.errors import RequestFailed
 
 if TYPE_CHECKING:
+    from cli.stamps import DelayFigures
     from common.clock import Clock
     from common.transport.bus import Bus
 
