@@ -52,7 +52,9 @@ class Knob:
             number: Any = int if whole else float
             low, high = (None if bound is None else number(bound) for bound in (p.minimum, p.maximum))
             step = step_of(p)
-            if low is not None and high is not None and step is not None and low <= value <= high:
+            if (low is not None and value < low) or (high is not None and value > high):
+                low = high = step = None  # its service must know
+            if low is not None and high is not None and step is not None:
                 return gui.add_slider(self._label, low, high, number(step), number(value), hint=hint)
             return gui.add_number(self._label, number(value), min=low, max=high, step=1 if whole else None, hint=hint)
         self.as_text = p.type != "string" or not isinstance(value, str)
@@ -94,10 +96,13 @@ class Knob:
 
     def fits(self, parameter: Parameter) -> bool:
         """Whether it can show that parameter; else another has to be made."""
-        now = self.parameter
-        same = (now.path, now.type, now.minimum, now.maximum, now.choices)
-        return same == (parameter.path, parameter.type, parameter.minimum, parameter.maximum, parameter.choices) and (
-            parameter.value is None) == (now.value is None)
+        return _form(self.parameter) == _form(parameter)
+
+
+def _form(p: Parameter) -> tuple[object, ...]:
+    """What of a parameter decides what it is turned with."""
+    kind = "number" if isinstance(p.value, int | float) and not isinstance(p.value, bool) else type(p.value).__name__
+    return p.path, p.type, p.minimum, p.maximum, p.choices, kind, p.choices and p.value in p.choices
 
 
 def label_of(parameter: Parameter) -> str:

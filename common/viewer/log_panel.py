@@ -18,6 +18,7 @@ _KIND = {"debug": "dim", "info": "", "warning": "busy", "error": "bad", "critica
 KEPT = 2000  # lines
 SHOWN = 200  # lines, the newest first
 LONGEST = 500  # characters of a line
+LATEST = 4e9  # [s] since the Unix epoch: a stamp may say anything
 
 
 class LogPanel:
@@ -40,7 +41,8 @@ class LogPanel:
 
     def add(self, line: LogLine) -> None:
         """Take in a line."""
-        when = time.strftime("%H:%M:%S", time.localtime(line.header.stamp * 1e-9)) if line.header.stamp else ""
+        stamp = min(line.header.stamp * 1e-9, LATEST)
+        when = time.strftime("%H:%M:%S", time.localtime(stamp)) if stamp else ""
         message = line.message if len(line.message) <= LONGEST else line.message[:LONGEST] + " …"
         shown = row(text(when), text(line.service), span(message, _KIND[line.level]), level=line.level)
         self._lines.append((_RANK[line.level], shown))

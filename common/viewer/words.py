@@ -100,8 +100,9 @@ def problem(error: ZencellError) -> str:
 def plan(response: PlanResponse) -> str:
     """How planning ended, in a line that names what is in the way."""
     if response.ok:
-        seconds = response.trajectory.points[-1].time_from_start if response.trajectory else 0.0
-        return f"Planned by {response.planner} in {1e3 * response.seconds:.0f} ms: a motion of {seconds:.1f} s"
+        points = response.trajectory.points if response.trajectory else []
+        length = f"a motion of {points[-1].time_from_start:.1f} s" if points else "no motion"
+        return f"Planned by {response.planner} in {1e3 * response.seconds:.0f} ms: {length}"
     line = response.message or response.error
     if response.colliding and not all(name in line for name in response.colliding):
         line += f"; {response.colliding[0]} would touch {response.colliding[1]}"
