@@ -48,7 +48,7 @@ class Player:
         self.quit = False
         self._recording = recording
         self._wants = wants
-        self._rename = rename
+        self.renamed = rename
         self._loop = loop
         self._start = recording.start + round(offset * 1e9)
         self._stamp_now = stamp_now
@@ -73,7 +73,7 @@ class Player:
         Its ids and numbers are its own, so that readers which have heard the topic before take what it says for new.
         """
         for topic, (message, kind) in topics.items():
-            key = f"{bus.cell}/{self._rename(topic)}"
+            key = f"{bus.cell}/{self.renamed(topic)}"
             known = kind if kind in ("event", "state") else "stream"
             self._writers[topic] = bus.raw_writer(key, encoding_of(message), known)  # type: ignore[arg-type]
 

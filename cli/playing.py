@@ -147,7 +147,7 @@ async def _play(
             showing = asyncio.create_task(_show(player, recording)) if terminal.on_terminal else None
             stopped = asyncio.create_task(interrupts.stop.wait())
             _greet(player, recording, cell, endpoint, own=own, live=showing is not None)
-            await _warn_of_others(bus, played)
+            await _warn_of_others(bus, [player.renamed(topic) for topic in played])
             try:
                 await asyncio.wait({playing, stopped}, return_when=asyncio.FIRST_COMPLETED)
                 if playing.done():
@@ -204,7 +204,7 @@ def _greet(player: Player, recording: Recording, cell: str, endpoint: str, *, ow
         typer.echo(f"it is not finished; zencell recover {recording.path} makes it whole", err=True)
 
 
-async def _warn_of_others(bus: Bus, played: Topics) -> None:
+async def _warn_of_others(bus: Bus, played: list[str]) -> None:
     """Say which services that are up write what is played too."""
     from common.topics import all_topics
 

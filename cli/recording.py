@@ -143,9 +143,9 @@ async def _record(bus: Bus, selection: Selection, asked: _Asked) -> None:
     reason = "interrupted"
     try:
         await capture.begin()
+        typer.echo(f"recording {bus.cell} to {path}")
         if asked.gate:
             await bus.ready()
-        typer.echo(f"recording {bus.cell} to {path}")
         if await _until_ended(interrupts, asked.seconds, sink, lambda: sum(capture.sequences.missed.values())):
             reason = "duration"
     finally:
