@@ -177,7 +177,7 @@ def board_of(squares: str, square: str, marker: str, dictionary: str) -> Board:
     from common.config import check
     from common.perception import calibration_board as b
 
-    columns, rows = _two("--squares", squares)
+    columns, rows = _two("--squares", squares, "7x5")
     if dictionary not in get_args(b.Dictionary):
         raise UnknownName("dictionary", dictionary, get_args(b.Dictionary))
     side = options.number("--square", square)
@@ -211,13 +211,13 @@ def parse_size(text: str) -> tuple[int, int] | None:
     Raises:
         ConfigError: it is not of that form.
     """
-    return _two("--size", text) if text else None
+    return _two("--size", text, "640x480") if text else None
 
 
-def _two(option: str, text: str) -> tuple[int, int]:
+def _two(option: str, text: str, example: str) -> tuple[int, int]:
     first, found, second = text.lower().partition("x")
     if not found or not first.isdecimal() or not second.isdecimal():
-        raise ConfigError(option, text, "must be two whole numbers, as 7x5")
+        raise ConfigError(option, text, f"must be two whole numbers, as {example}")
     return int(first), int(second)
 
 

@@ -210,14 +210,40 @@ def _fit(views: list[Sighting], k_coefficients: int) -> tuple[float, Array, list
     points = [np.ascontiguousarray(view.points, np.float32) for view in views]
     pixels = [np.ascontiguousarray(view.pixels[:, None], np.float32) for view in views]
     try:
-        rms, K, d, _, _, deviations, _, residuals = cv2.calibrateCameraExtended(  # type: ignore[call-overload]
+        rms, K, d, rotations, translations, _, _, residuals = cv2.calibrateCameraExtended(  # type: ignore[call-overload]
             points, pixels, views[0].size, None, None, flags=flags
         )
     except cv2.error as error:
         raise CalibrationFailed(f"no lens fits these {len(views)} views: {error.err}") from None
     length = 0 if k_coefficients == 0 else 4 if k_coefficients < 3 else 5 if k_coefficients == 3 else 8
     distortion = [float(value) for value in np.ravel(d)[:length]]
-    return rms, np.asarray(K, float), distortion, np.ravel(deviations), np.ravel(residuals)
+    poses = list(zip(rotations, translations, strict=True))
+    K = np.asarray(K, float)
+    return rms, K, distortion, _deviations(views, K, distortion, poses, rms), np.ravel(residuals)
+
+
+def _deviations(
+    views: list[Sighting], K: Array, distortion: list[float], poses: list[tuple[Array, Array]], rms: float
+) -> Array:
+    """Standard deviations of fx, fy, cx, cy [px] when corners err independently; infinite for what can not be told.
+
+    From the normal equations, of which the poses of the views are eliminated. OpenCV has its own, but they are tiny
+    where the views leave a parameter open.
+    """
+    count = 4 + len(distortion)
+    normal = np.zeros((count, count))
+    for view, (rotation, translation) in zip(views, poses, strict=True):
+        d = np.array(distortion or [0.0] * 4)
+        _, jacobian = cv2.projectPoints(view.points, np.asarray(rotation), np.asarray(translation), K, d)
+        J, P = np.asarray(jacobian)[:, 6 : 6 + count], np.asarray(jacobian)[:, :6]
+        normal += J.T @ J - J.T @ P @ np.linalg.pinv(P.T @ P) @ P.T @ J
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    told = np.maximum(values, 1e-300)
+    corners = sum(len(view.points) for view in views)
+    freedom = max(2 * corners - count - 6 * len(views), 1)
+    variances = rms**2 * corners / freedom * (vectors**2 / told).sum(axis=1) / scale**2
+    return np.asarray(np.sqrt(variances)[:4], float)
 
 
 def _distance(a: Sighting, b: Sighting) -> float:

@@ -30,6 +30,7 @@ _LEAST_FITTING = 0.7  # part of the markers that must lie where the board has th
 _MARKER_TOLERANCE = 0.1, 1.5  # of the length of markers: relative, or [px] by which blur makes them smaller
 _LOOKED_AT = (24, 48, 96, 192)  # [px] of a square in the pages that pictures are compared with
 _WINDOW = 15  # [px] in which an edge is looked at
+_LEAST_CONTRAST = 30  # grey levels without which nobody can tell
 _SMEARED = 1.3  # [px] from which on blur is why nothing is found
 
 
@@ -104,8 +105,7 @@ class Board:
 
         pages = []
         for side in _LOOKED_AT:
-            squares = self._board.generateImage((o.columns * side, o.rows * side), marginSize=0)
-            page = np.pad(np.asarray(squares, np.float32), side, constant_values=255)
+            page = np.pad(self._drawn(side), side, constant_values=255)
             pages.append(np.asarray(cv2.GaussianBlur(page, (0, 0), SMEARED), np.float32))
         self._print = Print(pages, list(_LOOKED_AT), o.rows, o.square)
 
@@ -119,6 +119,23 @@ class Board:
         p = np.array(points, dtype=float).reshape(-1, 3)
         return p * (1, -1, 1) + (0, self.size[1], 0)
 
+    def _drawn(self, side: int) -> npt.NDArray[np.float32]:
+        """The squares, each of so many pixels, grey where an edge of a marker cuts a pixel: OpenCV's own picture has
+        markers moved to whole pixels, which is as much as half of one."""
+        o, dictionary = self.options, self._board.getDictionary()
+        dark = np.indices((o.rows, o.columns)).sum(axis=0) % 2 == 0
+        page = np.where(np.kron(dark, np.ones((side, side), bool)), np.float32(0), np.float32(255))
+        cells = dictionary.markerSize + 2
+        for number, corners in zip(self._board.getIds(), self._board.getObjPoints(), strict=True):
+            low = np.asarray(corners, float)[0, :2] * side / o.square
+            marker = cv2.aruco.generateImageMarker(dictionary, int(number), cells).astype(float)
+            first = np.floor(low).astype(int)
+            count = int(np.ceil(side * o.marker / o.square)) + 1
+            edges = np.arange(cells + 1) * side * o.marker / o.square / cells
+            across, down = (_overlap(edges + low[axis] - first[axis], count) for axis in (0, 1))
+            page[first[1] : first[1] + count, first[0] : first[0] + count] += down @ (marker - 255) @ across.T
+        return np.asarray(page, np.float32)
+
     def page(self) -> tuple[Picture, float]:
         """The grey picture to print, with a margin that says what it is, and its density [px/m].
 
@@ -130,9 +147,8 @@ class Board:
         near = round(_PRINT_DENSITY * o.square)
         side = min(range(max(16, int(0.95 * near)), max(16, near) + 1), key=lambda side: _off(side, o, bits))
         density = side / o.square
-        squares = np.asarray(self._board.generateImage((o.columns * side, o.rows * side), marginSize=0), np.uint8)
         margin = round(_MARGIN * density)
-        page = np.pad(squares, margin, constant_values=255)
+        page = np.pad(np.asarray(np.rint(self._drawn(side)), np.uint8), margin, constant_values=255)
         bottom, mm = page.shape[0] - margin, density / 1000
         length = min(100, int(1e3 * o.columns * o.square) // 10 * 10)  # [mm]
         right, y = margin + round(length * mm), round(bottom + 3 * mm)
@@ -216,6 +232,12 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
 
 
+def _overlap(edges: Array, count: int) -> Array:
+    """(count, n) which part of each of `count` pixels lies in each of the n intervals between edges [px]."""
+    low = np.arange(count)[:, None]
+    return np.asarray(np.clip(np.minimum(low + 1, edges[1:]) - np.maximum(low, edges[:-1]), 0, 1), float)
+
+
 def _side(corners: Array) -> float:
     """Mean length of the sides of a (4, 2) polygon."""
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
@@ -229,6 +251,8 @@ def _off(side: int, options: BoardOptions, bits: int) -> float:
 
 
 def _blurred(grey: Picture) -> NotSeen | None:
+    if np.ptp(np.percentile(grey, (1, 99))) < _LEAST_CONTRAST:
+        return None
     blur = _blur(grey)
     return NotSeen("blurred", f"edges are smeared over {blur:.1f} px") if blur > _SMEARED else None
 

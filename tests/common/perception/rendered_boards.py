@@ -106,7 +106,7 @@ def many_poses(board: Board, count, seed=1, z=(0.45, 0.75)):
     for k in range(count):
         depth = rng.uniform(*z)
         angle = 2.4 * k
-        x, y = 0.42 * depth * rng.uniform(0.1, 0.8) * np.array([np.cos(angle), 0.75 * np.sin(angle)])
+        x, y = 0.42 * depth * rng.uniform(0.2, 1.2) * np.array([np.cos(angle), 0.75 * np.sin(angle)])
         tilt = rng.uniform(0.25, 0.65)
         poses.append(facing(board, x, y, depth, tilt * np.sin(1.7 * k), tilt * np.cos(1.7 * k), rng.uniform(-0.6, 0.6)))
     return poses

@@ -1,0 +1,150 @@
+import os
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from cli.main import app
+from common.robot.transforms import invert, rpy_to_matrix, transform
+from tests.common.perception.rendered_boards import BOARD, Lens, many_poses, render
+
+LENS = Lens()
+T_WORLD_CAMERA = transform(rpy_to_matrix(np.pi - 0.06, 0.04, -np.pi / 2 + 0.1), (0.42, -0.01, 0.80))
+PLACES = {"a": (0.35, -0.15, 0.1), "b": (0.3, 0.15, 1.7)}  # x, y, yaw
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    """Folders of pictures: views of the board, the board at two places on the table, the table without it."""
+    root = tmp_path_factory.mktemp("pictures")
+    made = {"views": [render(BOARD, LENS, T, seed=k) for k, T in enumerate(many_poses(BOARD, 10))],
+            "empty": [np.full((480, 640, 3), 100, np.uint8)] * 2,
+            "few": [render(BOARD, LENS, T, seed=k) for k, T in enumerate(many_poses(BOARD, 3))],
+            "blurred": [render(BOARD, LENS, T, blur=3, seed=k) for k, T in enumerate(many_poses(BOARD, 3))]}
+    for name, (x, y, yaw) in PLACES.items():
+        T = invert(T_WORLD_CAMERA) @ transform(rpy_to_matrix(0, 0, yaw), (x, y, 0))
+        made[name] = [render(BOARD, LENS, T, seed=k) for k in range(2)]
+    for name, images in made.items():
+        (root / name).mkdir()
+        for k, image in enumerate(images):
+            cv2.imwrite(str(root / name / f"p{k}.png"), image)
+    return root
+
+
+@pytest.fixture(scope="module")
+def calibrated(pictures):
+    """The file of the camera after both verbs, and what they told."""
+    here, path = os.getcwd(), pictures / "camera.yaml"
+    os.chdir(pictures)
+    try:
+        assert app.execute(["calibrate", "intrinsics", "views", "-o", str(path)]) == 0
+        places = [word for x, y, _ in PLACES.values() for word in ("--board-position", f"{x},{y},0")]
+        turns = [word for _, _, yaw in PLACES.values() for word in ("--board-rpy", f"0,0,{yaw}")]
+        assert app.execute(["calibrate", "pose", *PLACES, "--intrinsics", str(path), *places, *turns]) == 0
+    finally:
+        os.chdir(here)
+    return path
+
+
+def test_a_camera_is_calibrated_from_pictures_to_the_file_of_a_cell(calibrated):
+    found = yaml.safe_load(calibrated.read_text())
+    assert (found["width"], found["height"]) == (640, 480)
+    np.testing.assert_allclose([found[n] for n in ("fx", "fy", "cx", "cy")], (LENS.fx, LENS.fy, LENS.cx, LENS.cy),
+                               rtol=2e-3)
+    np.testing.assert_allclose(found["position"], T_WORLD_CAMERA[:3, 3], atol=0.5e-3)
+    np.testing.assert_allclose(rpy_to_matrix(*found["rpy"]), T_WORLD_CAMERA[:3, :3], atol=1e-3)
+    intrinsics, pose = found["calibration"]["intrinsics"], found["calibration"]["pose"]
+    assert intrinsics["source"] == "views" and intrinsics["views"] == 10 and intrinsics["distortion_model"] == "plumb_bob"
+    assert 0 < intrinsics["rms_px"] < 0.3 and 0 < intrinsics["std_px"]["fx"] < 1
+    assert 0 < pose["rms_px"] < 0.3 and 0 < pose["rms_mm"] < 0.3 and pose["pictures"] == 4
+    assert [place["source"] for place in pose["places"]] == ["a", "b"]
+    assert all(re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d", part["date"]) for part in (intrinsics, pose))
+
+
+def test_it_tells_residuals_uncertainty_and_what_comes_next(pictures, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(pictures)
+    path = str(tmp_path / "camera.yaml")
+    assert app.execute(["calibrate", "intrinsics", "views", "-o", path]) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"^10 views, \d+ corners, \d+ % of the picture covered$", told, re.MULTILINE)
+    assert re.search(r"^residual 0\.\d+ px rms; p0\.png 0\.\d+, p1\.png", told, re.MULTILINE)
+    assert re.search(r"^fx\s+53\d\.\d\d \+- 0\.\d\d px$", told, re.MULTILINE) and "calibrate pose" in told
+    assert app.execute(["calibrate", "pose", "a", "--intrinsics", path, "--board-position", "0.35,-0.15,0",
+                        "--board-rpy", "0,0,0.1"]) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"^2 pictures, residual 0\.\d+ px rms, 0\.\d+ mm on the board", told, re.MULTILINE)
+    assert re.search(r"^position 0\.4\d+, -0\.0\d+, 0\.\d+ m \+- 0\.\d+ mm$", told, re.MULTILINE)
+    assert f"--set world.camera={path}" in told
+    assert app.execute(["calibrate", "intrinsics", "views", "-o", path]) == 0
+    assert "had a pose, which was found with other intrinsics and is gone" in capsys.readouterr().out
+    assert "position" not in yaml.safe_load(Path(path).read_text())
+
+
+def test_a_video_serves_as_well_as_pictures(pictures, tmp_path):
+    path = str(tmp_path / "views.avi")
+    writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"FFV1"), 10, (640, 480))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV can not write a video")
+    for k in range(10):
+        writer.write(cv2.imread(str(pictures / "views" / f"p{k}.png")))
+    writer.release()
+    output = tmp_path / "camera.yaml"
+    assert app.execute(["calibrate", "intrinsics", path, "-o", str(output)]) == 0
+    assert yaml.safe_load(output.read_text())["fx"] == pytest.approx(LENS.fx, rel=2e-3)
+
+
+def test_a_board_is_written_with_its_true_size(tmp_path, capsys):
+    png, pdf = tmp_path / "board.png", tmp_path / "board.pdf"
+    assert app.execute(["calibrate", "board", "-o", str(png)]) == app.execute(["calibrate", "board", "-o", str(pdf)]) == 0
+    assert "7 x 5 squares of 36 mm, markers of 27 mm, 4x4_50; 276.0 x 204.0 mm" in capsys.readouterr().out
+    data = png.read_bytes()
+    at = data.index(b"pHYs") + 4
+    density = int.from_bytes(data[at : at + 4], "big")  # [px/m]
+    height, width = cv2.imread(str(png)).shape[:2]
+    assert (width / density, height / density) == (pytest.approx(0.276, abs=1e-4), pytest.approx(0.204, abs=1e-4))
+    box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ([\d.]+)", pdf.read_bytes())
+    points = [float(value) for value in box.groups()]  # of 1/72 inch
+    assert points == pytest.approx([276 / 25.4 * 72, 204 / 25.4 * 72], abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "wanted"),
+    [
+        (["intrinsics", "few"], 1, ["3 of 3 pictures are usable", "8 are needed, 5 more"]),
+        (["intrinsics", "empty"], 1, ["0 of 2 pictures", "2 show no marker"]),
+        (["intrinsics", "blurred"], 1, ["0 of 3 pictures", "3 are blurred"]),
+        (["intrinsics", "views", "--squares", "6x5"], 1, ["another board", "6x5"]),
+        (["intrinsics", "nowhere"], 2, ["nowhere", "is no device number"]),
+        (["intrinsics", "broken"], 2, ["p0.png", "is no image"]),
+        (["intrinsics", "/dev/zencell-none"], 2, ["/dev/zencell-none", "can not be opened"]),
+        (["intrinsics", "views", "-o", "no/where.yaml"], 2, ["--output", "no/where.yaml", "can not be written"]),
+        (["intrinsics", "views", "--views", "x"], 2, ["--views", "'x'", "3 or more"]),
+        (["intrinsics", "views", "--size", "big"], 2, ["--size", "'big'", "as 640x480"]),
+        (["intrinsics", "views", "--square", "0"], 2, ["square", "0"]),
+        (["intrinsics", "views", "--dictionary", "4x4_5"], 2, ["unknown dictionary '4x4_5'", "4x4_50"]),
+        (["intrinsics", "views", "--k-coefficients", "7"], 2, ["k_coefficients", "7", "6"]),
+        (["board", "-o", "board.jpg"], 2, ["board.jpg", ".png or .pdf"]),
+        (["board", "-o", "board.png", "--squares", "40x40"], 2, ["800 markers", "50"]),
+        (["pose", "a", "--intrinsics", "none.yaml", "--board-position", "0,0,0"], 2, ["none.yaml", "can not be read"]),
+        (["pose", "a", "--intrinsics", "FILE", "--board-position", "0,0"], 2, ["--board-position", "'0,0'", "three"]),
+        (["pose", "a", "b", "--intrinsics", "FILE", "--board-position", "0,0,0"], 2, ["1 times for 2 places"]),
+        (["pose", "empty", "--intrinsics", "FILE", "--board-position", "0,0,0"], 1, ["none of 2", "no marker"]),
+        (["pose", "blurred", "--intrinsics", "FILE", "--board-position", "0,0,0"], 1, ["none of 3", "smeared"]),
+        (["pose", "views", "--intrinsics", "FILE", "--board-position", "0,0,0"], 1, ["do not fit together"]),
+    ],
+)
+def test_what_can_not_be_calibrated_is_one_line(arguments, code, wanted, calibrated, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(calibrated.parent)
+    broken = calibrated.parent / "broken"
+    broken.mkdir(exist_ok=True)
+    (broken / "p0.png").write_bytes(b"no picture")
+    output = [] if "-o" in arguments or arguments[0] == "board" else ["-o", str(tmp_path / "out.yaml")]
+    filled = [str(calibrated) if word == "FILE" else word for word in arguments]
+    assert app.execute(["calibrate", *filled, *output]) == code
+    shown = capsys.readouterr()
+    (line,) = shown.err.splitlines()
+    assert all(part in line for part in wanted), line
+    assert shown.out == ""
