@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -45,8 +46,8 @@ async def assert_still(cell: str, joints: Reader[JointState], after: int) -> lis
     return list(seen.pop())
 
 
-async def pause_in_motion(cell: RunningCell, stage: str) -> None:
-    """Pause while the arm moves in a stage, look, and resume."""
+async def pause_in_motion(cell: RunningCell, stage: str) -> Any:
+    """The status when all is done; before, pause while the arm moves in a stage, look, and resume."""
     async with cell.listen() as bus:
         joints, motion, status = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS), bus.reader(
             STATUS[cell.name])
@@ -62,6 +63,7 @@ async def pause_in_motion(cell: RunningCell, stage: str) -> None:
         await tell(bus, "resume")
         ended = await until(motion, lambda m: m.id != at_rest.id or m.state != "active")
         assert ended.id != at_rest.id or ended.state == "succeeded", "the same motion goes on"
+        return await until(status, lambda s: s.state in ("DONE", "ERROR"), 120)
 
 
 def test_panda_paused_on_its_way_goes_on_and_puts_every_ball_in_the_box(tmp_path: Path) -> None:
@@ -76,11 +78,14 @@ def test_panda_paused_on_its_way_goes_on_and_puts_every_ball_in_the_box(tmp_path
 
 def test_ur5_paused_in_mid_trace_goes_on_with_the_same_trace(tmp_path: Path) -> None:
     with RunningCell(tmp_path, "run", "ur5", "--no-viewer", "--world", "w2", "--speed", "4", *PATIENT) as cell:
-        asyncio.run(pause_in_motion(cell, "trace"))
+        status = asyncio.run(pause_in_motion(cell, "trace"))
         assert asyncio.run(cell.ended(120)) == 0, cell.tail()
         summary = cell.summary
+    # The summary's `closed` compares the first and last joint states that it got, of which a busy machine loses some;
+    # the task's says that the executor reached the end of the trace.
+    assert status.closed and (status.object, status.failures) == ("Object_0", 0)
     outline = summary["outline"]
-    assert outline["fraction"] == 1.0 and outline["closed"]
+    assert outline["fraction"] == 1.0
     assert outline["deviation_mm"]["max"] < 0.5 and outline["deviation_mm"]["mean"] < 0.2
     assert outline["tracking_mm"]["max"] < 0.15
     assert summary["failures"] == 0 and len(summary["plans"]) == 5, "nothing was planned again"
