@@ -15,7 +15,7 @@ from common.viewer.poses import matrix_wxyz
 
 Picture = NDArray[np.uint8]  # (height, width, 3) RGB
 
-_WIDTH = 0.16  # of the picture in the scene [m]
+_WIDTH = 0.14  # of the picture in the scene [m]
 _PIXELS = 320  # at most so many across: it is small on the page
 _PERIOD = 0.5  # [s] between pictures
 _COLOR = (120, 170, 255)
@@ -43,7 +43,8 @@ class Camera:
                 color=_COLOR, thickness=1.5, thickness_units="screen", cast_shadow=False, receive_shadow=False,
                 format="jpeg", jpeg_quality=70,
             )
-            self._node.scale = _WIDTH / self._node.compute_canonical_frustum_size()[0]
+            depth = _WIDTH * m.k[0] / m.width  # of the picture from the optical centre
+            self._node.scale = depth / self._node.compute_canonical_frustum_size()[2]
             self._last = -math.inf
         self._info = m
         self._node.position, self._node.wxyz = T_world_optical[:3, 3], matrix_wxyz(T_world_optical)

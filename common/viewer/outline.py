@@ -42,7 +42,7 @@ class Outline:
             self._node.remove()
             self._node = None
         if len(points) > 1:
-            line = closed_line(points + np.array([0.0, 0.0, _LIFTED]))
+            line = closed_line(points + np.array([0.0, 0.0, 2 * _LIFTED]))  # above the line of its contour
             self._node = self._scene.add_line_segments(
                 self._name, line, OUTLINE, thickness=4.0, thickness_units="screen"
             )
@@ -90,7 +90,7 @@ class ContourChoice:
             return
         name, color = f"{self._root}/{contour.index}", rgb_of(contour.color)
         self._nodes.append(self._scene.add_line_segments(
-            f"{name}_line", closed_line(points), CHOSEN if chosen else color, thickness=3.0 if chosen else 2.0,
+            f"{name}_line", closed_line(points), CHOSEN if chosen else color, thickness=2.0,
             thickness_units="screen",
         ))
         x, y = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2

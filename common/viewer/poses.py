@@ -12,6 +12,8 @@ Position = tuple[float, float, float]
 Wxyz = tuple[float, float, float, float]
 Rgb = tuple[int, int, int]
 
+_DARKEST = 36
+
 
 def position_of(pose: Pose) -> Position:
     """Position x, y, z [m]."""
@@ -38,5 +40,9 @@ def pose_from(position: NDArray[np.float64], wxyz: NDArray[np.float64]) -> Pose:
 
 
 def rgb_of(color: Color) -> Rgb:
-    """Red, green, blue of a colour message."""
-    return round(255 * color.r), round(255 * color.g), round(255 * color.b)
+    """Red, green, blue of a colour message; black is a dark grey, so as to be seen before a dark background."""
+    return _seen(color.r), _seen(color.g), _seen(color.b)
+
+
+def _seen(value: float) -> int:
+    return max(_DARKEST, round(255 * value))

@@ -20,7 +20,8 @@ from common.robot.model import RobotModel
 
 Rgb = tuple[int, int, int]
 
-_FEW = 150  # triangles of a piece that are always kept
+_FEW = 150  # triangles of a connected part that are always kept
+_SHRINKS = 2e-3  # [m] the box about a part may change by less
 _SHARP = 0.6  # [rad] triangles that meet at more than this have an edge between them
 
 
@@ -37,7 +38,7 @@ class Piece:
     faces: NDArray[np.uint32]  # (m, 3)
 
 
-def visual_pieces(robot: RobotModel, triangles: int = 25_000) -> list[Piece]:
+def visual_pieces(robot: RobotModel, triangles: int = 40_000) -> list[Piece]:
     """The visual shapes of all links with about so many triangles in all, in the order of the links.
 
     Descriptions come with 100 000 and more, which a browser without a graphics card draws once a second.
@@ -69,14 +70,24 @@ def _merged(mesh: Any) -> trimesh.Trimesh:
 
 
 def _simplified(mesh: trimesh.Trimesh, kept: float) -> trimesh.Trimesh:
-    """About that share of the triangles, by quadric error; shapes of few triangles stay as they are."""
-    count = max(_FEW, round(kept * len(mesh.faces)))
-    if len(mesh.faces) <= count:
-        return mesh
+    """About that share of the triangles, by quadric error.
+
+    Each connected part by itself, since among others small ones are lost first; those of few triangles stay as they
+    are, as do those that would shrink.
+    """
+    return trimesh.util.concatenate([_simplified_part(part, kept) for part in mesh.split(only_watertight=False)])
+
+
+def _simplified_part(part: trimesh.Trimesh, kept: float) -> trimesh.Trimesh:
+    count = max(_FEW, round(kept * len(part.faces)))
+    if len(part.faces) <= count:
+        return part
     vertices, faces = fast_simplification.simplify(
-        np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32), target_count=count
+        np.asarray(part.vertices), np.asarray(part.faces, dtype=np.int32), target_count=count, agg=5,
+        preserve_border=True,
     )
-    return trimesh.Trimesh(vertices, faces, process=False)
+    simple = trimesh.Trimesh(vertices, faces, process=False)
+    return simple if np.abs(simple.bounds - part.bounds).max() < _SHRINKS else part
 
 
 def _piece(link: str, color: Rgb, mesh: trimesh.Trimesh) -> Piece:
