@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import CELL, PATIENCE, Zencell, ask, command_line, environment, free_domain, make_folder
+from tests.cli.conftest import CELL, Zencell, command_line, environment, free_domain, make_folder
 
 SPEED = "2"
+LONGEST = 100.0  # [s] until a command is taken for hanging, on a machine however busy
 LATE = 0.4  # [s] of cell time: how old the pictures are when they are sent
 
 FRAMES = f'''"""Says where things are, and sends pictures late."""
@@ -54,7 +55,10 @@ class Place:
         self.domain = domain
 
     def ask(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return ask(self.folder, *arguments, "--domain", str(self.domain))
+        return subprocess.run(
+            command_line(*arguments, "--domain", str(self.domain)), cwd=self.folder, env=environment(),
+            capture_output=True, text=True, timeout=LONGEST, check=False,
+        )
 
     def say(self, *arguments: str) -> list[str]:
         """The lines of a command that goes well."""
@@ -208,10 +212,7 @@ def test_what_goes_wrong_is_one_line(place: Place, arguments: list[str], code: i
 
 
 def test_doctor_finds_the_cell_and_its_version(place: Place) -> None:
-    done = subprocess.run(
-        command_line("doctor", "--json", "--domain", str(place.domain)), cwd=place.folder, env=environment(),
-        capture_output=True, text=True, timeout=PATIENCE, check=False,
-    )
+    done = place.ask("doctor", "--json")
     findings = [json.loads(line) for line in done.stdout.splitlines()]
     said = [finding["what"] for finding in findings]
     endpoint = f"tcp/127.0.0.1:{7447 + place.domain}"
