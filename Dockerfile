@@ -13,7 +13,7 @@ COPY config config
 # What only builds other programs, and the robots that no file of config/robots names.
 RUN /usr/local/bin/python deploy/slim.py /opt/zencell config/robots
 
-FROM python:3.11-slim
+FROM python:3.11-slim AS run
 RUN apt-get update -q && apt-get install -q -y --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/* /var/cache/apt/*.bin
 RUN useradd --uid 10001 --create-home zencell && mkdir -p /data && chown zencell /data
 COPY --from=build /opt/zencell /opt/zencell
@@ -27,3 +27,12 @@ COPY config config
 USER zencell
 HEALTHCHECK --interval=3s --timeout=3s --start-period=30s --retries=3 CMD ["python", "-m", "common.transport.health"]
 CMD ["zencell", "--help"]
+
+# For compose.dev.yaml: restarts a service when its source changes.
+FROM run AS dev
+USER root
+RUN --mount=type=cache,target=/root/.cache/pip --mount=type=secret,id=pip,target=/etc/pip.conf \
+    python -m ensurepip -q && python -m pip install -q --disable-pip-version-check watchfiles
+USER zencell
+
+FROM run

@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup run up test check bench docs clean
+.PHONY: setup run up test check bench docs deploy clean
 
 setup: $(STAMP)
 
@@ -33,6 +33,9 @@ bench: setup  ## every published figure, one module each
 
 docs: setup  ## write the generated tables and pages again
 	$(BIN)/python -m docs.generate
+
+deploy: setup  ## write the compose files and Kubernetes manifests again
+	$(BIN)/python -m deploy.generate
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -57,6 +57,31 @@ volumes:
 """
 
 
+DEV_HEAD = """\
+# Made by `make deploy`. For work on the code: it is mounted, and a service starts again when a file of it changes.
+#   docker compose -f compose.yaml -f compose.dev.yaml up --build
+services:
+"""
+SOURCE = ("common", "services", "cli")
+
+
+def compose_dev() -> str:
+    """The text of compose.dev.yaml, which is laid over compose.yaml."""
+    names = {ROUTER: router()}
+    for file, cell in cells().items():
+        names |= {f"{file}-{container.name}": container for container in containers_of(file, cell)}
+    blocks = []
+    for name, container in names.items():
+        started = " ".join([*container.command, *container.arguments])
+        blocks.append(_lines(name, {
+            "image": f"{IMAGE}-dev",
+            "build": {"context": ".", "target": "dev"},
+            "volumes": [f"./{folder}:/app/{folder}:ro" for folder in SOURCE],
+            "command": ["watchfiles", "--filter", "python", started, "/app/common", f"/app/services/{container.name}.py"],
+        }))
+    return DEV_HEAD + "\n".join(blocks)
+
+
 def compose() -> str:
     """The text of compose.yaml."""
     all_cells = cells()
@@ -87,8 +112,13 @@ def _extras(container: Container, before: list[str]) -> dict[str, Any]:
 
 
 def _block(name: str, container: dict[str, Any]) -> str:
-    """A service that takes over what is shared, indented as an entry of `services`."""
-    lines = [f"{name}:", "  <<: *service"]
+    """A service that takes over what is shared."""
+    return _lines(name, container, "<<: *service")
+
+
+def _lines(name: str, container: dict[str, Any], *first: str) -> str:
+    """A service, indented as an entry of `services`."""
+    lines = [f"{name}:", *(f"  {line}" for line in first)]
     for key, value in container.items():
         text = yaml.dump(value, default_flow_style=True, width=10_000, sort_keys=False).removesuffix("...\n").strip()
         lines.append(f"  {key}: {text}")

@@ -1,4 +1,4 @@
-"""Writes compose.yaml and deploy/kubernetes from the cells of config/cells: `python -m deploy.generate`.
+"""Writes the compose files and deploy/kubernetes from the cells of config/cells: `python -m deploy.generate`.
 
 A service is named once, in its cell file; a test holds that what lies there is what this writes.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from deploy.compose import compose
+from deploy.compose import compose, compose_dev
 from deploy.manifests import manifests
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -16,7 +16,11 @@ ROOT = Path(__file__).resolve().parent.parent
 def generated() -> dict[Path, str]:
     """Every file that is made, and its text."""
     kubernetes = ROOT / "deploy" / "kubernetes"
-    return {ROOT / "compose.yaml": compose(), **{kubernetes / name: text for name, text in manifests().items()}}
+    return {
+        ROOT / "compose.yaml": compose(),
+        ROOT / "compose.dev.yaml": compose_dev(),
+        **{kubernetes / name: text for name, text in manifests().items()},
+    }
 
 
 if __name__ == "__main__":

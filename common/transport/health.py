@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
-from itertools import pairwise
 from pathlib import Path
 
 import zenoh
@@ -24,9 +24,9 @@ FIRST_PROCESS = Path("/proc/1/cmdline")
 
 def first_service() -> str:
     """Name of the service that is the container's first process; empty when it is something else."""
-    words = FIRST_PROCESS.read_bytes().decode(errors="replace").split("\0")
-    modules = [module for flag, module in pairwise(words) if flag == "-m"]
-    return modules[0].rpartition(".")[2] if modules else ""
+    command = FIRST_PROCESS.read_bytes().decode(errors="replace").replace("\0", " ")
+    found = re.search(r" -m ([\w.]+)", command)  # also where something else restarts it, which is told the command
+    return found[1].rpartition(".")[2] if found else ""
 
 
 def is_ready(endpoint: str, cell: str, service: str) -> bool:
