@@ -73,11 +73,12 @@ def compose_dev() -> str:
     blocks = []
     for name, container in names.items():
         started = " ".join([*container.command, *container.arguments])
+        watched = ["/app/common", f"/app/services/{container.name}.py"]
         blocks.append(_lines(name, {
             "image": f"{IMAGE}-dev",
             "build": {"context": ".", "target": "dev"},
             "volumes": [f"./{folder}:/app/{folder}:ro" for folder in SOURCE],
-            "command": ["watchfiles", "--filter", "python", started, "/app/common", f"/app/services/{container.name}.py"],
+            "command": ["watchfiles", "--filter", "python", started, *watched],
         }))
     return DEV_HEAD + "\n".join(blocks)
 
