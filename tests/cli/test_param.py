@@ -89,9 +89,12 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Person, Zen
     (folder / "fakes" / "tuned.py").write_text(TUNED)
     (folder / "fakes" / "other.py").write_text(OTHER)
     (folder / "tuned.yaml").write_text(CELL)
-    up = Zencell(folder, free_domain(), "up", "tuned.yaml", "--set", "services.tuned.mode=slow")
+    given = folder / "given.yaml"
+    given.write_text("services: {tuned: {mode: slow}}\n")
+    up = Zencell(folder, free_domain(), "up", "tuned.yaml", "--set", "@given.yaml")
     try:
         up.until("is up at")
+        given.unlink()  # it was read once: services that are started again do not need it
         yield Person(folder, up.domain), up
     finally:
         up.interrupt()
@@ -215,6 +218,17 @@ def test_a_dump_reads_back_into_a_cell_and_into_one_that_is_up(person: Person) -
     assert "services.tuned.rate: 20.0 -> 10.0" in said and "services.tuned.file: is '' already" in said
     assert [json.loads(line)["value"] for line in person.param("list", "--json")] == [p["value"] for p in everything]
     person.param("set", f"@{person.folder / 'before.yaml'}")
+
+
+def test_a_service_that_is_started_again_begins_as_the_cell_was_brought_up(
+    person: Person, cell: tuple[Person, Zencell]
+) -> None:
+    person.param("set", "other.rate=55", "tuned.rate=55")
+    cell[1].children()["tuned"].kill()
+    cell[1].until("tuned is ready again")
+    assert (person.param("get", "tuned.rate"), person.param("get", "tuned.mode")) == (["20.0"], ["slow"])
+    assert person.param("get", "other.rate") == ["55.0"]
+    person.param("set", "other.rate=10")
 
 
 def test_the_request_itself_can_be_called_and_looked_at(person: Person) -> None:
