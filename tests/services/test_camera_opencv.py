@@ -190,6 +190,16 @@ def test_without_a_file_the_intrinsics_are_those_of_the_worlds_camera():
     assert (i.width, i.height, i.fx, i.fy, i.cx, i.cy, i.d) == (640, 480, 520, 520, 320, 240, [])
 
 
+def test_intrinsics_whose_pose_is_not_that_of_the_world_are_refused(tmp_path):
+    path = tmp_path / "camera.yaml"
+    path.write_text(yaml.safe_dump(SMALL | {"position": [0.1, 0.2, 0.9], "rpy": [3.1, 0.0, 0.0]}))
+    with pytest.raises(ConfigError, match=r"another pose than the world's camera has: .*--set world\.camera="):
+        calibrated(config(source=0, intrinsics=str(path)))
+    camera = around.camera
+    path.write_text(yaml.safe_dump(SMALL | {"position": list(camera.position), "rpy": list(camera.rpy)}))
+    assert calibrated(config(source=0, intrinsics=str(path))).fx == 50
+
+
 def test_distortion_is_taken_out():
     i = CameraFile(width=320, height=240, fx=250, fy=250, cx=160, cy=120, d=[-0.3, 0.08])
     k = np.array([[250, 0, 160], [0, 250, 120], [0, 0, 1.0]])

@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 
 from common.perception.calibration_board import Board, BoardOptions
+from common.perception.drawing import RIM_WIDTH, draw
+from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, rpy_to_matrix, transform
 
 FINER = 2  # rays along each side of a pixel
@@ -110,6 +112,20 @@ def many_poses(board: Board, count, seed=1, z=(0.45, 0.75)):
         tilt = rng.uniform(0.25, 0.65)
         poses.append(facing(board, x, y, depth, tilt * np.sin(1.7 * k), tilt * np.cos(1.7 * k), rng.uniform(-0.6, 0.6)))
     return poses
+
+
+def through(lens: Lens, T_world_camera, surroundings, balls, *, noise=2.0, seed=0):
+    """The bgr8 picture of balls (n, 3) in world on the table through the lens."""
+    finer, border = 3, 200  # [px] beyond the picture, which the lens may pull in
+    k = finer * lens.k
+    pinhole = Pinhole(k[0, 0], k[1, 1], finer * (lens.cx + border + 0.5) - 0.5, finer * (lens.cy + border + 0.5) - 0.5,
+                      finer * (lens.width + 2 * border), finer * (lens.height + 2 * border), T_world_camera)
+    straight = draw(balls, pinhole, surroundings, rim_width=finer * RIM_WIDTH)
+    rays = lens.rays()
+    u, v = rays[..., 0] * pinhole.fx + pinhole.cx, rays[..., 1] * pinhole.fy + pinhole.cy
+    smeared = cv2.GaussianBlur(straight.astype(np.float32), (0, 0), 0.7)
+    parts = cv2.remap(smeared, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+    return develop(parts, 0, noise, seed, lens)
 
 
 BOARD = Board(BoardOptions())

@@ -1,0 +1,87 @@
+"""From a calibration to places in the world: a camera whose lens and pose nobody told the cell but the board."""
+
+import asyncio
+from contextlib import AsyncExitStack
+
+import cv2
+import numpy as np
+import pytest
+
+from cli.main import app
+from common import topics
+from common.config import load_cell, service_config
+from common.perception.image import image_to_array
+from common.robot.transforms import invert, rpy_to_matrix, transform
+from common.transport.local import LocalNetwork
+from services import camera_opencv, robot_state_publisher, vision_detector
+from tests.common.perception.rendered_boards import BOARD, Lens, many_poses, render, through
+
+LENS = Lens()
+T_WORLD_CAMERA = transform(rpy_to_matrix(np.pi - 0.05, 0.04, -np.pi / 2 + 0.08), (0.41, -0.02, 0.82))
+PLACES = {"near": (0.35, -0.15, 0.1), "far": (0.3, 0.15, 1.7)}  # of the board: x, y, yaw
+BALLS = [(x, y, 0.03) for x, y in ((0.40, -0.30), (0.60, -0.20), (0.30, 0.0), (0.45, -0.05), (0.58, 0.05), (0.25, 0.3))]
+
+CELL = """\
+robot: panda
+pipeline: lerp
+task: none
+world: {camera: camera.yaml, container: {x: 2.0}, count: 0}
+services:
+  robot_state_publisher: {}
+  camera_opencv: {source: %s, rate: 20}
+  vision_detector: {}
+"""
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory):
+    """A cell whose camera was calibrated from pictures, and which looks at a table with balls."""
+    root = tmp_path_factory.mktemp("calibrated")
+    around = load_cell("panda", ["world.container.x=2"]).world
+    pictures = {"views": [render(BOARD, LENS, T, seed=k) for k, T in enumerate(many_poses(BOARD, 10))],
+                "table": [through(LENS, T_WORLD_CAMERA, around, BALLS)]}
+    for name, (x, y, yaw) in PLACES.items():
+        T_camera_board = invert(T_WORLD_CAMERA) @ transform(rpy_to_matrix(0, 0, yaw), (x, y, 0))
+        pictures[name] = [render(BOARD, LENS, T_camera_board, seed=k) for k in range(3)]
+    for name, images in pictures.items():
+        (root / name).mkdir()
+        for k, image in enumerate(images):
+            cv2.imwrite(str(root / name / f"{k}.png"), image)
+    file = str(root / "camera.yaml")
+    assert app.execute(["calibrate", "intrinsics", str(root / "views"), "-o", file]) == 0
+    positions = [word for x, y, _ in PLACES.values() for word in ("--board-position", f"{x},{y},0")]
+    turns = [word for _, _, yaw in PLACES.values() for word in ("--board-rpy", f"0,0,{yaw}")]
+    folders = [str(root / name) for name in PLACES]
+    assert app.execute(["calibrate", "pose", *folders, "--intrinsics", file, *positions, *turns]) == 0
+    (root / "cell.yaml").write_text(CELL % (root / "table"))
+    return str(root / "cell.yaml")
+
+
+async def test_balls_are_found_where_they_are_within_two_millimetres(cell):
+    loaded, net = load_cell(cell), LocalNetwork()
+    bus = net.bus()
+    found, infos, images = (bus.reader(t) for t in (topics.DETECTED_OBJECTS, topics.CAMERA_INFO, topics.CAMERA_IMAGE))
+    async with AsyncExitStack() as stack, asyncio.timeout(60):
+        for module in (robot_state_publisher, vision_detector, camera_opencv):
+            name = module.__name__.rpartition(".")[2]
+            config = service_config(loaded, name, module.Config)
+            await stack.enter_async_context(net.running(module.run, config, name=name))
+        message, info, image = await found.next(), await infos.next(), await images.next()
+    places = np.array([(m.pose.position.x, m.pose.position.y) for m in message.markers])
+    assert len(places) == len(BALLS)
+    off = [np.linalg.norm(places - ball[:2], axis=1).min() for ball in BALLS]
+    assert max(off) < 2e-3, off
+    assert not any(info.d) and info.k[0] == pytest.approx(LENS.fx, rel=2e-3)
+    assert image_to_array(image).shape == (480, 640, 3)
+
+
+async def test_pictures_as_they_come_are_sent_with_their_distortion_when_asked_for(cell):
+    loaded, net = load_cell(cell, ["services.camera_opencv.rectify=false"]), LocalNetwork()
+    bus = net.bus()
+    infos, images = bus.reader(topics.CAMERA_INFO), bus.reader(topics.CAMERA_IMAGE)
+    config = service_config(loaded, "camera_opencv", camera_opencv.Config)
+    async with net.running(camera_opencv.run, config, name="camera_opencv"), asyncio.timeout(30):
+        info, image = await infos.next(), await images.next()
+    assert info.distortion_model == "plumb_bob" and info.d == pytest.approx(LENS.d, abs=0.02)
+    sent = cv2.imread(str(config.source) + "/0.png")
+    assert np.array_equal(image_to_array(image), sent)
