@@ -61,7 +61,7 @@ def requests(incomplete: str) -> list[Offer]:
 
 def parameters(incomplete: str) -> list[Offer]:
     """Dotted paths of all parameters, as `--set` and `param` take them."""
-    return _starting(incomplete, _parameters())
+    return _starting(incomplete, _parameters(incomplete))
 
 
 def overrides(incomplete: str) -> list[Offer]:
@@ -115,12 +115,19 @@ def _topics() -> Iterator[tuple[str, str, str]]:
                     yield str(texts[0]), kind, str(texts[-1])
 
 
-def _parameters() -> Iterator[Offer]:
+def _parameters(incomplete: str) -> Iterator[Offer]:
+    """All parameters, without those whose files need not be read for what was typed so far."""
+
+    def may_follow(prefix: str) -> bool:
+        return f"{prefix}.".startswith(incomplete) or incomplete.startswith(f"{prefix}.")
+
     cell = find_model(ROOT / "common" / "config" / "cell.py", "Cell")
     for field in fields_of(cell) if cell else ():
-        if field.model is not None and field.name != "run":
+        if field.model is not None and field.name != "run" and may_follow(field.name):
             yield from _paths(field.model, field.name)
     for path in _modules("services"):
+        if not may_follow(f"services.{path.stem}"):
+            continue
         config = find_model(path, "Config")
         for field in fields_of(config) if config else ():
             if field.model is None or not is_section(field.model):

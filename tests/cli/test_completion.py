@@ -121,5 +121,11 @@ def test_parameters_are_those_of_the_models() -> None:
     assert {"motion.velocity_scaling", "world.count", "robot.hardware.backend"} <= words(completing.parameters(""))
 
 
+@pytest.mark.parametrize("typed", ["", "s", "services", "services.v", "services.viewer.po", "motion", "motion.", "x"])
+def test_what_was_typed_leaves_out_nothing_that_begins_so(typed: str) -> None:
+    wanted = {word for word in words(completing.parameters("")) if word.startswith(typed)}
+    assert words(completing.parameters(typed)) == wanted
+
+
 def test_every_override_can_be_completed_further() -> None:
     assert all(word.endswith("=") for word in words(completing.overrides("world.")))
