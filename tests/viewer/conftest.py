@@ -23,7 +23,7 @@ import pytest_asyncio
 from benchmarks.runs import RunningCell
 
 if TYPE_CHECKING:
-    from playwright.async_api import Browser, BrowserContext, Page
+    from playwright.async_api import Browser, BrowserContext, Page, ViewportSize
 
 IN_BROWSER = [
     pytest.mark.browser, pytest.mark.cell, pytest.mark.timeout(240), pytest.mark.asyncio(loop_scope="session"),
@@ -31,8 +31,14 @@ IN_BROWSER = [
 PATIENCE = 60.0  # [s] until a test gives up waiting for an event; a busy machine without a GPU is slow
 NAMES = ("chromium", "chromium-browser", "google-chrome-stable", "google-chrome")
 ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-SMALL = {"width": 320, "height": 240}  # [pixels] for pages that are only to be there: the CPU draws them
-USUAL = {"width": 1280, "height": 800}
+SIZE: ViewportSize = {"width": 1280, "height": 800}  # [CSS pixels]
+PIXELS = 0.5  # for each of them: the CPU draws the scene
+# A frame takes the CPU 0.1 s and more. Ten in a second are enough, and leave the cell its share.
+FEW_FRAMES = """
+const draw = window.requestAnimationFrame.bind(window);
+window.requestAnimationFrame = step => setTimeout(() => draw(step), 100);
+window.cancelAnimationFrame = clearTimeout;
+"""
 
 
 @dataclass
@@ -148,8 +154,9 @@ async def opened(browser: Browser) -> Opened:
     """A browser of its own, without cookies, that is closed after the block: `async with opened() as watched`."""
 
     @asynccontextmanager
-    async def block(viewport: dict[str, int] = USUAL) -> AsyncIterator[Watched]:
-        context: BrowserContext = await browser.new_context(viewport=viewport)  # type: ignore[arg-type]
+    async def block() -> AsyncIterator[Watched]:
+        context: BrowserContext = await browser.new_context(viewport=SIZE, device_scale_factor=PIXELS)
+        await context.add_init_script(FEW_FRAMES)
         try:
             yield Watched(await context.new_page())
         finally:
