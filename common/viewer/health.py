@@ -48,7 +48,7 @@ class HealthPanel:
             self._html.content = content
 
     def _row(self, name: str, state: str, pid: int | None, restarts: int, message: str) -> str:
-        word, kind = words.SERVICE_STATES[state]
+        word, kind = words.service_state(state, restarts)
         busiest = self._rates.busiest_of(name) if kind == "good" else None
         counted = self._counters.get(name)
         skipped = sum(counted.dropped.values()) if counted else 0

@@ -14,6 +14,7 @@ from common.messages import Parameter
 from common.viewer.desk import assign
 
 SLIDER_STEPS = 200  # at least; a slider that moves coarser than a quarter of the value is of no use
+COARSE = 10  # a slider's step about a value of 0
 TYPING = 0.8  # [s] after the last letter a text or number is sent
 SLIDING = 0.15  # [s] after a slider came to rest
 
@@ -127,4 +128,5 @@ def step_of(parameter: Parameter) -> float | None:
         step = max(1, step)
     sizes = [abs(v) for v in (parameter.value, parameter.default)
              if isinstance(v, int | float) and not isinstance(v, bool) and v]
-    return step if not sizes or step <= min(sizes) / 4 or parameter.type == "integer" else None
+    fine = step <= min(sizes) / 4 if sizes else step <= COARSE
+    return step if fine or parameter.type == "integer" else None

@@ -147,6 +147,7 @@ class Page:
             self._log.show()
         if self._periods.due("health", now):
             self._health.show(self._feeds.latest(topics.SUPERVISOR_STATUS), alive)
+        if self._periods.due("plots", now):
             self._plots.show(now)
         if self._periods.due("picture", now):
             self._show_pictures(now)

@@ -11,7 +11,8 @@ class Periods:
 
     picture: float = 0.1
     task: float = 0.2
-    health: float = 0.5
+    health: float = 0.25
+    plots: float = 0.5
     frustum: float = 0.5
     contours: float = 0.5
     detected: float = 0.5

@@ -23,7 +23,7 @@ SERVICE_STATES = {
     "waiting": ("waits for others", OFF),
     "starting": ("starting", BUSY),
     "ready": ("ready", GOOD),
-    "restarting": ("died, starts again", BAD),
+    "restarting": ("died", BAD),
     "stopping": ("stopping", OFF),
     "stopped": ("stopped", OFF),
     "failed": ("failed", BAD),
@@ -54,6 +54,13 @@ def task_state(status: TaskReport | None) -> tuple[str, str]:
         return "Stopped" if status.state != "IDLE" else "Waiting for start", OFF
     thing = status.object if isinstance(status, OutlineStatus) else status.target
     return f"{word} {thing}".rstrip(), GOOD
+
+
+def service_state(state: str, restarts: int) -> tuple[str, str]:
+    """How a process is, in words: one that died is not well before it is ready again."""
+    if state == "starting" and restarts:
+        return "starts again", BAD
+    return SERVICE_STATES[state]
 
 
 def counters(status: TaskReport | None) -> dict[str, object]:

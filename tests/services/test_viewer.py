@@ -220,7 +220,9 @@ async def test_dead_service_is_red_and_its_return_is_green(panda: Played, page: 
     say(state="ready", pid=41)
     await page.until(lambda: 'data-service="vision_detector" data-state="ready" data-pid="41"' in page.text)
     say(state="restarting", restarts=1, message="killed by SIGKILL")
-    await page.until(lambda: 'class="bad">● died, starts again' in page.text and "killed by SIGKILL" in page.text)
+    await page.until(lambda: 'class="bad">● died' in page.text and "killed by SIGKILL" in page.text)
+    say(state="starting", pid=42, restarts=1)
+    await page.until(lambda: 'class="bad">● starts again' in page.text)
     say(state="ready", pid=42, restarts=1)
     await page.until(lambda: 'data-state="ready" data-pid="42" data-restarts="1"' in page.text)
 
