@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+from typing import TYPE_CHECKING
 
+import viser
 from pydantic import Field
 
 from common import topics
 from common.config import Members, Parameters, RobotConfig, Run, Surroundings
-from common.planning.planners import planner_names
-from common.robot.model import RobotModel
 from common.transport.bus import Bus
 from common.transport.operator_motion import OperatorMotion
 from common.transport.service import main
@@ -21,9 +21,12 @@ from common.viewer.page import Page
 from common.viewer.periods import Periods
 from common.viewer.plots import Limits
 from common.viewer.requests import Requests
-from common.viewer.scene_view import SceneView
+
+if TYPE_CHECKING:
+    from common.viewer.scene_view import SceneView
 
 IDLE_PERIOD = 0.1  # [s] wall: without a browser
+START_PATIENCE = 15.0  # [s] wall: for the other services to be ready
 
 
 class Config(Parameters):
@@ -41,35 +44,59 @@ class Config(Parameters):
     picture_rate: float = Field(10.0, gt=0, le=30, description="of each camera picture at most, wall time [Hz]")
 
 
+def load(server: viser.ViserServer, config: Config, layers: dict[str, bool]) -> tuple[SceneView, Limits, list[str]]:
+    """The scene with its meshes, the limits of the joints and the names of the planners; takes seconds."""
+    from common.planning.planners import planner_names
+    from common.robot.model import RobotModel
+    from common.viewer.scene_view import SceneView
+
+    robot = RobotModel.load(config.robot)
+    limits = Limits(robot.joint_names, robot.lower, robot.upper, robot.velocity)
+    return SceneView(server, robot, config.world, visible=layers), limits, planner_names()
+
+
+async def quiet(bus: Bus, config: Config, page: Page) -> None:
+    """Return when the cell is up, or somebody wants to see it: until then the machine has better things to do."""
+    others = {*config.members.services} - {bus.service}
+    visited = asyncio.create_task(page.visited.wait())
+    up = [asyncio.create_task(bus.alive.wait(name)) for name in others]
+    all_up = asyncio.gather(*up)
+    try:
+        await asyncio.wait({visited, all_up}, timeout=START_PATIENCE, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        visited.cancel()
+        all_up.cancel()
+
+
 async def run(bus: Bus, config: Config) -> None:
     """Show the cell to whoever looks, until cancelled."""
     layout = load_layout(config.layout)
-    robot = RobotModel.load(config.robot)
     feeds = Feeds(bus, config.members)
     requests = Requests(bus, config.members, feeds)
     tasks = [feeds.reader(topic) for topic in (topics.PICK_PLACE_STATUS, topics.OUTLINE_STATUS)]
     motions = OperatorMotion(bus, [reader for reader in tasks if reader is not None])
-    alive = bus.alive
     server = make_server(config.host, config.port, config.token)
     try:
         page = Page(
-            server, feeds, requests, motions, config.members, cell=config.run.cell,
-            limits=Limits(robot.joint_names, robot.lower, robot.upper, robot.velocity), planners=planner_names(),
-            layout=layout, layout_file=config.layout, periods=Periods(picture=1 / config.picture_rate),
+            server, feeds, requests, motions, config.members, cell=config.run.cell, layout=layout,
+            layout_file=config.layout, periods=Periods(picture=1 / config.picture_rate),
         )
         await bus.ready()
         bus.log.info("the page is at %s", address_of(config.host, server.get_port()))
-        loop = asyncio.get_running_loop()
         async with asyncio.TaskGroup() as group:
             for activity in page.activities(bus.clock.age_ms):
                 group.create_task(activity)
-            # Meshes take a second to read and pack.
-            page.set_scene(await asyncio.to_thread(SceneView, server, robot, config.world, visible=page.layers))
+            group.create_task(_complete(bus, config, server, page))
             while True:
-                page.refresh(loop.time(), alive.names)
+                page.refresh(asyncio.get_running_loop().time(), bus.alive.names)
                 await asyncio.sleep(1 / config.rate if page.pages else IDLE_PERIOD)
     finally:
         close_server(server)
+
+
+async def _complete(bus: Bus, config: Config, server: viser.ViserServer, page: Page) -> None:
+    await quiet(bus, config, page)
+    page.complete(*await asyncio.to_thread(load, server, config, page.layers))
 
 
 if __name__ == "__main__":

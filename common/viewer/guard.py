@@ -39,6 +39,7 @@ MAX_CONNECTIONS = 96  # among them requests that are still read, and those who s
 MAX_MESSAGE = 4 * 2**20  # [bytes] from a browser
 OPEN_TIMEOUT = 5.0  # [s] until a connection has sent its request
 CLOSE_TIMEOUT = 0.5  # [s] for a browser to say goodbye
+STOP_TIMEOUT = 1.5  # [s] for all of that; viser itself would wait for 6
 
 # The page is one file: whatever it may become, it loads nothing from elsewhere, and stands in nobody else's frame.
 POLICY = (
@@ -93,9 +94,13 @@ def make_server(host: str, port: int, token: str = "") -> viser.ViserServer:
 
 
 def close_server(server: viser.ViserServer) -> None:
-    """Close all pages and stop listening."""
+    """Close all pages and stop listening; what takes longer than `STOP_TIMEOUT` goes on in the background."""
+    stopping = threading.Thread(target=server.stop, daemon=True)
     with _quiet():
-        server.stop()
+        stopping.start()
+        stopping.join(STOP_TIMEOUT)
+    if stopping.is_alive():
+        log.warning("not all pages were closed within %g s", STOP_TIMEOUT)
 
 
 class Guard:

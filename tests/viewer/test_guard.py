@@ -19,10 +19,13 @@ from viser._messages import GuiUpdateMessage, ShareUrlRequest
 from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as connect_socket
 
+from common.config import load_cell, service_config
+from common.config.tunables import describe
 from common.errors import ConfigError
 from common.viewer import guard
 from common.viewer.access import TOKEN_VARIABLE
 from common.viewer.guard import close_server, make_server
+from services.viewer import Config
 
 SECRET = "correct-horse-battery"
 PATIENCE = 20.0  # [s]
@@ -157,6 +160,13 @@ def test_token_that_can_not_be_used_is_refused_without_showing_it(make: Make, to
     with pytest.raises(ConfigError, match=r"services\.viewer\.token: must have 16 or more") as error:
         make(token=token)
     assert token not in str(error.value)
+
+
+def test_token_of_a_cell_is_not_among_the_parameters_that_anybody_may_read() -> None:
+    cell = load_cell("panda", [f"services.viewer.token={SECRET}"])
+    config = service_config(cell, "viewer", Config)
+    assert config.token == SECRET
+    assert SECRET not in repr(describe(config, "viewer")) and SECRET not in repr(config)
 
 
 def test_wider_than_this_machine_is_warned_of_and_the_token_is_not_logged(
