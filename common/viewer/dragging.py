@@ -43,7 +43,10 @@ class Drag:
         return self._held
 
     def stop(self) -> None:
-        """Listen no longer."""
+        """Listen no longer; what is held just now goes back to where it was."""
+        if self._held:
+            self._held = False
+            self._node.position = self._home
         self._node.remove_drag_callback(self._on_drag)
 
     async def _on_drag(self, event: viser.SceneNodeDragEvent[Any]) -> None:

@@ -75,7 +75,9 @@ def _simplified(mesh: trimesh.Trimesh, kept: float) -> trimesh.Trimesh:
     Each connected part by itself, since among others small ones are lost first; those of few triangles stay as they
     are, as do those that would shrink.
     """
-    return trimesh.util.concatenate([_simplified_part(part, kept) for part in mesh.split(only_watertight=False)])
+    parts = [_simplified_part(part, kept) for part in mesh.split(only_watertight=False)]
+    whole: trimesh.Trimesh = trimesh.util.concatenate(parts)
+    return whole
 
 
 def _simplified_part(part: trimesh.Trimesh, kept: float) -> trimesh.Trimesh:
@@ -103,7 +105,7 @@ def _coloured(item: Any) -> list[tuple[Rgb, trimesh.Trimesh]]:
         return [(given, _primitive(item.geometry))]
     try:
         scene = trimesh.load_scene(path)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, NotImplementedError) as error:
         raise ConfigError("robot.urdf", str(path), f"is a mesh that can not be read: {error}") from None
     meshes = []
     for mesh in scene.dump():

@@ -307,6 +307,7 @@ class SceneView:
 
     def _apply_scene(self, m: PlanningScene) -> None:
         self.objects.show(m)
+        self._apply("contours")  # they lie on the objects
 
     def _apply_targets(self, m: PoseArray) -> None:
         self.targets.show(m)
@@ -318,10 +319,15 @@ class SceneView:
         self._tf_applied = self._clock()
         if self._shown["frames"]:
             self.frames.show(self.transforms.message())
-        self._apply_camera(self._newest.get("camera"))
+        if "camera" in self._newest:
+            self._place_camera(self._newest["camera"])
 
-    def _apply_camera(self, m: CameraInfo | None) -> None:
-        if m is not None and self._shown["camera"]:
+    def _apply_camera(self, m: CameraInfo) -> None:
+        self._place_camera(m)
+        self._apply("contours")  # they are seen from there
+
+    def _place_camera(self, m: CameraInfo) -> None:
+        if self._shown["camera"]:
             self.camera.show(m, self.transforms.pose(m.header.frame_id))
 
     def _apply_picture(self, rgb: NDArray[np.uint8]) -> None:

@@ -91,7 +91,8 @@ class Truth:
 
     def _keep(self, names: list[str]) -> None:
         for name in [name for name in self._nodes if name not in names]:
-            self._drags.pop(name, None)
+            if name in self._drags:
+                self._drags.pop(name).stop()
             self._nodes.pop(name)[1].remove()
 
     def _listen(self) -> None:

@@ -1,0 +1,98 @@
+"""The ghost at the end of the plan, and the path of the tool."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from common import messages as m
+from tests.common.viewer.scene_cell import Stage, in_world
+
+
+def plan(stage: Stage, q: NDArray[np.float64], seconds: float = 2.0, count: int = 40) -> m.JointTrajectory:
+    start = stage.robot.named("home")
+    zeros = [0.0] * len(q)
+    return m.JointTrajectory(joint_names=stage.robot.joint_names, points=[
+        m.JointTrajectoryPoint(
+            time_from_start=float(s * seconds), positions=(start + s * (q - start)).tolist(), velocities=zeros,
+            accelerations=zeros,
+        ) for s in np.linspace(0, 1, count)
+    ])
+
+
+@pytest.fixture
+def there(panda: Stage) -> NDArray[np.float64]:
+    panda.view.show_joints(panda.joints(panda.robot.named("home")))
+    return panda.robot.named("home") + np.array([0.5, 0.2, 0, 0.1, 0, 0.1, 0])
+
+
+def tool_of_ghost(stage: Stage) -> NDArray[np.float64]:
+    return in_world(stage.server, stage.view.plan.ghost.links["panda_hand"])
+
+
+def test_ghost_stands_where_the_plan_ends(panda: Stage, there: NDArray[np.float64]) -> None:
+    assert not panda.view.plan.ghost.root.visible
+    panda.view.show_plan(plan(panda, there))
+    assert panda.view.plan.ghost.root.visible
+    np.testing.assert_allclose(tool_of_ghost(panda), panda.robot.link_poses(there)["panda_hand"], atol=1e-6)
+
+
+def test_line_is_the_path_of_the_tool(panda: Stage, there: NDArray[np.float64]) -> None:
+    trajectory = plan(panda, there)
+    panda.view.show_plan(trajectory)
+    line = panda.view.plan._line
+    assert line is not None
+    wanted = [panda.robot.fk(point.positions)[:3, 3] for point in trajectory.points]
+    np.testing.assert_allclose([line.points[0, 0], *line.points[:, 1]], wanted, atol=1e-5)
+
+
+def test_ghost_goes_when_the_robot_has_come(panda: Stage, there: NDArray[np.float64]) -> None:
+    panda.view.show_plan(plan(panda, there))
+    panda.view.show_joints(panda.joints(there - 0.05))
+    assert panda.view.plan.ghost.root.visible
+    panda.view.show_joints(panda.joints(there))
+    assert not panda.view.plan.ghost.root.visible
+
+
+def test_links_of_the_ghost_that_lie_in_the_robot_are_not_drawn(panda: Stage, there: NDArray[np.float64]) -> None:
+    panda.view.show_plan(plan(panda, there))
+    panda.view.show_joints(panda.joints(panda.robot.named("home")))
+    ghost = panda.view.plan.ghost.links
+    assert not ghost["panda_link0"].visible and ghost["panda_hand"].visible
+
+
+def test_ghost_plays_the_plan_over_and_over(panda: Stage, there: NDArray[np.float64]) -> None:
+    home = panda.robot.named("home")
+    panda.view.show_plan(plan(panda, there, seconds=2.0))
+    panda.view.play_plan()
+    panda.view.show_joints(panda.joints(home))
+    for seconds, share in ((1.0, 0.5), (1.5, 1.0), (1.0, 0.25)):  # 3.5 s: it began again after 2 s and a rest of 1 s
+        panda.clock.now += seconds
+        panda.view.show_joints(panda.joints(home))
+        wanted = panda.robot.link_poses(home + share * (there - home))["panda_hand"]
+        np.testing.assert_allclose(tool_of_ghost(panda), wanted, atol=1e-3)
+
+
+def test_ghost_stops_playing_when_the_robot_moves(panda: Stage, there: NDArray[np.float64]) -> None:
+    home = panda.robot.named("home")
+    panda.view.show_plan(plan(panda, there))
+    panda.view.play_plan()
+    panda.view.show_joints(panda.joints(home))
+    panda.clock.now += 0.5
+    panda.view.show_joints(panda.joints(home + 0.02 * (there - home) / 0.5))
+    assert not panda.view.plan.playing
+    np.testing.assert_allclose(tool_of_ghost(panda), panda.robot.link_poses(there)["panda_hand"], atol=1e-6)
+
+
+def test_plan_without_points_clears_the_last(panda: Stage, there: NDArray[np.float64]) -> None:
+    panda.view.show_plan(plan(panda, there))
+    panda.view.show_plan(m.JointTrajectory(joint_names=panda.robot.joint_names, points=[]))
+    assert not panda.view.plan.ghost.root.visible and panda.view.plan._line is None
+
+
+def test_plan_of_other_joints_does_no_harm(panda: Stage, there: NDArray[np.float64]) -> None:
+    odd = plan(panda, there).model_copy(update={"joint_names": [f"other_{i}" for i in range(7)]})
+    panda.view.show_plan(odd)
+    panda.view.play_plan()
+    panda.view.show_joints(panda.joints(there))

@@ -1,0 +1,203 @@
+"""The whole scene: robot, objects and layers; nothing is sent when nothing changed or nobody looks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import viser
+
+from common import messages as m
+from common.errors import UnknownName
+from common.robot.finger_joints import finger_positions
+from common.robot.transforms import pose_to_matrix
+from common.scene.fixtures import fixed_objects
+from common.viewer.layers import LAYERS
+from tests.common.viewer.scene_cell import WORLD, Stage, around_of, at, ball, in_world, is_shown, scene_of
+
+
+def fingers(stage: Stage, width: float) -> dict[str, float]:
+    gripper = stage.robot.config.gripper
+    assert gripper is not None
+    return dict(zip(gripper.joints, finger_positions(gripper, width), strict=True))
+
+
+@pytest.mark.parametrize("cell", ["panda", "ur5"])
+def test_links_are_where_forward_kinematics_puts_them(server: viser.ViserServer, cell: str) -> None:
+    stage = Stage(server, cell)
+    for share, width in ((0.0, 0.02), (0.4, 0.07)):
+        q = stage.robot.named("home") + share * (stage.robot.lower - stage.robot.named("home"))
+        stage.view.show_joints(stage.joints(q, fingers(stage, width)))
+        links = stage.robot.link_poses(q, fingers(stage, width))
+        for link, node in stage.view.figure.links.items():
+            np.testing.assert_allclose(in_world(server, node), links[link], atol=1e-6, err_msg=link)
+
+
+def test_fingers_move_apart(panda: Stage) -> None:
+    gaps = []
+    for width in (0.0, 0.08):
+        panda.view.show_joints(panda.joints(panda.robot.named("home"), fingers(panda, width)))
+        left, right = (in_world(panda.server, panda.view.figure.links[f"panda_{side}finger"]) for side in
+                       ("left", "right"))
+        gaps.append(float(np.linalg.norm(left[:3, 3] - right[:3, 3])))
+    assert gaps == pytest.approx([0.0, 0.08], abs=1e-6)
+
+
+def test_joints_that_the_robot_lacks_are_left_out(panda: Stage) -> None:
+    q = panda.robot.named("home") + 0.1
+    panda.view.show_joints(panda.joints(q, {"turntable_joint": 1.0}))
+    tcp = panda.view.figure.poses.pose("panda_hand_tcp")[0]
+    np.testing.assert_allclose(tcp, panda.robot.fk(q)[:3, 3], atol=1e-6)
+    panda.view.show_joints(m.JointState(header=WORLD, name=["other"], position=[1.0]))
+    np.testing.assert_allclose(panda.view.figure.poses.pose("panda_hand_tcp")[0], tcp)
+
+
+def test_nothing_is_sent_when_nothing_changed(panda: Stage) -> None:
+    pose = m.JointState(header=WORLD, name=panda.robot.joint_names, position=[0.1] * 3 + [-1.0] + [0.1] * 3)
+    scene = scene_of(*fixed_objects(around_of("panda")), ball("a", at(0.4, 0.1, 0.03)))
+    targets = m.PoseArray(header=WORLD, poses=[at(0.4, 0.1, 0.03)])
+    truth = m.PoseArray(header=WORLD, poses=[at(0.4, 0.1, 0.03)], ids=["ball_1"])
+    panda.view.set_visible("truth", True)
+
+    def show_all(stamp: int) -> None:
+        later = {"header": m.Header(stamp=stamp, frame_id="world")}
+        panda.view.show_joints(pose.model_copy(update=later))
+        panda.view.show_scene(scene.model_copy(update=later))
+        panda.view.show_targets(targets.model_copy(update=later))
+        panda.view.show_truth(balls=truth.model_copy(update=later))
+
+    with panda.sent() as first:
+        show_all(1)
+    with panda.sent() as again:
+        show_all(2)
+    assert first and not again
+
+
+def test_trembling_targets_are_not_sent_again(panda: Stage) -> None:
+    panda.view.show_targets(m.PoseArray(header=WORLD, poses=[at(0.4, 0.1, 0.03)]))
+    with panda.sent() as sent:
+        panda.view.show_targets(m.PoseArray(header=WORLD, poses=[at(0.4003, 0.0996, 0.03)]))
+    assert not sent
+
+
+def test_while_nobody_looks_nothing_is_sent_and_then_the_newest_of_all(panda: Stage) -> None:
+    panda.watched = False
+    q = panda.robot.named("home") + 0.2
+    with panda.sent() as sent:
+        for share in (0.5, 1.0):
+            panda.view.show_joints(panda.joints(panda.robot.named("home") + 0.2 * share))
+        panda.view.show_scene(scene_of(ball("a", at(0.4, 0.1, 0.03))))
+        panda.view.show_targets(m.PoseArray(header=WORLD, poses=[at(0.4, 0.1, 0.03)]))
+    assert not sent
+    panda.view._show_all()  # what a browser that connects brings about
+    assert panda.view.objects.node("a") is not None
+    hand = in_world(panda.server, panda.view.figure.links["panda_hand"])
+    np.testing.assert_allclose(hand, panda.robot.link_poses(q)["panda_hand"], atol=1e-6)
+
+
+def test_layers_are_shown_and_hidden(panda: Stage) -> None:
+    assert panda.view.layers == list(LAYERS)
+    panda.view.show_joints(panda.joints(panda.robot.named("home")))
+    hand = panda.view.figure.links["panda_hand"]
+    assert is_shown(panda.server, hand)
+    panda.view.set_visible("robot", False)
+    assert not is_shown(panda.server, hand) and not panda.view.visible("robot")
+    panda.view.set_visible("robot", True)
+    assert is_shown(panda.server, hand)
+
+
+def test_layers_begin_as_wanted_and_unknown_ones_are_refused(server: viser.ViserServer) -> None:
+    view = Stage(server, "panda", visible={"truth": True, "workspace": False}).view
+    assert view.visible("truth") and not view.visible("workspace") and view.visible("robot")
+    with pytest.raises(UnknownName, match=r"layer 'truht'.*'truth'"):
+        view.set_visible("truht", True)
+    with pytest.raises(UnknownName, match="choices: camera, contours"):
+        Stage(server, "panda", visible={"roboter": True})
+
+
+def test_hidden_layer_shows_the_newest_when_it_comes_back(panda: Stage) -> None:
+    panda.view.show_truth(balls=m.PoseArray(header=WORLD, poses=[at(0.4, 0.1, 0.03)], ids=["ball_1"]))
+    assert panda.view.truth.node("ball_1") is None
+    panda.view.set_visible("truth", True)
+    assert is_shown(panda.server, panda.view.truth.node("ball_1"))
+
+
+def test_objects_come_move_change_and_go(panda: Stage) -> None:
+    view = panda.view
+    view.show_scene(scene_of(*fixed_objects(around_of("panda")), ball("a", at(0.4, 0.1, 0.03))))
+    node, table = view.objects.node("a"), view.objects.node("table")
+    assert isinstance(node, viser.IcosphereHandle) and node.radius == 0.03 and node.color == (255, 36, 36)
+    assert isinstance(table, viser.BoxHandle) and table.dimensions == (1.0, 1.0, 0.05)
+    assert node.name.startswith("/objects/") and table.name.startswith("/fixtures/")
+    view.show_scene(scene_of(ball("a", at(0.5, 0.2, 0.03))))
+    assert view.objects.node("a") is node and view.objects.node("table") is None
+    np.testing.assert_allclose(in_world(panda.server, node)[:3, 3], [0.5, 0.2, 0.03])
+    larger = ball("a", at(0.5, 0.2, 0.03)).model_copy(update={"dimensions": [0.05]})
+    view.show_scene(scene_of(larger))
+    changed = view.objects.node("a")
+    assert isinstance(changed, viser.IcosphereHandle) and changed.radius == 0.05
+    view.show_scene(scene_of())
+    assert view.objects.node("a") is None
+
+
+def test_attached_object_moves_with_its_link(panda: Stage) -> None:
+    held = ball("held", at(0.01, 0.0, 0.02), role="attached")
+    panda.view.show_scene(scene_of(held={"panda_hand_tcp": held}))
+    for turn in (0.0, 0.3):
+        q = panda.robot.named("home") + turn
+        panda.view.show_joints(panda.joints(q))
+        wanted = panda.robot.fk(q) @ pose_to_matrix(held.pose)
+        node = panda.view.objects.node("held", "panda_hand_tcp")
+        np.testing.assert_allclose(in_world(panda.server, node), wanted, atol=1e-6)
+    panda.view.show_scene(scene_of(ball("held", at(0.5, 0.2, 0.03))))  # put down
+    assert panda.view.objects.node("held", "panda_hand_tcp") is None
+    np.testing.assert_allclose(in_world(panda.server, panda.view.objects.node("held"))[:3, 3], [0.5, 0.2, 0.03])
+
+
+def test_robot_can_be_hidden_without_what_it_holds(panda: Stage) -> None:
+    panda.view.show_scene(scene_of(held={"panda_hand": ball("held", at(0, 0, 0.1), role="attached")}))
+    panda.view.set_visible("robot", False)
+    assert is_shown(panda.server, panda.view.objects.node("held", "panda_hand"))
+
+
+def test_object_on_a_link_that_the_robot_lacks_is_left_out(panda: Stage) -> None:
+    panda.view.show_scene(scene_of(ball("a", at(0.4, 0, 0.03)), held={"third_hand": ball("b", at(0, 0, 0))}))
+    assert panda.view.objects.node("a") is not None
+    assert panda.view.objects.node("b", "third_hand") is None
+
+
+def test_prism_is_as_large_as_its_cross_section(ur5: Stage) -> None:
+    thing = m.CollisionObject(
+        id="yellow_1", role="target", shape="prism", dimensions=[0.06], pose=at(0.5, 0.0, 1.03),
+        outline=[(-0.02, -0.01), (0.04, -0.01), (0.04, 0.03), (-0.02, 0.03)],
+    )
+    ur5.view.show_scene(scene_of(thing))
+    node: Any = ur5.view.objects.node("yellow_1")
+    np.testing.assert_allclose(node.vertices.min(axis=0), [-0.02, -0.01, -0.03], atol=1e-6)
+    np.testing.assert_allclose(node.vertices.max(axis=0), [0.04, 0.03, 0.03], atol=1e-6)
+
+
+def test_messages_without_content_do_no_harm(ur5: Stage) -> None:
+    view = ur5.view
+    for name in view.layers:
+        view.set_visible(name, True)
+    view.show_joints(m.JointState(header=WORLD, name=[], position=[]))
+    view.show_scene(scene_of())
+    view.show_targets(m.PoseArray())
+    view.show_rejected(m.Rejections(header=WORLD, rejected=[]))
+    view.show_detected(m.MarkerArray(header=WORLD, markers=[]))
+    view.show_workspace(m.MarkerArray(header=WORLD, markers=[]))
+    view.show_transforms(m.TFMessage(transforms=[]))
+    view.show_picture(np.zeros((48, 64, 3), np.uint8))
+    view.show_plan(m.JointTrajectory(joint_names=["a"], points=[]))
+    view.play_plan()
+    view.show_outline(m.OutlinePoints())
+    view.show_contours(m.Contours(header=WORLD, width=64, height=48))
+    view.show_truth(balls=m.PoseArray(), objects=m.WorldObjects())
+    view.show_joints(m.JointState(header=WORLD, name=ur5.robot.joint_names, position=[0.0] * 6))
+
+
+def test_a_browser_is_met_with_plain_lights_and_a_view_of_the_cell(ur5: Stage) -> None:
+    assert ur5.server.initial_camera.look_at[2] == pytest.approx(1.0)  # the base is 0.75 m above the floor
+    assert not ur5.server.scene.world_axes.visible

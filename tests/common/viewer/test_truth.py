@@ -1,0 +1,143 @@
+"""The truth is shown when asked for; in the simulated world things are pulled about on their plane."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from common import messages as m
+from common.viewer.dragging import on_plane
+from tests.common.viewer.scene_cell import WORLD, Stage, at, is_shown
+
+EYE = np.array([1.0, -1.0, 1.0])
+
+
+def balls(**places: tuple[float, float]) -> m.PoseArray:
+    poses = [at(x, y, 0.03) for x, y in places.values()]
+    return m.PoseArray(header=WORLD, poses=poses, ids=list(places), labels=["table"] * len(poses))
+
+
+def disc(x: float) -> m.WorldObject:
+    angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    outline = [(float(x + 0.02 * np.cos(a)), float(0.02 * np.sin(a))) for a in angles]
+    return m.WorldObject(id="disc", shape="cylinder", outline=outline, base=1.0, height=0.02)
+
+
+def event(phase: str, start: tuple[float, ...], end: tuple[float, ...]) -> Any:
+    return SimpleNamespace(
+        phase=phase, client=SimpleNamespace(camera=SimpleNamespace(position=EYE)), start_position=start,
+        end_position=end,
+    )
+
+
+async def pull(node: Any, start: tuple[float, float], *way: tuple[float, float], z: float = 0.03) -> None:
+    """What viser says when somebody drags a node: points on a plane across the line of sight."""
+    def seen_at(x: float, y: float) -> tuple[float, ...]:
+        return tuple(EYE + 0.7 * (np.array([x, y, z]) - EYE))  # nearer to the eye, in the same line of sight
+
+    for entry in list(node._impl.drag_cb):
+        await entry.callback(event("start", (*start, z), (*start, z)))
+        for place in way:
+            await entry.callback(event("update", (*start, z), seen_at(*place)))
+        await entry.callback(event("end", (*start, z), seen_at(*way[-1])))
+
+
+@pytest.fixture
+def moved(panda: Stage) -> list[tuple[str, float, float]]:
+    found: list[tuple[str, float, float]] = []
+    panda.view.on_object_dragged = lambda name, x, y: found.append((name, round(x, 6), round(y, 6)))
+    return found
+
+
+def test_truth_is_hidden_until_it_is_asked_for(panda: Stage) -> None:
+    panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1)))
+    panda.view.set_visible("truth", True)
+    node = panda.view.truth.node("ball_1")
+    assert is_shown(panda.server, node) and node.wireframe
+    panda.view.set_visible("truth", False)
+    assert not is_shown(panda.server, node)
+
+
+def test_balls_come_move_and_go(panda: Stage) -> None:
+    panda.view.set_visible("truth", True)
+    panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1), ball_2=(0.5, 0.1)))
+    first = panda.view.truth.node("ball_1")
+    panda.view.show_truth(balls=balls(ball_1=(0.3, 0.1)))
+    assert panda.view.truth.node("ball_1") is first and panda.view.truth.node("ball_2") is None
+    np.testing.assert_allclose(first.position, [0.3, 0.1, 0.03])
+
+
+def test_object_of_the_world_is_shown_in_its_size(ur5: Stage) -> None:
+    ur5.view.set_visible("truth", True)
+    ur5.view.show_truth(objects=m.WorldObjects(header=WORLD, objects=[disc(0.5)]))
+    node = ur5.view.truth.node("disc")
+    np.testing.assert_allclose(node.position, [0.5, 0.0, 1.01], atol=1e-6)
+    np.testing.assert_allclose(np.ptp(node.vertices, axis=0), [0.04, 0.04, 0.02], atol=1e-4)
+    ur5.view.show_truth(objects=m.WorldObjects(header=WORLD, objects=[disc(0.6)]))
+    np.testing.assert_allclose(ur5.view.truth.node("disc").position, [0.6, 0.0, 1.01], atol=1e-6)
+
+
+async def test_ball_is_dropped_where_it_was_pulled_to(panda: Stage, moved: list[tuple[str, float, float]]) -> None:
+    panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1)))
+    panda.view.set_editing(True)
+    node = panda.view.truth.node("ball_1")
+    assert is_shown(panda.server, node)  # though the truth is not ticked
+    await pull(node, (0.41, 0.1), (0.45, 0.1), (0.51, 0.2))  # taken 1 cm beside its middle
+    assert moved == [("ball_1", 0.5, 0.2)]
+    np.testing.assert_allclose(node.position, [0.4, 0.1, 0.03])  # until the world says that it was moved
+
+
+async def test_ball_follows_the_pointer_and_not_the_world_meanwhile(panda: Stage) -> None:
+    panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1)))
+    panda.view.set_editing(True)
+    node = panda.view.truth.node("ball_1")
+    seen: list[list[float]] = []
+    for entry in node._impl.drag_cb:
+        for phase, place in (("start", (0.4, 0.1, 0.03)), ("update", (0.5, 0.2, 0.03))):
+            await entry.callback(event(phase, (0.4, 0.1, 0.03), place))
+        panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1)))
+        seen.append(node.position.tolist())
+    np.testing.assert_allclose(seen, [[0.5, 0.2, 0.03]])
+
+
+async def test_nothing_is_pulled_without_editing(panda: Stage, moved: list[tuple[str, float, float]]) -> None:
+    panda.view.set_visible("truth", True)
+    panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1)))
+    node = panda.view.truth.node("ball_1")
+    await pull(node, (0.4, 0.1), (0.5, 0.2))
+    panda.view.set_editing(True)
+    panda.view.set_editing(False)
+    await pull(node, (0.4, 0.1), (0.5, 0.2))
+    assert moved == [] and is_shown(panda.server, node)
+
+
+async def test_ball_in_the_hand_can_not_be_pulled(panda: Stage, moved: list[tuple[str, float, float]]) -> None:
+    panda.view.set_editing(True)
+    for label, count in (("held", 0), ("falling", 0), ("box", 1)):
+        there = balls(ball_1=(0.4, 0.1)).model_copy(update={"labels": [label]})
+        panda.view.show_truth(balls=there)
+        await pull(panda.view.truth.node("ball_1"), (0.4, 0.1), (0.5, 0.2))
+        assert len(moved) == count
+
+
+async def test_ball_that_goes_while_it_is_pulled_does_no_harm(
+    panda: Stage, moved: list[tuple[str, float, float]]
+) -> None:
+    panda.view.set_editing(True)
+    panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1)))
+    node = panda.view.truth.node("ball_1")
+    callbacks, place = list(node._impl.drag_cb), (0.4, 0.1, 0.03)
+    await callbacks[0].callback(event("start", place, place))
+    panda.view.show_truth(balls=balls())
+    for phase in ("update", "end"):
+        await callbacks[0].callback(event(phase, place, place))
+    assert moved == []
+
+
+def test_line_of_sight_meets_the_plane_below_and_not_above_the_horizon() -> None:
+    assert on_plane((0, 0, 2), (1, 1, 1), 0.0) == pytest.approx((2, 2))
+    assert on_plane((0, 0, 2), (1, 1, 3), 0.0) is None
+    assert on_plane((0, 0, 2), (1, 1, 2), 0.0) is None
