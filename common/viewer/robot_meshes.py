@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import coal
 import fast_simplification
@@ -76,8 +76,7 @@ def _simplified(mesh: trimesh.Trimesh, kept: float) -> trimesh.Trimesh:
     are, as do those that would shrink.
     """
     parts = [_simplified_part(part, kept) for part in mesh.split(only_watertight=False)]
-    whole: trimesh.Trimesh = trimesh.util.concatenate(parts)
-    return whole
+    return cast(trimesh.Trimesh, trimesh.util.concatenate(parts))
 
 
 def _simplified_part(part: trimesh.Trimesh, kept: float) -> trimesh.Trimesh:
