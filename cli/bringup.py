@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import os
 import signal
+import tempfile
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
@@ -237,6 +239,16 @@ class Operation:
         return 0 if self.summary.ready is not None else code
 
     async def _operate(self, work: Callable[[Bus], Awaitable[int]]) -> int:
+        """Exit code of the work, done in the cell. What is simulated stays as it is through restarts, until the end."""
+        from common.sim.standing import STATE_VARIABLE
+
+        if STATE_VARIABLE in os.environ:
+            return await self._in_cell(work)
+        with tempfile.TemporaryDirectory(prefix="zencell-") as folder:
+            self.launch = replace(self.launch, extra={**self.launch.extra, STATE_VARIABLE: folder})
+            return await self._in_cell(work)
+
+    async def _in_cell(self, work: Callable[[Bus], Awaitable[int]]) -> int:
         from common.supervision.interrupts import Interrupts
         from common.supervision.operation import Interrupted, operate
         from common.supervision.supervisor import Supervisor

@@ -32,6 +32,7 @@ from common.robot.model import RobotModel
 from common.scene.workspace import reach_reason
 from common.sim.layout import layout
 from common.sim.objects import world_object
+from common.sim.standing import Standing, state_file
 from common.sim.world import GraspTolerances, SimulatedWorld
 from common.transport.bus import Bus
 from common.transport.service import main
@@ -54,23 +55,33 @@ class Config(Parameters):
     grasp_tolerances: GraspTolerances = Field(GraspTolerances(), description="simulated hardware only")
 
 
-def make_cycle(config: Config, simulated: bool) -> ControlCycle:
-    """The controller with its hardware at the home pose and, when simulated, the balls laid out."""
+def make_cycle(config: Config, simulated: bool, kept: Standing | None, now: float) -> ControlCycle:
+    """The controller with its hardware at the home pose and, when simulated, the balls laid out.
+
+    Simulated hardware is found as it was `kept`, if that was of the same world.
+    """
     robot = RobotModel.load(config.robot)
     deceleration = np.array(config.robot.deceleration_limits) if config.robot.deceleration_limits else None
     limits = Limits(
         tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration, deceleration
     )
-    home = robot.named("home")
+    start = robot.named("home")
     world = None
     if simulated:
         places = layout(config.world, config.run.seed, lambda x, y: within_reach(robot, x, y, config))
         world = SimulatedWorld(config.world, places, config.grasp_tolerances)
-    return ControlCycle(
-        load_hardware(config.robot, limits, home), limits, home,
+        if kept is not None and (kept.layout != world.layout or len(kept.q) != robot.dof):
+            kept = None
+        if kept is not None:
+            start = np.array(kept.q)
+    cycle = ControlCycle(
+        load_hardware(config.robot, limits, start), limits, start,
         tolerances=config.tolerances, gripper=config.robot.gripper, controller=config.robot.controller,
         kinematics=robot, world=world,
     )
+    if kept is not None:
+        cycle.restore(kept, now)
+    return cycle
 
 
 def within_reach(robot: RobotModel, x: float, y: float, config: Config) -> bool:
@@ -117,7 +128,11 @@ async def run(bus: Bus, config: Config) -> None:
         bus.serve(topics.GRIPPER_COMMAND, command)
     if simulated:
         bus.serve(topics.WORLD_EDIT, edit)
-    cycle = await asyncio.to_thread(make_cycle, config, simulated)
+    memory = state_file(bus.cell) if simulated else None
+    kept = memory.load() if memory else None
+    cycle = await asyncio.to_thread(make_cycle, config, simulated, kept, bus.clock.now())
+    if kept is not None:
+        bus.log.info("the arm and what is about it are as they were")
     loop = asyncio.get_running_loop()
     period = 1 / bus.clock.wall_rate(config.joint_state_rate, MOST_CYCLES)
     try:
@@ -126,6 +141,8 @@ async def run(bus: Bus, config: Config) -> None:
         while True:
             cycle.speed_scaling = config.speed_scaling
             report = cycle.step(bus.header("world"))
+            if memory is not None and (standing := cycle.standing()) is not None:
+                memory.save(standing)
             if report.joints is not None:
                 joints.put(report.joints)
             if report.motion is not None:
@@ -143,6 +160,8 @@ async def run(bus: Bus, config: Config) -> None:
             await asyncio.sleep(due - loop.time())
     finally:
         cycle.close()
+        if memory is not None:
+            memory.close()
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -29,6 +30,7 @@ from common.messages import (
     WorldEditReply,
 )
 from common.robot.finger_joints import finger_positions, finger_velocities
+from common.sim.standing import Standing, StandingBall
 
 PROGRESS_PERIOD = 0.1  # cell time between reports of progress [s]
 WORLD_PERIOD = 0.05  # cell time between reports of a ball that moves [s]
@@ -61,6 +63,16 @@ class Truth(Protocol):
 
     def scene_balls(self, header: Header) -> PoseArray:
         """Where everything is."""
+
+    @property
+    def layout(self) -> list[tuple[float, float]]:
+        """Where everything was at first."""
+
+    def standing(self) -> dict[str, StandingBall]:
+        """Everything as it is, for `restore`."""
+
+    def restore(self, balls: Mapping[str, StandingBall]) -> None:
+        """Put everything where it was."""
 
     def take_events(self) -> list[SceneUpdate]:
         """What happened since the last call."""
@@ -118,6 +130,7 @@ class ControlCycle:
         self._told_motion_at = self._told_gripper_at = self._told_world_at = -np.inf
         self._told_gripper: GripperState | None = None
         self._told_version = -1
+        self._kept: object = None
 
     def step(self, header: Header) -> Report:
         """Do one cycle at the header's time and say what is new."""
@@ -140,6 +153,31 @@ class ControlCycle:
                 report.balls = self._world.scene_balls(header)
                 self._told_version, self._told_world_at = self._world.version, now
         return report
+
+    def standing(self) -> Standing | None:
+        """What simulated hardware would be found like after a restart, if it has changed since the last call."""
+        if self._world is None:
+            return None
+        width = self._gripper.state.width if self._gripper else None
+        told = self._gripper.told if self._gripper else None
+        mark = (self._q.tobytes(), width, told, self._world.version)
+        if mark == self._kept:
+            return None
+        self._kept = mark
+        return Standing(
+            layout=self._world.layout, q=self._q.tolist(), width=width, told_width=told, balls=self._world.standing()
+        )
+
+    def restore(self, state: Standing, now: float) -> None:
+        """Find fingers and world as they were; the arm was begun where it stood."""
+        assert self._world is not None
+        self._world.restore(state.balls)
+        if self._gripper is None or self._obstructible is None or self._kinematics is None or state.width is None:
+            return
+        self._obstructible.place(state.width)
+        self._obstructible.obstruct(self._world.obstruction(self._kinematics.fk(self._q), state.width))
+        self._gripper.resume(state.width if state.told_width is None else state.told_width, now)
+        self._gripper.update(self._obstructible.read(now))
 
     def execute(self, request: ExecuteRequest, now: float) -> MotionStatus:
         """The state of the goal: active, or rejected with the reason; for a known id what became of it."""

@@ -46,6 +46,12 @@ class Fingers:
             self._blocked = False
             self._start(self._now)
 
+    def place(self, width: float) -> None:
+        """Be at rest at a width [m] at once."""
+        self._width = self._target = min(max(width, 0.0), self._config.max_width)
+        self._velocity = self._acceleration = 0.0
+        self._motion, self._blocked = None, False
+
     def read(self, now: float) -> GripperReading:
         """Width [m], its rate [m/s], whether the fingers move, whether they press on something, and how hard."""
         self._advance(now)

@@ -45,6 +45,16 @@ class GripperController:
         self.state = GripperState.model_validate({**reading, "moving": True, "id": request.id, "state": "active"})
         return self._memory.put(request.id, self.state)
 
+    @property
+    def told(self) -> float:
+        """Width that the fingers were told last [m]."""
+        return self._target
+
+    def resume(self, width: float, now: float) -> None:
+        """Go on pressing or moving to the width [m] that was told before this process began."""
+        self._gripper.command(width, now, self._config.max_effort)
+        self._target = width
+
     def update(self, reading: GripperReading) -> GripperState:
         """The state with the newest reading: a goal is over when the fingers have stopped."""
         changes: dict[str, object] = {

@@ -75,6 +75,9 @@ class SimulatedGripper(Gripper, Protocol):
     def obstruct(self, width: float) -> None:
         """Let the fingers close no further than a width [m]; 0 when nothing is between them."""
 
+    def place(self, width: float) -> None:
+        """Be at rest at a width [m]: where the fingers stood when the process before this one ended."""
+
 
 class Hardware(Protocol):
     """The joints of an arm, and its gripper where it has one."""

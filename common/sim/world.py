@@ -7,7 +7,7 @@ can not stay where it falls appears at the nearest place where it can.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +19,7 @@ from common.config import Parameters, Tunable, World
 from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Header, Pose, PoseArray, SceneUpdate, Vector3, WorldEdit
 from common.sim.places import Slot, Slots, Table
+from common.sim.standing import StandingBall
 
 Array = NDArray[np.float64]
 BallState = Literal["table", "held", "falling", "box", "elsewhere"]
@@ -84,6 +85,35 @@ class SimulatedWorld:
         except Refused as refusal:
             raise ConfigError("world.balls", self._layout, f"can not be laid out: {refusal}") from None
         self._events.clear()
+
+    # --- over a restart ---
+
+    @property
+    def layout(self) -> list[tuple[float, float]]:
+        """Where the balls lay at first (x, y) [m]."""
+        return self._layout
+
+    def standing(self) -> dict[str, StandingBall]:
+        """All balls, for `restore`."""
+        return {
+            name: StandingBall(
+                position=_triple(ball.position), state=ball.state, slot=ball.slot, dropped=ball.dropped,
+                since=ball.since, grip=None if ball.grip is None else _triple(ball.grip),
+                rest=None if ball.rest is None else _triple(ball.rest),
+            )
+            for name, ball in self._balls.items()
+        }
+
+    def restore(self, balls: Mapping[str, StandingBall]) -> None:
+        """Put all balls where they were."""
+        self._balls = {
+            name: _Ball(
+                np.array(ball.position), ball.state, ball.slot, None if ball.grip is None else np.array(ball.grip),
+                ball.dropped, ball.since, None if ball.rest is None else np.array(ball.rest),
+            )
+            for name, ball in balls.items()
+        }
+        self.version += 1
 
     # --- the hand ---
 
@@ -318,6 +348,11 @@ class SimulatedWorld:
     def _places(self, but: str) -> Array:
         """The same seen from above (N, 2), without what lies below the table."""
         return np.array([there[:2] for _, there in self._lying(but) if there[2] > self._table.height]).reshape(-1, 2)
+
+
+def _triple(position: Array) -> tuple[float, float, float]:
+    x, y, z = position.tolist()
+    return x, y, z
 
 
 def _pose(position: Array) -> Pose:

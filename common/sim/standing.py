@@ -1,0 +1,92 @@
+"""What stays as it is while the process that simulates it is gone: an arm with its brakes on, and things that lie.
+
+Real hardware and a real table do not go back to their beginnings when a driver is started again. So that simulated
+ones do not either, their state is kept in a file, which survives the process however it ends.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+STATE_VARIABLE = "ZENCELL_STATE"  # folder for it; without one nothing is kept
+SLOT = 256 * 1024  # [bytes] for each of the two newest states
+_HEAD = struct.Struct("<QII")  # number of the state, its length and checksum
+
+
+class StandingBall(BaseModel):
+    """A ball as the simulated world knows it; positions [m] in world, `grip` in the frame of the tool centre point."""
+
+    position: tuple[float, float, float]
+    state: Literal["table", "held", "falling", "box", "elsewhere"]
+    slot: tuple[int, int] | None = None
+    grip: tuple[float, float, float] | None = None
+    dropped: float = 0.0
+    since: float = 0.0
+    rest: tuple[float, float, float] | None = None
+
+
+class Standing(BaseModel):
+    """Joints (dof,) [rad], fingers [m] and balls at one moment."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    layout: list[tuple[float, float]]
+    q: list[float]
+    width: float | None = None
+    told_width: float | None = None
+    balls: dict[str, StandingBall] = {}
+
+
+class StateFile:
+    """Keeps the newest state in a file: two places are written in turn, so that one of them is always whole."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file, which need not be there yet."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+        self._number = 0
+
+    def load(self) -> Standing | None:
+        """The newest state that is whole; None when there is none."""
+        newest: Standing | None = None
+        for place in (0, SLOT):
+            head = os.pread(self._descriptor, _HEAD.size, place)
+            if len(head) < _HEAD.size:
+                continue
+            number, length, checksum = _HEAD.unpack(head)
+            body = os.pread(self._descriptor, min(length, SLOT), place + _HEAD.size)
+            if number <= self._number or zlib.crc32(body) != checksum:
+                continue
+            try:
+                newest, self._number = Standing.model_validate_json(body), number
+            except ValidationError:  # of another version
+                continue
+        return newest
+
+    def save(self, state: Standing) -> None:
+        """Write a state, which outlives this process at once, but not the machine."""
+        body = state.model_dump_json().encode()
+        self._number += 1
+        place = SLOT * (self._number % 2)
+        os.pwrite(self._descriptor, _HEAD.pack(self._number, len(body), zlib.crc32(body)) + body, place)
+
+    def close(self) -> None:
+        """Close the file, which stays."""
+        os.close(self._descriptor)
+
+
+def state_file(cell: str, environ: Mapping[str, str] = os.environ) -> StateFile | None:
+    """The file of a cell's simulated hardware; None when nobody has said where it is to be kept.
+
+    Its name has that of the host: a container that is started again has the same one, a new one has not.
+    """
+    folder = environ.get(STATE_VARIABLE)
+    return StateFile(Path(folder) / f"{cell}-{socket.gethostname()}.state") if folder else None
