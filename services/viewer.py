@@ -38,7 +38,7 @@ class Config(Parameters):
     members: Members
     host: str = Field("127.0.0.1", min_length=1, description="address to listen at; others than this need a token")
     port: int = Field(8080, ge=0, le=65535, description="TCP port; 0: any that is free")
-    token: str = Field("", description="that a browser has to bring: http://HOST:PORT/?token=TOKEN")
+    token: str = Field("", repr=False, description="that a browser has to bring: http://HOST:PORT/?token=TOKEN")
     layout: str = Field("", description="file of the layout; empty: config/viewer.yaml")
     rate: float = Field(30.0, ge=1, le=60, description="of the moving robot, wall time [Hz]")
     picture_rate: float = Field(10.0, gt=0, le=30, description="of each camera picture at most, wall time [Hz]")
@@ -57,15 +57,21 @@ def load(server: viser.ViserServer, config: Config, layers: dict[str, bool]) -> 
 
 async def quiet(bus: Bus, config: Config, page: Page) -> None:
     """Return when the cell is up, or somebody wants to see it: until then the machine has better things to do."""
-    others = {*config.members.services} - {bus.service}
-    visited = asyncio.create_task(page.visited.wait())
-    up = [asyncio.create_task(bus.alive.wait(name)) for name in others]
-    all_up = asyncio.gather(*up)
+
+    async def up() -> None:
+        for name in config.members.services:
+            await bus.alive.wait(name)
+
+    either = [asyncio.create_task(waiting) for waiting in (up(), _visited(page))]
     try:
-        await asyncio.wait({visited, all_up}, timeout=START_PATIENCE, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait(either, timeout=START_PATIENCE, return_when=asyncio.FIRST_COMPLETED)
     finally:
-        visited.cancel()
-        all_up.cancel()
+        for task in either:
+            task.cancel()
+
+
+async def _visited(page: Page) -> None:
+    await page.visited.wait()
 
 
 async def run(bus: Bus, config: Config) -> None:
