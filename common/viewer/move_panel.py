@@ -42,7 +42,7 @@ class MovePanel:
     """A tick for the goal marker, a list of planners, buttons to plan and go, and how it went."""
 
     def __init__(
-        self, gui: viser.GuiApi, desk: Desk, motions: Motions, goal: Callable[[], Goal | None],
+        self, gui: viser.GuiApi, desk: Desk, motions: Motions, goal: Goal,
         planners: Sequence[str], *, planner: str, marker: bool, tell: Callable[[str, str], None],
     ) -> None:
         """Lay the panel out where the GUI stands.
@@ -51,7 +51,7 @@ class MovePanel:
             gui: of the server.
             desk: takes the orders.
             motions: carry them out.
-            goal: the goal marker, once there is one.
+            goal: the goal marker.
             planners: that may be asked.
             planner: that is asked at first.
             marker: whether the goal marker is shown at first.
@@ -66,28 +66,27 @@ class MovePanel:
                                  hint="pipeline: the cell's planners, in their order")
         desk.on_change(names, self._set_planner)
         desk.on_choice(gui.add_button_group("Goal", (PLAN, GO)), self._go)
+        if marker:
+            goal.goal_marker(True)
         self._html = gui.add_html(_line("Show the goal marker, drag it, then plan or go there.", "dim"))
 
     def set_marker(self, on: bool) -> None:
         """Show or hide the goal marker."""
         self.marker = on
         assign(self._tick, on)
-        goal = self._goal()
-        if goal is not None:
-            goal.goal_marker(on)
+        self._goal.goal_marker(on)
 
     async def go_home(self) -> None:
         """Have the arm go home."""
         await self._do(self._move(JointGoal(named="home"), "", "At home"), "Going home …")
 
     async def _go(self, chosen: str) -> None:
-        goal = self._goal()
-        if goal is None or not self.marker:
+        if not self.marker:
             self.set_marker(True)
             self._tell("Drag the goal marker to where the tool should be, then try again.", "busy")
             return
         planner = "" if self.planner == PIPELINE else self.planner
-        there = PoseGoal(pose=goal.goal_pose)
+        there = PoseGoal(pose=self._goal.goal_pose)
         if chosen == PLAN:
             await self._do(self._plan(there, planner), "Planning …")
         elif chosen == GO:

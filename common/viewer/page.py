@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import viser
 
 from common import topics
 from common.config import Members, check
 from common.errors import ZencellError
-from common.messages import Image, JointState, OutlineSelect
+from common.messages import Image, OutlineSelect
 from common.topics import Topic
 from common.viewer.desk import Desk
 from common.viewer.feeds import Feeds
@@ -25,11 +25,13 @@ from common.viewer.pictures import ANNOTATED, LIVE, PicturePanel
 from common.viewer.plots import Limits, PlotPanel
 from common.viewer.requests import Requests
 from common.viewer.scene_feed import SceneFeed
-from common.viewer.scene_view import SceneView
 from common.viewer.task_panel import TaskPanel
 from common.viewer.tuning import TuningPanel
 from common.viewer.view_panel import ViewPanel
 from common.viewer.words import gripper
+
+if TYPE_CHECKING:
+    from common.viewer.scene_view import SceneView
 
 OUTLINER = "contour_tracer"
 IMAGES: dict[str, tuple[Topic[Image], ...]] = {
@@ -45,11 +47,12 @@ class Page:
     Attributes:
         desk: carries out what persons do.
         pages: how many browsers look.
+        visited: set once one has.
     """
 
     def __init__(
         self, server: viser.ViserServer, feeds: Feeds, requests: Requests, motions: Motions, members: Members, *,
-        cell: str, limits: Limits, planners: list[str], layout: Layout, layout_file: str, periods: Periods,
+        cell: str, layout: Layout, layout_file: str, periods: Periods,
     ) -> None:
         """Lay the page out; on the running loop.
 
@@ -60,17 +63,18 @@ class Page:
             motions: for the person.
             members: of the cell.
             cell: its name.
-            limits: of the joints.
-            planners: that may be asked.
             layout: what is on.
             layout_file: where the layout is kept; empty for the project's file.
             periods: of the parts.
         """
         self._server, self._feeds, self._requests = server, feeds, requests
-        self._cell, self._members, self._limits = cell, members, limits
+        self._motions, self._cell = motions, cell
         self._layout, self._layout_file, self._periods = layout, layout_file, periods
         self._scene = SceneFeed(feeds, periods, layout.layers, layout.edit_world)
+        self._plots: PlotPanel | None = None
+        self._move: MovePanel | None = None
         self.pages = 0
+        self.visited = asyncio.Event()
         self.desk = Desk(asyncio.get_running_loop(), self._tell)
         gui = server.gui
         gui.configure_theme(dark_mode=layout.dark, show_logo=False, show_share_button=False)
@@ -83,20 +87,15 @@ class Page:
         panel.dock_below(gui.main_panel)
         hidden = gui.add_folder(None, visible=False)  # holds the panels that have no tab
         place: dict[Tab, viser.GuiTabHandle | viser.GuiFolderHandle] = {tab: tabs.get(tab, hidden) for tab in TABS}
+        self._place = place
         with place["Cameras"]:
             self._pictures = PicturePanel(
                 gui, self.desk, {LIVE: layout.live_image, ANNOTATED: layout.annotated_image}, self._listen)
         with place["Health"]:
             self._health = HealthPanel(gui, members.services)
-        with place["Plots"]:
-            seen = "Picture to targets" if topics.VALIDATED_TARGETS in feeds else "Picture to path"
-            self._plots = PlotPanel(gui, limits, seen)
         with place["Log"]:
             self._log = LogPanel(gui, self.desk, layout.log_level)
         self._tuning = TuningPanel(gui, place["Tuning"], self.desk, requests)
-        with place["Move"]:
-            self._move = MovePanel(gui, self.desk, motions, lambda: self._scene.scene, planners, planner=layout.planner,
-                                   marker=layout.goal_marker, tell=self._task.tell)
         with place["View"]:
             self._view = ViewPanel(gui, self.desk, self._scene.layers, self._scene.editing, on_layer=self._set_layer,
                                    on_editing=self._set_editing, on_save=self._save)
@@ -120,13 +119,24 @@ class Page:
         """Whether each layer of the scene is shown."""
         return dict(self._scene.layers)
 
-    def set_scene(self, scene: SceneView) -> None:
-        """Show what the cell says in a scene, from now on."""
+    def complete(self, scene: SceneView, limits: Limits, planners: list[str]) -> None:
+        """Add what takes a while to load, and show what the cell says in the scene from now on.
+
+        Args:
+            scene: of the server.
+            limits: of the joints.
+            planners: that may be asked.
+        """
+        gui = self._server.gui
+        with self._place["Plots"]:
+            seen = "Picture to targets" if topics.VALIDATED_TARGETS in self._feeds else "Picture to path"
+            self._plots = PlotPanel(gui, limits, seen)
+        with self._place["Move"]:
+            self._move = MovePanel(gui, self.desk, self._motions, scene, planners, planner=self._layout.planner,
+                                   marker=self._layout.goal_marker, tell=self._task.tell)
         scene.on_select = lambda index: self.desk.put(lambda: self._select(index))
         scene.on_object_dragged = lambda name, x, y: self.desk.put(lambda: self._requests.move(name, x, y))
         self._scene.begin(scene)
-        if self._move.marker:
-            scene.goal_marker(True)
 
     def refresh(self, now: float, alive: frozenset[str]) -> None:
         """Show what is new at a wall time [s], monotonic; without a browser only what plots need is kept.
@@ -136,8 +146,8 @@ class Page:
             alive: the services that are ready.
         """
         state = self._feeds.fresh(topics.JOINT_STATES)
-        if state is not None:
-            self._sample(state, now)
+        if state is not None and self._plots is not None:
+            self._plots.measured(state, now)
         if not self.pages:
             return
         if self._periods.due("task", now):
@@ -147,7 +157,7 @@ class Page:
             self._log.show()
         if self._periods.due("health", now):
             self._health.show(self._feeds.latest(topics.SUPERVISOR_STATUS), alive)
-        if self._periods.due("plots", now):
+        if self._plots is not None and self._periods.due("plots", now):
             self._plots.show(now)
         if self._periods.due("picture", now):
             self._show_pictures(now)
@@ -155,14 +165,6 @@ class Page:
         if contours is not None:
             self._task.show_contours(contours)
         self._scene.show(state, contours, now)
-
-    def _sample(self, state: JointState, now: float) -> None:
-        at = {name: index for index, name in enumerate(state.name)}
-        if not all(name in at for name in self._limits.names):
-            return
-        order = [at[name] for name in self._limits.names]
-        speeds = [state.velocity[i] for i in order] if state.velocity else None
-        self._plots.joints([state.position[i] for i in order], speeds, now)
 
     def _show_pictures(self, now: float) -> None:
         for name, sources in IMAGES.items():
@@ -201,7 +203,8 @@ class Page:
     async def _follow_latency(self, topic: Topic[Any], age_ms: Callable[[int], float]) -> None:
         if (reader := self._feeds.reader(topic)) is not None:
             async for message in reader:
-                self._plots.latency(age_ms(message.header.stamp), asyncio.get_running_loop().time())
+                if self._plots is not None:
+                    self._plots.latency(age_ms(message.header.stamp), asyncio.get_running_loop().time())
 
     async def _follow_parameters(self) -> None:
         while True:
@@ -215,6 +218,7 @@ class Page:
         before, self.pages = self.pages, len(self._server.get_clients())
         if self.pages and not before:
             self._periods.hurry()
+            self.visited.set()
         self._listen()
 
     def _listen(self) -> None:
@@ -226,7 +230,10 @@ class Page:
         self._feeds.listen(wanted)
 
     async def _home(self) -> None:
-        await self._move.go_home()
+        if self._move is None:
+            self._task.tell("The page is still loading: try again in a moment.", "busy")
+        else:
+            await self._move.go_home()
 
     async def _select(self, index: int) -> None:
         await self._task.choose(OutlineSelect(rule="index", index=index))
@@ -238,6 +245,9 @@ class Page:
     def _set_editing(self, on: bool) -> None:
         self._scene.set_editing(on)
         self._listen()
+
+    def _chosen_motion(self) -> dict[str, object]:
+        return {"goal_marker": self._move.marker, "planner": self._move.planner} if self._move else {}
 
     def _save(self, client: viser.ClientHandle | None) -> None:
         usual = layers_shown({})
@@ -251,7 +261,7 @@ class Page:
                 "layers": {name: on for name, on in self._scene.layers.items() if on != usual[name]},
                 "viewpoints": viewpoints, "live_image": self._pictures.shown[LIVE],
                 "annotated_image": self._pictures.shown[ANNOTATED], "log_level": self._log.level,
-                "edit_world": self._scene.editing, "goal_marker": self._move.marker, "planner": self._move.planner,
+                "edit_world": self._scene.editing, **self._chosen_motion(),
             })
             path = save_layout(self._layout_file, layout)
         except OSError as error:

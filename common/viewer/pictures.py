@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -30,6 +29,8 @@ def rgb_picture(image: Image, widest: int = WIDEST) -> Picture:
     Raises:
         ImageError: the message contradicts itself, or is no picture to look at.
     """
+    import cv2  # only when there is a picture: the page is to be there soon
+
     array: NDArray[Any] = image_to_array(image)
     if array.dtype != np.uint8:
         raise ImageError("encoding", f"{image.encoding} is no picture to look at")

@@ -12,6 +12,7 @@ import viser
 from numpy.typing import ArrayLike, NDArray
 from viser import uplot
 
+from common.messages import JointState
 from common.viewer.markup import block, fields
 
 SECONDS = 30.0  # [s] wall time that is shown
@@ -55,6 +56,14 @@ class PlotPanel:
         self._speeds = _plot(gui, joints, names, "Speed, % of the limit", (-105.0, 105.0))
         self._latency = _plot(gui, (x, none), [latency], f"{latency} [ms]", None)
         self._figures = gui.add_html("")
+
+    def measured(self, state: JointState, now: float) -> None:
+        """Take a sample of joint states that came at a wall time [s]; one in which a joint is missing is left out."""
+        at = {name: index for index, name in enumerate(state.name)}
+        if all(name in at for name in self._limits.names):
+            order = [at[name] for name in self._limits.names]
+            speeds = [state.velocity[i] for i in order] if state.velocity else None
+            self.joints([state.position[i] for i in order], speeds, now)
 
     def joints(self, positions: ArrayLike, velocities: ArrayLike | None, now: float) -> None:
         """Take a sample of the joints, in the order of the limits, at a wall time [s]; too many are left out.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from common import topics
 from common.messages import Contours, JointState, Rejections
@@ -12,7 +12,9 @@ from common.viewer.feeds import Feeds
 from common.viewer.layers import layers_shown
 from common.viewer.periods import Periods
 from common.viewer.pictures import Picture
-from common.viewer.scene_view import SceneView
+
+if TYPE_CHECKING:
+    from common.viewer.scene_view import SceneView
 
 TRUTH: tuple[Topic[Any], ...] = (topics.SCENE_BALLS, topics.SCENE_OBJECTS)
 

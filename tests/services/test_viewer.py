@@ -59,7 +59,8 @@ class SceneDouble:
 
 @pytest.fixture(autouse=True)
 def scenes(monkeypatch: pytest.MonkeyPatch) -> list[SceneDouble]:
-    monkeypatch.setattr(viewer, "SceneView", SceneDouble)
+    monkeypatch.setattr("common.viewer.scene_view.SceneView", SceneDouble)
+    monkeypatch.setattr(viewer, "START_PATIENCE", 0.0)
     monkeypatch.setattr(SceneDouble, "made", [])
     return SceneDouble.made
 
@@ -363,7 +364,7 @@ async def test_rejection_that_came_before_the_scene_is_shown_in_it(
         assert go.wait(PATIENCE)
         return SceneDouble(*arguments, **options)
 
-    monkeypatch.setattr(viewer, "SceneView", slow)
+    monkeypatch.setattr("common.viewer.scene_view.SceneView", slow)
     async with page_of("panda") as played, opened(played.port) as page:
         rejected = m.Rejections(header=m.Header(), rejected=[m.Rejection(position=m.Vector3(x=1.0), reason="too far")])
         played.bus.writer(topics.REJECTED_TARGETS).put(rejected)
@@ -371,3 +372,21 @@ async def test_rejection_that_came_before_the_scene_is_shown_in_it(
         await until(lambda: played.commands)
         go.set()
         await until(lambda: scenes and scenes[0].shown("show_rejected") == [(rejected,)])
+
+
+async def test_meshes_are_read_when_the_cell_is_up_or_somebody_looks(
+    scenes: list[SceneDouble], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(viewer, "START_PATIENCE", 1e6)
+    cell = load_cell("panda")
+    async with page_of("panda") as played:
+        await played.bus.alive.wait("viewer")
+        assert not scenes
+        async with opened(played.port):
+            await until(lambda: scenes)
+    scenes.clear()
+    async with page_of("panda") as played:
+        for name in cell.services:
+            assert not scenes
+            await played.net.bus(name, cell="test").ready()
+        await until(lambda: scenes)
