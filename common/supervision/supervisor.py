@@ -24,7 +24,7 @@ T = TypeVar("T")
 START_TIMEOUT = 15.0  # [s] from being let through the gate to the readiness token
 HEAD_START = 0.5  # [s] between SIGTERM to one service and to the one before it, when it does not end sooner
 TERM_TIMEOUT = 5.0  # [s] from SIGTERM to SIGKILL
-STOP_TIMEOUT = 6.5  # [s] after which whatever still runs is killed
+STOP_TIMEOUT = 6.5  # [s] after which every service that still runs is killed
 SHOWN_LINES = 5  # last log lines in the error of a service that did not become ready
 CONFIG_EXIT = 2  # a process that ends with this code was configured wrongly: starting it again will not help
 
@@ -156,9 +156,12 @@ class Supervisor:
         deadline = time.monotonic() + STOP_TIMEOUT
         ending: set[asyncio.Task[None]] = set()
         for watched in reversed(self._all):
-            if watched is self._router and ending:  # the others say goodbye through it
+            # The others say goodbye through the router, and those that look on want to hear it.
+            if (watched is self._router or not watched.again) and ending:
                 await asyncio.wait(ending, timeout=max(0.0, deadline - 0.5 - time.monotonic()))
-            task = asyncio.create_task(self._end(watched, min(deadline, time.monotonic() + TERM_TIMEOUT), hurry))
+            latest = time.monotonic() + TERM_TIMEOUT
+            # Who looks on has its whole time, however long the others took: it may have much to write.
+            task = asyncio.create_task(self._end(watched, min(deadline, latest) if watched.again else latest, hurry))
             ending.add(task)
             await asyncio.wait({task}, timeout=0 if hurry.is_set() else HEAD_START)
         await asyncio.wait(ending)

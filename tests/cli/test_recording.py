@@ -284,7 +284,7 @@ def test_terminal_is_given_back_after_a_signal(tmp_path: Path, number: int) -> N
 def test_run_records_from_before_its_services_are_ready_to_after_their_end(zencell: Start, folder: Path) -> None:
     command = zencell("run", "tiny.yaml", "--set", "services.last.behave=done", "--record", "run.mcap", "--seed", "9")
     assert command.end() == 0, command.lines
-    assert any("recorded " in line and "run.mcap" in line for line in command.lines)
+    assert any("recorded " in line and "run.mcap" in line for line in command.lines), command.lines
     said = [line for line in command.lines if "hello from" in line or "recording tiny" in line]
     assert said[0].startswith("recorder: recording tiny")
     command.until_childless()
