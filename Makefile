@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup run up test check bench docs deploy clean
+.PHONY: setup run up test containers check bench docs deploy clean
 
 setup: $(STAMP)
 
@@ -22,6 +22,9 @@ up: setup  ## the same, and stay until Ctrl-C
 
 test: setup
 	$(BIN)/python -m pytest -q
+
+containers: setup  ## build the image and run a cell in containers; needs a container engine
+	$(BIN)/python -m pytest -q -m container tests/deploy
 
 check: setup
 	$(BIN)/ruff check .
