@@ -28,6 +28,7 @@ from cli import (
     param,
     playing,
     recording,
+    report,
     robot,
     secure,
     tf,
@@ -108,6 +109,7 @@ app.command()(recording.record)
 app.command()(recording.info)
 app.command()(playing.play)
 app.command()(recording.recover)
+app.command()(report.report)
 app.command()(exporting.export)
 app.add_typer(secure.app, name="secure")
 app.command()(doctor.doctor)

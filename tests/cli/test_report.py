@@ -1,0 +1,295 @@
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from cli.main import app
+from common import messages as m
+from common.recording.sample import Sample
+from common.recording.writing import RUN, RecordingWriter
+from common.transport.codec import encode
+
+BEGIN = 1_700_000_000_000_000_000  # [ns]
+ARM = [f"panda_joint{k}" for k in range(1, 8)]
+UR5 = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
+KINDS = {"joint_states": "stream", "detected_objects": "stream", "validated_targets": "stream", "log": "event",
+         "rejected_targets": "event", "counters": "event"}
+NASTY = '<script>alert("1")</script> & $x^2$'
+
+
+class Tape:
+    """Writes a recording of which every number is known."""
+
+    def __init__(self, path, cell="panda", **run):
+        self.cell = cell
+        self.writer = RecordingWriter(path, {"cell": cell, "versions": {"zencell": "0.1.0"}})
+        self.writer.describe(RUN, {"speed": 1.0, "epoch": BEGIN, "seed": 7, "world": "", "overrides": [], **run})
+
+    def put(self, seconds, topic, message):
+        name = type(message).__name__
+        self.writer.add(Sample(f"{self.cell}/{topic}", encode(message), BEGIN + round(seconds * 1e9), message=name,
+                               kind=KINDS.get(topic, "state"), writer="w"))
+
+    def header(self, seconds):
+        return m.Header(stamp=BEGIN + round(seconds * 1e9), frame_id="world")
+
+
+class Page(HTMLParser):
+    """Sections with their text, rows of tables, and everything that a browser would ask for."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.sections, self.rows, self.asked, self.tags = {}, [], [], []
+        self._section, self._cell = "", None
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        self.tags.append(tag)
+        self.asked += [v for k, v in values.items() if k in ("src", "href", "xlink:href", "action") and v]
+        if tag == "section":
+            self._section = values["id"]
+            self.sections[self._section] = ""
+        elif tag == "tr":
+            self.rows.append((self._section, []))
+        elif tag == "td":
+            self.rows[-1][1].append("")
+            self._cell = self.rows[-1][1]
+
+    def handle_endtag(self, tag):
+        if tag == "td":
+            self._cell = None
+
+    def handle_data(self, data):
+        if self._section:
+            self.sections[self._section] += f" {data}"
+        if self._cell is not None:
+            self._cell[-1] += data
+
+    def table(self, section):
+        return [row for name, row in self.rows if name == section and row]
+
+
+def point(x, y, z=0.03):
+    return m.Vector3(x=x, y=y, z=z)
+
+
+def pick_and_place(tape):
+    plans = [m.PlanFigure(planner="cartesian", seconds=0.012, fraction=1.0, attempts=1),
+             m.PlanFigure(planner="ompl", seconds=0.345, fraction=1.0, attempts=3)]
+    ball = m.CollisionObject(id="ball_1", role="target", shape="sphere", dimensions=[0.03],
+                             pose=m.Pose(position=point(0.5, 0.1)))
+    table = m.CollisionObject(id="table", role="fixture", shape="box", dimensions=[1, 1, 0.05],
+                              pose=m.Pose(position=point(0.5, 0, -0.025)))
+    services = [m.ServiceStatus(name="vision_detector", state="ready", ready_seconds=1.25)]
+    tape.put(0, "supervisor/status", m.SupervisorStatus(cell="panda", services=services))
+    tape.put(0.1, "planning_scene", m.PlanningScene(header=tape.header(0.1), objects=[ball, table]))
+    tape.put(0.2, "pick_place_status", m.PickPlaceStatus(header=tape.header(0.2), state="IDLE", targets=2))
+    for k in range(100):
+        t = 0.25 + 0.02 * k
+        q = [0.3 * np.sin(t), 0.1, 0, -1.5, 0, 1.5, 0.2]
+        dq = [0.1] * 6 + [-1.305]
+        tape.put(t, "joint_states", m.JointState(header=tape.header(t), name=ARM, position=q, velocity=dq))
+    for k in range(10):
+        t = 0.3 + 0.1 * k
+        exposed = tape.header(t - 0.001 * (k + 1))  # 1 to 10 ms old
+        found = [m.Marker(ns="ball", id=0, type="sphere", pose=m.Pose(position=point(0.5, 0.1)), scale=point(1, 1, 1))]
+        tape.put(t - 0.0005, "detected_objects", m.MarkerArray(header=exposed, markers=found))
+        tape.put(t, "validated_targets", m.PoseArray(header=exposed, poses=[m.Pose(position=point(0.5, 0.1))]))
+    tape.put(0.5, "rejected_targets", m.Rejections(
+        header=tape.header(0.5), rejected=[m.Rejection(position=point(0.2, 0.0), reason=f"too near {NASTY}")]))
+    for k in range(len(plans)):
+        rest = {"positions": [0] * 7, "velocities": [0] * 7, "accelerations": [0] * 7}
+        last = m.JointTrajectoryPoint(time_from_start=2.5 + k, **rest)
+        tape.put(0.6 + k, "display_trajectory", m.JointTrajectory(joint_names=ARM, points=[last]))
+        tape.put(0.65 + k, "pick_place_status", m.PickPlaceStatus(
+            header=tape.header(0.65 + k), state="GRASPING", target="ball_1", started=True, targets=2,
+            plans=plans[: k + 1], planning_seconds=sum(p.seconds for p in plans[: k + 1])))
+        tape.put(0.7 + k, "motion/status", m.MotionStatus(id=f"goal_{k}", state="active"))
+        tape.put(1.2 + k, "motion/status", m.MotionStatus(
+            id=f"goal_{k}", state="aborted" if k else "succeeded", error="path_tolerance" if k else "",
+            message="joint 3 is 0.2 rad off" if k else "", source="arm_controller"))
+    tape.put(1.3, "gripper/state", m.GripperState(holding=True))
+    tape.put(1.8, "gripper/state", m.GripperState(holding=False))
+    services = [services[0].model_copy(update={"restarts": 1, "message": "killed by SIGKILL"})]
+    tape.put(1.9, "supervisor/status", m.SupervisorStatus(cell="panda", services=services))
+    tape.put(2.0, "log", m.LogLine(service="motion_planner", level="warning", message=f"no way: {NASTY}"))
+    tape.put(2.0, "log", m.LogLine(service="motion_planner", level="info", message="not shown"))
+    tape.put(2.1, "counters", m.ServiceCounters(service="vision_detector", dropped={"camera/image_raw": 12},
+                                                invalid={"camera/image_raw": 3}, overflow={"x": 1}))
+    tape.put(2.2, "scene_balls", m.PoseArray(header=tape.header(2.2), labels=["box", "table"], poses=[
+        m.Pose(position=point(0.55, 0.25)), m.Pose(position=point(0.2, 0))]))
+    tape.put(2.5, "pick_place_status", m.PickPlaceStatus(
+        header=tape.header(2.5), state="DONE", started=True, placed=1, targets=2, failures=4, retries=5, plans=plans,
+        moving_seconds=1.75, planning_seconds=0.357, task_seconds=2.25,
+        skipped=[m.Rejection(position=point(0.3, 0.3), reason="given up after 3 tries")]))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("report") / "run.mcap"
+    tape = Tape(path)
+    pick_and_place(tape)
+    tape.writer.close({"dropped": {"panda/joint_states": 2}, "missed": {"panda/joint_states": 3}})
+    return path
+
+
+@pytest.fixture(scope="module")
+def page(recorded):
+    output = recorded.with_name("report.html")
+    assert app.execute(["report", str(recorded), "-o", str(output)]) == 0
+    return Page(output.read_text(encoding="utf-8"))
+
+
+def test_the_page_has_every_section_and_asks_nobody(page, recorded):
+    assert list(page.sections) == [
+        "summary", "timeline", "top", "plans", "latency", "joints", "problems", "services", "log"
+    ]
+    assert all(reference.startswith("#") for reference in page.asked)
+    text = recorded.with_name("report.html").read_text()
+    assert "<script" not in text and "@import" not in text and not re.search(r"url\((?!#)", text)
+    assert page.tags.count("svg") == 5
+
+
+def test_its_numbers_are_those_that_were_recorded(page):
+    head = " ".join(page.sections["summary"].split())
+    for part in ("panda: DONE", "placed 1 of 2", "rejected places 2", "truth 1 in the box, 1 on the table",
+                 "moving 1.8 s", "planning 0.4 s in 2 plans", "failures, retries 4, 5", "started again 1 x", "seed 7",
+                 "2.5 s", "frame to target 5.0 ms (median)", "zencell 0.1.0"):
+        assert part in head, part
+    assert page.table("plans") == [["1", "0.60", "cartesian", "12.0", "1", "1.00", "2.50"],
+                                   ["2", "1.60", "ompl", "345.0", "3", "1.00", "3.50"]]
+    assert "10 frames: median 5.5 ms" in page.sections["latency"] and "at most 10.0 ms" in page.sections["latency"]
+    assert "1 picked, 1 rejected" in page.sections["top"]
+
+
+def test_joints_stand_beside_their_limits(page):
+    rows = {row[0]: row for row in page.table("joints")}
+    assert set(rows) == set(ARM)
+    assert rows["panda_joint7"][1:] == ["0.200", "0.200", "1.305", "-2.897 to 2.897", "2.610", "50%"]
+    assert float(rows["panda_joint1"][2]) == pytest.approx(0.3 * np.sin(1.5708), abs=2e-3)
+
+
+def test_what_failed_is_listed_in_time_with_its_reason(page):
+    assert page.table("problems") == [
+        ["0.50", "rejected", "(0.200, 0.000, 0.030)", f"too near {NASTY}"],
+        ["1.90", "started again", "vision_detector", "killed by SIGKILL"],
+        ["2.20", "motion aborted", "goal_1", "joint 3 is 0.2 rad off [arm_controller]"],
+        ["2.50", "given up", "(0.300, 0.300, 0.030)", "given up after 3 tries"],
+    ]
+    assert page.table("log") == [["2.00", "warning", "motion_planner", f"no way: {NASTY}"]]
+    assert page.table("services") == [["vision_detector", "ready", "1.25", "1", "12", "3", "1"]]
+    assert "joint_states 5" in page.sections["services"]
+
+
+def test_a_recording_that_ran_faster_tells_latency_in_wall_time(tmp_path):
+    path = tmp_path / "fast.mcap"
+    tape = Tape(path, speed=5.0)
+    tape.put(0, "pick_place_status", m.PickPlaceStatus())
+    for k in range(3):  # exposed 20 ms of wall time before: cell time runs five times as fast
+        stamp = m.Header(stamp=BEGIN + round((1 + k - 0.02) * 5e9))
+        tape.put(1 + k, "validated_targets", m.PoseArray(header=stamp, poses=[]))
+    tape.writer.close()
+    assert app.execute(["report", str(path)]) == 0
+    assert "3 frames: median 20.0 ms" in Page((tmp_path / "fast.html").read_text()).sections["latency"]
+
+
+def test_an_outline_is_compared_with_what_was_traced(tmp_path):
+    path = tmp_path / "outline.mcap"
+    tape = Tape(path, "ur5", world="w2")
+    corners = [(0.45, -0.05), (0.55, -0.05), (0.55, 0.05), (0.45, 0.05)]
+    poses = [m.Pose(position=point(x, y, 1.05)) for x, y in corners]
+    tape.put(0, "outline_status", m.OutlineStatus(header=tape.header(0), state="PLANNING", started=True))
+    tape.put(0.4, "contour_path", m.OutlinePoints(header=tape.header(0.1), poses=poses, object="Object_0"))
+    tape.put(0.5, "scene_objects", m.WorldObjects(objects=[m.WorldObject(
+        id="cube", shape="box", outline=corners, base=1.0, height=0.05)]))
+    tape.put(1, "outline_status", m.OutlineStatus(header=tape.header(1), state="APPROACHING", started=True))
+    tape.put(1.5, "outline_status", m.OutlineStatus(header=tape.header(1.5), state="TRACING", started=True))
+    for k in range(20):
+        t = 1.6 + 0.05 * k
+        q = [0.01 * k, -1.5, 1.5, -1.5, -1.5, 0.0]
+        tape.put(t, "joint_states", m.JointState(header=tape.header(t), name=UR5, position=q, velocity=[0.2] * 6))
+    tape.put(3, "outline_status", m.OutlineStatus(
+        header=tape.header(3), state="DONE", started=True, object="Object_0", points=4, fraction=0.75, length_m=0.4))
+    tape.writer.close()
+    assert app.execute(["report", str(path)]) == 0
+    page = Page((tmp_path / "outline.html").read_text())
+    assert "outline" in page.sections and "top" not in page.sections
+    head = " ".join(page.sections["summary"].split())
+    assert "outlined Object_0" in head and "of 0.400 m" in head and "world w2" in head and "from the true edge" in head
+    assert "4 points of the contour" in page.sections["outline"]
+    assert "1 frame: median 300.0 ms" in page.sections["latency"]
+
+
+def test_the_recording_of_a_cell_that_is_not_here_has_no_limits_and_says_so(tmp_path):
+    path = tmp_path / "away.mcap"
+    tape = Tape(path, "elsewhere")
+    tape.put(0, "pick_place_status", m.PickPlaceStatus(state="ERROR", started=True, message="x"))
+    tape.put(1, "joint_states", m.JointState(header=tape.header(1), name=[*ARM, "panda_finger_joint1"],
+                                             position=[0.5] * 8, velocity=[0.0] * 8))
+    tape.writer.close()
+    assert app.execute(["report", str(path)]) == 0
+    page = Page((tmp_path / "away.html").read_text())
+    assert "elsewhere: ERROR" in " ".join(page.sections["summary"].split())
+    assert "Limits and the way of the tool are not shown" in page.sections["summary"]
+    assert page.table("joints")[0] == ["panda_joint1", "0.500", "0.500", "0.000"] and len(page.table("joints")) == 7
+    assert app.execute(["report", str(path), "--cell", "panda"]) == 0
+    page = Page((tmp_path / "away.html").read_text())
+    assert len(page.table("joints")[0]) == 7 and "not shown" not in page.sections["summary"]
+
+
+def test_a_recording_that_was_cut_is_reported_as_far_as_it_goes(tmp_path, capsys):
+    path = tmp_path / "cut.mcap"
+    tape = Tape(path)
+    tape.put(0, "pick_place_status", m.PickPlaceStatus(state="GRASPING", started=True, targets=3))
+    tape.put(2, "motion/status", m.MotionStatus(id="g", state="active"))
+    tape.writer.flush()
+    tape.writer.abandon()
+    assert app.execute(["report", str(path)]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "was cut" in line and "zencell recover" in line
+    page = Page((tmp_path / "cut.html").read_text())
+    assert "was cut" in page.sections["summary"] and "zencell recover" in page.sections["summary"]
+    assert "panda: GRASPING" in " ".join(page.sections["summary"].split())
+    for section in ("plans", "latency", "joints"):
+        assert page.sections[section].strip()
+
+
+@pytest.mark.parametrize(
+    ("content", "code", "wanted"),
+    [
+        (None, 2, ["there is no such file"]),
+        (b"", 2, ["says nothing about a run"]),
+        (b"PK\x03\x04 a picture book", 2, ["is no MCAP file"]),
+        ("empty", 2, ["says nothing about a run", "joint_states"]),
+        ("foreign", 2, ["says nothing about a run"]),
+    ],
+)
+def test_what_is_no_recording_of_a_run_is_one_line(content, code, wanted, tmp_path, capsys):
+    path = tmp_path / "run.mcap"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content:
+        tape = Tape(path)
+        if content == "foreign":
+            tape.put(0, "somebody/else", m.PickPlaceStatus())
+        tape.writer.close()
+    assert app.execute(["report", str(path)]) == code
+    (line,) = capsys.readouterr().err.splitlines()
+    assert all(part in line for part in [str(path), *wanted]) and not (tmp_path / "run.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        (["-o", "report.pdf"], ["--output", "report.pdf", "must end in .html"]),
+        (["-o", "no/where/report.html"], ["--output", "report.html", "can not be written"]),
+        (["--cell", "pnada"], ["unknown cell 'pnada'", "panda"]),
+    ],
+)
+def test_bad_options_are_one_line(arguments, wanted, recorded, capsys, monkeypatch):
+    monkeypatch.chdir(recorded.parent)
+    assert app.execute(["report", str(recorded), *arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert all(part in line for part in wanted)
