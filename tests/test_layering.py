@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PURE = ("robot", "scene", "planning", "perception", "tasks", "hardware", "sim", "recording")
+PURE = ("robot", "scene", "planning", "perception", "tasks", "hardware", "sim", "recording", "reporting")
 NOT_PURE = ("asyncio", "zenoh", "common.topics", "common.transport", "common.supervision", "services", "cli")
 CONTAINER_FILES = ("Dockerfile", "compose.yaml", ".dockerignore")
 MACHINE_PATH = re.compile(rb"(?<![\w.])/(?:home|root|work|Users|farm)/\w")
