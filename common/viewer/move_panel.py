@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import viser
 
 from common.errors import ZencellError
-from common.messages import JointGoal, MotionStatus, PlanResponse, Pose, PoseGoal
+from common.messages import JointGoal, JointTrajectory, MotionStatus, PlanResponse, Pose, PoseGoal
 from common.viewer.desk import Desk, assign
 from common.viewer.markup import block, span, text
 from common.viewer.words import plan, problem
@@ -44,6 +44,7 @@ class MovePanel:
     def __init__(
         self, gui: viser.GuiApi, desk: Desk, motions: Motions, goal: Goal,
         planners: Sequence[str], *, planner: str, marker: bool, tell: Callable[[str, str], None],
+        play: Callable[[JointTrajectory], None],
     ) -> None:
         """Lay the panel out where the GUI stands.
 
@@ -56,8 +57,9 @@ class MovePanel:
             planner: that is asked at first.
             marker: whether the goal marker is shown at first.
             tell: called with a line about how it went, and whether that is good, busy or bad.
+            play: shows a plan as a motion.
         """
-        self._motions, self._goal, self._tell_all = motions, goal, tell
+        self._motions, self._goal, self._tell_all, self._play = motions, goal, tell, play
         self.planner = planner if planner in planners else PIPELINE
         self.marker = marker
         self._tick = gui.add_checkbox("Goal marker", marker, hint="drag it in the scene to where the tool should be")
@@ -102,6 +104,8 @@ class MovePanel:
     async def _plan(self, goal: PoseGoal, planner: str) -> None:
         response = await self._motions.plan(goal, planner=planner)
         self._tell(plan(response), "good" if response.ok else "bad")
+        if response.ok and response.trajectory is not None:
+            self._play(response.trajectory)
 
     async def _move(self, goal: PoseGoal | JointGoal, planner: str, there: str) -> None:
         await self._motions.move(goal, planner=planner)

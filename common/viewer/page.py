@@ -12,6 +12,7 @@ from common import topics
 from common.config import Members, check
 from common.errors import ZencellError
 from common.messages import Image, OutlineSelect
+from common.supervision.summary import Rejected
 from common.topics import Topic
 from common.viewer.desk import Desk
 from common.viewer.feeds import Feeds
@@ -71,6 +72,7 @@ class Page:
         self._motions, self._cell = motions, cell
         self._layout, self._layout_file, self._periods = layout, layout_file, periods
         self._scene = SceneFeed(feeds, periods, layout.layers, layout.edit_world)
+        self._rejected = Rejected()
         self._plots: PlotPanel | None = None
         self._move: MovePanel | None = None
         self.pages = 0
@@ -133,7 +135,7 @@ class Page:
             self._plots = PlotPanel(gui, limits, seen)
         with self._place["Move"]:
             self._move = MovePanel(gui, self.desk, self._motions, scene, planners, planner=self._layout.planner,
-                                   marker=self._layout.goal_marker, tell=self._task.tell)
+                                   marker=self._layout.goal_marker, tell=self._task.tell, play=self._scene.play)
         scene.on_select = lambda index: self.desk.put(lambda: self._select(index))
         scene.on_object_dragged = lambda name, x, y: self.desk.put(lambda: self._requests.move(name, x, y))
         self._scene.begin(scene)
@@ -153,7 +155,8 @@ class Page:
         if self._periods.due("task", now):
             task = self._feeds.latest(topics.OUTLINE_STATUS) or self._feeds.latest(topics.PICK_PLACE_STATUS)
             holding = self._feeds.latest(topics.GRIPPER_STATE)
-            self._task.show(task, self._feeds.latest(topics.MOTION_STATUS), gripper(holding))
+            self._task.show(task, self._feeds.latest(topics.MOTION_STATUS), gripper(holding),
+                            len(self._rejected.places))
             self._log.show()
         if self._periods.due("health", now):
             self._health.show(self._feeds.latest(topics.SUPERVISOR_STATUS), alive)
@@ -199,6 +202,7 @@ class Page:
         if (reader := self._feeds.reader(topics.REJECTED_TARGETS)) is not None:
             async for rejections in reader:
                 self._scene.reject(rejections)
+                self._rejected.add(rejections.rejected)
 
     async def _follow_latency(self, topic: Topic[Any], age_ms: Callable[[int], float]) -> None:
         if (reader := self._feeds.reader(topic)) is not None:

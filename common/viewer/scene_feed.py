@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from common import topics
-from common.messages import Contours, JointState, Rejections
+from common.messages import Contours, JointState, JointTrajectory, Rejections
 from common.topics import Topic
 from common.viewer.feeds import Feeds
 from common.viewer.layers import layers_shown
@@ -44,6 +44,7 @@ class SceneFeed:
         self.scene: SceneView | None = None
         self.layers = layers_shown(layers)
         self.editing = editing
+        self._played = -1  # stamp of the plan that a person asked for
         self._rejected: list[Rejections] = []  # before there is a scene: each is said only once
 
     def begin(self, scene: SceneView) -> None:
@@ -87,6 +88,17 @@ class SceneFeed:
         else:
             self._rejected.append(rejections)
 
+    def play(self, plan: JointTrajectory) -> None:
+        """Let the ghost of the robot move along a plan."""
+        if self.scene is not None:
+            self._played = plan.header.stamp
+            self.scene.show_plan(plan)
+            self.scene.play_plan()
+
+    def _plan(self, plan: JointTrajectory) -> None:
+        if self.scene is not None and plan.header.stamp != self._played:  # else it is on show and would begin anew
+            self.scene.show_plan(plan)
+
     def picture(self, rgb: Picture, now: float) -> None:
         """Show what the camera sees in its frustum, at a wall time [s]; a few of them are enough."""
         if self.scene is not None and self.layers["camera"] and self._periods.due("frustum", now):
@@ -111,7 +123,7 @@ class SceneFeed:
             (topics.PLANNING_SCENE, scene.show_scene), (topics.VALIDATED_TARGETS, scene.show_targets),
             (topics.WORKSPACE_MARKERS, scene.show_workspace), (topics.TF_STATIC, scene.show_transforms),
             (topics.TF, scene.show_transforms), (topics.CAMERA_INFO, scene.show_camera),
-            (topics.DEPTH_CAMERA_INFO, scene.show_camera), (topics.DISPLAY_TRAJECTORY, scene.show_plan),
+            (topics.DEPTH_CAMERA_INFO, scene.show_camera), (topics.DISPLAY_TRAJECTORY, self._plan),
             (topics.CONTOUR_PATH, scene.show_outline),
         ]
         if self._periods.due("detected", now):

@@ -70,8 +70,15 @@ class TaskPanel:
         """Show a line about what a person asked for; an empty one takes it away."""
         self._notice.content = block(span(line, kind), "notice", kind=kind) if line else ""
 
-    def show(self, task: TaskReport | None, motion: MotionStatus | None, gripper: str) -> None:
-        """Show how the task is doing, what the arm does and what the fingers hold."""
+    def show(self, task: TaskReport | None, motion: MotionStatus | None, gripper: str, rejected: int) -> None:
+        """Show how the task is doing.
+
+        Args:
+            task: what it says of itself.
+            motion: what the arm does.
+            gripper: what the fingers do, in words.
+            rejected: places that can not be taken.
+        """
         word, kind = words.task_state(task)
         lines = [f'<div>{span("●", kind + " dot")} {span(word, "big")}</div>']
         if task is not None and task.stage and task.state not in ("DONE", "ERROR"):
@@ -79,7 +86,7 @@ class TaskPanel:
         if task is not None and task.message:
             lines.append(f"<div>{span(task.message, 'bad' if task.state == 'ERROR' else 'dim')}</div>")
         lines.append(f"<div>{span('Arm:', 'dim')} {text(words.motion(motion))} · {text(gripper)}</div>")
-        lines.append(fields(words.counters(task)))
+        lines.append(fields(words.counters(task, rejected)))
         state = task.state if task else ""
         held = motion.held if motion else False
         content = block("".join(lines), "task", state=state, paused=bool(task and task.paused), held=held)

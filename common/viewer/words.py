@@ -63,7 +63,7 @@ def service_state(state: str, restarts: int) -> tuple[str, str]:
     return SERVICE_STATES[state]
 
 
-def counters(status: TaskReport | None) -> dict[str, object]:
+def counters(status: TaskReport | None, rejected: int) -> dict[str, object]:
     """The figures of the task by their names."""
     if isinstance(status, OutlineStatus):
         return {
@@ -71,7 +71,7 @@ def counters(status: TaskReport | None) -> dict[str, object]:
             "planned": f"{100 * status.fraction:.0f} %", "failures": status.failures,
         }
     if isinstance(status, PickPlaceStatus):
-        return {"placed": status.placed, "targets": status.targets, "retries": status.retries,
+        return {"placed": status.placed, "targets": status.targets, "rejected": rejected, "retries": status.retries,
                 "failures": status.failures}
     return {}
 

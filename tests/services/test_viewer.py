@@ -390,3 +390,33 @@ async def test_meshes_are_read_when_the_cell_is_up_or_somebody_looks(
             assert not scenes
             await played.net.bus(name, cell="test").ready()
         await until(lambda: scenes)
+
+
+async def test_plan_that_was_found_is_played_and_not_begun_anew(
+    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+) -> None:
+    found, other = (m.JointTrajectory(header=m.Header(stamp=stamp), joint_names=["a"], points=[]) for stamp in (5, 6))
+
+    async def plan(request: m.PlanRequest) -> m.PlanResponse:
+        display.put(found)
+        return m.PlanResponse(id=request.id, ok=True, planner="ompl", trajectory=found)
+
+    display = panda.bus.writer(topics.DISPLAY_TRAJECTORY)
+    panda.bus.serve(topics.MOTION_PLAN, plan)
+    await page.set("Goal marker", True)
+    await until(lambda: scenes and scenes[0].shown("goal_marker"))
+    await page.click("Plan here")
+    await page.until(lambda: "Planned by ompl" in page.text)
+    display.put(other)
+    await until(lambda: (other,) in scenes[0].shown("show_plan"))
+    told = [name for name, _ in scenes[0].calls if name in ("show_plan", "play_plan")]
+    assert told in (["show_plan", "play_plan", "show_plan"], ["show_plan", "show_plan", "play_plan", "show_plan"])
+
+
+async def test_rejected_places_are_counted_once(panda: Played, page: BrowserDouble) -> None:
+    writer = panda.bus.writer(topics.REJECTED_TARGETS)
+    panda.bus.writer(topics.PICK_PLACE_STATUS).put(m.PickPlaceStatus())
+    for x, reason in ((0.9, "too far"), (0.91, "too far"), (0.2, "too near"), (0.5, "inside the container")):
+        rejection = m.Rejection(position=m.Vector3(x=x), reason=reason)
+        writer.put(m.Rejections(header=m.Header(), rejected=[rejection]))
+    await page.until(lambda: '<div data-field="rejected"><b>2</b>' in page.text)
