@@ -1,13 +1,16 @@
-"""A robot in the scene: a node for each link that has a shape, moved by joint positions."""
+"""A robot in the scene: a node for each joint below that of its parent, and in them the links that have a shape."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+import numpy as np
 import viser
 
 from common.viewer.link_poses import LinkPoses
 from common.viewer.robot_meshes import Piece, Rgb
+
+_STILL = 1e-7  # [m or of a unit quaternion]
 
 
 class Figure:
@@ -37,13 +40,20 @@ class Figure:
         """
         self.poses = poses
         self.root = scene.add_frame(root, show_axes=False, visible=visible)
+        paths, self._joints = {0: root}, []
+        for name, index, parent in poses.joints:
+            paths[index] = f"{paths[parent]}/{name}"
+            self._joints.append(scene.add_frame(paths[index], show_axes=False))
+        self._placed = np.full((len(self._joints), 7), np.nan)
         self.links: dict[str, viser.FrameHandle] = {}
         for number, piece in enumerate(pieces):
+            joint, position, wxyz = poses.carrier(piece.link)
+            name = f"{paths[joint]}/{piece.link}"
             if piece.link not in self.links:
-                self.links[piece.link] = scene.add_frame(f"{root}/{piece.link}", show_axes=False)
+                self.links[piece.link] = scene.add_frame(name, show_axes=False, position=position, wxyz=wxyz)
             scene.add_mesh_simple(
-                f"{root}/{piece.link}/{number}", piece.vertices, piece.faces, color=color or piece.color,
-                opacity=opacity, cast_shadow=False, receive_shadow=False,
+                f"{name}/{number}", piece.vertices, piece.faces, color=color or piece.color, opacity=opacity,
+                cast_shadow=False, receive_shadow=False,
             )
         self._place()
 
@@ -55,5 +65,12 @@ class Figure:
         return moved
 
     def _place(self) -> None:
-        for link, node in self.links.items():
-            node.position, node.wxyz = self.poses.pose(link)
+        """Say only what moved: of a joint that turns just the rotation, which moves everything beyond it."""
+        poses = self.poses.in_parents()
+        moved = ~(np.abs(poses - self._placed) < _STILL)
+        self._placed = poses
+        for node, pose, changed in zip(self._joints, poses, moved, strict=True):
+            if changed[:3].any():
+                node.position = pose[:3]
+            if changed[3:].any():
+                node.wxyz = pose[3:]

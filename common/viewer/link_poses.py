@@ -61,5 +61,21 @@ class LinkPoses:
         x = pin.SE3ToXYZQUAT(self._data.oMf[self._frames[link]])
         return x[:3], x[[6, 3, 4, 5]]
 
+    @property
+    def joints(self) -> list[tuple[str, int, int]]:
+        """Name, index and index of the parent of each joint, parents first; 0 is the world."""
+        return [(str(name), i, int(self._model.parents[i])) for i, name in enumerate(self._model.names) if i]
+
+    def carrier(self, link: str) -> tuple[int, Array, Array]:
+        """The joint that carries a link, and the link's position (3,) [m] and quaternion w, x, y, z (4,) in it."""
+        frame = self._model.frames[self._frames[link]]
+        x = pin.SE3ToXYZQUAT(frame.placement)
+        return int(frame.parentJoint), x[:3], x[[6, 3, 4, 5]]
+
+    def in_parents(self) -> Array:
+        """(n, 7) position [m] and quaternion w, x, y, z of each of `joints` in the frame of its parent."""
+        x = np.array([pin.SE3ToXYZQUAT(self._data.liMi[i]) for i in range(1, self._model.njoints)])
+        return np.asarray(x[:, [0, 1, 2, 6, 3, 4, 5]])
+
     def _compute(self) -> None:
         pin.framesForwardKinematics(self._model, self._data, self._q)
