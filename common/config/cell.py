@@ -9,6 +9,7 @@ from pydantic import Field
 from common.config.basics import Section
 from common.config.motion import Grasp, Motion, Pipeline, Run
 from common.config.robot import RobotConfig
+from common.config.watchdogs import Watchdogs
 from common.config.world import Surroundings, World
 
 
@@ -36,6 +37,7 @@ class Cell(Section):
     motion: Motion = Motion()
     grasp: Grasp = Grasp()
     pipeline: Pipeline
+    watchdogs: Watchdogs = Watchdogs()
     services: dict[str, ServiceEntry]
     task: str = Field(description="the service that runs the task and ends in DONE")
 
@@ -50,7 +52,7 @@ class Cell(Section):
             return Surroundings.model_validate({f: getattr(self.world, f) for f in Surroundings.model_fields})
         if kind is Members:
             return Members(services=[entry.name for entry in self.services.values()], task=self.task)
-        for value in (self.run, self.robot, self.world, self.motion, self.grasp, self.pipeline):
+        for value in (self.run, self.robot, self.world, self.motion, self.grasp, self.pipeline, self.watchdogs):
             if type(value) is kind:
                 return value
         raise TypeError(f"{kind.__name__} is not a section of a cell")

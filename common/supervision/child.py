@@ -12,6 +12,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
+import psutil
+
+from common.transport.loop_watch import STUCK_EXIT
+
 TAIL_LINES = 50
 LONGEST_LINE = 4000  # [characters] the rest of a longer line is cut
 
@@ -52,6 +56,13 @@ class Child:
         """Process id while the process runs."""
         running = self._process is not None and self._exited is not None and not self._exited.done()
         return self._process.pid if running and self._process else None
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the process is there but was stopped (SIGSTOP)."""
+        with contextlib.suppress(psutil.Error):
+            return self.pid is not None and psutil.Process(self.pid).status() == psutil.STATUS_STOPPED
+        return False
 
     @property
     def alive_seconds(self) -> float:
@@ -172,6 +183,8 @@ def _kill_group(pid: int) -> None:
 
 def describe_exit(code: int) -> str:
     """What an exit code means, for people: "exit code 1", "killed by SIGKILL"."""
+    if code == STUCK_EXIT:
+        return f"its event loop was stuck, exit code {code}"
     if code >= 0:
         return f"exit code {code}"
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import time
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -15,6 +16,7 @@ from common.messages import SupervisorStatus
 from common.security.credentials import SUPERVISOR
 from common.supervision.interrupts import Interrupts
 from common.supervision.launch import Launch
+from common.supervision.silence import PERIOD, Silence
 from common.supervision.supervisor import Supervisor
 
 if TYPE_CHECKING:
@@ -101,7 +103,8 @@ async def _work(
             await _require_unused(bus, endpoint)
         prepare(bus)
         bus.alive.on_change(supervisor.mark_alive)
-        return await beside(_publish(bus, cell, launch, supervisor), _bring_up_and_work(bus, supervisor, work))
+        watching = beside(_kill_frozen(bus, cell, supervisor), _bring_up_and_work(bus, supervisor, work))
+        return await beside(_publish(bus, cell, launch, supervisor), watching)
     finally:
         log.removeHandler(to_topic)
         await connecting.__aexit__(None, None, None)
@@ -138,6 +141,23 @@ async def _publish(bus: Bus, cell: Cell, launch: Launch, supervisor: Supervisor)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(STATUS_PERIOD):  # wait_for can swallow a cancellation before Python 3.12
                 await supervisor.changed.wait()
+
+
+async def _kill_frozen(bus: Bus, cell: Cell, supervisor: Supervisor) -> None:
+    """Kill processes that are there and yet do nothing: they are started again."""
+    silence = Silence(cell.watchdogs)
+
+    async def listen() -> None:
+        async for counters in bus.reader(topics.COUNTERS):  # which they tell each second while somebody listens
+            silence.heard(counters.service)
+
+    async def look() -> None:
+        while True:
+            await asyncio.sleep(PERIOD)
+            for verdict in silence.look(time.monotonic(), bus.connected, supervisor.kept, supervisor.stopped):
+                supervisor.kill(verdict.name, verdict.reason)
+
+    await beside(listen(), look())
 
 
 async def beside(background: Coroutine[Any, Any, None], main: Coroutine[Any, Any, T]) -> T:

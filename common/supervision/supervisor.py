@@ -52,6 +52,7 @@ class Watched:
         self.ready = asyncio.Event()
         self.gone = asyncio.Event()
         self.status = ServiceStatus(name=child.name, state="waiting")
+        self.killed_because = ""
 
 
 class Supervisor:
@@ -149,6 +150,25 @@ class Supervisor:
         if self._router and connected and self._router.child.pid is not None:
             self._become_ready(self._router)
 
+    @property
+    def kept(self) -> list[ServiceStatus]:
+        """The processes that are started again when they end, once the cell is up; none before and while it stops."""
+        if not self._up or self._stopping.is_set():
+            return []
+        return [watched.status.model_copy(update={"pid": watched.child.pid}) for watched in self._all if watched.again]
+
+    @property
+    def stopped(self) -> list[str]:
+        """Names of the processes on their way to be ready that the system does not run (SIGSTOP)."""
+        starting = [watched.child for watched in self._all if watched.status.state == "starting"]
+        return [child.name for child in starting if child.stopped]
+
+    def kill(self, name: str, reason: str) -> None:
+        """End a process that is of no use any more; it is started again."""
+        log.error("%s %s; killed", name, reason)
+        self._by_name[name].killed_because = reason
+        self._by_name[name].child.kill()
+
     async def stop(self, hurry: asyncio.Event | None = None) -> None:
         """End all processes in reverse order: SIGTERM, then SIGKILL; at once when `hurry` is set."""
         self._stopping.set()
@@ -196,7 +216,7 @@ class Supervisor:
                     log.error("%s ended (%s)", child.name, describe_exit(code))
                     break
                 delay = watched.backoff.after(child.alive_seconds)
-                message = describe_exit(code)
+                message, watched.killed_because = watched.killed_because or describe_exit(code), ""
                 log.warning("%s ended (%s); starting it again in %.1f s", child.name, message, delay)
                 self._set(watched, state="restarting", restarts=watched.status.restarts + 1, message=message)
                 with contextlib.suppress(TimeoutError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
 import select
@@ -14,6 +15,7 @@ from typing import NoReturn
 
 log = logging.getLogger(__name__)
 
+PR_SET_PDEATHSIG = 1  # of linux/prctl.h
 GRACE_SECONDS = 0.7  # from the signal to the end; the rest of the second is the system's
 
 
@@ -42,6 +44,8 @@ class Lifeline:
 
     def start(self) -> None:
         """Take over the signals; on the main thread."""
+        if self._gate:
+            wake_when_orphaned()
         read, write = os.pipe()
         os.set_blocking(write, False)
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -94,6 +98,12 @@ class Lifeline:
         on_stop()
         time.sleep(GRACE_SECONDS)
         os._exit(0)
+
+
+def wake_when_orphaned() -> None:
+    """Have the kernel wake this process, should it be stopped when its parent ends: it can then end itself in order."""
+    if sys.platform == "linux":  # elsewhere a stopped process stays until somebody wakes it
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGCONT)
 
 
 def leave(code: int) -> NoReturn:

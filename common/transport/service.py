@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Generic, NoReturn, TypeVar
 
 from common.clock import EPOCH_VARIABLE, SPEED_VARIABLE, Clock
-from common.config import Parameters, load_cell, service_config
+from common.config import Parameters, Watchdogs, load_cell, service_config
 from common.errors import ConfigError, UnknownName, ZencellError
 from common.security.credentials import Credentials, common_name, credentials_of, secure_folder
 from common.transport.bus import Bus
@@ -21,6 +21,7 @@ from common.transport.endpoint import endpoint_of
 from common.transport.handoff import call_on_loop
 from common.transport.lifeline import Lifeline, fail, leave
 from common.transport.log import BusLog, log_to_stderr
+from common.transport.loop_watch import LoopWatch
 from common.transport.parameters import serve_parameters
 from common.transport.zenoh_session import ZenohSession, close_bounded, open_zenoh
 
@@ -50,6 +51,7 @@ class Start(Generic[P]):
     config: P
     clock: Clock
     endpoint: str
+    watchdogs: Watchdogs
     credentials: Credentials | None = None
 
 
@@ -103,7 +105,8 @@ def prepare(name: str, config: type[P], options: argparse.Namespace) -> Start[P]
     cell = load_cell(chosen, options.set, world=options.world, seed=options.seed)
     folder = secure_folder()
     credentials = credentials_of(common_name(cell.name, name), folder) if folder else None
-    return Start(name, cell.name, service_config(cell, name, config), clock_from(options.speed), endpoint, credentials)
+    clock = clock_from(options.speed)
+    return Start(name, cell.name, service_config(cell, name, config), clock, endpoint, cell.watchdogs, credentials)
 
 
 def own_name() -> str:
@@ -162,13 +165,20 @@ async def _live(run: Run[P], start: Start[P], lifeline: Lifeline) -> int:
         root = logging.getLogger()
         to_topic = BusLog(bus)
         root.addHandler(to_topic)
+        watch = LoopWatch(asyncio.get_running_loop(), lambda: _patience(start.watchdogs, bus.ready_event.is_set()))
         try:
             return await _run(run, bus, start.config, lifeline)
         finally:
+            watch.stop()
             root.removeHandler(to_topic)
             await bus.close()
     finally:
         await close_bounded(session, _CLOSE_SECONDS)
+
+
+def _patience(watchdogs: Watchdogs, ready: bool) -> float:
+    """How long the loop may stand still [s]: while it starts, a service may load what it needs in one go."""
+    return watchdogs.loop if ready or not watchdogs.loop else max(watchdogs.loop, watchdogs.start)
 
 
 async def _connected(start: Start[P]) -> ZenohSession:

@@ -1,0 +1,98 @@
+"""Who of the processes is alive and yet frozen: judged by what is heard of them, without a clock of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+from common.config import Watchdogs
+from common.messages import ServiceStatus
+from common.transport.keys import ROUTER
+from common.waking import Waking
+
+PERIOD = 0.25  # [s] between two looks
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A process that is to be killed, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass
+class _Heard:
+    pid: int | None
+    state: str
+    since: float  # waking time [s] of the newest sign of life
+
+
+class Silence:
+    """Counts for how long each process has been silent, in time in which we ourselves were awake and connected.
+
+    A service that is ready says each second what it has counted. While the router is not reached nobody can be heard,
+    so nobody is blamed but the router; nor is a single service when all of them fall silent at once.
+    """
+
+    def __init__(self, watchdogs: Watchdogs) -> None:
+        """Blame nobody yet."""
+        self._limits = watchdogs
+        self._awake = Waking(2 * PERIOD)
+        self._heard: dict[str, _Heard] = {}
+        self._router_blamed = False
+
+    def heard(self, name: str) -> None:
+        """Take note of a sign of life of a service."""
+        self._router_blamed = False
+        if name in self._heard:
+            self._heard[name].since = self._awake.now
+
+    def look(
+        self, now: float, connected: bool, processes: Sequence[ServiceStatus], stopped: Collection[str] = (),
+    ) -> list[Verdict]:
+        """Which processes are to be killed now.
+
+        Args:
+            now: what the clock says [s, monotonic].
+            connected: whether the router is reached.
+            processes: those that are started again when they end.
+            stopped: names of those that the system does not run (SIGSTOP).
+        """
+        awake = self._awake.look(now)
+        if not self._limits.silence:
+            return []
+        verdicts = []
+        for process in processes:
+            silent = self._silent(process, connected, awake)
+            start_limit = self._limits.silence if process.name in stopped else self._limits.start
+            if process.state == "starting" and silent > start_limit:
+                verdicts.append(Verdict(process.name, f"was started again {silent:.0f} s ago and is not ready"))
+            elif process.state == "ready" and silent > self._limits.silence:
+                what = "does not answer" if process.name == ROUTER else "has not been heard"
+                verdicts.append(Verdict(process.name, f"{what} for {silent:.1f} s"))
+        return self._without_scapegoats(verdicts, processes, awake)
+
+    def _silent(self, process: ServiceStatus, connected: bool, awake: float) -> float:
+        known = self._heard.get(process.name)
+        router = process.name == ROUTER
+        # The router is there while we are connected; the others can be heard only then.
+        blameless = connected if router and process.state == "ready" else not connected and not router
+        if known is None or blameless or (known.pid, known.state) != (process.pid, process.state):
+            known = self._heard[process.name] = _Heard(process.pid, process.state, awake)
+        return awake - known.since
+
+    def _without_scapegoats(
+        self, verdicts: list[Verdict], processes: Sequence[ServiceStatus], awake: float
+    ) -> list[Verdict]:
+        ready = [process.name for process in processes if process.state == "ready" and process.name != ROUTER]
+        silent = {verdict.name for verdict in verdicts}
+        nobody = [name for name in ready if awake - self._heard[name].since < self._limits.silence / 2]
+        if not silent & set(ready) or nobody or len(ready) < 2 or self._router_blamed:
+            return verdicts
+        self._router_blamed = True
+        for name in ready:
+            self._heard[name].since = awake
+        if any(process.name == ROUTER and process.state == "ready" for process in processes):
+            return [Verdict(ROUTER, "lets none of the services be heard")]
+        return []
