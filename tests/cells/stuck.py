@@ -1,0 +1,26 @@
+"""A service for tests: once its parameter says so, its event loop does not turn any more."""
+
+import asyncio
+import time
+
+from common.config import Parameters, Tunable
+from common.transport.bus import Bus
+from common.transport.service import main
+
+
+class Config(Parameters):
+    stuck: Tunable[bool] = False
+
+
+async def run(bus: Bus, config: Config) -> None:
+    def retuned() -> None:
+        if config.stuck:
+            time.sleep(1000)
+
+    bus.on_parameters(retuned)
+    await bus.ready()
+    await asyncio.Event().wait()
+
+
+if __name__ == "__main__":
+    main(run, Config)
