@@ -11,6 +11,8 @@ ROUTER, ROUTER_PORT = "router", 7447
 VIEWER, VIEWER_PORT = "viewer", 8080
 CONFIG = "/app/config"
 DATA = "/data"
+# A container's port is published to the loopback of its host only, and forwarded from a pod only by kubectl.
+PAGE = ["--set", "services.viewer.host=0.0.0.0", "--set", "services.viewer.published=true"]
 USER = 10001  # as in the Dockerfile
 # About twice what a service takes in a whole run [MB]: benchmarks/resources.py prints that.
 MEMORY = {"motion_planner": 768, VIEWER: 768}
@@ -48,7 +50,7 @@ def containers_of(file: str, cell: Cell) -> list[Container]:
         Container(
             entry.name, ["python", "-m", entry.module], environment, MEMORY.get(entry.name, USUAL_MEMORY),
             is_task=entry.name == cell.task, page=entry.name == VIEWER,
-            arguments=["--set", "services.viewer.host=0.0.0.0"] if entry.name == VIEWER else [],
+            arguments=PAGE if entry.name == VIEWER else [],
         )
         for entry in cell.services.values()
     ]

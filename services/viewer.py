@@ -39,6 +39,9 @@ class Config(Parameters):
     host: str = Field("127.0.0.1", min_length=1, description="address to listen at; others than this need a token")
     port: int = Field(8080, ge=0, le=65535, description="TCP port; 0: any that is free")
     token: str = Field("", repr=False, description="that a browser has to bring: http://HOST:PORT/?token=TOKEN")
+    published: bool = Field(
+        False, description="the port is reached through a loopback only, as compose.yaml has it: no token is needed"
+    )
     layout: str = Field("", description="file of the layout; empty: config/viewer.yaml")
     rate: float = Field(30.0, ge=1, le=60, description="of the moving robot, wall time [Hz]")
     picture_rate: float = Field(10.0, gt=0, le=30, description="of each camera picture at most, wall time [Hz]")
@@ -81,14 +84,15 @@ async def run(bus: Bus, config: Config) -> None:
     requests = Requests(bus, config.members, feeds)
     tasks = [feeds.reader(topic) for topic in (topics.PICK_PLACE_STATUS, topics.OUTLINE_STATUS)]
     motions = OperatorMotion(bus, [reader for reader in tasks if reader is not None])
-    server = make_server(config.host, config.port, config.token)
+    server = make_server(config.host, config.port, config.token, published=config.published)
     try:
         page = Page(
             server, feeds, requests, motions, config.members, cell=config.run.cell, layout=layout,
             layout_file=config.layout, periods=Periods(picture=1 / config.picture_rate),
         )
         await bus.ready()
-        bus.log.info("the page is at %s", address_of(config.host, server.get_port()))
+        host = "127.0.0.1" if config.published else config.host
+        bus.log.info("the page is at %s", address_of(host, server.get_port()))
         async with asyncio.TaskGroup() as group:
             for activity in page.activities(bus.clock.age_ms):
                 group.create_task(activity)

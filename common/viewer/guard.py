@@ -53,25 +53,27 @@ Process = Callable[[websocket_server.ServerConnection, Request], "Awaitable[Resp
 _replacing = threading.Lock()
 
 
-def make_server(host: str, port: int, token: str = "") -> viser.ViserServer:
+def make_server(host: str, port: int, token: str = "", *, published: bool = False) -> viser.ViserServer:
     """A server of pages at host and port that refuses foreign web pages, foreign names, and who has not the token.
 
     Args:
         host: address or name to listen at; beyond this machine there must be a token.
         port: TCP port; 0 is any that is free (`server.get_port()`).
         token: that a browser has to bring once; empty: `ZENCELL_VIEWER_TOKEN`, and without that none is asked for.
+        published: the port is reached through the loopback of a machine only, as that of a container: no token is
+            needed, and no other name than the loopback's is served.
 
     Raises:
         ConfigError: the port is taken (names by whom), the host is not of this machine, or the token is missing or
             too short.
     """
     token = token or os.environ.get(TOKEN_VARIABLE, "")
-    _check_token(host, token)
+    _check_token("127.0.0.1" if published else host, token)
     try:
         listening = open_socket(host, port)
     except OSError as error:
         raise refusal(error, host, port) from None
-    guard = Guard(Access(host, listening.getsockname()[1], token))
+    guard = Guard(Access("127.0.0.1" if published else host, listening.getsockname()[1], token))
     try:
         with _serving(listening, guard), _quiet():
             server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
@@ -85,7 +87,7 @@ def make_server(host: str, port: int, token: str = "") -> viser.ViserServer:
     # Whoever has the page open could ask for these, and get it tunnelled to a public server.
     for message in (ShareUrlRequest, ShareUrlDisconnect):
         server._websock_server.unregister_handler(message)
-    if not is_loopback(host):
+    if not (published or is_loopback(host)):
         log.warning(
             "the page is served beyond this machine, without encryption: `ssh -L %d:127.0.0.1:%d HOST` to a page on "
             "127.0.0.1 is the safe way", guard.access.port, guard.access.port,

@@ -38,8 +38,10 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
     made: list[viser.ViserServer] = []
 
-    def one(host: str = "127.0.0.1", port: int = 0, token: str = "") -> viser.ViserServer:
-        made.append(make_server(host, port, token))
+    def one(
+        host: str = "127.0.0.1", port: int = 0, token: str = "", *, published: bool = False
+    ) -> viser.ViserServer:
+        made.append(make_server(host, port, token, published=published))
         return made[-1]
 
     yield one
@@ -293,3 +295,9 @@ def test_viser_that_serves_in_another_way_is_not_left_unguarded(monkeypatch: pyt
     with pytest.raises(RuntimeError, match="serves in another way"):
         make_server("127.0.0.1", 0)
     assert stopped == [True]
+
+
+def test_published_page_needs_no_token_and_is_served_under_loopback_names_only(make: Make) -> None:
+    server = make("0.0.0.0", published=True)
+    assert get(server).status == get(server, Host="localhost:8080").status == 200
+    assert get(server, Host="panda-viewer:8080").status == get(server, Host="172.17.0.2:8080").status == 403
