@@ -12,7 +12,7 @@ import time
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
 
 import typer
 
@@ -20,6 +20,7 @@ from cli import options, viewing
 
 if TYPE_CHECKING:
     from cli.screens import Content, Screen
+    from common.chaos.agent import Chaos
     from common.config import Cell
     from common.supervision.collector import Collector
     from common.supervision.supervisor import Supervisor
@@ -34,6 +35,12 @@ NoViewer = Annotated[bool, typer.Option("--no-viewer", help="without the operato
 SummaryFile = Annotated[str | None, typer.Option("--summary", metavar="FILE.json", help="write the figures there")]
 LogJson = Annotated[bool, typer.Option("--log-json", help="log lines as JSON objects")]
 Record = Annotated[str | None, typer.Option("--record", metavar="FILE.mcap", help="record all of it there")]
+ChaosSeed = Annotated[
+    str | None, typer.Option("--chaos", metavar="SEED", help="faults on purpose: the same seed plans the same ones")
+]
+ChaosRate = Annotated[
+    str | None, typer.Option("--chaos-rate", metavar="N", help="faults per minute of wall time, on average [30]")
+]
 Ask = Annotated[bool, typer.Option("--ask", help="outlining: ask at the terminal which object")]
 From = Annotated[str | None, typer.Option("--from", metavar="DIR", help="outlining: trace coordinates stored there")]
 
@@ -54,12 +61,15 @@ def run(
     record: Record = None,
     ask: Ask = False,
     source: From = None,
+    chaos: ChaosSeed = None,
+    chaos_rate: ChaosRate = None,
 ) -> None:
     """Bring a cell up, run its task to the end, print a summary and shut down; exit 0 only if the task is DONE."""
     chosen = choices(cell, overrides, world, ask=ask, source=source)
     operation = Operation(cell, chosen, world, seed, speed, domain, connect, no_viewer, summary, log_json)
     operation.serve_page(viewer_host, viewer_port)
     operation.record_to(record)
+    operation.disturb(chaos, chaos_rate, until_ended=True)
     operation.ask = ask
     raise typer.Exit(operation.run_to_end())
 
@@ -78,11 +88,14 @@ def up(
     summary: SummaryFile = None,
     log_json: LogJson = False,
     record: Record = None,
+    chaos: ChaosSeed = None,
+    chaos_rate: ChaosRate = None,
 ) -> None:
     """Bring a cell up and stay until Ctrl-C; the task starts by itself unless the cell says `autostart: false`."""
     operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json)
     operation.serve_page(viewer_host, viewer_port)
     operation.record_to(record)
+    operation.disturb(chaos, chaos_rate, until_ended=False)
     raise typer.Exit(operation.stay())
 
 
@@ -113,6 +126,14 @@ def choices(
     file = (Path(source or "") / CLEARED).absolute()
     read_coordinates(file)
     return [f"services.duplicate_remover.coordinates={json.dumps(str(file))}", *given]
+
+
+class Disturbance(NamedTuple):
+    """Faults that were asked for."""
+
+    seed: int
+    per_minute: float
+    until_ended: bool  # rather than without end
 
 
 class Operation:
@@ -163,6 +184,8 @@ class Operation:
         self._screen: Screen | None = None
         self._page = ""  # address
         self._watchers: dict[str, list[str]] = {}  # commands by name
+        self._disturbance: Disturbance | None = None
+        self._chaos: Chaos | None = None
         self.ask = False  # the person at the terminal which object is to be outlined
 
     def serve_page(self, host: str | None, port: str | None) -> None:
@@ -194,6 +217,23 @@ class Operation:
         self._watchers[NAME] = [
             *python_module("cli.main"), "record", "--cell", self.cell.name, "-o", str(path), *place, "--gate",
         ]
+
+    def disturb(self, seed: str | None, rate: str | None, *, until_ended: bool) -> None:
+        """Have faults made on purpose once the cell is up: without end, or until a run has time left to finish.
+
+        Raises:
+            ConfigError: seed or rate can not be used.
+        """
+        from common.chaos.plan import MOST_PER_MINUTE, PER_MINUTE
+        from common.errors import ConfigError
+
+        number = options.whole("--chaos", seed, 0)
+        per_minute = PER_MINUTE if rate is None else options.number("--chaos-rate", rate)
+        if not 0 < per_minute <= MOST_PER_MINUTE:
+            raise ConfigError("--chaos-rate", rate, f"must be more than 0 and at most {MOST_PER_MINUTE:g} [1/min]")
+        if rate is not None and number is None:
+            raise ConfigError("--chaos-rate", rate, "needs --chaos SEED")
+        self._disturbance = None if number is None else Disturbance(number, per_minute, until_ended)
 
     def leave_out(self, name: str) -> None:
         """Do not start a service."""
@@ -274,6 +314,7 @@ class Operation:
             if self._collector:
                 self._collector.read_truth()
             self.summary.restarts = self._supervisor.restarts
+            self.summary.chaos = self._chaos.as_dicts() if self._chaos else None
             if self._screen:
                 self._screen.close()
 
@@ -309,7 +350,7 @@ class Operation:
         from common.messages import TaskCommand
         from common.supervision.operation import beside
 
-        collector = self._came_up()
+        collector = self._came_up(bus)
         if not self.cell.run.autostart:
             await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"), START_REQUEST_TIMEOUT)
 
@@ -321,26 +362,37 @@ class Operation:
             await collector.ended.wait()
             await collector.settle()
 
-        await beside(collector.run(), end())
+        await beside(self._disturbing(), beside(collector.run(), end()))
         return 0 if self.summary.state == "DONE" else 1
 
     async def _until_interrupted(self, bus: Bus) -> int:
+        from common.supervision.operation import beside
         from common.transport.endpoint import endpoint_of
 
-        collector = self._came_up()
+        collector = self._came_up(bus)
         assert self._screen is not None
         endpoint = endpoint_of(None if self.launch.connect else self.launch.domain, self.launch.connect)
         took = f"{self.summary.ready:.1f} s"
         self._screen.note(f"{self.cell.name} is up at {endpoint} after {took}. Read it from outside:")
         self._screen.note(zenoh_cli_line(endpoint, self.cell.name))
-        await collector.run()
+        await beside(self._disturbing(), collector.run())
         return 0
 
-    def _came_up(self) -> Collector:
+    async def _disturbing(self) -> None:
+        if self._chaos is not None:
+            await self._chaos.run()
+
+    def _came_up(self, bus: Bus) -> Collector:
         assert self._collector is not None
         self.summary.ready = time.monotonic() - self.began
         if self._page and self._screen:
             self._screen.note(f"Open {self._page}")
+        if self._disturbance is not None:
+            from common.chaos.setting import chaos_in
+
+            assert self._supervisor is not None
+            seed, per_minute, until_ended = self._disturbance
+            self._chaos = chaos_in(bus, self.cell, self._supervisor, seed, per_minute, until_ended=until_ended)
         return self._collector
 
     def _write_summary(self) -> None:

@@ -19,9 +19,12 @@ class SceneUpdate(Message):
 
 
 class WorldEdit(Message):
-    """Change the simulated world. `reset` brings the first layout back; `id` may be empty for `add`."""
+    """Change the simulated world. `reset` brings the first layout back, `drop` lets what is held slip.
 
-    op: Literal["add", "move", "remove", "reset"]
+    `id` may be empty for `add` and `drop`.
+    """
+
+    op: Literal["add", "move", "remove", "reset", "drop"]
     id: str = ""
     position: Vector3 | None = Field(None, description="centre [m]; z is found from what lies there")
 

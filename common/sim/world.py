@@ -237,6 +237,8 @@ class SimulatedWorld:
         if self._config.objects and not self._layout:
             raise Refused("no_balls", "this world has objects and no balls; objects are placed by world.objects")
         name = request.id
+        if request.op == "drop":
+            return self._slip(name, now)
         if request.op == "add":
             name = name or next(n for i in range(1, len(self._balls) + 2) if (n := f"ball_{i}") not in self._balls)
             if name in self._balls:
@@ -263,6 +265,14 @@ class SimulatedWorld:
             self._sink(old.slot, now)
         self.version += 1
         return name
+
+    def _slip(self, name: str, now: float) -> str:
+        """Let the held ball slip out of the fingers, which close on without it; its id. Raises Refused without one."""
+        held = self.held
+        if not held or name not in ("", held):
+            raise Refused("not_held", f"{name or 'no ball'} is {'not ' if name else ''}between the fingers")
+        self._release(held, now)
+        return held
 
     def _reset(self) -> str:
         for name, ball in self._balls.items():

@@ -104,6 +104,7 @@ class Summary:
         self.rejected = Rejected()
         self.restarts: dict[str, int] = {}
         self.failed = False  # the cell did not come up
+        self.chaos: list[dict[str, object]] | None = None  # faults that were made on purpose, if any were to be
         self._latencies: list[float] = []  # [ms]
         self._before = Counted()  # of earlier lives of the task's process
         self._now = Counted()
@@ -173,6 +174,7 @@ class Summary:
             "speed": self.speed,
             "truth": count_truth(self.truth),
             **({"outline": self.traced.figures()} if self.traced else {}),
+            **({"chaos": list(self.chaos)} if self.chaos is not None else {}),
         }
 
 
@@ -241,6 +243,8 @@ def describe(summary: dict[str, Any]) -> list[str]:
     if summary["frame_to_target_ms"]["p50"] is not None:
         latency = summary["frame_to_target_ms"]
         lines.append(f"  frame to target {latency['p50']:.1f} ms (median), {latency['p99']:.1f} ms (99 %)")
+    if "chaos" in summary:
+        lines.append(f"  {len(summary['chaos'])} faults on purpose")
     if restarted := {name: count for name, count in summary["restarts"].items() if count}:
         lines.append("  started again: " + ", ".join(f"{name} {count} x" for name, count in restarted.items()))
     return lines

@@ -20,7 +20,7 @@ from common.transport.keys import alive_key, serves_key
 from common.transport.raw_writer import RawWriter
 from common.transport.reader import Reader
 from common.transport.requests import Client, Server
-from common.transport.session import Declared, RawReply, RawSample, Session
+from common.transport.session import Declared, Publisher, RawReply, RawSample, Session
 from common.transport.tokens import TokenWatch
 from common.transport.writer import Writer
 
@@ -231,8 +231,14 @@ class Bus:
             self._raw_states.append(writer)
         return writer
 
-    async def raw_get(self, key: str, timeout: float = 1.0) -> list[RawSample]:
-        """The values that can be asked for under a full key expression; requests refuse to be asked like this."""
+    def raw_publisher(self, key: str, encoding: str, *, reliable: bool) -> Publisher:
+        """Where bytes are put under a full key just as they are, with whatever attachment."""
+        return self._session.publisher(key, encoding, reliable=reliable)
+
+    async def raw_get(
+        self, key: str, timeout: float = 1.0, *, payload: bytes | None = None, encoding: str = ""
+    ) -> list[RawSample]:
+        """The values that can be asked for under a full key expression; requests refuse to be asked without payload."""
         samples: list[RawSample] = []
         done = asyncio.Event()
 
@@ -240,7 +246,10 @@ class Bus:
             if reply.sample is not None:
                 samples.append(reply.sample)
 
-        cancel = self._session.get(key, on_reply, lambda: call_on_loop(self._loop, done.set), timeout=timeout)
+        cancel = self._session.get(
+            key, on_reply, lambda: call_on_loop(self._loop, done.set), timeout=timeout, payload=payload,
+            encoding=encoding,
+        )
         try:
             async with asyncio.timeout(timeout):
                 await done.wait()

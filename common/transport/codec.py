@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -13,6 +14,7 @@ from common.messages import SCHEMA_VERSION, Message
 
 DEFAULT_LIMIT = 32 * 1024 * 1024  # [bytes]; a 4096 x 2560 bgr8 picture still fits
 MSGPACK = "application/msgpack"
+CHECKED_BYTES = 64 * 1024  # of a payload that its checksum covers: a damaged pixel harms nobody
 _SHOWN = 60  # characters of a value that an error shows
 
 M = TypeVar("M", bound=Message)
@@ -88,17 +90,34 @@ def _one_line(text: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """What rides beside a payload: who wrote it, which of his messages it is, and what it was caused by."""
+    """What rides beside a payload: who wrote it, which of his messages it is, what it was caused by, its checksum."""
 
     writer: str
     sequence: int
     schema: int = SCHEMA_VERSION
     trace: str = ""
+    checksum: int | None = None  # `checksum_of` the payload
+
+
+def checksum_of(payload: bytes) -> int:
+    """CRC-32 of a payload's first 64 kB, begun with its length: tells damage, not intent."""
+    return zlib.crc32(payload[:CHECKED_BYTES], len(payload) & 0xFFFFFFFF)
+
+
+def require_whole(attachment: Attachment | None, payload: bytes) -> None:
+    """Return when the payload is the one that was sent, or nothing is known of that.
+
+    Raises:
+        DecodeError: it was damaged on the way.
+    """
+    if attachment is not None and attachment.checksum is not None and attachment.checksum != checksum_of(payload):
+        raise DecodeError("payload does not fit its checksum: damaged on the way")
 
 
 def encode_attachment(attachment: Attachment) -> bytes:
     """The attachment as a small msgpack array."""
-    packed: bytes = msgpack.packb([attachment.writer, attachment.sequence, attachment.schema, attachment.trace])
+    fields: list[object] = [attachment.writer, attachment.sequence, attachment.schema, attachment.trace]
+    packed: bytes = msgpack.packb(fields if attachment.checksum is None else [*fields, attachment.checksum])
     return packed
 
 
@@ -112,11 +131,15 @@ def decode_attachment(data: bytes | None) -> Attachment | None:
         return None
     value = _unpack(data, 1024, "attachment")
     match value:
-        case [str(writer), int(sequence), int(schema), str(trace)]:
+        case [str(writer), int(sequence), int(schema), str(trace), *rest]:
             if schema != SCHEMA_VERSION:
                 raise DecodeError(f"attachment: schema version {schema}, this side has {SCHEMA_VERSION}")
-            return Attachment(writer, sequence, schema, trace)
-    raise DecodeError("attachment: not [writer, sequence, schema version, trace]")
+            match rest:
+                case []:
+                    return Attachment(writer, sequence, schema, trace)
+                case [int(checksum)]:
+                    return Attachment(writer, sequence, schema, trace, checksum)
+    raise DecodeError("attachment: not [writer, sequence, schema version, trace, checksum]")
 
 
 def encode_error(code: str, message: str) -> bytes:

@@ -6,7 +6,7 @@ import secrets
 import threading
 
 from common.topics import PublishedKind
-from common.transport.codec import Attachment, encode_attachment
+from common.transport.codec import Attachment, checksum_of, encode_attachment
 from common.transport.session import Query, Session
 
 
@@ -44,7 +44,9 @@ class RawWriter:
         """Send a payload, caused by what has the trace id; never blocks."""
         with self._lock:
             self._sequence += 1
-            attachment = encode_attachment(Attachment(self._id, self._sequence, trace=trace))
+            attachment = encode_attachment(
+                Attachment(self._id, self._sequence, trace=trace, checksum=checksum_of(payload))
+            )
             if self.kind == "state":
                 self._last = (payload, attachment)
             self._publisher.put(payload, attachment)

@@ -13,7 +13,7 @@ from typing import Generic, Protocol, TypeVar
 from common.errors import DecodeError
 from common.messages import Message
 from common.topics import Topic
-from common.transport.codec import DEFAULT_LIMIT, Attachment, decode, decode_attachment
+from common.transport.codec import DEFAULT_LIMIT, Attachment, decode, decode_attachment, require_whole
 from common.transport.handoff import Doorbell, call_on_loop
 from common.transport.session import RawSample
 from common.transport.trace import follow
@@ -102,11 +102,13 @@ class Reader(Generic[M]):
 
     def arrive(self, sample: RawSample) -> None:
         """Take a message as it came from the network; on any thread."""
+        attachment = None
         try:
             attachment = decode_attachment(sample.attachment)
+            require_whole(attachment, sample.payload)
         except DecodeError as error:
             with self._lock:
-                self._refusals.add(NO_SENDER, error)
+                self._refusals.add(attachment.writer if attachment else NO_SENDER, error)
             return
         with self._lock:
             if attachment is not None and not self._newness.is_new(attachment):

@@ -12,6 +12,7 @@ from common.messages import Message
 from common.topics import Request
 from common.transport.codec import (
     Attachment,
+    checksum_of,
     decode,
     decode_attachment,
     decode_error,
@@ -19,6 +20,7 @@ from common.transport.codec import (
     encode_attachment,
     encode_error,
     encoding_of,
+    require_whole,
 )
 from common.transport.handoff import call_on_loop
 from common.transport.reader import NO_SENDER, Refusals
@@ -79,6 +81,7 @@ class Server(Generic[Q, A]):
             try:
                 attachment = decode_attachment(query.attachment)
                 sender = attachment.writer if attachment else NO_SENDER
+                require_whole(attachment, payload)
                 request = decode(self.topic.message, payload, self._limit)
             except DecodeError as error:
                 self._refuse(query, "invalid", error, sender)
@@ -119,7 +122,8 @@ class Server(Generic[Q, A]):
             self._crash(error)
         else:
             self._sequence += 1
-            attachment = encode_attachment(Attachment(self._service, self._sequence, trace=current_trace()))
+            attachment = encode_attachment(Attachment(
+                self._service, self._sequence, trace=current_trace(), checksum=checksum_of(payload)))
             query.reply(self._key, payload, encoding_of(self.topic.answer), attachment)
 
     async def close(self) -> None:
@@ -200,6 +204,7 @@ class Client(Generic[Q, A]):
                 raise RequestTimeout(self.topic.key, timeout)
             raise RemoteError(self.topic.key, *refusal)
         try:
+            require_whole(decode_attachment(reply.sample.attachment), reply.sample.payload)
             return decode(self.topic.answer, reply.sample.payload, self._limit)
         except DecodeError as error:
             raise RemoteError(self.topic.key, "bad_answer", f"the answer can not be read: {error}") from None
@@ -207,7 +212,8 @@ class Client(Generic[Q, A]):
     async def _ask(self, payload: bytes, seconds: float, timeout: float) -> RawReply | None:
         future: asyncio.Future[RawReply | None] = self._loop.create_future()
         self._sequence += 1
-        attachment = encode_attachment(Attachment(self._service, self._sequence, trace=current_trace()))
+        attachment = encode_attachment(Attachment(
+            self._service, self._sequence, trace=current_trace(), checksum=checksum_of(payload)))
 
         def settle(reply: RawReply | None) -> None:
             call_on_loop(self._loop, lambda: _settle(future, reply))

@@ -1,0 +1,1 @@
+"""Faults on purpose: a seeded plan of them, and what carries it out in a running cell."""

@@ -1,0 +1,225 @@
+"""Carries a plan of faults out in a cell that is up, from the process of its supervisor."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from common import topics
+from common.chaos.damage import damaged
+from common.chaos.plan import STATELESS_FORMS, Fault
+from common.config import Container
+from common.errors import RequestFailed
+from common.messages import WorldEdit
+from common.transport.codec import Attachment, checksum_of, decode_attachment, encode_attachment, encoding_of
+
+if TYPE_CHECKING:
+    from common.transport.bus import Bus, Reader
+    from common.transport.session import RawSample
+
+PATIENCE = 4.0  # [s] wall, that a fault waits for a ball in the hand
+SAMPLE_SECONDS = 1.5  # within which a state is repeated
+DROP_TIMEOUT = 1.0  # [s]
+SPACING = 0.02  # [s] between bad messages in a row
+CLEARANCE = 0.12  # [m] from the container's edge: what falls between its wall and this may be hidden by it
+
+log = logging.getLogger("chaos")
+
+
+@dataclass(frozen=True)
+class Happened:
+    """A fault that was carried out, `t` [s, wall time] after the cell was up."""
+
+    t: float
+    what: str
+    target: str
+
+
+class Chaos:
+    """Faults, carried out one after the other; `happened` lists them."""
+
+    def __init__(
+        self, bus: Bus, plan: Iterable[Fault], pids: Callable[[], dict[str, int]], container: Container | None
+    ) -> None:
+        """Declare what is listened to.
+
+        Args:
+            bus: of the cell.
+            plan: faults in order of time.
+            pids: the processes that run now, by name.
+            container: balls are let slip clear of its edge; None when there are no balls.
+        """
+        self.happened: list[Happened] = []
+        self._bus, self._plan, self._pids, self._container = bus, plan, pids, container
+        self._gripper = bus.reader(topics.GRIPPER_STATE) if container else None
+        self._balls = bus.reader(topics.SCENE_BALLS) if container else None
+        self._edit = bus.client(topics.WORLD_EDIT) if container else None
+        self._began = 0.0
+        self._stopped: set[int] = set()
+
+    async def run(self) -> None:
+        """Carry the plan out; what is stopped goes on at the end, however this ends."""
+        self._began = time.monotonic()
+        try:
+            async with asyncio.TaskGroup() as lasting:
+                for fault in self._plan:
+                    await asyncio.sleep(max(0.0, self._began + fault.at - time.monotonic()))
+                    if fault.holding:
+                        await _until(self._gripper, self._is_holding)
+                    await self._begin(fault, lasting)
+        finally:
+            for pid in self._stopped:
+                _signal(pid, signal.SIGCONT)
+
+    def as_dicts(self) -> list[dict[str, object]]:
+        """What happened, for the summary file."""
+        return [asdict(one) for one in self.happened]
+
+    async def _begin(self, fault: Fault, lasting: asyncio.TaskGroup) -> None:
+        """Carry out a fault; one that lasts goes on beside those that follow."""
+        if fault.kind == "drop":
+            await self._drop(fault)
+        elif fault.kind in ("corrupt", "replay"):
+            lasting.create_task(self._disturb(fault))
+        elif (pid := self._pids().get(fault.target)) is None:
+            log.info("%s is not there to be disturbed", fault.target)
+        elif fault.kind in ("kill", "restart"):
+            self._note(fault)
+            _signal(pid, signal.SIGKILL if fault.kind == "kill" else signal.SIGTERM)
+        else:
+            self._note(fault)
+            lasting.create_task(self._stop_and_go(fault, pid))
+
+    def _note(self, fault: Fault) -> None:
+        now = time.monotonic() - self._began
+        log.warning("CHAOS %.1f s: %s %s", now, fault.what, fault.target)
+        self.happened.append(Happened(round(now, 2), fault.what, fault.target))
+
+    async def _stop_and_go(self, fault: Fault, pid: int) -> None:
+        for _ in range(fault.count):
+            self._stopped.add(pid)
+            _signal(pid, signal.SIGSTOP)
+            await asyncio.sleep(fault.seconds)
+            self._stopped.discard(pid)
+            if self._pids().get(fault.target) != pid:  # somebody has lost patience with it
+                return
+            _signal(pid, signal.SIGCONT)
+            await asyncio.sleep(fault.seconds / 2)
+
+    # --- balls ----------------------------------------------------------------------------------------------------
+
+    def _is_holding(self) -> bool:
+        latest = self._gripper.latest if self._gripper else None
+        return latest is not None and latest.holding
+
+    def _may_slip(self) -> bool:
+        """Whether a ball is in the hand that would fall to where it can be seen and taken again, or into the box."""
+        balls, box = self._balls.latest if self._balls else None, self._container
+        if balls is None or box is None or "held" not in balls.labels:
+            return False
+        place = balls.poses[balls.labels.index("held")].position
+        off = max(abs(place.x - box.x), abs(place.y - box.y)) - box.half_side
+        return off > CLEARANCE or off < -box.wall_thickness
+
+    async def _drop(self, fault: Fault) -> None:
+        rng = np.random.default_rng(fault.seed)
+        if self._edit is None or not await _until(self._balls, self._may_slip):
+            log.info("there is no ball in the hand to be let slip")
+            return
+        await asyncio.sleep(float(rng.uniform(0, 0.3)))
+        if not self._may_slip():
+            log.info("there is no ball in the hand to be let slip any more")
+            return
+        try:
+            await self._edit.call(WorldEdit(op="drop"), DROP_TIMEOUT)
+        except RequestFailed as error:
+            log.info("no ball slips: %s", error)
+            return
+        self._note(fault)
+
+    # --- messages -------------------------------------------------------------------------------------------------
+
+    async def _disturb(self, fault: Fault) -> None:
+        """Put bad messages under a key, as if they came from who writes it, or from nobody."""
+        topic: Any = topics.find_topic(fault.target)
+        key, encoding = f"{self._bus.cell}/{topic.key}", encoding_of(topic.message)
+        rng = np.random.default_rng(fault.seed)
+        if topic.kind == "request":
+            self._note(fault)
+            for _ in range(fault.count):
+                await self._bus.raw_get(key, 0.5, payload=damaged(b"", _stateless(fault, rng), rng), encoding=encoding)
+            return
+        real = None if fault.form in STATELESS_FORMS else await self._sample(key)
+        if fault.kind == "replay":
+            if real is None:
+                log.info("%s is silent: nothing to repeat", fault.target)
+                return
+            await asyncio.sleep(fault.seconds)
+        self._note(fault)
+        publisher = self._bus.raw_publisher(key, encoding, reliable=topic.kind != "stream")
+        try:
+            for _ in range(fault.count):
+                if real is not None and fault.kind == "replay":
+                    publisher.put(real.payload, real.attachment or b"")
+                else:
+                    publisher.put(*self._damaged(real, fault, rng))
+                await asyncio.sleep(SPACING)
+        finally:
+            publisher.undeclare()
+
+    def _damaged(self, real: RawSample | None, fault: Fault, rng: np.random.Generator) -> tuple[bytes, bytes]:
+        """A damaged payload and what rides beside it: damaged on its way, or put by a stranger."""
+        attachment = decode_attachment(real.attachment) if real else None
+        if real is None or attachment is None:
+            payload = damaged(b"", _stateless(fault, rng), rng)
+            own = Attachment("chaos", int(rng.integers(2**31)), checksum=checksum_of(payload))
+            return payload, encode_attachment(own) if rng.random() < 0.5 else b""
+        # The next message of this writer, as it would look had it been damaged on the way.
+        following = Attachment(
+            attachment.writer, attachment.sequence + int(rng.integers(1, 50)), trace=attachment.trace,
+            checksum=checksum_of(real.payload),
+        )
+        return damaged(real.payload, fault.form, rng), encode_attachment(following)
+
+    async def _sample(self, key: str) -> RawSample | None:
+        """A real message of a key; None when nothing is said there."""
+        reader: Any = self._bus.raw_reader(key)
+        try:
+            async with asyncio.timeout(SAMPLE_SECONDS):
+                sample: RawSample = await anext(reader)
+                return sample
+        except TimeoutError:
+            return None
+        finally:
+            await reader.aclose()
+
+
+def _stateless(fault: Fault, rng: np.random.Generator) -> Any:
+    """The form of the damage where there is no real message to start from."""
+    return fault.form if fault.form in STATELESS_FORMS else STATELESS_FORMS[int(rng.integers(2))]
+
+
+async def _until(reader: Reader[Any] | None, condition: Callable[[], bool]) -> bool:
+    """Whether the condition came to hold in time, looked at whenever something is read."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(PATIENCE):
+            while not condition():
+                if reader is None:
+                    return False
+                await reader.next()
+            return True
+    return False
+
+
+def _signal(pid: int, number: signal.Signals) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, number)

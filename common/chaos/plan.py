@@ -1,0 +1,125 @@
+"""Which faults happen to a cell, and when: the same seed makes the same plan. Nothing happens here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from typing import Literal, get_args
+
+import numpy as np
+
+Kind = Literal["kill", "restart", "freeze", "delay", "corrupt", "replay", "drop"]
+Form = Literal["", "truncated", "flipped", "noise", "wrong type", "huge"]
+
+PER_MINUTE = 30.0  # faults per minute of wall time
+MOST_PER_MINUTE = 600.0
+CELL_SECONDS = 75.0  # of cell time in which a run sees faults; what comes after is left to it to finish
+LEAST_GAP = 0.05  # [s] between two faults
+HOLDING = 0.4  # share of the faults of processes that wait for a ball in the hand
+STATELESS_FORMS: tuple[Form, ...] = ("noise", "wrong type", "huge")  # for which no real message is needed
+
+_WEIGHTS: dict[Kind, float] = {
+    "kill": 6, "restart": 2, "freeze": 4, "delay": 2, "corrupt": 5, "replay": 2, "drop": 3,
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault.
+
+    Attributes:
+        at: when [s, wall time] from the cell being up.
+        kind: kill -9, SIGTERM, SIGSTOP for a time, short stops in a row, damaged messages, old messages, a ball that
+            slips out of the fingers.
+        target: name of the process, or key without the cell; empty for a ball.
+        seconds: how long it lasts, where it lasts.
+        form: of damaged messages.
+        count: messages, or stops in a row.
+        seed: of everything else that is random about it.
+        holding: whether it waits for a ball in the hand.
+    """
+
+    at: float
+    kind: Kind
+    target: str = ""
+    seconds: float = 0.0
+    form: Form = ""
+    count: int = 1
+    seed: int = 0
+    holding: bool = False
+
+    @property
+    def what(self) -> str:
+        """What is done, for people: "kill -9", "SIGSTOP for 2.1 s", "truncated messages (12)"."""
+        match self.kind:
+            case "kill":
+                text = "kill -9"
+            case "restart":
+                text = "SIGTERM"
+            case "freeze":
+                text = f"SIGSTOP for {self.seconds:.1f} s"
+            case "delay":
+                text = f"delays of {self.seconds:.2f} s ({self.count})"
+            case "corrupt":
+                text = f"{self.form} messages ({self.count})"
+            case "replay":
+                text = f"messages of {self.seconds:.1f} s ago ({self.count})"
+            case "drop":
+                return "the held ball slips"
+        return text + (" with a ball in the hand" if self.holding else "")
+
+
+def faults(
+    seed: int, processes: Sequence[str], keys: Sequence[str], *, balls: bool, per_minute: float = PER_MINUTE
+) -> Iterator[Fault]:
+    """Faults without end, in order.
+
+    Args:
+        seed: of the plan.
+        processes: that can be killed and stopped.
+        keys: of topics and requests under which bad messages are put.
+        balls: whether there is something that can slip out of a hand.
+        per_minute: of wall time, on average.
+    """
+    rng = np.random.default_rng(seed)
+    kinds = [kind for kind in get_args(Kind) if balls or kind != "drop"]
+    weights = np.array([_WEIGHTS[kind] for kind in kinds])
+    mean = max(60.0 / per_minute - LEAST_GAP, 0.01)
+    at = 0.0
+    while True:
+        at += LEAST_GAP + min(float(rng.exponential(mean)), 3 * mean)
+        kind: Kind = rng.choice(kinds, p=weights / weights.sum())
+        yield _fault(at, kind, rng, processes, keys, balls)
+
+
+def plan(
+    seed: int, processes: Sequence[str], keys: Sequence[str], *, balls: bool, seconds: float,
+    per_minute: float = PER_MINUTE,
+) -> list[Fault]:
+    """The faults of the first `seconds` [s, wall time]; see `faults`."""
+    endless = faults(seed, processes, keys, balls=balls, per_minute=per_minute)
+    return list(takewhile(lambda fault: fault.at <= seconds, endless))
+
+
+def _fault(
+    at: float, kind: Kind, rng: np.random.Generator, processes: Sequence[str], keys: Sequence[str], balls: bool
+) -> Fault:
+    seed, at = int(rng.integers(2**31)), round(at, 3)
+    process, key = str(rng.choice(processes)), str(rng.choice(keys))
+    holding = balls and bool(rng.random() < HOLDING)
+    if kind in ("kill", "restart"):
+        return Fault(at, kind, process, seed=seed, holding=holding)
+    if kind == "freeze":
+        return Fault(at, kind, process, round(float(rng.uniform(0.3, 6.0)), 2), seed=seed, holding=holding)
+    if kind == "delay":
+        seconds = round(float(rng.uniform(0.05, 0.5)), 2)
+        return Fault(at, kind, process, seconds, count=int(rng.integers(2, 6)), seed=seed)
+    if kind == "corrupt":
+        form: Form = rng.choice([form for form in get_args(Form) if form])
+        count = 1 if form == "huge" else int(rng.integers(3, 40))
+        return Fault(at, kind, key, form=form, count=count, seed=seed)
+    if kind == "replay":
+        seconds = round(float(rng.uniform(0.5, 3.0)), 2)
+        return Fault(at, kind, key, seconds, count=int(rng.integers(1, 20)), seed=seed)
+    return Fault(at, kind, seed=seed)

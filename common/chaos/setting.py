@@ -1,0 +1,47 @@
+"""A plan of faults that fits a cell, with what carries it out."""
+
+from __future__ import annotations
+
+from common import topics
+from common.chaos.agent import Chaos
+from common.chaos.plan import CELL_SECONDS, faults, plan
+from common.config import Cell
+from common.hardware.loading import find_backend
+from common.supervision.supervisor import Supervisor
+from common.transport.bus import Bus
+from common.transport.keys import ROUTER
+
+PICKS = "smart_pick_place"
+
+
+def chaos_in(
+    bus: Bus, cell: Cell, supervisor: Supervisor, seed: int, per_minute: float, *, until_ended: bool
+) -> Chaos:
+    """Faults for the processes and keys of a cell that is up.
+
+    Args:
+        bus: of the supervisor.
+        cell: the resolved cell.
+        supervisor: knows the processes.
+        seed: of the plan.
+        per_minute: faults per minute of wall time, on average.
+        until_ended: the faults end while a run of the task has time left to finish; else they go on.
+    """
+    ours = [entry.name for entry in cell.services.values()]
+    processes = [status.name for status in supervisor.statuses if status.name in (ROUTER, *ours)]
+    balls = PICKS in ours and find_backend(cell.robot).simulated
+    if until_ended:
+        seconds = CELL_SECONDS / bus.clock.speed
+        planned = iter(plan(seed, processes, keys_of(ours), balls=balls, seconds=seconds, per_minute=per_minute))
+    else:
+        planned = faults(seed, processes, keys_of(ours), balls=balls, per_minute=per_minute)
+
+    def pids() -> dict[str, int]:
+        return {status.name: status.pid for status in supervisor.statuses if status.pid is not None}
+
+    return Chaos(bus, planned, pids, cell.world.container if balls else None)
+
+
+def keys_of(services: list[str]) -> list[str]:
+    """Keys that these services write or answer, but for those of all services."""
+    return [key for key, topic in topics.all_topics().items() if set(topic.writer.split(", ")) & set(services)]
