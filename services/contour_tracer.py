@@ -10,6 +10,7 @@ from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.tasks.outline import Outline, OutlineParameters
 from common.tasks.outline_legs import OutlineView
+from common.tasks.reliance import Reliance
 from common.transport.bus import Bus
 from common.transport.service import main
 from common.transport.task_runner import TaskRunner
@@ -45,7 +46,8 @@ async def run(bus: Bus, config: Config) -> None:
             view.q, view.tcp = q.tolist(), matrix_to_pose(robot.fk(q))
         return view
 
-    runner = TaskRunner(bus, task, look, status, lambda: config.planning_time)
+    reliance = Reliance(lambda: joints.received, lambda: config.joint_states_timeout)
+    runner = TaskRunner(bus, task, look, status, lambda: config.planning_time, reliance)
     await bus.ready()
     await runner.run((path, scene, gripper, motion))
 

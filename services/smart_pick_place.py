@@ -9,6 +9,7 @@ from common.config import Grasp, RobotConfig, Run, Surroundings
 from common.robot.model import RobotModel
 from common.tasks.pick_place import PickPlace
 from common.tasks.pick_place_parameters import PickPlaceParameters
+from common.tasks.reliance import Reliance
 from common.tasks.stages import View
 from common.transport.bus import Bus
 from common.transport.service import main
@@ -52,7 +53,8 @@ async def run(bus: Bus, config: Config) -> None:
             view.tcp = (float(x), float(y), float(z))
         return view
 
-    runner = TaskRunner(bus, task, look, status, lambda: config.planning_time)
+    reliance = Reliance(lambda: joints.received, lambda: config.joint_states_timeout)
+    runner = TaskRunner(bus, task, look, status, lambda: config.planning_time, reliance)
     await bus.ready()
     await runner.run((targets, scene, gripper, motion))
 

@@ -6,6 +6,7 @@ robot is held its goal stays active, at rest on its path; one that comes meanwhi
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from common.hardware.goals import GoalMemory
 from common.hardware.interface import Limits, Vector
 from common.hardware.pacing import next_rate, way
 from common.hardware.trajectory import Trajectory
-from common.messages import GoalState, JointTrajectory, MotionStatus
+from common.messages import GoalState, Holder, JointTrajectory, MotionStatus
 
 LARGEST_STEP = 0.1  # cell time [s]: after a stall of the loop a trajectory goes on where it was, instead of jumping
 BLEND_TIME = 0.3  # the difference between the robot's and the trajectory's start fades in this time [s]
@@ -66,7 +67,7 @@ class TrajectoryController:
         self._goal: _Goal | None = None
         self._memory: GoalMemory[MotionStatus] = GoalMemory(remember)
         self._fault = ""
-        self._held: str | None = None  # the reason, while the robot is held
+        self._holds: dict[Holder, str] = {}  # the reasons, by who holds the robot
         self._status = MotionStatus()
         self.speed_scaling = 1.0
 
@@ -76,9 +77,11 @@ class TrajectoryController:
         return self._as_of_now(self._status)
 
     def _as_of_now(self, status: MotionStatus) -> MotionStatus:
-        now: dict[str, object] = {"held": self._held is not None, "speed_scaling": self.speed_scaling}
-        if self._held is not None and status.state != "active" and not status.message:
-            now["message"] = _told("held", self._held)
+        now: dict[str, object] = {
+            "held": bool(self._holds), "held_by": sorted(self._holds), "speed_scaling": self.speed_scaling,
+        }
+        if self._holds and status.state != "active" and not status.message:
+            now["message"] = _told("held", self._holds.values())
         return status.model_copy(update=now)
 
     def accept(self, goal: str, trajectory: JointTrajectory, now: float, measured: Vector) -> MotionStatus:
@@ -107,7 +110,7 @@ class TrajectoryController:
         # Go on from the set-point, unless the arm was moved from outside since.
         near = np.all(np.abs(self._hold - measured) <= self._tolerances.start)
         begin = self._hold if near else measured
-        rate = 0.0 if self._held is not None else self.speed_scaling
+        rate = 0.0 if self._holds else self.speed_scaling
         self._goal = _Goal(goal, checked, begin - checked.positions[0], now, rate)
         return self._report("active", message=self._holding(self._goal))
 
@@ -129,18 +132,21 @@ class TrajectoryController:
             running.stopping, running.reason = True, reason
         return self._report("active", message=f"stopping: {running.reason}")
 
-    def hold(self, hold: bool, reason: str) -> MotionStatus:
-        """The status with `held` as asked: begin to bring the robot to rest on its path, or let it go on."""
-        self._held = reason if hold else None
+    def hold(self, hold: bool, reason: str, by: Holder = "person") -> MotionStatus:
+        """The status: begin to bring the robot to rest on its path, or let it go on, unless another holds it."""
+        if hold:
+            self._holds[by] = reason
+        else:
+            self._holds.pop(by, None)
         if self._goal is not None and not self._goal.stopping:
             return self._report("active", message=self._holding(self._goal))
         return self.status
 
     def _holding(self, goal: _Goal) -> str:
         """What there is to say of a goal about being held."""
-        if self._held is None:
+        if not self._holds:
             return ""
-        return _told("held" if goal.rate == 0.0 else "coming to rest", self._held)
+        return _told("held" if goal.rate == 0.0 else "coming to rest", self._holds.values())
 
     def update(self, now: float, measured: Vector, measured_velocity: Vector) -> tuple[Vector, Vector]:
         """The set-points (dof,) [rad], [rad/s] for now. `status` says what became of the goal.
@@ -160,7 +166,7 @@ class TrajectoryController:
             return self._hold, 0.0 * self._hold
         elapsed = min(max(now - goal.last, 0.0), LARGEST_STEP)
         goal.last = now
-        braking = goal.stopping or self._held is not None
+        braking = goal.stopping or bool(self._holds)
         goal.advance(elapsed, 0.0 if braking else self.speed_scaling,
                      self._limits.braking if braking else self._limits.acceleration)
         over = goal.time >= goal.trajectory.duration or (goal.stopping and goal.rate == 0.0)
@@ -219,5 +225,5 @@ class TrajectoryController:
         self._goal = None
 
 
-def _told(what: str, reason: str) -> str:
-    return f"{what}: {reason}" if reason else what
+def _told(what: str, reasons: Iterable[str]) -> str:
+    return ": ".join([what, *filter(None, ["; ".join(filter(None, reasons))])])

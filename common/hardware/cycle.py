@@ -189,7 +189,7 @@ class ControlCycle:
 
     def hold(self, request: HoldRequest) -> MotionStatus:
         """The status, with the arm being brought to rest on its path, or going on; the fingers finish their motion."""
-        return self._arm.hold(request.hold, request.reason)
+        return self._arm.hold(request.hold, request.reason, request.by)
 
     @property
     def speed_scaling(self) -> float:

@@ -13,6 +13,7 @@ from common.messages.execution import (
     GoalState,
     GripperCommand,
     GripperState,
+    Holder,
     HoldRequest,
     MotionStatus,
     StopRequest,

@@ -10,6 +10,7 @@ from common.messages.basics import Finite, Fraction, Header, Message, Name
 from common.messages.robot import JointTrajectory
 
 GoalState = Literal["none", "rejected", "active", "succeeded", "aborted", "cancelled"]
+Holder = Literal["person", "watchdog"]
 
 
 class ExecuteRequest(Message):
@@ -31,6 +32,7 @@ class HoldRequest(Message):
 
     hold: bool
     reason: str = ""
+    by: Holder = Field("person", description="each lets go only of its own hold; the robot moves when nobody holds it")
 
 
 class MotionStatus(Message):
@@ -44,7 +46,13 @@ class MotionStatus(Message):
     message: str = ""
     source: str = Field("", description="who said so: the controller by its name, or hardware")
     held: bool = Field(False, description="kept at rest on its path until let go; no new goal begins to move")
+    held_by: list[Holder] = []
     speed_scaling: Fraction = Field(1.0, description="trajectories are followed at this share of their speed")
+
+    @property
+    def paused(self) -> bool:
+        """Whether somebody has to let go of the robot: a watchdog does so by itself."""
+        return self.held and self.held_by != ["watchdog"]
 
 
 class GripperCommand(Message):

@@ -31,6 +31,9 @@ class OutlineParameters(TracingParameters):
     overtime: Tunable[float] = Field(
         30.0, gt=0, le=3600, description="a motion that takes so much longer is stopped [s]"
     )
+    joint_states_timeout: Tunable[float] = Field(
+        0.2, ge=0.05, le=60, description="without joint states for so long the arm is held on its path [s, wall time]"
+    )
     selection_timeout: Tunable[float] = Field(
         10.0, ge=0, le=3600, description="wait for a contour before giving up; 0: for ever [s, wall time]"
     )
@@ -137,8 +140,8 @@ class Outline:
             return []
         assert view.motion is not None and view.gripper is not None
         if not self._found:
-            self._found, self.status.paused = True, view.motion.held
-            if view.motion.held:
+            self._found, self.status.paused = True, view.motion.paused
+            if view.motion.paused:
                 self.status.message = FOUND_HELD
         if self._began is None and self.status.started:
             self._began = view.now
@@ -150,7 +153,7 @@ class Outline:
         self.status.task_seconds = view.now - (self._began or view.now)
         if self._running is None and not self._stages and not (view.motion.state == "active" or view.gripper.moving):
             self._decide(view)
-        return [*self._plan_ahead(), *self._advance(view)]
+        return [*self._plan_ahead(), *(() if view.trouble else self._advance(view))]
 
     def _watch(self, view: OutlineView) -> list[Command]:
         """Follow the stage that runs to its end or its failure."""

@@ -56,6 +56,7 @@ class OutlineView:
     motion: m.MotionStatus | None = None
     q: list[float] | None = None
     tcp: m.Pose | None = None
+    trouble: str = ""  # why no motion may begin
 
     @property
     def missing(self) -> list[str]:

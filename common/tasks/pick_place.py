@@ -113,8 +113,8 @@ class PickPlace:
             # Balls in the container were placed before a restart, or by somebody else.
             self._looked, self.status.placed = True, len(view.objects("contained"))
         if not self._found:
-            self._found, self.status.paused = True, view.motion.held
-            if view.motion.held:
+            self._found, self.status.paused = True, view.motion.paused
+            if view.motion.paused:
                 self.status.message = FOUND_HELD
         if self._began is None and self.status.started:
             self._began = view.now
@@ -134,7 +134,7 @@ class PickPlace:
         self.status.skipped = self.choice.rejections()
         if self.status.stage not in ("close", "lift", "across", "release"):  # then one is in the hand or in the air
             self.status.targets = self.status.placed + len(view.targets)
-        return [*self._plan_ahead(view), *self._advance(view)]
+        return [*self._plan_ahead(view), *(() if view.trouble else self._advance(view))]
 
     # --- what runs -------------------------------------------------------------------------------------------
 

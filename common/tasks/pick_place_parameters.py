@@ -34,6 +34,9 @@ class PickPlaceParameters(Parameters):
     frame_timeout: Tunable[float] = Field(
         1.0, ge=0.1, le=60, description="an older picture starts no motion [s, wall time]"
     )
+    joint_states_timeout: Tunable[float] = Field(
+        0.2, ge=0.05, le=60, description="without joint states for so long the arm is held on its path [s, wall time]"
+    )
     max_retries: Tunable[int] = Field(3, ge=0, le=100, description="grasps of one place that may close on nothing")
     max_failures: Tunable[int] = Field(
         10, ge=1, le=1000, description="failures in a row after which the task gives up"

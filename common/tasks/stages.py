@@ -78,6 +78,7 @@ class View:
     gripper: m.GripperState | None = None
     motion: m.MotionStatus | None = None
     tcp: Place | None = None
+    trouble: str = ""  # why no motion may begin
 
     @property
     def missing(self) -> list[str]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol, TypeVar
 
 from common import messages as m
 from common import topics
 from common.errors import RemoteError
+from common.tasks.reliance import LOOK_PERIOD, Reliance
 from common.transport.bus import Bus
 from common.transport.persist import persist
 from common.transport.reader import Reader
@@ -21,12 +23,11 @@ Q = TypeVar("Q", bound=m.Message)
 
 GOAL_TIMEOUT = 1.0  # [s] wall: for a goal to be accepted
 PLAN_OVERTIME = 5.0  # [s] wall: that a plan may take beyond its planning time
-LONGEST_STEP = 0.05  # [s] wall: time passes too
+LONGEST_STEP = LOOK_PERIOD  # [s] wall: time passes too
+WAITS = "the arm waits: "
 
 Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
 
-# A stop makes the motion void that was asked for before it, a hold the hold before it.
-VOIDS: dict[type[m.Message], type[m.Message]] = {m.StopRequest: m.ExecuteRequest, m.HoldRequest: m.HoldRequest}
 
 
 class Task(Protocol):
@@ -54,6 +55,7 @@ class TaskRunner:
 
     def __init__(
         self, bus: Bus, task: Task, look: Callable[[], Any], status: Writer[Any], planning_time: Callable[[], float],
+        reliance: Reliance | None = None,
     ) -> None:
         """Declare the requests of a task and the command that it serves.
 
@@ -63,15 +65,16 @@ class TaskRunner:
             look: what is known now.
             status: where the task's status goes.
             planning_time: that the task asks for now [s, wall].
+            reliance: holds the arm while those are missing that the task relies on.
         """
         self._task, self._look, self._status, self._bus = task, look, status, bus
         self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
         self._stop, self._grip = bus.client(topics.MOTION_STOP), bus.client(topics.GRIPPER_COMMAND)
         self._hold = bus.client(topics.MOTION_HOLD)
-        self._planning_time = planning_time
+        self._planning_time, self._reliance = planning_time, reliance
         self._woken = asyncio.Event()
         self._told: list[Command] = []
-        self._asking: dict[type[m.Message], asyncio.Task[None]] = {}  # the newest of each
+        self._asking: dict[str, asyncio.Task[None]] = {}  # the newest of each kind
         self._before: m.TaskReport | None = None
         bus.serve(topics.TASK_COMMAND, self._obey)
 
@@ -86,9 +89,20 @@ class TaskRunner:
                         await self._woken.wait()
                 self._woken.clear()
                 told, self._told = self._told, []
-                for command in [*told, *self._task.step(self._look())]:
+                view = self._look()
+                holds = self._mind(view)
+                for command in [*told, *holds, *self._task.step(view)]:
                     self._begin(group, command)
                 self._tell()
+
+    def _mind(self, view: Any) -> list[m.HoldRequest]:
+        """The holds to ask for, because something is missing or is back again; the view has what is missing."""
+        if self._reliance is None:
+            return []
+        serving = {client.topic.writer: client.available for client in (self._plan, self._execute)}
+        holds = self._reliance.look(time.monotonic(), serving, view.motion)
+        view.trouble = self._reliance.trouble
+        return holds
 
     async def _obey(self, command: m.TaskCommand) -> m.TaskStatus:
         self._bus.log.info("told to %s", command.command)
@@ -103,6 +117,11 @@ class TaskRunner:
     def _tell(self) -> None:
         """Publish the status when more of it has changed than the time."""
         now, before = self._task.status, self._before
+        trouble = self._reliance.trouble if self._reliance else ""
+        if trouble and now.state not in ("DONE", "ERROR"):
+            now.message = f"{WAITS}{trouble}"
+        elif now.message.startswith(WAITS):
+            now.message = ""
         if before and now.model_copy(update={"task_seconds": before.task_seconds, "header": before.header}) == before:
             return
         if now.state == "ERROR" and (before is None or before.state != "ERROR"):
@@ -122,10 +141,10 @@ class TaskRunner:
 
     def _begin(self, group: asyncio.TaskGroup, command: Command) -> None:
         """Send a command; what it makes void is not asked for again, should it still be without an answer."""
-        void = self._asking.pop(VOIDS[type(command)], None) if type(command) in VOIDS else None
+        void = self._asking.pop(_voided(command), None)
         if void is not None:
             void.cancel()
-        self._asking[type(command)] = group.create_task(self._do(command))
+        self._asking[_kind(command)] = group.create_task(self._do(command))
 
     async def _do(self, command: Command) -> None:
         """Send what a command stands for; what is refused is an answer too."""
@@ -158,3 +177,15 @@ class TaskRunner:
 
     def _answered(self, answer: m.MotionStatus | m.GripperState) -> None:
         self._task.on_goal(answer, self._look())
+
+
+def _kind(command: Command) -> str:
+    """What a command is of which only the newest counts; a watchdog's hold is not a person's."""
+    return f"{type(command).__name__} {command.by if isinstance(command, m.HoldRequest) else ''}"
+
+
+def _voided(command: Command) -> str:
+    """The kind of command that is void from now on: by a stop the motion before it, by a hold the one before it."""
+    if isinstance(command, m.StopRequest):
+        return f"{m.ExecuteRequest.__name__} "
+    return _kind(command) if isinstance(command, m.HoldRequest) else ""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import time
 from pathlib import Path
 
 import psutil
@@ -85,8 +84,6 @@ async def test_nothing_is_left_of_a_cell_whose_supervisor_is_killed_not_even_wha
             for name in ("scene_manager", "trajectory_executor"):
                 cell.processes()[name].send_signal(signal.SIGSTOP)
         os.kill(cell.process.pid, signal.SIGKILL)
-        began = time.monotonic()
         _, left = await asyncio.to_thread(psutil.wait_procs, processes, STOP_SECONDS)
-        print(f"{len(processes)} processes were gone after {time.monotonic() - began:.2f} s")
     assert len(processes) == 9
     assert not left

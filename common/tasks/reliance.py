@@ -1,0 +1,82 @@
+"""What a task relies on while the arm moves: joint states that keep coming, a planner, and an executor.
+
+Without them the arm is held on its path, and goes on along the same path when they are back. It could finish a motion
+that was planned; but without joint states nobody sees where it is, and without a planner nobody could bring it away
+from where something goes wrong. A hold loses nothing and does nothing twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from common import messages as m
+from common.waking import Waking
+
+LOOK_PERIOD = 0.05  # [s] the longest time between two looks of a task that is not late itself
+USUAL_GAPS = 4  # joint states that come slowly are missed after so many of their usual gaps
+SLOWEST_GAP = 2.0  # [s] a longer one is a silence
+REMEMBERED = 2.0  # [s] for which our own lateness counts: who waits for a processor is seldom alone
+HOPS = 2  # processes between the robot and us, each as late as we are
+
+
+class Reliance:
+    """Judges by our own waking time whether the task can rely on the others. Times are wall time [s]."""
+
+    def __init__(self, received: Callable[[], int], timeout: Callable[[], float]) -> None:
+        """Begin without having heard anything, which is no trouble yet.
+
+        Args:
+            received: how many joint states came so far.
+            timeout: after how long without one the arm is held [s].
+        """
+        self.trouble = ""  # why the arm must not move now
+        self._received, self._timeout = received, timeout
+        self._awake = Waking(2 * LOOK_PERIOD)
+        self._count: int | None = None
+        self._heard = 0.0  # waking time
+        self._gap = 0.0  # usual time between two joint states
+        self._late = self._late_at = 0.0
+        self._seen: set[str] = set()
+        self._holding: bool | None = None  # not known until the robot was looked at
+
+    def look(self, now: float, serving: dict[str, bool], motion: m.MotionStatus | None) -> list[m.HoldRequest]:
+        """What to ask of the executor; `trouble` says what is the matter.
+
+        Args:
+            now: what the clock says [s, monotonic].
+            serving: by the name of a service, whether it answers requests now.
+            motion: what is known of the robot's motion.
+        """
+        self._seen |= {name for name, there in serving.items() if there}
+        gone = [name for name, there in serving.items() if not there and name in self._seen]
+        silent = self._joints_are_missing(self._awake.look(now))
+        self.trouble = f"{' and '.join(gone)} is gone" if gone else silent
+        if motion is None:
+            return []
+        if self._holding is None:  # by the task before this one
+            self._holding = "watchdog" in motion.held_by
+        if self.trouble and motion.state == "active" and not self._holding:
+            self._holding = True
+            return [_hold(True, self.trouble)]
+        if not self.trouble and self._holding:
+            self._holding = False
+            return [_hold(False, "what was missing is back")]
+        return []
+
+    def _joints_are_missing(self, awake: float) -> str:
+        if self._awake.late >= self._late or awake - self._late_at > REMEMBERED:
+            self._late, self._late_at = self._awake.late, awake
+        new = self._received() - (self._count or 0)
+        if new > 0:
+            gap = (awake - self._heard) / new
+            if self._count is not None and gap <= SLOWEST_GAP:
+                self._gap += 0.1 * (gap - self._gap)
+            self._count, self._heard = self._received(), awake
+        if self._count is None:
+            return ""
+        patience = max(self._timeout(), USUAL_GAPS * self._gap) + HOPS * self._late
+        return f"no joint states for {1e3 * self._timeout():.0f} ms" if awake - self._heard > patience else ""
+
+
+def _hold(hold: bool, reason: str) -> m.HoldRequest:
+    return m.HoldRequest(hold=hold, reason=reason, by="watchdog")
