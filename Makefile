@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup run up test containers check bench docs deploy clean
+.PHONY: setup run up test containers check bench chaos docs deploy clean
 
 setup: $(STAMP)
 
@@ -33,6 +33,9 @@ check: setup
 bench: setup  ## every published figure, one module each
 	@for script in $$(grep -l __main__ benchmarks/*.py); do module=benchmarks.$$(basename $$script .py); \
 	  echo "== $$module"; $(BIN)/python -m $$module || exit 1; done
+
+chaos: setup  ## fifty runs, each under a plan of faults of its own: all of them have to end well
+	$(BIN)/python -m benchmarks.chaos
 
 docs: setup  ## write the generated tables and pages again
 	$(BIN)/python -m docs.generate

@@ -101,7 +101,7 @@ class Chaos:
 
     def _note(self, fault: Fault) -> None:
         now = time.monotonic() - self._began
-        log.warning("CHAOS %.1f s: %s %s", now, fault.what, fault.target)
+        log.warning("CHAOS %.1f s: %s", now, fault)
         self.happened.append(Happened(round(now, 2), fault.what, fault.target))
 
     async def _stop_and_go(self, fault: Fault, pid: int) -> None:

@@ -14,10 +14,15 @@ Form = Literal["", "truncated", "flipped", "noise", "wrong type", "huge"]
 
 PER_MINUTE = 30.0  # faults per minute of wall time
 MOST_PER_MINUTE = 600.0
-CELL_SECONDS = 75.0  # of cell time in which a run sees faults; what comes after is left to it to finish
+CELL_SECONDS = 100.0  # of cell time in which a run sees faults; what comes after is left to it to finish
 LEAST_GAP = 0.05  # [s] between two faults
 HOLDING = 0.4  # share of the faults of processes that wait for a ball in the hand
 STATELESS_FORMS: tuple[Form, ...] = ("noise", "wrong type", "huge")  # for which no real message is needed
+
+LABELS: dict[Kind, str] = {
+    "kill": "kill -9", "restart": "SIGTERM", "freeze": "SIGSTOP", "delay": "short SIGSTOPs",
+    "corrupt": "damaged messages on", "replay": "old messages on", "drop": "the held ball slips",
+}
 
 _WEIGHTS: dict[Kind, float] = {
     "kill": 6, "restart": 2, "freeze": 4, "delay": 2, "corrupt": 5, "replay": 2, "drop": 3,
@@ -50,24 +55,30 @@ class Fault:
     holding: bool = False
 
     @property
-    def what(self) -> str:
-        """What is done, for people: "kill -9", "SIGSTOP for 2.1 s", "truncated messages (12)"."""
+    def detail(self) -> str:
+        """How it is done, for people: "2.1 s", "12 truncated"; may be empty."""
         match self.kind:
-            case "kill":
-                text = "kill -9"
-            case "restart":
-                text = "SIGTERM"
             case "freeze":
-                text = f"SIGSTOP for {self.seconds:.1f} s"
+                text = f"{self.seconds:.1f} s"
             case "delay":
-                text = f"delays of {self.seconds:.2f} s ({self.count})"
+                text = f"{self.count} x {self.seconds:.2f} s"
             case "corrupt":
-                text = f"{self.form} messages ({self.count})"
+                text = f"{self.count} {self.form}"
             case "replay":
-                text = f"messages of {self.seconds:.1f} s ago ({self.count})"
-            case "drop":
-                return "the held ball slips"
-        return text + (" with a ball in the hand" if self.holding else "")
+                text = f"{self.count}, {self.seconds:.1f} s late"
+            case _:
+                text = ""
+        return ", ".join(part for part in (text, "a ball in the hand" if self.holding else "") if part)
+
+    @property
+    def what(self) -> str:
+        """What is done and how: "kill -9", "SIGSTOP: 2.1 s"."""
+        return ": ".join(part for part in (LABELS[self.kind], self.detail) if part)
+
+    def __str__(self) -> str:
+        """As "SIGSTOP vision_detector: 2.1 s"."""
+        action = f"{LABELS[self.kind]} {self.target}".rstrip()
+        return ": ".join(part for part in (action, self.detail) if part)
 
 
 def faults(
