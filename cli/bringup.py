@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
 
 import typer
 
-from cli import options, viewing
+from cli import options, securing, viewing
 
 if TYPE_CHECKING:
     from cli.screens import Content, Screen
@@ -53,6 +53,7 @@ def run(
     speed: Speed = "1",
     domain: options.Domain = None,
     connect: options.Connect = None,
+    secure: options.Secure = None,
     no_viewer: NoViewer = False,
     viewer_host: viewing.Host = None,
     viewer_port: viewing.Port = None,
@@ -65,6 +66,7 @@ def run(
     chaos_rate: ChaosRate = None,
 ) -> None:
     """Bring a cell up, run its task to the end, print a summary and shut down; exit 0 only if the task is DONE."""
+    securing.choose(secure)
     chosen = choices(cell, overrides, world, ask=ask, source=source)
     operation = Operation(cell, chosen, world, seed, speed, domain, connect, no_viewer, summary, log_json)
     operation.serve_page(viewer_host, viewer_port)
@@ -82,6 +84,7 @@ def up(
     speed: Speed = "1",
     domain: options.Domain = None,
     connect: options.Connect = None,
+    secure: options.Secure = None,
     no_viewer: NoViewer = False,
     viewer_host: viewing.Host = None,
     viewer_port: viewing.Port = None,
@@ -92,6 +95,7 @@ def up(
     chaos_rate: ChaosRate = None,
 ) -> None:
     """Bring a cell up and stay until Ctrl-C; the task starts by itself unless the cell says `autostart: false`."""
+    securing.choose(secure)
     operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json)
     operation.serve_page(viewer_host, viewer_port)
     operation.record_to(record)
@@ -177,6 +181,7 @@ class Operation:
         self.cell: Cell = loaded
         self.summary = Summary(loaded.name, loaded.run.seed, self.launch.clock.speed)
         require_modules(loaded)
+        securing.require_secured(self.launch, loaded)
         if endpoint is None:
             require_free_port(endpoint_of(number))
         self._supervisor: Supervisor | None = None

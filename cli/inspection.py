@@ -30,7 +30,7 @@ class NothingUp(RequestFailed):
 
 def inspect(
     visit: Callable[[Bus], Awaitable[T]], *, cell: str | None = None, any_cell: bool = False,
-    domain: str | None, connect: str | None,
+    domain: str | None, connect: str | None, identity: str | None = None,
 ) -> T:
     """What a visit to a cell's network returns.
 
@@ -40,30 +40,35 @@ def inspect(
         any_cell: the visit is to the network, no cell needs to be up.
         domain: where, as given to `--domain`.
         connect: where, as given to `--connect`.
+        identity: whose certificate is shown in a secured cell; the operator's if not given.
 
     Raises:
         NothingUp: there is no router, or no cell.
         UnknownName: several cells are up and none was named, or another one was.
     """
-    return asyncio.run(_inspect(visit, cell, any_cell, domain, connect))
+    return asyncio.run(_inspect(visit, cell, any_cell, domain, connect, identity))
 
 
 async def _inspect(
-    visit: Callable[[Bus], Awaitable[T]], cell: str | None, any_cell: bool, domain: str | None, connect: str | None
+    visit: Callable[[Bus], Awaitable[T]], cell: str | None, any_cell: bool, domain: str | None, connect: str | None,
+    identity: str | None,
 ) -> T:
     from common.clock import Clock
     from common.errors import NoRouter
+    from common.security.credentials import OPERATOR
     from common.transport.connect import connect as connect_to
     from common.transport.endpoint import endpoint_of
 
     endpoint = endpoint_of(domain, connect)
     clock = Clock.from_environment()
+    shown = identity or OPERATOR
     try:
         if cell is None and not any_cell:
-            async with connect_to(cell="_", service=TOOL, endpoint=endpoint, timeout=CONNECT_TIMEOUT) as bus:
+            async with connect_to(cell="_", service=TOOL, endpoint=endpoint, timeout=CONNECT_TIMEOUT,
+                                  identity=shown) as bus:
                 cell = _only({name for name, _ in await alive(bus)}, endpoint)
         async with connect_to(
-            cell=cell or "_", service=TOOL, endpoint=endpoint, clock=clock, timeout=CONNECT_TIMEOUT
+            cell=cell or "_", service=TOOL, endpoint=endpoint, clock=clock, timeout=CONNECT_TIMEOUT, identity=shown,
         ) as bus:
             return await visit(bus)
     except NoRouter:

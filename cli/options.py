@@ -28,6 +28,10 @@ Connect = Annotated[
     str | None,
     typer.Option("--connect", metavar="ENDPOINT", help="use the router there, start none [ZENCELL_CONNECT]"),
 ]
+Secure = Annotated[
+    str | None,
+    typer.Option("--secure", metavar="DIR", help="certificates of `zencell secure init`: TLS for all [ZENCELL_SECURE]"),
+]
 PublishedKey = Annotated[
     str, typer.Argument(metavar="KEY", help="as in `zencell topic list`, without the cell",
                         autocompletion=completing.published)

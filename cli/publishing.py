@@ -43,7 +43,9 @@ def pub(
     A state can be asked for while this runs. A key of your own services takes any JSON; {"base64": "..."} is bytes.
     """
     from cli.inspection import inspect
+    from common.security.credentials import refuse_to_publish
 
+    refuse_to_publish("topic pub")
     period = 1 / options.rate(rate)
     most = 1 if once else options.whole("--count", count, 1)
     topic = _publishable(key)

@@ -52,6 +52,7 @@ def record(
     """Record what travels in a cell, all keys if none are given, until Ctrl-C."""
     from cli.inspection import inspect
     from common.recording.selection import Selection
+    from common.security.credentials import identity_of_listener
 
     selection = Selection.of(keys or (), regex, exclude)
     _require_published(selection)
@@ -63,7 +64,8 @@ def record(
     if gate:
         asyncio.run(_gated(selection, asked, cell, domain, connect))
     else:
-        inspect(lambda bus: _record(bus, selection, asked), cell=cell, domain=domain, connect=connect)
+        inspect(lambda bus: _record(bus, selection, asked), cell=cell, domain=domain, connect=connect,
+                identity=identity_of_listener())
 
 
 class _Asked:
@@ -115,11 +117,13 @@ async def _gated(
     selection: Selection, asked: _Asked, cell: str | None, domain: str | None, connect: str | None
 ) -> None:
     """Record under a supervisor: be ready before its services are let through, end with its SIGTERM or with it."""
+    from common.security.credentials import RECORDER
     from common.transport.connect import connect as connect_to
     from common.transport.endpoint import endpoint_of
 
     endpoint = endpoint_of(domain, connect)
-    async with connect_to(cell=cell or "_", service=NAME, endpoint=endpoint, timeout=None) as bus:
+    joining = connect_to(cell=cell or "_", service=NAME, endpoint=endpoint, timeout=None, identity=RECORDER)
+    async with joining as bus:
         await _record(bus, selection, asked)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
+from cli.viewing import VIEWER
 
 if TYPE_CHECKING:
     from common.config import Cell
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Certificates for a cell's processes, and who may do what.", no_args_is_help=True)
 
 DAYS = 365
+SHOWN = ("writes", "reads", "answers", "asks")
 LOCAL = ("localhost", "127.0.0.1", "::1")
 ACCESS_HEAD = "// Who may do what, as the services declare it; all else is denied. Made by `zencell secure init`.\n"
 
@@ -70,16 +72,83 @@ def init(
     (place / ACCESS).write_text(text, encoding="utf-8")
     typer.echo(f"{len(names) + 1} certificates, valid for {valid} days, and {ACCESS} in {folder}")
     typer.echo(f"keep {key} elsewhere: nothing but another `secure init --renew` needs it")
-    typer.echo(f"next: zencell up {loaded[0].name} --secure {folder}")
+    typer.echo(f"next: zencell up {(cells or names_of('cells'))[0]} --secure {folder}")
+
+
+@app.command()
+def show(folder: Folder, as_json: options.Json = False) -> None:
+    """Show who may do what, as the router enforces it, and until when each certificate is valid."""
+    from common.errors import ConfigError
+    from common.security.checking import allowances, certificate_in
+    from common.security.credentials import ROUTER_NAME, read_access
+
+    place = Path(folder)
+    allowed = allowances(read_access(place))
+    for name in [ROUTER_NAME, *allowed]:
+        file = place / f"{name}.pem"
+        try:
+            until = f"{certificate_in(file).not_valid_after_utc:%Y-%m-%d}" if file.is_file() else ""
+        except PermissionError:
+            raise ConfigError("DIR", str(file), "can not be read by this user") from None
+        rights = {kind: sorted(keys) for kind, keys in allowed.get(name, {}).items() if kind in SHOWN}
+        if as_json:
+            typer.echo(json.dumps({"name": name, "valid_until": until, **rights}))
+            continue
+        typer.echo(f"{name}: {f'valid until {until}' if until else 'its certificate is not here'}")
+        for kind, keys in rights.items():
+            cell = name.partition(".")[0]
+            typer.echo(f"  {kind:<8} {', '.join(key.removeprefix(f'{cell}/') for key in keys)}")
+
+
+@app.command()
+def check(
+    folder: Folder,
+    cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="all of config/cells if not given; "
+                                                    "repeatable")] = None,
+    overrides: options.Overrides = None,
+    world: options.WorldName = None,
+    no_viewer: Annotated[bool, typer.Option("--no-viewer", hidden=True)] = False,
+) -> None:
+    """Say whether the certificates are valid, and the rules those that the cells' services need now."""
+    from common.config import load_cell, names_of
+    from common.security.checking import require_current, require_valid
+    from common.security.credentials import OPERATOR, ROUTER_NAME, common_name, read_access
+
+    place = Path(folder)
+    for given in cells or names_of("cells"):
+        cell = without_viewer(load_cell(given, overrides or (), world=world), no_viewer)
+        again = renewal(folder, given)
+        rights = rights_in(cell)
+        require_valid(place, [ROUTER_NAME, OPERATOR, *(common_name(cell.name, process) for process in rights)], again)
+        require_current(place, read_access(place), cell.name, rights, again)
+        typer.echo(f"{cell.name}: {len(rights)} processes, certificates and rules are as they need them")
+
+
+def renewal(folder: str, cell: str) -> str:
+    """The command line that makes certificates and rules for a cell anew."""
+    from common.config import names_of
+
+    chosen = "" if cell in names_of("cells") else f" --cell {cell}"
+    return f"zencell secure init {folder} --renew{chosen}"
+
+
+def without_viewer(cell: Cell, wanted: bool) -> Cell:
+    """The cell, without its page if that is wanted."""
+    kept = {key: entry for key, entry in cell.services.items() if not wanted or entry.name != VIEWER}
+    return cell.model_copy(update={"services": kept})
 
 
 def rights_in(cell: Cell) -> dict[str, Rights]:
-    """What each process of a cell may do, found by letting its services declare what they need."""
-    from common.security.access import rights_of, rights_of_supervisor
-    from common.security.credentials import SUPERVISOR
+    """What each process of a cell may do, found by letting its services declare what they need.
+
+    Raises:
+        ConfigError: one of them can not be configured so.
+    """
+    from common.security.access import rights_of, rights_of_recorder, rights_of_supervisor
+    from common.security.credentials import RECORDER, SUPERVISOR
     from common.transport.wiring import wiring_of
 
     async def find() -> dict[str, Rights]:
         return {entry.name: rights_of(entry.name, await wiring_of(cell, entry)) for entry in cell.services.values()}
 
-    return {**asyncio.run(find()), SUPERVISOR: rights_of_supervisor()}
+    return {**asyncio.run(find()), SUPERVISOR: rights_of_supervisor(), RECORDER: rights_of_recorder()}

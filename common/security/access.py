@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from common.security.credentials import OBSERVER, OPERATOR, common_name
-from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, parameters_of
+from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, all_topics, parameters_of
 from common.transport.keys import alive_key, serves_key
 
 
@@ -31,7 +31,7 @@ class Rights:
     write: set[str] = field(default_factory=set)  # streams and events
     keep: set[str] = field(default_factory=set)  # states: written, and answered for
     read: set[str] = field(default_factory=set)
-    get: set[str] = field(default_factory=set)  # states that are asked for
+    get: set[str] = field(default_factory=set)  # states that are asked for; ** would be every request too
     serve: set[str] = field(default_factory=set)
     call: set[str] = field(default_factory=set)
 
@@ -56,12 +56,22 @@ def rights_of_supervisor() -> Rights:
     return Rights(write={LOG.key, COUNTERS.key}, keep={SUPERVISOR_STATUS.key}, read={"**"}, get={"**"}, call={"**"})
 
 
+def rights_of_recorder() -> Rights:
+    """What the recorder of a cell may do: it hears everything and commands nothing."""
+    return Rights(write={LOG.key, COUNTERS.key}, read={"**"}, get=_states())
+
+
 def rights_of_tools() -> dict[str, Rights]:
     """What people's tools may do, in all cells behind a router."""
     return {
         OPERATOR: Rights(read={"**"}, get={"**"}, call={"**"}),
-        OBSERVER: Rights(read={"**"}, get={"**"}),
+        OBSERVER: Rights(read={"**"}, get=_states()),
     }
+
+
+def _states() -> set[str]:
+    # Not `**`: who may ask for every key may call every request, since both are the same to the router.
+    return {topic.key for topic in all_topics().values() if topic.kind == "state"}
 
 
 def access_control(cells: Mapping[str, Mapping[str, Rights]]) -> dict[str, Any]:

@@ -13,7 +13,8 @@ from common.errors import ConfigError
 from common.transport.endpoint import SECURE_VARIABLE
 
 AUTHORITY, ROUTER_NAME, ACCESS = "ca", "router", "access.json5"
-SUPERVISOR, OPERATOR, OBSERVER = "supervisor", "operator", "observer"  # the last two are tools, for all cells
+SUPERVISOR, RECORDER = "supervisor", "recorder"  # beside the services of each cell
+OPERATOR, OBSERVER = "operator", "observer"  # people's tools, for all cells
 REMEDY = "make it with `zencell secure init`"
 
 
@@ -45,6 +46,22 @@ def secure_folder(environ: Mapping[str, str] = os.environ) -> Path | None:
     """The folder of certificates that is to be used; None for an open cell."""
     given = environ.get(SECURE_VARIABLE)
     return Path(given) if given else None
+
+
+def identity_of_listener(environ: Mapping[str, str] = os.environ) -> str:
+    """Whose certificate a tool shows that only listens: the observer's, where there is one."""
+    folder = secure_folder(environ)
+    return OBSERVER if folder is not None and (folder / f"{OBSERVER}.key").is_file() else OPERATOR
+
+
+def refuse_to_publish(what: str, environ: Mapping[str, str] = os.environ) -> None:
+    """Return in an open cell.
+
+    Raises:
+        ConfigError: the cell is secured, where the router would take nothing that a tool publishes.
+    """
+    if secure_folder(environ) is not None:
+        raise ConfigError(what, ..., "is not possible with certificates: only a cell's own services publish")
 
 
 def credentials_of(name: str, folder: Path) -> Credentials:

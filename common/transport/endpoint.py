@@ -24,6 +24,10 @@ SECURE_VARIABLE = "ZENCELL_SECURE"  # folder of certificates, as `zencell secure
 LEASE_MS = 2000  # a frozen process or cut link is noticed after this
 STUCK_MS = 1000  # so is a link that takes nothing
 STREAM_BATCHES = 16  # of 64 kB that may wait in a link: a whole picture, so that what follows it is not dropped
+MOST_BYTES = 40 * 1024 * 1024  # of one message; the largest picture that is read has 32 MB
+MOST_SESSIONS = 512  # at one router: 50 cells of ten services
+MOST_PENDING = 32  # of these that have not shown who they are yet
+ACCEPT_MS = 3000  # in which they must; a loaded machine takes 1 s
 STREAM_WAIT_US = 5000  # that a stream's message waits for room before it is dropped, once until there is room again
 
 
@@ -110,7 +114,13 @@ def router_config(
     """
     secure = {"transport__link__tls": credentials.tls(listens=True)} if credentials else {}
     controlled = {"access_control": access} if access else {}
-    return _config(mode="router", listen__endpoints=[endpoint], connect__endpoints=[], **secure, **controlled)
+    return _config(
+        mode="router", listen__endpoints=[endpoint], connect__endpoints=[],
+        transport__unicast__max_sessions=MOST_SESSIONS,
+        transport__unicast__accept_pending=MOST_PENDING,
+        transport__unicast__accept_timeout=ACCEPT_MS,
+        **secure, **controlled,
+    )
 
 
 def _config(**values: Any) -> zenoh.Config:
@@ -130,6 +140,8 @@ def _config(**values: Any) -> zenoh.Config:
         "transport__link__tx__queue__congestion_control__drop__wait_before_drop": STREAM_WAIT_US,
         # Shared memory goes round the size limits of a link, and queries over it were lost when a receiver stalled.
         "transport__shared_memory__enabled": False,
+        # What is longer ends the link that it comes from; by default a message may have 1 GB.
+        "transport__link__rx__max_message_size": MOST_BYTES,
     }
     for key, value in {**common, **values}.items():
         config.insert_json5(key.replace("__", "/"), json.dumps(value))
