@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from common.config import Cell, load_cell, names_of
+from common.sim.standing import STATE_VARIABLE
 
 IMAGE = "zencell"
 ROUTER, ROUTER_PORT = "router", 7447
 VIEWER, VIEWER_PORT = "viewer", 8080
+EXECUTOR = "trajectory_executor"
 CONFIG = "/app/config"
 DATA = "/data"
 # A container's port is published to the loopback of its host only, and forwarded from a pod only by kubectl.
@@ -46,9 +48,11 @@ def router() -> Container:
 def containers_of(file: str, cell: Cell) -> list[Container]:
     """The services of a cell, in start order."""
     environment = {"ZENCELL_CONNECT": f"tcp/{ROUTER}:{ROUTER_PORT}", "ZENCELL_CELL": file}
+    kept = {EXECUTOR: {STATE_VARIABLE: DATA}}  # started again, it finds what it simulates as it was
     return [
         Container(
-            entry.name, ["python", "-m", entry.module], environment, MEMORY.get(entry.name, USUAL_MEMORY),
+            entry.name, ["python", "-m", entry.module], environment | kept.get(entry.name, {}),
+            MEMORY.get(entry.name, USUAL_MEMORY),
             is_task=entry.name == cell.task, page=entry.name == VIEWER,
             arguments=PAGE if entry.name == VIEWER else [],
         )
