@@ -31,6 +31,9 @@ class OutlineParameters(TracingParameters):
     overtime: Tunable[float] = Field(
         30.0, gt=0, le=3600, description="a motion that takes so much longer is stopped [s]"
     )
+    frame_timeout: Tunable[float] = Field(
+        3.0, ge=0.1, le=60, description="a contour from an older picture starts no motion [s, wall time]"
+    )
     joint_states_timeout: Tunable[float] = Field(
         0.2, ge=0.05, le=60, description="without joint states for so long the arm is held on its path [s, wall time]"
     )
@@ -209,10 +212,12 @@ class Outline:
         if path is not None and path.header.stamp * 1e-9 < self._still_since:
             path = None
         solid = view.solid()
-        if path is not None and len(path.poses) > 1 and solid is not None:
+        if path is not None and len(path.poses) > 1 and solid is not None and self._is_fresh(path, view):
             self._take(path, solid, view)
             return
-        if path is None:
+        if path is not None and not self._is_fresh(path, view):
+            problem = "no fresh picture"
+        elif path is None:
             problem = "no contour came from the camera"
         elif not path.poses:
             problem = path.message or "no object is chosen"
@@ -236,6 +241,11 @@ class Outline:
         if view.gripper.width > SHUT:
             self._stages.append(Close())
         self._stages += self.legs.outline(points, solid)
+
+    def _is_fresh(self, path: m.OutlinePoints, view: OutlineView) -> bool:
+        """Whether the picture in which a contour was found is new enough to decide by."""
+        # A picture that is late by the clock on the wall is later still by that of a fast cell.
+        return view.now - path.header.stamp * 1e-9 < self.p.frame_timeout * self._speed
 
     def _is_home(self, view: OutlineView) -> bool:
         assert view.q is not None
@@ -270,6 +280,10 @@ class Outline:
             command = m.GripperCommand(id=next(self._ids), width=0.0)
         elif all(leg.trajectory is not None for leg in self._stages if isinstance(leg, Leg)):
             assert stage.trajectory is not None
+            if stage.name == "approach" and (view.path is None or not self._is_fresh(view.path, view)):
+                self._clear()  # look again: what was planned around may have moved
+                self._selecting_since = None
+                return
             command = m.ExecuteRequest(id=next(self._ids), trajectory=stage.trajectory)
             self.status.state, self._returned = stage.state, False
         else:
