@@ -42,10 +42,10 @@ class Capture:
 
     async def begin(self) -> None:
         """Listen from now on; returns when the values of all states that were there are in the recording."""
-        wanted = [f"{self._bus.cell}/{key}" for key in self._keys()]
+        wanted = [f"{self._bus.cell}/{key}" for key in self._selection.expressions]
         status = f"{self._bus.cell}/{topics.SUPERVISOR_STATUS.key}"
         self._declared = [self._bus.raw_subscriber(key, self.on_sample) for key in wanted]
-        if not self._selection.everything and status not in wanted:
+        if f"{self._bus.cell}/**" not in wanted and status not in wanted:
             self._declared.append(self._bus.raw_subscriber(status, self._on_status))
             for sample in await self._bus.raw_get(status, ASK_TIMEOUT):
                 self._on_status(sample)
@@ -58,11 +58,6 @@ class Capture:
             return wanted
         # Who may ask for every key could call every request, so the rules name the states one by one.
         return [f"{self._bus.cell}/{key}" for key, kind in self._kinds.items() if kind == "state"]
-
-    def _keys(self) -> tuple[str, ...]:
-        if self._selection.everything or any("*" in key for key in self._selection.keys):
-            return ("**",)
-        return self._selection.keys
 
     def end(self) -> None:
         """Listen no more."""

@@ -26,14 +26,17 @@ class Selection:
         """
         given = tuple(keys)
         for key in given:
-            if not key or key.startswith("/") or key.endswith("/") or "//" in key or set(key) & set("#?$ "):
+            bad = not key or key.startswith("/") or key.endswith("/") or "//" in key or set(key) & set("#?$ ")
+            if bad or any("**" in part and part != "**" for part in key.split("/")):
                 raise ConfigError("KEY", key, "is not a key such as camera/image_raw, or camera/* or tf*")
         return cls(given, _compiled("--regex", regex), _compiled("--exclude", exclude))
 
     @property
-    def everything(self) -> bool:
-        """Whether all keys of a cell may be wanted."""
-        return not self.keys or self.regex is not None
+    def expressions(self) -> tuple[str, ...]:
+        """Key expressions, without the cell, that cover what is wanted, and little else."""
+        if not self.keys or self.regex is not None:
+            return ("**",)
+        return tuple(dict.fromkeys(_expression(key) for key in self.keys))
 
     def wants(self, topic: str) -> bool:
         """Whether a topic (key without the cell) is meant."""
@@ -53,6 +56,12 @@ def _compiled(option: str, text: str | None) -> re.Pattern[str] | None:
         return re.compile(text)
     except re.error as error:
         raise ConfigError(option, text, f"is not a regular expression: {error}") from None
+
+
+def _expression(key: str) -> str:
+    if key.count("**") > 1 or "**/*" in key:  # Zenoh wants these in a form of its own
+        return "**"
+    return "/".join(part if part in ("*", "**") else part.replace("*", "$*") for part in key.split("/"))
 
 
 def _pattern(key: str) -> re.Pattern[str]:

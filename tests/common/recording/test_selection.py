@@ -43,7 +43,15 @@ def test_bad_expression_is_named(option: str, value: str) -> None:
         Selection.of([], **{option: value})
 
 
-@pytest.mark.parametrize("key", ["", "/tf", "tf/", "a//b", "a b", "a?b", "a#"])
+@pytest.mark.parametrize("key", ["", "/tf", "tf/", "a//b", "a b", "a?b", "a#", "a**", "a/b**/c"])
 def test_bad_key_is_named(key: str) -> None:
     with pytest.raises(ConfigError, match="is not a key"):
         Selection.of([key])
+
+
+def test_expressions_cover_what_is_wanted_and_no_more_than_needed() -> None:
+    assert Selection.of().expressions == ("**",)
+    assert Selection.of(["tf"], regex="x").expressions == ("**",)
+    assert Selection.of(["tf", "camera/*", "depth_camera/**", "tf*", "tf"]).expressions == (
+        "tf", "camera/*", "depth_camera/**", "tf$*")
+    assert Selection.of(["**/*"]).expressions == ("**",)
