@@ -18,7 +18,7 @@ from common.viewer.markup import block, span
 WIDEST = 640  # [px] that are sent: more than the panel shows
 QUALITY = 75
 LIVE, ANNOTATED = "live", "annotated"
-LABELS = {LIVE: "Live picture", ANNOTATED: "With findings"}
+LABELS = {ANNOTATED: "With what was found", LIVE: "As it comes"}
 
 Picture = NDArray[np.uint8]
 

@@ -110,6 +110,8 @@ class TaskPanel:
 
     @staticmethod
     def _done(task: TaskReport | None, motion: MotionStatus | None) -> float:
+        if task is not None and task.state == "DONE":
+            return 1.0
         if task is None or isinstance(task, OutlineStatus):
             return motion.progress if motion and motion.state == "active" else 0.0
         return min(1.0, task.placed / task.targets) if task.targets else 0.0

@@ -29,6 +29,7 @@ SERVICE_STATES = {
     "failed": ("failed", BAD),
     "gone": ("not there", BAD),
 }
+CLOSED = 0.001  # [m]
 GOAL_STATES = {
     "none": "at rest",
     "rejected": "motion was refused",
@@ -92,7 +93,7 @@ def gripper(state: GripperState | None) -> str:
         return "fingers not known yet"
     if state.holding:
         return "fingers hold something"
-    return f"fingers {1e3 * state.width:.0f} mm apart"
+    return f"fingers {1e3 * state.width:.0f} mm apart" if state.width >= CLOSED else "fingers closed"
 
 
 def problem(error: ZencellError) -> str:

@@ -45,6 +45,7 @@ class SceneDouble:
         self.goal_pose = m.Pose(position=m.Vector3(x=0.4, z=0.5))
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
         self.visible = dict(visible)
+        self.begun = False  # is fed, and heard
         SceneDouble.made.append(self)
 
     def __getattr__(self, name: str) -> Callable[..., None]:
@@ -52,6 +53,7 @@ class SceneDouble:
 
     def set_visible(self, layer: str, on: bool) -> None:
         self.visible[layer] = on
+        self.begun = True
 
     def shown(self, name: str) -> list[tuple[Any, ...]]:
         return [arguments for called, arguments in self.calls if called == name]
@@ -183,7 +185,7 @@ async def test_pictures_and_truth_are_read_only_while_a_page_that_shows_them_is_
         assert not balls.matched
         await page.set("Truth (simulated hardware)", True)
         await until(lambda: balls.matched)
-        await page.set("With findings", False)
+        await page.set("With what was found", False)
         await until(lambda: not writers[topics.DETECTION_IMAGE].matched)
         assert writers[topics.CAMERA_IMAGE].matched
     await until(lambda: not writers[topics.CAMERA_IMAGE].matched and not balls.matched)
@@ -293,7 +295,7 @@ async def test_chosen_object_is_traced_once_its_path_is_known() -> None:
 
 async def test_contour_that_is_clicked_in_the_scene_is_chosen(scenes: list[SceneDouble]) -> None:
     async with page_of("ur5") as played:
-        await until(lambda: scenes)
+        await until(lambda: scenes and scenes[0].begun)
         await asyncio.to_thread(lambda: scenes[0].on_select(1))  # as viser does
         await until(lambda: played.selects)
         assert played.selects == [m.OutlineSelect(rule="index", index=1)]
@@ -319,7 +321,7 @@ async def test_object_that_is_dragged_is_moved_in_the_world_and_a_refusal_is_tol
 async def test_layers_are_shown_as_ticked_also_before_the_scene_is_there(
     panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
 ) -> None:
-    await until(lambda: scenes)
+    await until(lambda: scenes and scenes[0].begun)
     assert scenes[0].visible["targets"] and not scenes[0].visible["truth"]
     await page.set("Targets", False)
     await until(lambda: not scenes[0].visible["targets"])

@@ -92,6 +92,16 @@ async def test_stop_stops_arm_and_task(bring: Bring, watched: Watched) -> None:
         await page.locator('[data-part="notice"]').get_by_text("Stopped").wait_for()
 
 
+async def test_escape_stops_as_the_button_does(bring: Bring, watched: Watched) -> None:
+    cell = await bring(*PANDA)
+    page = await watched.open(cell.address)
+    async with cell.listen() as bus:
+        await in_motion(page, bus.reader(topics.JOINT_STATES))
+        await page.keyboard.press("Escape")
+        await until(bus.reader(topics.MOTION_STATUS), lambda told: told.state == "cancelled", PATIENCE)
+        await until(bus.reader(topics.PICK_PLACE_STATUS), lambda told: not told.started, PATIENCE)
+
+
 async def test_parameter_changed_on_the_page_changes_the_service_and_the_other_way_round(
     bring: Bring, watched: Watched
 ) -> None:
