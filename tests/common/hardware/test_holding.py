@@ -93,6 +93,20 @@ def test_whatever_is_held_and_scaled_the_arm_stays_on_its_path_and_within_limits
     assert_within(rig, LIMITS, LIMITS.acceleration)
 
 
+def test_the_robot_moves_only_when_neither_a_person_nor_a_watchdog_holds_it():
+    rig = Timed(LIMITS)
+    rig.accept("a", winding(2, 0.5))
+    controller = rig.controller
+    controller.hold(True, "paused")
+    both = controller.hold(True, "no joint states", "watchdog")
+    assert both.held and both.held_by == ["person", "watchdog"] and "paused; no joint states" in both.message
+    alone = controller.hold(False, "")
+    assert alone.held and alone.held_by == ["watchdog"] and not alone.paused
+    assert not controller.hold(False, "", "watchdog").held
+    assert rig.until_over().state == "succeeded"
+    assert_on_path(rig, 2)
+
+
 @settings(max_examples=10, deadline=None)
 @given(swings=st.integers(0, 6), share=st.sampled_from([0.5, 0.9]), when=st.floats(0.02, 0.98),
        deed=st.sampled_from(["hold", "stop"]))

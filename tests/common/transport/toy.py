@@ -1,6 +1,7 @@
 """A service for tests of the transport, run as a process: its answers show every end of a request."""
 
 import asyncio
+import time
 from typing import Literal
 
 from common import topics
@@ -12,8 +13,12 @@ from common.transport.service import main
 
 
 class Config(Parameters):
-    mode: Literal["serve", "busy", "stubborn", "crash", "bad_config", "end"] = "serve"
+    mode: Literal["serve", "busy", "stubborn", "crash", "bad_config", "end", "stuck", "native"] = "serve"
     placed: int = 7
+
+
+def hang() -> None:
+    time.sleep(1000)
 
 
 async def run(bus: Bus, config: Config) -> None:
@@ -35,6 +40,11 @@ async def run(bus: Bus, config: Config) -> None:
     bus.log.info("is ready")
     if config.mode == "busy":
         await asyncio.to_thread(lambda: [None for _ in iter(int, 1)])
+    if config.mode == "stuck":
+        hang()
+    if config.mode == "native":
+        await asyncio.to_thread(time.sleep, 3.0)
+        bus.log.info("woke up")
     if config.mode == "stubborn":
         while True:
             try:
