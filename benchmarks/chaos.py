@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from benchmarks.runs import LOG, RunningCell, folder_for
+from benchmarks.runs import LOG, SUMMARY, RunningCell, folder_for
 from common.chaos.plan import LABELS
 
 CELL = "panda"
@@ -41,7 +41,7 @@ async def run_once(seed: int, folder: Path, options: argparse.Namespace) -> dict
             except TimeoutError:
                 outcome["code"] = None
         outcome["left_behind"] = sorted(cell.processes())
-        outcome["summary"] = cell.summary if outcome["code"] is not None else None
+        outcome["summary"] = cell.summary if (folder / SUMMARY).exists() else None
     outcome["seconds"] = round(time.monotonic() - began, 1)
     outcome["problems"] = problems(outcome)
     if not outcome["problems"]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from common.transport.bus import Bus, Reader
     from common.transport.session import RawSample
 
-PATIENCE = 4.0  # [s] wall, that a fault waits for a ball in the hand
+PATIENCE = 4.0  # [s]
 SAMPLE_SECONDS = 1.5  # within which a state is repeated
 DROP_TIMEOUT = 1.0  # [s]
 SPACING = 0.02  # [s] between bad messages in a row
@@ -48,7 +48,8 @@ class Chaos:
     """Faults, carried out one after the other; `happened` lists them."""
 
     def __init__(
-        self, bus: Bus, plan: Iterable[Fault], pids: Callable[[], dict[str, int]], container: Container | None
+        self, bus: Bus, plan: Iterable[Fault], pids: Callable[[], dict[str, int]], container: Container | None,
+        patience: float = PATIENCE,
     ) -> None:
         """Declare what is listened to.
 
@@ -57,9 +58,11 @@ class Chaos:
             plan: faults in order of time.
             pids: the processes that run now, by name.
             container: balls are let slip clear of its edge; None when there are no balls.
+            patience: that a fault waits for a ball in the hand [s, wall time].
         """
         self.happened: list[Happened] = []
         self._bus, self._plan, self._pids, self._container = bus, plan, pids, container
+        self._patience = patience
         self._gripper = bus.reader(topics.GRIPPER_STATE) if container else None
         self._balls = bus.reader(topics.SCENE_BALLS) if container else None
         self._edit = bus.client(topics.WORLD_EDIT) if container else None
@@ -74,7 +77,7 @@ class Chaos:
                 for fault in self._plan:
                     await asyncio.sleep(max(0.0, self._began + fault.at - time.monotonic()))
                     if fault.holding:
-                        await _until(self._gripper, self._is_holding)
+                        await _until(self._gripper, self._is_holding, self._patience)
                     await self._begin(fault, lasting)
         finally:
             for pid in self._stopped:
@@ -132,7 +135,7 @@ class Chaos:
 
     async def _drop(self, fault: Fault) -> None:
         rng = np.random.default_rng(fault.seed)
-        if self._edit is None or not await _until(self._balls, self._may_slip):
+        if self._edit is None or not await _until(self._balls, self._may_slip, self._patience):
             log.info("there is no ball in the hand to be let slip")
             return
         await asyncio.sleep(float(rng.uniform(0, 0.3)))
@@ -208,10 +211,10 @@ def _stateless(fault: Fault, rng: np.random.Generator) -> Any:
     return fault.form if fault.form in STATELESS_FORMS else STATELESS_FORMS[int(rng.integers(2))]
 
 
-async def _until(reader: Reader[Any] | None, condition: Callable[[], bool]) -> bool:
+async def _until(reader: Reader[Any] | None, condition: Callable[[], bool], seconds: float) -> bool:
     """Whether the condition came to hold in time, looked at whenever something is read."""
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(PATIENCE):
+        async with asyncio.timeout(seconds):
             while not condition():
                 if reader is None:
                     return False

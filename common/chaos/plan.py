@@ -14,7 +14,7 @@ Form = Literal["", "truncated", "flipped", "noise", "wrong type", "huge"]
 
 PER_MINUTE = 30.0  # faults per minute of wall time
 MOST_PER_MINUTE = 600.0
-CELL_SECONDS = 100.0  # of cell time in which a run sees faults; what comes after is left to it to finish
+CELL_SECONDS = 80.0  # of cell time in which a run sees faults; what comes after is left to it to finish
 LEAST_GAP = 0.05  # [s] between two faults
 HOLDING = 0.4  # share of the faults of processes that wait for a ball in the hand
 STATELESS_FORMS: tuple[Form, ...] = ("noise", "wrong type", "huge")  # for which no real message is needed

@@ -56,9 +56,13 @@ class _Publisher:
             self._outbox.post(lambda: self._publisher.put(payload, attachment=attachment or None))
 
     def undeclare(self) -> None:
-        if not self._undeclared:
-            self._undeclared = True
+        if self._undeclared:
+            return
+        self._undeclared = True
+        if self._outbox is None:
             self._publisher.undeclare()  # type: ignore[no-untyped-call]
+        else:  # which may be in the middle of a put; Zenoh refuses both at once
+            self._outbox.post(self._publisher.undeclare)
 
 
 class _Query:

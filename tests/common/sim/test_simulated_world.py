@@ -399,3 +399,36 @@ class AnythingHappens(RuleBasedStateMachine):
 
 TestAnythingHappens = AnythingHappens.TestCase
 TestAnythingHappens.settings = settings(max_examples=60, stateful_step_count=25, deadline=None)
+
+
+# --- a ball that slips ---
+
+
+def test_a_held_ball_slips_out_of_fingers_that_stay_closed_and_lies_where_it_fell():
+    rig = Rig()
+    rig.grasp(0.5, 0.0)
+    rig.tick(tool_down(0.4, -0.1, 0.2))
+    assert rig.edit("drop") == "ball_1"
+    assert rig.world.held == "" and rig.world.obstruction(rig.hand, rig.width) == 0.0
+    rig.settle()
+    label, place = rig.where()["ball_1"]
+    assert label == "table" and np.allclose(place, [0.4, -0.1, R], atol=0.011)
+    assert rig.world.held == ""
+
+
+def test_a_ball_that_slips_above_the_box_lies_in_it():
+    rig = Rig()
+    rig.grasp(0.5, 0.0)
+    rig.tick(tool_down(*BOX, 0.2))
+    rig.edit("drop", "ball_1")
+    rig.settle()
+    assert rig.where()["ball_1"][0] == "box"
+
+
+@pytest.mark.parametrize("name", ["", "ball_1"])
+def test_nothing_slips_out_of_an_empty_hand(name):
+    rig = Rig()
+    with pytest.raises(Refused, match="between the fingers") as refused:
+        rig.edit("drop", name)
+    assert refused.value.code == "not_held"
+    assert rig.where()["ball_1"][0] == "table"

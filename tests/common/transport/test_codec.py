@@ -86,9 +86,9 @@ def test_error_names_the_field_within_the_message() -> None:
         decode(m.PoseArray, msgpack.packb(value))
 
 
-@given(st.text(max_size=30), st.integers(0, 2**60), st.text(max_size=30))
-def test_attachment_comes_back_as_it_was(writer: str, sequence: int, trace: str) -> None:
-    attachment = Attachment(writer, sequence, trace=trace)
+@given(st.text(max_size=30), st.integers(0, 2**60), st.text(max_size=30), st.none() | st.integers(0, 2**32 - 1))
+def test_attachment_comes_back_as_it_was(writer: str, sequence: int, trace: str, checksum: int | None) -> None:
+    attachment = Attachment(writer, sequence, trace=trace, checksum=checksum)
     assert decode_attachment(encode_attachment(attachment)) == attachment
 
 
@@ -98,7 +98,8 @@ def test_missing_attachment_is_allowed() -> None:
 
 
 @pytest.mark.parametrize(
-    "data", [b"\xc1", msgpack.packb([1, 2]), msgpack.packb(["a", 1, 99, ""]), msgpack.packb({"a": 1})]
+    "data", [b"\xc1", msgpack.packb([1, 2]), msgpack.packb(["a", 1, 99, ""]), msgpack.packb(["a", 1, 1, "", "sum"]),
+             msgpack.packb({"a": 1})]
 )
 def test_foreign_attachment_is_refused(data: bytes) -> None:
     with pytest.raises(DecodeError, match="attachment"):

@@ -9,7 +9,7 @@ import pytest
 from common import topics
 from common.messages import Image, LogLine, PickPlaceStatus, Rejections
 from common.transport.bus import Bus, Reader, Writer
-from common.transport.codec import Attachment, encode, encode_attachment
+from common.transport.codec import Attachment, checksum_of, encode, encode_attachment
 from common.transport.log import BusLog
 
 PATIENCE = 20.0
@@ -189,6 +189,21 @@ async def test_bad_payloads_are_dropped_counted_and_reported_once(new_bus, until
     await until(lambda: "somebody" in caplog.text)
     assert len([r for r in caplog.records if r.levelno == logging.WARNING]) == 2
     assert bus.counters().invalid == {"log": len(BAD) + 3}
+
+
+async def test_a_message_that_was_damaged_on_its_way_is_refused_and_the_next_real_one_is_not(new_bus, until) -> None:
+    bus = await new_bus()
+    reader, writer = bus.reader(topics.PICK_PLACE_STATUS), bus.writer(topics.PICK_PLACE_STATUS)
+    await matched(writer, until)
+    sent = encode(status(3))
+    for damaged in (sent[:-1], encode(status(4)), b"x" + sent[1:]):
+        put_raw(bus, topics.PICK_PLACE_STATUS, damaged,
+                encode_attachment(Attachment("somebody", 9, checksum=checksum_of(sent))))
+    await until(lambda: reader.invalid == 3)
+    put_raw(bus, topics.PICK_PLACE_STATUS, sent,
+            encode_attachment(Attachment("somebody", 5, checksum=checksum_of(sent))))
+    assert (await next_of(reader)).placed == 3
+    assert reader.invalid == 3
 
 
 async def test_rubbish_does_not_displace_a_state_that_was_not_read_yet(new_bus, until) -> None:

@@ -1,0 +1,91 @@
+"""Plans of faults: the same seed plans the same ones, and over seeds there is something of everything."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import islice
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from common.chaos.damage import damaged
+from common.chaos.plan import CELL_SECONDS, LABELS, Fault, Form, Kind, faults, plan
+from common.chaos.setting import keys_of
+from common.errors import DecodeError
+from common.messages import PickPlaceStatus
+from common.transport.codec import Attachment, checksum_of, decode, encode, require_whole
+
+PROCESSES = ["router", "motion_planner", "trajectory_executor", "smart_pick_place"]
+KEYS = ["camera/image_raw", "gripper/state", "motion/plan"]
+
+
+def planned(seed: int, *, balls: bool = True, seconds: float = 60.0, per_minute: float = 30.0) -> list[Fault]:
+    return plan(seed, PROCESSES, KEYS, balls=balls, seconds=seconds, per_minute=per_minute)
+
+
+def test_the_same_seed_plans_the_same_faults_and_another_one_others() -> None:
+    assert planned(3) == planned(3)
+    assert planned(3) != planned(4)
+    assert planned(3, seconds=20.0) == [fault for fault in planned(3) if fault.at <= 20.0]
+
+
+def test_every_kind_form_process_and_key_occurs_over_seeds() -> None:
+    every = [fault for seed in range(20) for fault in planned(seed)]
+    assert {fault.kind for fault in every} == set(get_args(Kind)) == set(LABELS)
+    assert {fault.form for fault in every} == set(get_args(Form))
+    assert {f.target for f in every if f.kind in ("kill", "restart", "freeze", "delay")} == set(PROCESSES)
+    assert {f.target for f in every if f.kind in ("corrupt", "replay")} == set(KEYS)
+    assert any(fault.holding for fault in every)
+
+
+def test_no_ball_slips_and_nothing_waits_for_one_where_there_are_none() -> None:
+    every = [fault for seed in range(20) for fault in planned(seed, balls=False)]
+    assert not any(fault.kind == "drop" or fault.holding for fault in every)
+
+
+@pytest.mark.parametrize("per_minute", [6.0, 30.0, 120.0])
+def test_faults_come_in_order_and_about_as_often_as_asked(per_minute: float) -> None:
+    many = list(islice(faults(1, PROCESSES, KEYS, balls=True, per_minute=per_minute), 2000))
+    times = [fault.at for fault in many]
+    assert times == sorted(times)
+    assert 0.8 * per_minute < 60 * len(many) / times[-1] < 1.3 * per_minute
+
+
+def test_a_run_at_speed_5_sees_five_to_ten_faults_as_a_rule() -> None:
+    counts = Counter(len(planned(seed, seconds=CELL_SECONDS / 5)) for seed in range(100))
+    assert sum(n for count, n in counts.items() if 4 <= count <= 12) > 85
+
+
+def test_faults_are_told_in_a_line() -> None:
+    assert str(Fault(1.0, "kill", "vision_detector")) == "kill -9 vision_detector"
+    assert str(Fault(1.0, "freeze", "router", 2.14, holding=True)) == "SIGSTOP router: 2.1 s, a ball in the hand"
+    corrupt = Fault(1.0, "corrupt", "tf", form="truncated", count=12)
+    assert (str(corrupt), corrupt.what) == ("damaged messages on tf: 12 truncated", "damaged messages on: 12 truncated")
+    assert str(Fault(1.0, "drop")) == "the held ball slips"
+
+
+def test_keys_are_those_that_the_services_write_or_answer() -> None:
+    keys = keys_of(["trajectory_executor", "scene_manager"])
+    assert {"joint_states", "motion/execute", "planning_scene"} < set(keys)
+    assert not {"camera/image_raw", "supervisor/status", "log", "counters"} & set(keys)
+
+
+@pytest.mark.parametrize("form", [form for form in get_args(Form) if form])
+def test_damaged_messages_are_refused(form: Form) -> None:
+    payload = encode(PickPlaceStatus(placed=3))
+    attachment = Attachment("smart_pick_place.1", 7, checksum=checksum_of(payload))
+    require_whole(attachment, payload)
+    for seed in range(50):
+        bad = damaged(payload, form, np.random.default_rng(seed))
+        with pytest.raises(DecodeError):
+            require_whole(attachment, bad)
+            decode(PickPlaceStatus, bad)
+        if form == "huge":
+            break
+
+
+def test_bytes_from_nowhere_are_refused_without_a_checksum_too() -> None:
+    for seed in range(50):
+        with pytest.raises(DecodeError):
+            decode(PickPlaceStatus, damaged(b"", "noise", np.random.default_rng(seed)))
