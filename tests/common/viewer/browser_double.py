@@ -53,7 +53,7 @@ class BrowserDouble:
             self._changed.set()
 
     def _take(self, message: dict[str, Any]) -> None:
-        uuid = message.get("uuid")
+        uuid = str(message.get("uuid"))
         if "props" in message and str(message["type"]).startswith("Gui"):
             self.parts[uuid] = message["props"]
             self.values[uuid] = message.get("value")
