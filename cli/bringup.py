@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
 
 import typer
 
-from cli import options, securing, viewing
+from cli import hosts, options, securing, viewing
 
 if TYPE_CHECKING:
     from cli.screens import Content, Screen
@@ -53,6 +53,10 @@ def run(
     speed: Speed = "1",
     domain: options.Domain = None,
     connect: options.Connect = None,
+    listen: options.Listen = None,
+    link: options.Link = None,
+    only: options.Only = None,
+    without: options.Without = None,
     secure: options.Secure = None,
     no_viewer: NoViewer = False,
     viewer_host: viewing.Host = None,
@@ -68,7 +72,8 @@ def run(
     """Bring a cell up, run its task to the end, print a summary and shut down; exit 0 only if the task is DONE."""
     securing.choose(secure)
     chosen = choices(cell, overrides, world, ask=ask, source=source)
-    operation = Operation(cell, chosen, world, seed, speed, domain, connect, no_viewer, summary, log_json)
+    operation = Operation(cell, chosen, world, seed, speed, domain, connect, no_viewer, summary, log_json,
+                          hosts.Share(listen, link, only, without))
     operation.serve_page(viewer_host, viewer_port)
     operation.record_to(record)
     operation.disturb(chaos, chaos_rate, until_ended=True)
@@ -84,6 +89,10 @@ def up(
     speed: Speed = "1",
     domain: options.Domain = None,
     connect: options.Connect = None,
+    listen: options.Listen = None,
+    link: options.Link = None,
+    only: options.Only = None,
+    without: options.Without = None,
     secure: options.Secure = None,
     no_viewer: NoViewer = False,
     viewer_host: viewing.Host = None,
@@ -96,7 +105,8 @@ def up(
 ) -> None:
     """Bring a cell up and stay until Ctrl-C; the task starts by itself unless the cell says `autostart: false`."""
     securing.choose(secure)
-    operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json)
+    operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json,
+                          hosts.Share(listen, link, only, without))
     operation.serve_page(viewer_host, viewer_port)
     operation.record_to(record)
     operation.disturb(chaos, chaos_rate, until_ended=False)
@@ -146,6 +156,7 @@ class Operation:
     def __init__(
         self, cell: str, overrides: list[str] | None, world: str | None, seed: str | None, speed: str,
         domain: str | None, connect: str | None, no_viewer: bool, summary: str | None = None, log_json: bool = False,
+        share: hosts.Share | None = None,
     ) -> None:
         """Check everything that was asked for; nothing is started yet.
 
@@ -169,11 +180,13 @@ class Operation:
         self.file = Path(summary) if summary else None
         if self.file and not self.file.absolute().parent.is_dir():
             raise ConfigError("--summary", summary, "is in a folder that does not exist")
+        share = share or hosts.Share()
         number, endpoint = place_of(domain, connect)
-        self.launch = Launch(
+        factor = options.number("--speed", speed)
+        self.launch = share.linked(Launch(
             cell=cell, overrides=tuple(expanded(overrides or ())), world=world, seed=options.whole("--seed", seed, 0),
-            domain=number, connect=endpoint, log_json=log_json, clock=clock_of(options.number("--speed", speed)),
-        )
+            domain=number, connect=endpoint, log_json=log_json, clock=clock_of(factor, share.epoch(factor)),
+        ))
         loaded = load_cell(cell, self.launch.overrides, world=world, seed=self.launch.seed)
         if no_viewer:
             kept = {name: entry for name, entry in loaded.services.items() if entry.name != viewing.VIEWER}
@@ -184,6 +197,7 @@ class Operation:
         securing.require_secured(self.launch, loaded)
         if endpoint is None:
             require_free_port(endpoint_of(number))
+        self.cell = share.part_of(loaded)
         self._supervisor: Supervisor | None = None
         self._collector: Collector | None = None
         self._screen: Screen | None = None

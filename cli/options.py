@@ -28,6 +28,24 @@ Connect = Annotated[
     str | None,
     typer.Option("--connect", metavar="ENDPOINT", help="use the router there, start none [ZENCELL_CONNECT]"),
 ]
+Listen = Annotated[
+    list[str] | None,
+    typer.Option("--listen", metavar="ENDPOINT", help="have the router listen there as well, as tcp/192.168.1.10:7489; "
+                                                      "repeatable [ZENCELL_LISTEN]"),
+]
+Link = Annotated[
+    list[str] | None,
+    typer.Option("--link", metavar="ENDPOINT", help="link the router with that of another host; repeatable "
+                                                    "[ZENCELL_LINK]"),
+]
+Only = Annotated[
+    list[str] | None,
+    typer.Option("--only", metavar="SERVICE,...", help="the part of the cell that runs on this host"),
+]
+Without = Annotated[
+    list[str] | None,
+    typer.Option("--without", metavar="SERVICE,...", help="all but these, which run on another host"),
+]
 Secure = Annotated[
     str | None,
     typer.Option("--secure", metavar="DIR", help="certificates of `zencell secure init`: TLS for all [ZENCELL_SECURE]"),

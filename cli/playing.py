@@ -177,7 +177,7 @@ async def _router(endpoint: str, *, may_start: bool) -> AsyncIterator[bool]:
     if not may_start or await asyncio.to_thread(_listens, endpoint):
         yield False
         return
-    session = await asyncio.to_thread(open_router, endpoint)
+    session = await asyncio.to_thread(open_router, [endpoint])
     try:
         yield True
     finally:

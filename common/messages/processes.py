@@ -18,6 +18,7 @@ class ServiceStatus(Message):
     restarts: int = 0
     ready_seconds: Finite | None = Field(None, description="wall time from its start to its readiness token [s]")
     message: str = ""
+    host: str = Field("", description="name of the computer that it runs on")
 
 
 class SupervisorStatus(Message):
@@ -26,6 +27,7 @@ class SupervisorStatus(Message):
     header: Header = Header()
     cell: str
     services: list[ServiceStatus]
+    host: str = Field("", description="name of the computer of this supervisor; each tells of the whole cell")
     speed: Positive = Field(1.0, description="cell time per wall time")
     epoch: int = Field(0, ge=0, description="when cell time and wall time were equal [ns since the Unix epoch]")
     seed: int = 0

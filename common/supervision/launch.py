@@ -29,13 +29,19 @@ class Launch:
     seed: int | None = None
     domain: int = 42
     connect: str | None = None  # endpoint of a router that runs already
+    listen: tuple[str, ...] = ()  # where our router listens, when not for its own host only
+    link: tuple[str, ...] = ()  # routers of other hosts that it is linked with
     log_json: bool = False
     clock: Clock = field(default_factory=Clock)
     extra: Mapping[str, str] = field(default_factory=dict, repr=False)  # environment that no command line may show
 
     def router_command(self) -> list[str]:
         """Command line of the router."""
-        return [*python_module(ROUTER_MODULE), "--domain", str(self.domain), *self._process_options()]
+        command = [*python_module(ROUTER_MODULE), "--domain", str(self.domain)]
+        for option, endpoints in (("--listen", self.listen), ("--link", self.link)):
+            for endpoint in endpoints:
+                command += [option, endpoint]
+        return [*command, *self._process_options()]
 
     def service_command(self, entry: ServiceEntry, *, gate: bool = True) -> list[str]:
         """Command line of a service, which waits behind its gate unless told otherwise."""
@@ -57,14 +63,14 @@ class Launch:
         return {**inherited, **self.extra, **self.clock.environment(), "PYTHONPATH": python_path(inherited)}
 
 
-def clock_of(speed: float) -> Clock:
-    """A clock of that speed.
+def clock_of(speed: float, epoch: int | None = None) -> Clock:
+    """A clock of that speed, from now on or from an epoch [ns since the Unix epoch].
 
     Raises:
         ConfigError: the speed is out of bounds.
     """
     try:
-        return Clock(speed)
+        return Clock(speed, epoch)
     except ValueError:
         raise ConfigError("--speed", speed, f"must be {MIN_SPEED:g} to {MAX_SPEED:g}") from None
 

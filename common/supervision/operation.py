@@ -5,15 +5,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import socket
 import time
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from common import topics
 from common.config import Cell
-from common.errors import ConfigError, ZencellError
-from common.messages import SupervisorStatus
+from common.errors import ConfigError, DecodeError, ZencellError
+from common.messages import ServiceStatus, SupervisorStatus
 from common.security.credentials import SUPERVISOR
+from common.supervision.elsewhere import Elsewhere
 from common.supervision.interrupts import Interrupts
 from common.supervision.launch import Launch
 from common.supervision.silence import PERIOD, Silence
@@ -100,11 +102,13 @@ async def _work(
     log.addHandler(to_topic)
     try:
         if launch.connect:
-            await _require_unused(bus, endpoint)
+            await _require_unused(bus, endpoint, {entry.name for entry in cell.services.values()})
         prepare(bus)
         bus.alive.on_change(supervisor.mark_alive)
         watching = beside(_kill_frozen(bus, cell, supervisor), _bring_up_and_work(bus, supervisor, work))
-        return await beside(_publish(bus, cell, launch, supervisor), watching)
+        elsewhere = Elsewhere(socket.gethostname(), [service.name for service in supervisor.statuses])
+        telling = beside(_hear_elsewhere(bus, elsewhere), _publish(bus, cell, launch, supervisor, elsewhere))
+        return await beside(telling, watching)
     finally:
         log.removeHandler(to_topic)
         await connecting.__aexit__(None, None, None)
@@ -116,26 +120,42 @@ async def _bring_up_and_work(bus: Bus, supervisor: Supervisor, work: Callable[[B
     return await work(bus)
 
 
-async def _require_unused(bus: Bus, endpoint: str) -> None:
-    """Return when no other supervisor has the cell up on somebody else's router.
+async def _require_unused(bus: Bus, endpoint: str, names: set[str]) -> None:
+    """Return when no other supervisor behind somebody else's router has one of these services.
 
     Raises:
         ConfigError: one has.
     """
-    if await bus.raw_get(f"{bus.cell}/{topics.SUPERVISOR_STATUS.key}", LOOK_TIMEOUT):
-        raise ConfigError("--connect", endpoint, f"is where a cell named {bus.cell} is up already")
+    from common.transport.codec import decode
+
+    for sample in await bus.raw_get(f"{bus.cell}/{topics.SUPERVISOR_STATUS.key}", LOOK_TIMEOUT):
+        try:
+            others = {service.name for service in decode(SupervisorStatus, sample.payload).services}
+        except DecodeError:
+            others = names  # of another version: its services can not be told apart from ours
+        if names & others:
+            raise ConfigError("--connect", endpoint, f"is where a cell named {bus.cell} is up already")
 
 
-async def _publish(bus: Bus, cell: Cell, launch: Launch, supervisor: Supervisor) -> None:
+async def _hear_elsewhere(bus: Bus, elsewhere: Elsewhere) -> None:
+    async for status in bus.reader(topics.SUPERVISOR_STATUS):
+        elsewhere.hear(status)
+
+
+async def _publish(bus: Bus, cell: Cell, launch: Launch, supervisor: Supervisor, elsewhere: Elsewhere) -> None:
     """Say on supervisor/status whenever something has changed; take note of a router that is back."""
     out = bus.writer(topics.SUPERVISOR_STATUS)
+    told: list[ServiceStatus] = []
     while True:
         supervisor.mark_connected(bus.connected)
-        if supervisor.changed.is_set():
+        away = elsewhere.statuses(bus.alive.names)
+        if supervisor.changed.is_set() or away != told:
             supervisor.changed.clear()
+            told = away
             out.put(SupervisorStatus(
-                header=bus.header(), cell=bus.cell, services=supervisor.statuses, speed=bus.clock.speed,
-                epoch=bus.clock.epoch_ns, seed=cell.run.seed, world=launch.world or "",
+                header=bus.header(), cell=bus.cell, host=elsewhere.host,
+                services=[*elsewhere.ours(supervisor.statuses), *away],
+                speed=bus.clock.speed, epoch=bus.clock.epoch_ns, seed=cell.run.seed, world=launch.world or "",
                 overrides=[text for text in launch.overrides if SECRET not in text.partition("=")[0]],
             ))
         with contextlib.suppress(TimeoutError):

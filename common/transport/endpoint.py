@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from common.errors import ConfigError
@@ -20,9 +20,11 @@ MAX_DOMAIN = 232
 DOMAIN_VARIABLE = "ZENCELL_DOMAIN"
 CONNECT_VARIABLE = "ZENCELL_CONNECT"
 LISTEN_VARIABLE = "ZENCELL_LISTEN"
+LINK_VARIABLE = "ZENCELL_LINK"
 SECURE_VARIABLE = "ZENCELL_SECURE"  # folder of certificates, as `zencell secure init` makes it
 LEASE_MS = 2000  # a frozen process or cut link is noticed after this
 STUCK_MS = 1000  # so is a link that takes nothing
+LINK_RETRY_MS = (100, 1000)  # between two tries to reach the router of another host: at first, and at most
 STREAM_BATCHES = 16  # of 64 kB that may wait in a link: a whole picture, so that what follows it is not dropped
 MOST_BYTES = 40 * 1024 * 1024  # of one message; the largest picture that is read has 32 MB
 MOST_SESSIONS = 512  # at one router: 50 cells of ten services
@@ -84,6 +86,35 @@ def _checked_endpoint(field: str, endpoint: str) -> str:
     return endpoint
 
 
+def endpoints_of(field: str, given: Sequence[str], variable: str, environ: Mapping[str, str] = os.environ) -> list[str]:
+    """The endpoints that were given to an option, else those of a variable, which stand there with commas between.
+
+    Raises:
+        ConfigError: one of them is not an endpoint, or goes without TLS in a secured cell.
+    """
+    if not given:
+        field = variable
+        given = [text.strip() for text in environ.get(variable, "").split(",") if text.strip()]
+    for endpoint in given:
+        _checked_endpoint(field, endpoint)
+        if environ.get(SECURE_VARIABLE) and not endpoint.startswith(("tls/", "quic/")):
+            raise ConfigError(field, endpoint, "is an open endpoint: with certificates it must be tls/HOST:PORT")
+    return list(dict.fromkeys(given))
+
+
+def listening(domain: int, wider: Sequence[str]) -> list[str]:
+    """Where the router of a domain listens: at its own port for the services of its host, and wherever else it must."""
+    own = endpoint_of(domain)
+    port = own.rpartition(":")[2]
+    every = [endpoint for endpoint in wider if endpoint.rpartition(":")[2] == port and is_any(endpoint)]
+    return [*every, *(e for e in wider if e not in every)] if every else list(dict.fromkeys([own, *wider]))
+
+
+def is_any(endpoint: str) -> bool:
+    """Whether it stands for all addresses of a host."""
+    return endpoint.partition("/")[2].rpartition(":")[0].strip("[]") in {"0.0.0.0", "::"}
+
+
 def is_loopback(endpoint: str) -> bool:
     """Whether an endpoint is reached from its own host only."""
     host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
@@ -103,19 +134,24 @@ def client_config(endpoint: str, *, connect_ms: int, credentials: Credentials | 
 
 
 def router_config(
-    endpoint: str, credentials: Credentials | None = None, access: dict[str, Any] | None = None
+    endpoints: Sequence[str], credentials: Credentials | None = None, access: dict[str, Any] | None = None,
+    links: Sequence[str] = (),
 ) -> zenoh.Config:
-    """Configuration of a router that listens at one endpoint only.
+    """Configuration of a router that listens at these endpoints only.
 
     Args:
-        endpoint: where.
+        endpoints: where.
         credentials: with which it proves itself; without them everybody is let in.
         access: who may do what.
+        links: endpoints of routers of other hosts, which it tries to reach for as long as it runs.
     """
+    first, most = LINK_RETRY_MS
     secure = {"transport__link__tls": credentials.tls(listens=True)} if credentials else {}
     controlled = {"access_control": access} if access else {}
     return _config(
-        mode="router", listen__endpoints=[endpoint], connect__endpoints=[],
+        mode="router", listen__endpoints=list(endpoints), connect__endpoints=list(links),
+        connect__timeout_ms=-1, connect__exit_on_failure=False,
+        connect__retry={"period_init_ms": first, "period_max_ms": most, "period_increase_factor": 1.5},
         transport__unicast__max_sessions=MOST_SESSIONS,
         transport__unicast__accept_pending=MOST_PENDING,
         transport__unicast__accept_timeout=ACCEPT_MS,

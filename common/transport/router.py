@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -17,8 +18,10 @@ from common.security.credentials import ROUTER_NAME, credentials_of, read_access
 from common.transport.endpoint import (
     DEFAULT_DOMAIN,
     DOMAIN_VARIABLE,
+    LINK_VARIABLE,
     LISTEN_VARIABLE,
     endpoint_of,
+    endpoints_of,
     is_loopback,
     port_of,
     router_config,
@@ -30,6 +33,7 @@ from common.transport.service import add_process_options
 log = logging.getLogger("router")
 
 _CLOSE_SECONDS = 0.4
+_LOOK_SECONDS = 0.5  # between looks at the links with other routers
 
 
 class PortInUse(ZencellError):
@@ -57,12 +61,13 @@ def holder_of(port: int) -> str:
     return "another process"
 
 
-def open_router(endpoint: str, secured: Path | None = None) -> zenoh.Session:
-    """A session that routes for everybody who connects to the endpoint, and listens nowhere else.
+def open_router(endpoints: Sequence[str], secured: Path | None = None, links: Sequence[str] = ()) -> zenoh.Session:
+    """A session that routes for everybody who connects to the endpoints, and listens nowhere else.
 
     Args:
-        endpoint: where.
+        endpoints: where.
         secured: folder of certificates and rules; without one everybody may do everything.
+        links: endpoints of routers of other hosts; it is no error when nobody is there yet.
 
     Raises:
         PortInUse: names the port, the domain and the process that holds it.
@@ -70,14 +75,28 @@ def open_router(endpoint: str, secured: Path | None = None) -> zenoh.Session:
     """
     try:
         if secured is None:
-            return zenoh.open(router_config(endpoint))
-        return zenoh.open(router_config(endpoint, credentials_of(ROUTER_NAME, secured), read_access(secured)))
+            return zenoh.open(router_config(endpoints, links=links))
+        credentials = credentials_of(ROUTER_NAME, secured)
+        return zenoh.open(router_config(endpoints, credentials, read_access(secured), links))
     except zenoh.ZError as error:
         text = str(error)
+        endpoint = next((each for each in endpoints if each in text), endpoints[0])
         if "os error 98" in text or "in use" in text:
             raise PortInUse(endpoint, holder_of(int(endpoint.rpartition(":")[2]))) from None
         reason = text.split(" at /", maxsplit=1)[0]  # without the place in Zenoh's own source
         raise ConfigError("endpoint", endpoint, f"can not be listened at: {reason}") from None
+
+
+def tell_of_links(session: zenoh.Session, stop: threading.Event) -> None:
+    """Log which routers of other hosts are reached and lost, until told to stop."""
+    linked: set[str] = set()
+    while not stop.wait(_LOOK_SECONDS):
+        now = {str(zid) for zid in session.info.routers_zid()}
+        for zid in now - linked:
+            log.info("linked with router %s", zid)
+        for zid in linked - now:
+            log.warning("the link with router %s is lost", zid)
+        linked = now
 
 
 class _Parser(argparse.ArgumentParser):
@@ -89,7 +108,10 @@ def main() -> NoReturn:
     """Be the router until SIGINT, SIGTERM or the end of the supervisor; exit 2 when it can not listen."""
     parser = _Parser(prog="router")
     parser.add_argument("--domain", help="0 to 232 (ZENCELL_DOMAIN, 42)")
-    parser.add_argument("--listen", metavar="ENDPOINT", help="instead of 127.0.0.1 (ZENCELL_LISTEN)")
+    parser.add_argument("--listen", metavar="ENDPOINT", action="append", default=[],
+                        help="instead of 127.0.0.1; repeatable (ZENCELL_LISTEN)")
+    parser.add_argument("--link", metavar="ENDPOINT", action="append", default=[],
+                        help="router of another host to be linked with; repeatable (ZENCELL_LINK)")
     add_process_options(parser)
     options = parser.parse_args()
     lifeline = Lifeline(gate=options.gate)
@@ -104,16 +126,19 @@ def main() -> NoReturn:
             leave(0)
     try:
         domain = options.domain if options.domain is not None else os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN)
-        listen = options.listen or os.environ.get(LISTEN_VARIABLE)
-        endpoint = endpoint_of(connect=listen) if listen else endpoint_of(domain)
+        endpoints = endpoints_of("--listen", options.listen, LISTEN_VARIABLE) or [endpoint_of(domain)]
+        links = endpoints_of("--link", options.link, LINK_VARIABLE)
         secured = secure_folder()
-        session = open_router(endpoint, secured)
+        session = open_router(endpoints, secured, links)
     except ZencellError as error:
         fail(error)
-    log.info("listening at %s", endpoint)
-    if secured is None and not is_loopback(endpoint):
-        log.warning("whoever reaches %s can read and command every cell behind it: see docs/security.md", endpoint)
-    stop.wait()
+    log.info("listening at %s", " and ".join(endpoints))
+    for endpoint in endpoints:
+        if secured is None and not is_loopback(endpoint):
+            log.warning("whoever reaches %s can read and command every cell behind it: see docs/security.md", endpoint)
+    for link in links:
+        log.info("to be linked with the router at %s", link)
+    tell_of_links(session, stop)
     log.info("stopped: %s", lifeline.reason)
     closing = threading.Thread(target=session.close, daemon=True)
     closing.start()
