@@ -97,9 +97,12 @@ async def run(bus: Bus, config: Config) -> None:
             for activity in page.activities(bus.clock.age_ms):
                 group.create_task(activity)
             group.create_task(_complete(bus, config, server, page))
+            loop = asyncio.get_running_loop()
+            due = loop.time()
             while True:
-                page.refresh(asyncio.get_running_loop().time(), bus.alive.names)
-                await asyncio.sleep(1 / config.rate if page.pages else IDLE_PERIOD)
+                page.refresh(loop.time(), bus.alive.names)
+                due = max(due + (1 / config.rate if page.pages else IDLE_PERIOD), loop.time())  # late: from now on
+                await asyncio.sleep(due - loop.time())
     finally:
         close_server(server)
 

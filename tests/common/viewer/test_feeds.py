@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+from common import messages as m
+from common import topics
+from common.config import Members, load_cell
+from common.transport.local import LocalNetwork
+from common.viewer.feeds import Feeds, in_cell
+
+PANDA, UR5 = (load_cell(name).section(Members) for name in ("panda", "ur5"))
+
+
+def members(*extra: str) -> Members:
+    return Members(services=["trajectory_executor", "viewer", *extra], task="")
+
+
+def test_cell_has_the_topics_of_its_services_and_what_everybody_writes() -> None:
+    assert isinstance(PANDA, Members) and isinstance(UR5, Members)
+    assert in_cell(topics.VALIDATED_TARGETS, PANDA) and not in_cell(topics.VALIDATED_TARGETS, UR5)
+    assert in_cell(topics.CONTOURS, UR5) and not in_cell(topics.CONTOURS, PANDA)
+    for topic in (topics.LOG, topics.SUPERVISOR_STATUS, topics.COUNTERS):
+        assert in_cell(topic, members())
+
+
+def test_service_that_is_not_known_here_may_write_anything() -> None:
+    assert not in_cell(topics.CAMERA_IMAGE, members())
+    assert in_cell(topics.CAMERA_IMAGE, members("camera_opencv"))
+    assert in_cell(topics.CONTOURS, members("somebody's_own"))
+
+
+async def test_message_is_fresh_once_and_the_latest_for_long() -> None:
+    net = LocalNetwork()
+    feeds = Feeds(net.bus("viewer"), members())
+    writer = net.bus("trajectory_executor").writer(topics.GRIPPER_STATE)
+    assert feeds.latest(topics.GRIPPER_STATE) is None is feeds.fresh(topics.GRIPPER_STATE)
+    writer.put(m.GripperState(width=0.01))
+    first = feeds.fresh(topics.GRIPPER_STATE)
+    assert first == m.GripperState(width=0.01)
+    assert feeds.fresh(topics.GRIPPER_STATE) is None and feeds.latest(topics.GRIPPER_STATE) is first
+    writer.put(m.GripperState(width=0.02))
+    assert feeds.fresh(topics.GRIPPER_STATE) == m.GripperState(width=0.02)
+
+
+async def test_topic_that_the_cell_does_not_have_is_not_asked_for() -> None:
+    feeds = Feeds(LocalNetwork().bus("viewer"), members())
+    assert topics.CONTOURS not in feeds and feeds.reader(topics.CONTOURS) is None
+    feeds.listen([topics.CONTOURS])
+    assert feeds.latest(topics.CONTOURS) is None
+
+
+async def test_what_is_large_is_listened_to_while_it_is_wanted() -> None:
+    net = LocalNetwork()
+    feeds = Feeds(net.bus("viewer"), members())
+    balls = net.bus("trajectory_executor").writer(topics.SCENE_BALLS)
+    assert not balls.matched
+    feeds.listen([topics.SCENE_BALLS])
+    assert balls.matched
+    feeds.listen([])
+    assert not balls.matched
