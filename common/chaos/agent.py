@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import os
 import signal
 import time
@@ -70,7 +71,7 @@ class Chaos:
         self._stopped: set[int] = set()
 
     async def run(self) -> None:
-        """Carry the plan out; what is stopped goes on at the end, however this ends."""
+        """Carry the plan out; what is stopped and was not noticed goes on when this is cancelled."""
         self._began = time.monotonic()
         try:
             async with asyncio.TaskGroup() as lasting:
@@ -79,8 +80,10 @@ class Chaos:
                     if fault.holding:
                         await _until(self._gripper, self._is_holding, self._patience)
                     await self._begin(fault, lasting)
+            if self._stopped:  # and stays so until somebody else ends it, or us
+                await asyncio.Event().wait()
         finally:
-            for pid in self._stopped:
+            for pid in self._stopped.intersection(self._pids().values()):
                 _signal(pid, signal.SIGCONT)
 
     def as_dicts(self) -> list[dict[str, object]]:
@@ -111,6 +114,8 @@ class Chaos:
         for _ in range(fault.count):
             self._stopped.add(pid)
             _signal(pid, signal.SIGSTOP)
+            if not math.isfinite(fault.seconds):  # it is for a watchdog to end it; at our end it goes on
+                return
             await asyncio.sleep(fault.seconds)
             self._stopped.discard(pid)
             if self._pids().get(fault.target) != pid:  # somebody has lost patience with it

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
@@ -16,6 +17,7 @@ PER_MINUTE = 30.0  # faults per minute of wall time
 MOST_PER_MINUTE = 600.0
 CELL_SECONDS = 80.0  # of cell time in which a run sees faults; what comes after is left to it to finish
 LEAST_GAP = 0.05  # [s] between two faults
+LEFT_STOPPED = 0.25  # share of what is stopped that stays so until a watchdog takes notice
 HOLDING = 0.4  # share of the faults of processes that wait for a ball in the hand
 STATELESS_FORMS: tuple[Form, ...] = ("noise", "wrong type", "huge")  # for which no real message is needed
 
@@ -38,7 +40,7 @@ class Fault:
         kind: kill -9, SIGTERM, SIGSTOP for a time, short stops in a row, damaged messages, old messages, a ball that
             slips out of the fingers.
         target: name of the process, or key without the cell; empty for a ball.
-        seconds: how long it lasts, where it lasts.
+        seconds: how long it lasts, where it lasts; infinite for what stays stopped.
         form: of damaged messages.
         count: messages, or stops in a row.
         seed: of everything else that is random about it.
@@ -59,7 +61,7 @@ class Fault:
         """How it is done, for people: "2.1 s", "12 truncated"; may be empty."""
         match self.kind:
             case "freeze":
-                text = f"{self.seconds:.1f} s"
+                text = f"{self.seconds:.1f} s" if math.isfinite(self.seconds) else "until it is noticed"
             case "delay":
                 text = f"{self.count} x {self.seconds:.2f} s"
             case "corrupt":
@@ -122,7 +124,8 @@ def _fault(
     if kind in ("kill", "restart"):
         return Fault(at, kind, process, seed=seed, holding=holding)
     if kind == "freeze":
-        return Fault(at, kind, process, round(float(rng.uniform(0.3, 6.0)), 2), seed=seed, holding=holding)
+        seconds = math.inf if rng.random() < LEFT_STOPPED else round(float(rng.uniform(0.3, 6.0)), 2)
+        return Fault(at, kind, process, seconds, seed=seed, holding=holding)
     if kind == "delay":
         seconds = round(float(rng.uniform(0.05, 0.5)), 2)
         return Fault(at, kind, process, seconds, count=int(rng.integers(2, 6)), seed=seed)

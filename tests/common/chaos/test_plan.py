@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from itertools import islice
 from typing import get_args
@@ -37,6 +38,8 @@ def test_every_kind_form_process_and_key_occurs_over_seeds() -> None:
     assert {f.target for f in every if f.kind in ("kill", "restart", "freeze", "delay")} == set(PROCESSES)
     assert {f.target for f in every if f.kind in ("corrupt", "replay")} == set(KEYS)
     assert any(fault.holding for fault in every)
+    assert {math.isfinite(f.seconds) for f in every if f.kind == "freeze"} == {True, False}
+    assert all(math.isfinite(f.seconds) for f in every if f.kind != "freeze")
 
 
 def test_no_ball_slips_and_nothing_waits_for_one_where_there_are_none() -> None:
@@ -60,6 +63,7 @@ def test_a_run_at_speed_5_sees_five_to_ten_faults_as_a_rule() -> None:
 def test_faults_are_told_in_a_line() -> None:
     assert str(Fault(1.0, "kill", "vision_detector")) == "kill -9 vision_detector"
     assert str(Fault(1.0, "freeze", "router", 2.14, holding=True)) == "SIGSTOP router: 2.1 s, a ball in the hand"
+    assert str(Fault(1.0, "freeze", "tf", math.inf)) == "SIGSTOP tf: until it is noticed"
     corrupt = Fault(1.0, "corrupt", "tf", form="truncated", count=12)
     assert (str(corrupt), corrupt.what) == ("damaged messages on tf: 12 truncated", "damaged messages on: 12 truncated")
     assert str(Fault(1.0, "drop")) == "the held ball slips"
