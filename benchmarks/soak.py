@@ -1,0 +1,243 @@
+"""A Panda cell that works for a long time beside a slow and a stuck subscriber: does anything grow or get lost?
+
+`python -m benchmarks.soak` takes 30 minutes at speed 1 with the camera at 30 Hz. Exit code 1 unless, after the first
+5 minutes, memory grows by less than 2 % and descriptors not at all, nothing of a state or event topic is lost, joint
+states keep their rate and the task goes on placing.
+
+Memory is what a process has for itself (anonymous and shared pages, also those swapped out): pages of files, such as
+libraries, come and go with whatever else runs on the machine. Growth is the median of the last fifth of the looks
+against that of the first fifth, of those after the first minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import tempfile
+import time
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+
+import psutil
+
+from benchmarks.losses import Losses
+from benchmarks.runs import RunningCell, until
+from benchmarks.subscribers import Subscriber
+from common import topics
+from common.messages import WorldEdit
+from common.transport.bus import Bus
+
+CELL = "panda"
+PERIOD = 10.0  # [s] between looks
+MOST_GROWTH = 0.02
+MOST_BYTES = 1e6  # a process may grow by so much: pieces of the allocator
+WINDOW = 5  # the first and the last of so many parts are compared
+JOINT_RATE = 100.0  # [Hz]
+LEAST_RATE = 0.95  # of it
+FROZEN, AWAKE = 25.0, 5.0  # [s] the stuck subscriber is dropped by the router meanwhile and has to come back
+PLACING = 120.0  # [s] in which the task has to place something
+
+
+@dataclass
+class Look:
+    """One process at one time."""
+
+    private: float  # [bytes]
+    pss: float  # [bytes]
+    descriptors: int
+    threads: int
+
+
+@dataclass
+class Seen:
+    """What was seen of a cell in a soak."""
+
+    looks: dict[str, list[Look]] = field(default_factory=lambda: defaultdict(list))
+    loads: list[float] = field(default_factory=list)
+    placed: list[tuple[float, int]] = field(default_factory=list)  # time [s, monotonic] and number so far
+    resets: int = 0
+    failures: int = 0
+    restarts: int = 0
+    dropped: Counter[tuple[str, str]] = field(default_factory=Counter)  # service and key
+    overflow: Counter[tuple[str, str]] = field(default_factory=Counter)
+    invalid: Counter[tuple[str, str]] = field(default_factory=Counter)
+
+
+def look_at(process: psutil.Process) -> Look:
+    """Memory, descriptors and threads of a process, now."""
+    status = dict(
+        line.split(":", 1) for line in Path(f"/proc/{process.pid}/status").read_text(encoding="ascii").splitlines()
+    )
+    private = sum(int(status[name].split()[0]) for name in ("RssAnon", "RssShmem", "VmSwap")) * 1024
+    return Look(private, process.memory_full_info().pss, process.num_fds(), process.num_threads())
+
+
+async def watch_processes(cell: RunningCell, seen: Seen, period: float) -> None:
+    """Look at each process again and again."""
+    processes: dict[str, psutil.Process] = {}
+    while True:
+        await asyncio.sleep(period)
+        now = {**cell.processes(), "supervisor": psutil.Process(cell.process.pid)}
+        seen.restarts += sum(name in processes and processes[name] != one for name, one in now.items())
+        processes = now
+        for name, process in now.items():
+            try:
+                seen.looks[name].append(look_at(process))
+            except (psutil.Error, FileNotFoundError):
+                continue
+        seen.loads.append(os.getloadavg()[0])
+
+
+async def keep_busy(bus: Bus, seen: Seen) -> None:
+    """Put all balls back on the table whenever the task has cleared it."""
+    status, edit = bus.reader(topics.PICK_PLACE_STATUS), bus.client(topics.WORLD_EDIT)
+    async for message in status:
+        seen.failures = message.failures
+        if not seen.placed or seen.placed[-1][1] != message.placed:
+            seen.placed.append((time.monotonic(), message.placed))
+        if message.state == "DONE":
+            await edit.call(WorldEdit(op="reset"), 5.0)
+            seen.resets += 1
+            await until(status, lambda one: one.state != "DONE", 30.0)
+
+
+async def count(bus: Bus, seen: Seen) -> None:
+    """Note what the services have dropped, lost and refused so far."""
+    async for counters in bus.reader(topics.COUNTERS):
+        for into, told in ((seen.dropped, counters.dropped), (seen.overflow, counters.overflow),
+                           (seen.invalid, counters.invalid)):
+            for key, number in told.items():
+                into[counters.service, key] = number
+
+
+async def freeze_and_wake(subscriber: Subscriber) -> None:
+    """Keep a subscriber stuck: a frozen one is dropped by the router after a while, so it is let back now and then."""
+    while True:
+        subscriber.freeze()
+        await asyncio.sleep(FROZEN)
+        subscriber.wake()
+        await asyncio.sleep(AWAKE)
+
+
+def growth(values: list[float]) -> tuple[float, float]:
+    """Median of the first and of the last part of the values."""
+    size = max(1, len(values) // WINDOW)
+    return median(values[:size]), median(values[-size:])
+
+
+def report(seen: Seen, losses: Losses, settle: float, period: float) -> tuple[list[str], list[str]]:
+    """The tables as lines, and what is wrong."""
+    wrong: list[str] = []
+    skipped = round(settle / period)
+    lines = ["", "| process | memory first [MB] | last [MB] | growth | PSS last [MB] | descriptors | threads |",
+             "|---|---|---|---|---|---|---|"]
+    all_first = all_last = 0.0
+    for name, looks in seen.looks.items():
+        looks = looks[skipped:]
+        if len(looks) < WINDOW:
+            wrong.append(f"{name} was looked at {len(looks)} times only")
+            continue
+        first, last = growth([look.private for look in looks])
+        fds, threads = growth([look.descriptors for look in looks]), growth([look.threads for look in looks])
+        all_first, all_last = all_first + first, all_last + last
+        lines.append(
+            f"| {name} | {first / 1e6:.1f} | {last / 1e6:.1f} | {last / first - 1:+.2%} | {looks[-1].pss / 1e6:.0f} | "
+            f"{fds[0]:g} → {fds[1]:g} | {threads[0]:g} → {threads[1]:g} |"
+        )
+        if last - first > max(MOST_GROWTH * first, MOST_BYTES):
+            wrong.append(f"memory of {name} grew from {first / 1e6:.1f} to {last / 1e6:.1f} MB")
+        if fds[1] > fds[0]:
+            wrong.append(f"descriptors of {name} grew from {fds[0]:g} to {fds[1]:g}")
+    if all_first:
+        lines.append(f"| together | {all_first / 1e6:.1f} | {all_last / 1e6:.1f} | {all_last / all_first - 1:+.2%} | | | |")
+        if all_last > (1 + MOST_GROWTH) * all_first:
+            wrong.append(f"memory grew by {all_last / all_first - 1:.2%}")
+    lines += ["", *losses.table(), "", *_counted(seen, wrong)]
+    lost = {key: one.lost for key, one in losses.of.items() if one.lost and losses.kind(key) in ("state", "event")}
+    wrong += [f"{number} messages of {key} were lost on the way" for key, number in lost.items()]
+    joints = losses.of[topics.JOINT_STATES.key]
+    if joints.rate < LEAST_RATE * JOINT_RATE:
+        wrong.append(f"joint states came at {joints.rate:.1f} Hz")
+    return lines, wrong
+
+
+def _counted(seen: Seen, wrong: list[str]) -> list[str]:
+    """Lines on what the readers of the services counted."""
+    kinds = {key: topic.kind for key, topic in topics.all_topics().items()}
+    lines = ["| readers of | replaced unread | overflow | refused |", "|---|---|---|---|"]
+    for kind in ("stream", "state", "event"):
+        dropped, overflow, invalid = (
+            {pair: number for pair, number in counter.items() if kinds.get(pair[1]) == kind}
+            for counter in (seen.dropped, seen.overflow, seen.invalid)
+        )
+        lines.append(f"| {kind} topics | {sum(dropped.values())} | {sum(overflow.values())} | {sum(invalid.values())} |")
+        if kind != "stream":
+            lines += [f"| {service}: {key} | {number} | | |" for (service, key), number in sorted(dropped.items())]
+        wrong += [f"{number} messages of {key} overflowed in {service}" for (service, key), number in overflow.items()]
+        wrong += [f"{service} refused {number} messages of {key}" for (service, key), number in invalid.items()]
+    return lines
+
+
+async def soak(minutes: float, settle: float, period: float, folder: Path, disturbed: bool) -> int:
+    """Run, print what was seen, and 0 if all of it is good."""
+    seen, end = Seen(), time.monotonic() + minutes * 60
+    arguments = ("--speed", "1", "--set", "services.camera_simulator.rate=30")
+    with RunningCell(folder, "up", CELL, *arguments) as cell:
+        async with cell.listen() as bus:
+            await until(bus.reader(topics.MOTION_STATUS), lambda status: status.progress > 0)
+            losses = Losses(bus)
+            with Subscriber(cell.endpoint, f"{CELL}/**", 1.0) as slow, Subscriber(cell.endpoint, f"{CELL}/**", 0) as stuck:
+                if not disturbed:
+                    slow.process.kill()
+                async with asyncio.TaskGroup() as group:
+                    work = [group.create_task(one) for one in (
+                        watch_processes(cell, seen, period), keep_busy(bus, seen), count(bus, seen), losses.watch(),
+                        *([freeze_and_wake(stuck)] if disturbed else []),
+                    )]
+                    while time.monotonic() < end and cell.process.poll() is None:
+                        await asyncio.sleep(min(60.0, max(0.1, end - time.monotonic())))
+                        private = sum(looks[-1].private for looks in seen.looks.values() if looks)
+                        print(f"{(end - time.monotonic()) / 60:4.1f} min left: {seen.placed[-1][1] if seen.placed else 0} "
+                              f"placed, {seen.resets} resets, {private / 1e6:.0f} MB, load {os.getloadavg()[0]:.1f}",
+                              flush=True)
+                    for task in work:
+                        task.cancel()
+            ended_early = cell.process.poll() is not None
+        cell.interrupt()
+        code = await cell.ended(30.0)
+    lines, wrong = report(seen, losses, settle, period)
+    placed = seen.placed[-1][1] - seen.placed[0][1] if seen.placed else 0
+    idle = max((b[0] - a[0] for a, b in zip(seen.placed, [*seen.placed[1:], (end, 0)], strict=True)), default=1e9)
+    if idle > PLACING:
+        wrong.append(f"nothing was placed for {idle:.0f} s")
+    if ended_early or code:
+        wrong.append(f"the cell ended with {code}; its log is {folder / 'cell.log'}")
+    print("\n".join(lines))
+    print(f"\n{minutes:g} minutes: {placed} balls placed in {seen.resets + 1} rounds, at most {idle:.0f} s between two; "
+          f"{seen.failures} failures, {seen.restarts} processes started again; load of the machine "
+          f"{min(seen.loads):.1f} to {max(seen.loads):.1f}, median {median(seen.loads):.1f}, {os.cpu_count()} cores")
+    (folder / "looks.json").write_text(json.dumps({n: [vars(x) for x in looks] for n, looks in seen.looks.items()}))
+    print("\n".join(wrong) or "nothing grows, nothing is lost")
+    return 1 if wrong else 0
+
+
+def main() -> int:
+    """Read the options and run."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.soak", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--settle", type=float, default=5.0, help="minutes before memory is compared")
+    parser.add_argument("--period", type=float, default=PERIOD, help="seconds between looks")
+    parser.add_argument("--folder", help="where log and looks go")
+    parser.add_argument("--alone", action="store_true", help="without the slow and the stuck subscriber")
+    options = parser.parse_args()
+    folder = Path(options.folder or tempfile.mkdtemp(prefix="zencell-soak-"))
+    print(f"log and looks are in {folder}", flush=True)
+    return asyncio.run(soak(options.minutes, options.settle * 60, options.period, folder, not options.alone))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

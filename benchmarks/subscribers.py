@@ -1,0 +1,80 @@
+"""Subscribers that do not keep up, as processes of their own: one reads slowly, one has stopped reading at all.
+
+`python -m benchmarks.subscribers ENDPOINT KEY SECONDS` is such a subscriber: it rests for so long over each message.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from typing import IO
+
+import zenoh
+
+from benchmarks.runs import ROOT, environment
+from common.transport.endpoint import client_config
+
+CONNECT_MS = 30_000
+
+
+class Subscriber:
+    """A process that subscribes to everything of a cell; gone at the end of its `with` block."""
+
+    def __init__(self, endpoint: str, key: str, rest: float) -> None:
+        """Start it; it has subscribed when this returns.
+
+        Args:
+            endpoint: of the router.
+            key: key expression, such as `panda/**`.
+            rest: how long it does nothing over each message [s].
+
+        Raises:
+            RuntimeError: it ended instead.
+        """
+        command = [sys.executable, "-m", "benchmarks.subscribers", endpoint, key, str(rest)]
+        self.process = subprocess.Popen(command, cwd=ROOT, env=environment(), stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        self._told: IO[str] = self.process.stdout
+        if not self._told.readline():
+            raise RuntimeError(f"a subscriber ended with {self.process.wait()}")
+
+    def freeze(self) -> None:
+        """Stop it in the middle of whatever it does: its connection stays open and nothing is read from it."""
+        self.process.send_signal(signal.SIGSTOP)
+
+    def wake(self) -> None:
+        """Let it go on; if it was dropped by the router meanwhile, it comes back."""
+        self.process.send_signal(signal.SIGCONT)
+
+    def __enter__(self) -> Subscriber:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(ProcessLookupError):
+            self.process.kill()
+        self.process.wait()
+        self._told.close()
+
+
+def main() -> int:
+    """Subscribe, say so, and rest over each message until killed."""
+    endpoint, key, rest = sys.argv[1:]
+    parent = os.getppid()
+    session = zenoh.open(client_config(endpoint, connect_ms=CONNECT_MS))
+    seconds = float(rest)
+    # Direct: what is not read waits in the connection and not in a queue of this process.
+    subscriber = session.declare_subscriber(
+        key, zenoh.handlers.Callback(lambda _sample: time.sleep(seconds), indirect=False)
+    )
+    print("subscribed to", subscriber.key_expr, flush=True)
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(0)  # closing would wait for the callback that rests
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
