@@ -27,6 +27,7 @@ STUCK_MS = 1000  # so is a link that takes nothing
 LINK_RETRY_MS = (100, 1000)  # between two tries to reach the router of another host: at first, and at most
 STREAM_BATCHES = 16  # of 64 kB that may wait in a link: a whole picture, so that what follows it is not dropped
 MOST_BYTES = 40 * 1024 * 1024  # of one message; the largest picture that is read has 32 MB
+MOST_BYTES_BESIDES = 8 * 1024 * 1024  # of one that holds no picture: minutes of a trajectory have 1 MB
 MOST_SESSIONS = 512  # at one router: 50 cells of ten services
 MOST_PENDING = 32  # of these that have not shown who they are yet
 ACCEPT_MS = 3000  # in which they must; a loaded machine takes 1 s
@@ -152,11 +153,24 @@ def router_config(
         mode="router", listen__endpoints=list(endpoints), connect__endpoints=list(links),
         connect__timeout_ms=-1, connect__exit_on_failure=False,
         connect__retry={"period_init_ms": first, "period_max_ms": most, "period_increase_factor": 1.5},
+        low_pass_filter=[size_limit()],
         transport__unicast__max_sessions=MOST_SESSIONS,
         transport__unicast__accept_pending=MOST_PENDING,
         transport__unicast__accept_timeout=ACCEPT_MS,
         **secure, **controlled,
     )
+
+
+def size_limit() -> dict[str, Any]:
+    """What the router drops, because it is larger than any message of its topic ever is."""
+    from common.messages import Image, PointCloud2
+    from common.topics import all_topics
+
+    small = [topic.key for topic in all_topics().values() if topic.message not in (Image, PointCloud2)]
+    return {
+        "id": "no pictures", "flows": ["ingress"], "messages": ["put", "query", "reply"],
+        "key_exprs": sorted(f"*/{key.replace('<service>', '*')}" for key in small), "size_limit": MOST_BYTES_BESIDES,
+    }
 
 
 def _config(**values: Any) -> zenoh.Config:

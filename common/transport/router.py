@@ -32,6 +32,10 @@ from common.transport.service import add_process_options
 
 log = logging.getLogger("router")
 
+OPEN = (
+    "whoever reaches %s can read and command every cell behind it: `zencell secure init DIR`, then --secure DIR "
+    "(docs/security.md)"
+)
 _CLOSE_SECONDS = 0.4
 _LOOK_SECONDS = 0.5  # between looks at the links with other routers
 
@@ -135,7 +139,7 @@ def main() -> NoReturn:
     log.info("listening at %s", " and ".join(endpoints))
     for endpoint in endpoints:
         if secured is None and not is_loopback(endpoint):
-            log.warning("whoever reaches %s can read and command every cell behind it: see docs/security.md", endpoint)
+            log.warning(OPEN, endpoint)
     for link in links:
         log.info("to be linked with the router at %s", link)
     tell_of_links(session, stop)
