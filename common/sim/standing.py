@@ -63,7 +63,7 @@ class StateFile:
                 continue
             number, length, checksum = _HEAD.unpack(head)
             body = os.pread(self._descriptor, min(length, SLOT), place + _HEAD.size)
-            if number <= self._number or zlib.crc32(body) != checksum:
+            if number <= self._number or _checksum(number, body) != checksum:
                 continue
             try:
                 newest, self._number = Standing.model_validate_json(body), number
@@ -76,11 +76,16 @@ class StateFile:
         body = state.model_dump_json().encode()
         self._number += 1
         place = SLOT * (self._number % 2)
-        os.pwrite(self._descriptor, _HEAD.pack(self._number, len(body), zlib.crc32(body)) + body, place)
+        os.pwrite(self._descriptor, _HEAD.pack(self._number, len(body), _checksum(self._number, body)) + body, place)
 
     def close(self) -> None:
         """Close the file, which stays."""
         os.close(self._descriptor)
+
+
+def _checksum(number: int, body: bytes) -> int:
+    """Of the number too: one that was written over an older state must not make it the newest."""
+    return zlib.crc32(body, zlib.crc32(number.to_bytes(8, "little")))
 
 
 def state_file(cell: str, environ: Mapping[str, str] = os.environ) -> StateFile | None:

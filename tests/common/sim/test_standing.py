@@ -1,0 +1,136 @@
+"""What is simulated is found as it was, also when its process was killed in the middle of writing it."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.messages import Header
+from common.robot.transforms import tool_down
+from common.sim.standing import SLOT, STATE_VARIABLE, Standing, StandingBall, StateFile, state_file
+from common.sim.world import SimulatedWorld
+
+PLACES = [(0.40, -0.30), (0.52, -0.30), (0.40, -0.17)]
+OPEN, GRIP, R = 0.08, 0.06, 0.03
+
+
+def a_state(number: int) -> Standing:
+    return Standing(layout=PLACES, q=[0.1 * number] * 7, width=0.01 * number, told_width=None,
+                    balls={"ball_1": StandingBall(position=(0.4, -0.3, 0.01 * number), state="table")})
+
+
+def move(world: SimulatedWorld, hand, width: float, now: float, gripping: bool = False) -> None:
+    world.obstruction(hand, width)
+    world.tick(now, hand, width, gripping)
+
+
+def grasp(world: SimulatedWorld, hand, now: float) -> None:
+    move(world, hand, OPEN, now)
+    move(world, hand, GRIP, now + 0.01, gripping=True)
+
+
+@pytest.fixture
+def world(world_config) -> SimulatedWorld:
+    """One ball in the box, one falling, one in the hand."""
+    world = SimulatedWorld(world_config, PLACES)
+    over_box, over_table = tool_down(0.55, 0.25, 0.25), tool_down(0.60, -0.05, 0.5)
+    grasp(world, tool_down(*PLACES[0], R), 1.0)
+    move(world, over_box, GRIP, 1.1, gripping=True)
+    for k in range(100):
+        move(world, over_box, OPEN, 1.2 + 0.01 * k)
+    grasp(world, tool_down(*PLACES[1], R), 3.0)
+    move(world, over_table, GRIP, 3.1, gripping=True)
+    move(world, over_table, OPEN, 3.2)
+    move(world, over_table, OPEN, 3.21)
+    grasp(world, tool_down(*PLACES[2], R), 3.22)
+    assert sorted(ball.state for ball in world.standing().values()) == ["box", "falling", "held"]
+    return world
+
+
+def test_balls_that_are_held_that_fall_and_that_lie_in_the_box_go_on_where_they_were(
+    world: SimulatedWorld, world_config, tmp_path: Path
+) -> None:
+    file = StateFile(tmp_path / "state")
+    file.save(Standing(layout=world.layout, q=[0.0], balls=world.standing()))
+    found = StateFile(tmp_path / "state").load()
+    assert found is not None
+    again = SimulatedWorld(world_config, PLACES)
+    again.restore(found.balls)
+    assert again.held == world.held != ""
+    hand = tool_down(0.45, 0.0, 0.3)
+    for k in range(100):  # the falling one comes to rest, the held one moves with the hand
+        for each in (world, again):
+            move(each, hand, GRIP, 3.3 + 0.01 * k, gripping=True)
+        assert again.scene_balls(Header()) == world.scene_balls(Header())
+    assert sorted(again.scene_balls(Header()).labels) == ["box", "held", "table"]
+    for each in (world, again):
+        move(each, tool_down(0.55, 0.25, 0.25), OPEN, 5.0)
+        for k in range(100):
+            move(each, hand, OPEN, 5.1 + 0.01 * k)
+    assert sorted(again.scene_balls(Header()).labels) == ["box", "box", "table"], "not where the first one lies"
+    assert again.scene_balls(Header()) == world.scene_balls(Header())
+
+
+def test_without_a_file_there_is_nothing(tmp_path: Path) -> None:
+    assert StateFile(tmp_path / "new" / "state").load() is None
+
+
+def test_the_newest_of_many_is_found_and_what_is_written_after_it_is_newer(tmp_path: Path) -> None:
+    file = StateFile(tmp_path / "state")
+    for number in range(7):
+        file.save(a_state(number))
+        assert StateFile(tmp_path / "state").load() == a_state(number)
+    again = StateFile(tmp_path / "state")
+    again.load()
+    again.save(a_state(50))
+    assert StateFile(tmp_path / "state").load() == a_state(50)
+
+
+@settings(max_examples=60, deadline=None)
+@given(before=st.integers(1, 4), cut=st.integers(0, 400), rubbish=st.booleans())
+def test_a_state_that_was_half_written_leaves_the_one_before_it(
+    tmp_path_factory: pytest.TempPathFactory, before: int, cut: int, rubbish: bool
+) -> None:
+    path = tmp_path_factory.mktemp("torn") / "state"
+    file = StateFile(path)
+    for number in range(before):
+        file.save(a_state(number))
+    old = path.read_bytes().ljust(2 * SLOT, b"\0")
+    file.save(a_state(before))
+    new = path.read_bytes().ljust(2 * SLOT, b"\0")
+    changed = [i for i in range(len(new)) if new[i] != old[i]]
+    at = SLOT * (before + 1 & 1)
+    end = at + 16 + len(a_state(before).model_dump_json())
+    assert at <= changed[0] and changed[-1] < end
+    torn = min(at + cut, end)
+    rest = bytes(b ^ 0x5A for b in old[torn:end]) if rubbish else old[torn:end]
+    path.write_bytes(new[:torn] + rest + old[end:])
+    whole = torn > changed[-1] and (torn == end or not rubbish)
+    assert StateFile(path).load() == a_state(before if whole else before - 1)
+    again = StateFile(path)
+    again.load()
+    again.save(a_state(9))
+    assert StateFile(path).load() == a_state(9), "and the next one is written over what was torn"
+
+
+def test_a_state_of_another_version_is_no_state(tmp_path: Path) -> None:
+    class Later(Standing):
+        wheels: int = 4
+
+    file = StateFile(tmp_path / "state")
+    file.save(Later(**a_state(1).model_dump()))
+    assert StateFile(tmp_path / "state").load() is None
+    again = StateFile(tmp_path / "state")
+    again.save(a_state(2))
+    assert StateFile(tmp_path / "state").load() == a_state(2)
+
+
+def test_the_file_is_that_of_a_cell_on_a_host_and_only_where_a_folder_is_named(tmp_path: Path) -> None:
+    assert state_file("panda", {}) is None
+    file = state_file("panda", {STATE_VARIABLE: str(tmp_path)})
+    assert file is not None
+    assert [path.name for path in tmp_path.iterdir()] == [f"panda-{socket.gethostname()}.state"]
