@@ -70,7 +70,7 @@ class Reliance:
         if new > 0:
             gap = (awake - self._heard) / new
             if self._count is not None and gap <= SLOWEST_GAP:
-                self._gap += 0.1 * (gap - self._gap)
+                self._gap += (0.1 if self._gap else 1.0) * (gap - self._gap)
             self._count, self._heard = self._received(), awake
         if self._count is None:
             return ""

@@ -177,6 +177,48 @@ def test_contour_seen_before_the_arm_came_home_is_not_trusted() -> None:
     assert cell.moves() == WHOLE * 2
 
 
+def test_picture_that_is_too_old_starts_no_motion() -> None:
+    cell = OutlineDouble(selection_timeout=0.0)
+    cell.camera_on = False
+    cell.now += 10
+    for _ in range(200):
+        cell.step()
+    assert cell.status.state == "SELECTING" and cell.status.message == "no fresh picture"
+    assert not any(isinstance(r, m.ExecuteRequest) for r in cell.requests)
+    cell.camera_on = True
+    cell.until("DONE")
+    assert cell.moves() == WHOLE
+
+
+def test_camera_that_freezes_while_the_motions_are_planned_has_them_planned_anew_from_a_newer_picture() -> None:
+    cell = OutlineDouble(selection_timeout=0.0)
+    plan, frozen = cell.unplannable, []
+
+    def freeze(request: m.PlanRequest) -> str:
+        if request.stage == "home" and not frozen:
+            frozen.append(request.id)
+            cell.camera_on = False
+            cell.now += 10
+        return plan(request)
+
+    cell.unplannable = freeze
+    for _ in range(200):
+        cell.step()
+    assert frozen and cell.status.message == "no fresh picture"
+    assert not any(isinstance(r, m.ExecuteRequest) for r in cell.requests)
+    cell.camera_on = True
+    cell.until("DONE")
+    assert cell.moves() == WHOLE
+
+
+def test_camera_that_stays_frozen_ends_the_task_with_that_reason() -> None:
+    cell = OutlineDouble()
+    cell.camera_on = False
+    cell.now += 10
+    cell.until("ERROR")
+    assert cell.status.message == "no fresh picture" and cell.moves() == []
+
+
 def test_arm_that_is_not_at_home_at_the_start_goes_there_first() -> None:
     cell = OutlineDouble()
     cell.q = list(AWAY)

@@ -9,6 +9,8 @@ from typing import Any
 
 from common import messages as m
 from common import topics
+from common.tasks.outline_legs import OutlineView
+from common.tasks.reliance import Reliance
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from common.transport.task_runner import Command, TaskRunner
@@ -24,13 +26,14 @@ class Script:
     def __init__(self) -> None:
         self.status = m.PickPlaceStatus()
         self.first: list[Command] = [GO]
+        self.also: list[Command] = []  # together with every command
 
     def step(self, view: Any) -> list[Command]:
         asked, self.first = self.first, []
         return asked
 
     def command(self, command: str, view: Any) -> list[Command]:
-        return [HOLD.get(command, m.StopRequest(reason=command))]
+        return [HOLD.get(command, m.StopRequest(reason=command)), *self.also]
 
     def on_plan(self, response: m.PlanResponse, view: Any) -> None:
         raise AssertionError
@@ -40,9 +43,11 @@ class Script:
 
 
 @asynccontextmanager
-async def running(net: LocalNetwork) -> AsyncIterator[Bus]:
+async def running(net: LocalNetwork, *also: Command) -> AsyncIterator[Bus]:
     async def run(bus: Bus, config: None) -> None:
-        runner = TaskRunner(bus, Script(), lambda: None, bus.writer(topics.PICK_PLACE_STATUS), lambda: 1.0)
+        script = Script()
+        script.also = list(also)
+        runner = TaskRunner(bus, script, lambda: None, bus.writer(topics.PICK_PLACE_STATUS), lambda: 1.0)
         await bus.ready()
         await runner.run(())
 
@@ -97,3 +102,51 @@ async def test_only_the_newest_hold_and_no_motion_after_a_stop_reach_an_executor
         await tell(net, "resume")
         assert await executor.next() == HOLD["resume"]
         assert executor.asked.empty()
+
+
+async def test_a_watchdog_and_a_person_do_not_make_each_others_holds_void() -> None:
+    net = LocalNetwork()
+    watchdog = m.HoldRequest(hold=True, reason="no joint states", by="watchdog")
+    async with running(net, watchdog):
+        await tell(net, "pause")
+        executor = Executor(net)
+        await executor.bus.ready()
+        asked = [await executor.next() for _ in range(3)]
+        assert watchdog in asked and HOLD["pause"] in asked and GO in asked
+
+
+class Silent(Script):
+    """A task that asks for nothing by itself."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first = []
+
+
+async def test_what_is_missing_is_told_in_the_status_and_holds_the_arm_until_it_is_back() -> None:
+    net = LocalNetwork()
+    executor = Executor(net)
+    await executor.bus.ready()
+    view = OutlineView(now=0.0, motion=m.MotionStatus(id="go", state="active"))
+
+    async def run(bus: Bus, config: None) -> None:
+        joints = bus.reader(topics.JOINT_STATES)
+        reliance = Reliance(lambda: joints.received, lambda: 0.2)
+        writer = bus.writer(topics.PICK_PLACE_STATUS)
+        runner = TaskRunner(bus, Silent(), lambda: view, writer, lambda: 1.0, reliance)
+        await bus.ready()
+        await runner.run(())
+
+    person = net.bus("person")
+    status, joints = person.reader(topics.PICK_PLACE_STATUS), executor.bus.writer(topics.JOINT_STATES)
+    async with net.running(run, None, name="smart_pick_place"):
+        joints.put(m.JointState(header=m.Header(stamp=1), name=["j"], position=[0.0]))
+        hold = await executor.next()
+        assert isinstance(hold, m.HoldRequest) and hold.hold and hold.by == "watchdog"
+        async with asyncio.timeout(10):
+            while (await status.next()).message != "the arm waits: no joint states for 200 ms":
+                pass
+        assert view.trouble
+        joints.put(m.JointState(header=m.Header(stamp=1), name=["j"], position=[0.0]))
+        release = await executor.next()
+        assert isinstance(release, m.HoldRequest) and not release.hold and release.by == "watchdog"

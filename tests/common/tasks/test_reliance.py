@@ -1,0 +1,179 @@
+"""What holds the arm and lets it go again, with a clock of the test's own; then with both tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common import messages as m
+from common.tasks.reliance import LOOK_PERIOD, Reliance
+from tests.common.tasks.cell_double import CellDouble
+from tests.common.tasks.outline_double import OutlineDouble
+
+ACTIVE, IDLE = m.MotionStatus(id="a", state="active"), m.MotionStatus()
+PLANNER, EXECUTOR = "motion_planner", "trajectory_executor"
+
+
+class Setting:
+    """Joint states at a rate, a planner and an executor, seen by a task that looks 20 times a second."""
+
+    def __init__(self, rate: float = 100.0, motion: m.MotionStatus = ACTIVE) -> None:
+        self.rate, self.motion, self.now = rate, motion, 100.0
+        self.there = {PLANNER: True, EXECUTOR: True}
+        self.came = 0.0
+        self.asked: list[m.HoldRequest] = []
+        self.reliance = Reliance(lambda: int(self.came), lambda: 0.2)
+
+    def wait(self, seconds: float, step: float = LOOK_PERIOD) -> list[bool]:
+        """The holds (True) and releases (False) that were asked for meanwhile."""
+        before, end = len(self.asked), self.now + seconds
+        while self.now < end - 1e-9:
+            self.now += step
+            self.came += step * self.rate
+            self.asked += self.reliance.look(self.now, dict(self.there), self.motion)
+        return [hold.hold for hold in self.asked[before:]]
+
+
+def test_nothing_is_held_while_all_is_well() -> None:
+    setting = Setting()
+    assert setting.wait(60) == [] and setting.reliance.trouble == ""
+
+
+def test_without_joint_states_the_arm_is_held_within_a_quarter_second_and_let_go_when_they_are_back() -> None:
+    setting = Setting()
+    setting.wait(5)
+    setting.rate = 0.0
+    assert setting.wait(0.2) == []
+    assert setting.wait(0.1) == [True]
+    assert setting.asked[-1].by == "watchdog" and setting.asked[-1].reason == "no joint states for 200 ms"
+    assert setting.wait(60) == []
+    setting.rate = 100.0
+    assert setting.wait(0.1) == [False]
+    assert setting.wait(60) == [] and setting.reliance.trouble == ""
+
+
+@pytest.mark.parametrize("name", [PLANNER, EXECUTOR])
+def test_the_arm_is_held_while_a_service_is_gone(name: str) -> None:
+    setting = Setting()
+    setting.wait(1)
+    setting.there[name] = False
+    assert setting.wait(0.1) == [True] and setting.asked[-1].reason == f"{name} is gone"
+    setting.there[name] = True
+    assert setting.wait(0.1) == [False]
+
+
+def test_the_arm_is_let_go_when_all_is_back_not_before() -> None:
+    setting = Setting()
+    setting.wait(1)
+    setting.there[PLANNER], setting.rate = False, 0.0
+    assert setting.wait(1) == [True]
+    setting.rate = 100.0
+    assert setting.wait(1) == []
+    setting.there[PLANNER] = True
+    assert setting.wait(1) == [False]
+
+
+def test_with_no_motion_there_is_nothing_to_hold_but_trouble_is_known() -> None:
+    setting = Setting(motion=IDLE)
+    setting.wait(1)
+    setting.there[PLANNER] = False
+    assert setting.wait(1) == [] and setting.reliance.trouble == "motion_planner is gone"
+
+
+def test_what_was_never_there_is_not_missing() -> None:
+    setting = Setting(rate=0.0)
+    setting.there = {PLANNER: False, EXECUTOR: False}
+    assert setting.wait(10) == [] and setting.reliance.trouble == ""
+
+
+@pytest.mark.parametrize("late", [0.5, 2.0, 60.0])
+def test_a_task_that_was_late_itself_misses_nothing(late: float) -> None:
+    setting = Setting()
+    setting.wait(5)
+    setting.now += late  # nobody ran: neither we nor the robot
+    assert setting.wait(0.3) == []
+
+
+def test_on_a_busy_machine_a_late_joint_state_is_no_fault() -> None:
+    setting = Setting()
+    setting.wait(5, step=0.3)
+    setting.rate = 0.0
+    assert setting.wait(0.6, step=0.3) == []
+    assert setting.wait(6.0, step=0.3) == [True], "but a silence is"
+
+
+def test_joint_states_that_come_slowly_are_not_missing() -> None:
+    setting = Setting(rate=2.0)
+    assert setting.wait(20)[1:] in ([], [False])  # at first it is not known that they are so slow
+    assert setting.wait(60) == []
+    setting.rate = 0.0
+    assert setting.wait(6) == [True]
+
+
+def test_a_hold_of_the_task_before_this_one_is_taken_over() -> None:
+    setting = Setting(motion=m.MotionStatus(id="a", state="active", held=True, held_by=["watchdog"]))
+    assert setting.wait(0.1) == [False]
+
+
+@given(st.lists(st.tuples(st.sampled_from(["joints", PLANNER, EXECUTOR]), st.floats(0.01, 3.0)), max_size=12))
+def test_holds_and_releases_alternate_and_the_last_is_a_release(events: list[tuple[str, float]]) -> None:
+    setting = Setting()
+    setting.wait(1)
+    for what, seconds in events:
+        if what == "joints":
+            setting.rate = 100.0 - setting.rate
+        else:
+            setting.there[what] = not setting.there[what]
+        setting.wait(seconds)
+    setting.rate, setting.there = 100.0, {PLANNER: True, EXECUTOR: True}
+    setting.wait(1)
+    holds = [hold.hold for hold in setting.asked]
+    assert holds == [True, False] * (len(holds) // 2)
+
+
+# --- with the tasks -----------------------------------------------------------------------------------------------
+
+Double = CellDouble | OutlineDouble
+TASKS: dict[str, tuple[Callable[[], Double], str]] = {
+    "pick_place": (lambda: CellDouble([(0.40, -0.30)]), "pre-grasp"), "outline": (OutlineDouble, "trace"),
+}
+
+
+@pytest.mark.parametrize(("make", "stage"), TASKS.values(), ids=TASKS)
+def test_no_motion_begins_while_something_is_missing_and_none_is_done_twice(
+    make: Callable[[], Double], stage: str
+) -> None:
+    cell = make()
+    view = cell.view
+    trouble = ""
+
+    def troubled() -> object:
+        seen = view()
+        seen.trouble = trouble
+        return seen
+
+    cell.view = troubled  # type: ignore[assignment,method-assign]
+    cell.until(stage)
+    trouble = "motion_planner is gone"
+    before = sum(isinstance(r, m.ExecuteRequest) for r in cell.requests)
+    for _ in range(100):
+        cell.step()
+    assert sum(isinstance(r, m.ExecuteRequest) for r in cell.requests) == before
+    assert cell.motion.state == "succeeded", "what was under way may end"
+    trouble = ""
+    cell.until("DONE")
+    executed = [r.id for r in cell.requests if isinstance(r, m.ExecuteRequest)]
+    assert len(executed) == len(set(executed)) and cell.task.status.failures == 0
+
+
+@pytest.mark.parametrize(("make", "stage"), TASKS.values(), ids=TASKS)
+def test_a_task_that_finds_the_robot_held_by_a_watchdog_is_not_paused(make: Callable[[], Double], stage: str) -> None:
+    cell = make()
+    cell.motion = m.MotionStatus(held=True, held_by=["watchdog"])
+    cell.step()
+    assert not cell.task.status.paused
+    cell.motion = m.MotionStatus()
+    cell.until("DONE")
