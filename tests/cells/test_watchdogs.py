@@ -87,3 +87,23 @@ async def test_nothing_is_left_of_a_cell_whose_supervisor_is_killed_not_even_wha
         _, left = await asyncio.to_thread(psutil.wait_procs, processes, STOP_SECONDS)
     assert len(processes) == 9
     assert not left
+
+
+async def test_the_arm_is_held_while_the_planner_is_dead_and_the_same_motion_goes_on_when_it_is_back(
+    tmp_path: Path,
+) -> None:
+    with RunningCell(tmp_path, "run", "panda", "--speed", "1.5", "--set", "world.count=1") as cell:
+        async with cell.listen() as bus:
+            motion, status = bus.reader(topics.MOTION_STATUS), bus.reader(topics.PICK_PLACE_STATUS)
+            before = await until(motion, halfway, 60)
+            cell.processes()["motion_planner"].kill()
+            told = await until(status, lambda s: s.message == "the arm waits: motion_planner is gone", 20)
+            held = await until(motion, lambda m: m.held, 20)
+            assert held.held_by == ["watchdog"] and not told.paused
+            assert held.id == before.id and "motion_planner is gone" in held.message
+            ended = await until(motion, lambda m: not m.held and m.state != "active", 60)
+            assert (ended.id, ended.state) == (before.id, "succeeded")
+            assert await cell.ended(120) == 0, cell.tail()
+        summary = cell.summary
+    assert summary["state"] == "DONE" and summary["truth"] == {"in_box": 1, "on_table": 0, "elsewhere": 0}
+    assert (summary["failures"], summary["restarts"]["motion_planner"]) == (0, 1)

@@ -25,6 +25,7 @@ from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.scene.workspace import reach_reason
+from common.sim.standing import STATE_VARIABLE
 from common.transport.local import LocalNetwork
 from common.transport.wiring import wiring
 from services import trajectory_executor
@@ -305,3 +306,49 @@ async def test_random_layout_is_within_reach_also_when_seen_a_few_millimetres_of
     for p in (pose.position for pose in seen.poses):
         radius = float(np.hypot(p.x, p.y))
         assert not reach_reason(robot, (p.x * (1 + off / radius), p.y * (1 + off / radius), p.z), cell.grasp)
+
+
+# --- what is simulated survives the process that simulates it ---
+
+
+async def test_started_again_with_a_ball_in_the_hand_it_finds_arm_fingers_and_ball_as_they_were(
+    robot: RobotModel, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(STATE_VARIABLE, str(tmp_path))
+    home, world = robot.named("home"), load_cell("panda").world
+    x, y = world.spots[3]
+    above = solve_ik(robot, tool_down(x, y, 0.2), home)
+    at_ball = solve_ik(robot, tool_down(x, y, world.ball_radius), above)
+    async with executor() as person:
+        await person.follow("a", move(robot, home, above))
+        await person.follow("b", move(robot, above, at_ball))
+        assert (await person.grip("close", 0.0)).holding
+        await person.follow("c", move(robot, at_ball, above))
+        before = await person.see(person.balls, lambda b: "held" in b.labels)
+        joints = await person.see(person.joints, lambda _: True)
+        gripper = person.gripper.latest
+    async with executor() as person:
+        found = await person.see(person.joints, lambda _: True)
+        assert found.position == pytest.approx(joints.position, abs=1e-3)
+        again = await person.see(person.gripper, lambda _: True)
+        assert again.holding and again.width == pytest.approx(gripper.width) and again.state == "none"
+        balls = await person.see(person.balls, lambda _: True)
+        assert dict(zip(balls.ids, balls.labels, strict=True)) == dict(zip(before.ids, before.labels, strict=True))
+        await person.follow("d", move(robot, above, home))
+        held = balls.ids[balls.labels.index("held")]
+        await person.grip("open", 0.08)
+        balls = await person.see(person.balls, lambda b: b.labels[b.ids.index(held)] == "table")
+        assert len(balls.ids) == len(before.ids)
+
+
+async def test_what_was_kept_of_another_layout_is_not_used(
+    robot: RobotModel, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(STATE_VARIABLE, str(tmp_path))
+    home = robot.named("home")
+    async with executor() as person:
+        await person.follow("a", move(robot, home, home + 0.2))
+    async with executor("world.balls=[[0.5, 0.0]]") as person:
+        assert len((await person.see(person.balls, lambda _: True)).ids) == 1
+        found = await person.see(person.joints, lambda _: True)
+        assert found.position[: robot.dof] == pytest.approx(home)
