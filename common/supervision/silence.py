@@ -11,6 +11,7 @@ from common.transport.keys import ROUTER
 from common.waking import Waking
 
 PERIOD = 0.25  # [s] between two looks
+LEASE = 2.0  # [s] after which a connection counts as lost on which nothing comes
 
 
 @dataclass(frozen=True)
@@ -65,10 +66,13 @@ class Silence:
         verdicts = []
         for process in processes:
             silent = self._silent(process, connected, awake)
+            limit = self._limits.silence
+            if process.name == ROUTER:  # when it is found to be lost, it has already been silent for a lease
+                limit = max(limit - LEASE, limit / 2)
             start_limit = self._limits.silence if process.name in stopped else self._limits.start
             if process.state == "starting" and silent > start_limit:
                 verdicts.append(Verdict(process.name, f"was started again {silent:.0f} s ago and is not ready"))
-            elif process.state == "ready" and silent > self._limits.silence:
+            elif process.state == "ready" and silent > limit:
                 what = "does not answer" if process.name == ROUTER else "has not been heard"
                 verdicts.append(Verdict(process.name, f"{what} for {silent:.1f} s"))
         return self._without_scapegoats(verdicts, processes, awake)

@@ -50,7 +50,7 @@ class Reliance:
         self._seen |= {name for name, there in serving.items() if there}
         gone = [name for name, there in serving.items() if not there and name in self._seen]
         silent = self._joints_are_missing(self._awake.look(now))
-        self.trouble = f"{' and '.join(gone)} is gone" if gone else silent
+        self.trouble = f"{' and '.join(gone)} {'is' if len(gone) == 1 else 'are'} gone" if gone else silent
         if motion is None:
             return []
         if self._holding is None:  # by the task before this one

@@ -6,7 +6,7 @@ import pytest
 
 from common.config import Watchdogs
 from common.messages import ServiceStatus
-from common.supervision.silence import PERIOD, Silence
+from common.supervision.silence import LEASE, PERIOD, Silence
 
 NAMES = ["router", "camera", "detector", "task"]
 LIMIT, START = Watchdogs().silence, Watchdogs().start
@@ -69,8 +69,8 @@ def test_a_service_that_never_speaks_once_it_is_ready_is_killed_too() -> None:
 def test_nobody_but_the_router_is_blamed_while_it_is_not_reached() -> None:
     cell = Cell()
     cell.wait(5)
-    cell.silent, cell.connected = {"router"}, False
-    assert cell.wait(LIMIT - 0.5) == []
+    cell.silent, cell.connected = {"router"}, False  # found to be lost
+    assert cell.wait(LIMIT - LEASE - 0.5) == []
     assert cell.wait(1.0) == ["router"]
     assert "does not answer" in cell.killed[0][1]
     cell.connected = True
