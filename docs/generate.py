@@ -95,6 +95,7 @@ def parameters() -> str:
         *seed_table(cell, VALIDATOR), "", "### Camera and detector", "", *seed_table(cell, CAMERA), "", "## The cell", "",
         *head, *rows_of(c.Motion, "motion", cell.motion), *rows_of(c.Grasp, "grasp", cell.grasp),
         *rows_of(c.World, "world", cell.world), *rows_of(c.RobotConfig, "robot", cell.robot),
+        *rows_of(c.Watchdogs, "watchdogs", cell.watchdogs),
         f"| `pipeline.validation_step` | {cell.pipeline.validation_step:g} | > 0, <= 0.2 | yes | "
         f"{c.Pipeline.model_fields['validation_step'].description} |", "",
         "## Planners", "", "Set in the pipeline file, under `options` of the planner.", "", *head,
