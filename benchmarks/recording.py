@@ -67,10 +67,16 @@ def _lines(summary: Summary) -> list[str]:
     payload = sum(topic.bytes for topic in summary.topics.values())
     largest = sorted(summary.topics.items(), key=lambda item: -item[1].bytes)[:SHOWN]
     return [
-        f"  {summary.messages:,} messages in {summary.seconds:.1f} s, {summary.lost} lost",
+        f"  {summary.messages:,} messages in {summary.seconds:.1f} s, {summary.lost} lost{_where(summary)}",
         f"  {summary.size / 1e6:.1f} MB on disk for {payload / 1e6:.1f} MB of payload",
         *(f"  {name:<30} {topic.hz:7.2f} Hz {topic.bytes / 1e6:9.1f} MB" for name, topic in largest),
     ]
+
+
+def _where(summary: Summary) -> str:
+    lost = {name: (topic.missed, topic.dropped) for name, topic in summary.topics.items()}
+    told = [f"{name} {m} on the way, {d} at the disk" for name, (m, d) in lost.items() if m or d]
+    return f" ({'; '.join(told)})" if told else ""
 
 
 async def main() -> None:
