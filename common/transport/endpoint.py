@@ -31,6 +31,7 @@ MOST_BYTES_BESIDES = 8 * 1024 * 1024  # of one that holds no picture: minutes of
 MOST_SESSIONS = 512  # at one router: 50 cells of ten services
 MOST_PENDING = 32  # of these that have not shown who they are yet
 ACCEPT_MS = 3000  # in which they must; a loaded machine takes 1 s
+STATE_BATCHES = 16  # of states and events, the most there can be: seconds of them for a reader that is held up
 STREAM_WAIT_US = 5000  # that a stream's message waits for room before it is dropped, once until there is room again
 
 
@@ -149,7 +150,16 @@ def router_config(
     first, most = LINK_RETRY_MS
     secure = {"transport__link__tls": credentials.tls(listens=True)} if credentials else {}
     controlled = {"access_control": access} if access else {}
+    # What must arrive is put to wait apart: else the router itself waits for a reader that takes nothing, and with it
+    # stands all that comes from the writer, for a second each time. Only that reader misses what no longer fits. And
+    # small messages share a batch where they have to wait.
+    patient = {
+        "messages": ["put"], "flows": ["egress"], "qos": {"congestion_control": "block"},
+        "overwrite": {"congestion_control": "block_first", "express": False},
+    }
     return _config(
+        qos__network=[patient],
+        transport__link__tx__queue__size__data_high=STATE_BATCHES,
         mode="router", listen__endpoints=list(endpoints), connect__endpoints=list(links),
         connect__timeout_ms=-1, connect__exit_on_failure=False,
         connect__retry={"period_init_ms": first, "period_max_ms": most, "period_increase_factor": 1.5},
