@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from dataclasses import dataclass, field
 
@@ -67,13 +66,10 @@ class Losses:
     def _arrive(self, sample: RawSample) -> None:
         self.of[sample.key.removeprefix(self._prefix)].add(sample)
 
-    async def watch(self) -> None:
-        """Run until cancelled, then stop listening."""
-        try:
-            await asyncio.Event().wait()
-        finally:
-            for declared in self._declared:
-                declared.undeclare()
+    def stop(self) -> None:
+        """Listen no more."""
+        while self._declared:
+            self._declared.pop().undeclare()
 
     @staticmethod
     def kind(key: str) -> str:

@@ -14,18 +14,22 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import math
 import os
 import tempfile
 import time
 from collections import Counter, defaultdict
-from dataclasses import dataclass, field
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, nullcontext
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
 import psutil
 
 from benchmarks.losses import Losses
-from benchmarks.runs import RunningCell, until
+from benchmarks.runs import LOG, RunningCell, beside, until
 from benchmarks.subscribers import Subscriber
 from common import topics
 from common.messages import WorldEdit
@@ -136,8 +140,8 @@ def report(seen: Seen, losses: Losses, settle: float, period: float) -> tuple[li
     lines = ["", "| process | memory first [MB] | last [MB] | growth | PSS last [MB] | descriptors | threads |",
              "|---|---|---|---|---|---|---|"]
     all_first = all_last = 0.0
-    for name, looks in seen.looks.items():
-        looks = looks[skipped:]
+    for name, all_looks in seen.looks.items():
+        looks = all_looks[skipped:]
         if len(looks) < WINDOW:
             wrong.append(f"{name} was looked at {len(looks)} times only")
             continue
@@ -153,9 +157,10 @@ def report(seen: Seen, losses: Losses, settle: float, period: float) -> tuple[li
         if fds[1] > fds[0]:
             wrong.append(f"descriptors of {name} grew from {fds[0]:g} to {fds[1]:g}")
     if all_first:
-        lines.append(f"| together | {all_first / 1e6:.1f} | {all_last / 1e6:.1f} | {all_last / all_first - 1:+.2%} | | | |")
-        if all_last > (1 + MOST_GROWTH) * all_first:
-            wrong.append(f"memory grew by {all_last / all_first - 1:.2%}")
+        more = all_last / all_first - 1
+        lines.append(f"| together | {all_first / 1e6:.1f} | {all_last / 1e6:.1f} | {more:+.2%} | | | |")
+        if more > MOST_GROWTH:
+            wrong.append(f"memory grew by {more:.2%}")
     lines += ["", *losses.table(), "", *_counted(seen, wrong)]
     lost = {key: one.lost for key, one in losses.of.items() if one.lost and losses.kind(key) in ("state", "event")}
     wrong += [f"{number} messages of {key} were lost on the way" for key, number in lost.items()]
@@ -174,7 +179,8 @@ def _counted(seen: Seen, wrong: list[str]) -> list[str]:
             {pair: number for pair, number in counter.items() if kinds.get(pair[1]) == kind}
             for counter in (seen.dropped, seen.overflow, seen.invalid)
         )
-        lines.append(f"| {kind} topics | {sum(dropped.values())} | {sum(overflow.values())} | {sum(invalid.values())} |")
+        sums = [sum(counted.values()) for counted in (dropped, overflow, invalid)]
+        lines.append(f"| {kind} topics | {sums[0]} | {sums[1]} | {sums[2]} |")
         if kind != "stream":
             lines += [f"| {service}: {key} | {number} | | |" for (service, key), number in sorted(dropped.items())]
         wrong += [f"{number} messages of {key} overflowed in {service}" for (service, key), number in overflow.items()]
@@ -182,45 +188,54 @@ def _counted(seen: Seen, wrong: list[str]) -> list[str]:
     return lines
 
 
-async def soak(minutes: float, settle: float, period: float, folder: Path, disturbed: bool) -> int:
+@asynccontextmanager
+async def disturbed(endpoint: str) -> AsyncIterator[None]:
+    """A slow and a stuck subscriber to everything, during the block."""
+    with Subscriber(endpoint, f"{CELL}/**", 1.0), Subscriber(endpoint, f"{CELL}/**", 0) as stuck:
+        async with beside(freeze_and_wake(stuck)):
+            yield
+
+
+async def until_over(cell: RunningCell, seen: Seen, end: float) -> None:
+    """Wait for the end [s, monotonic] or for that of the cell, and tell each minute how it goes."""
+    while (left := end - time.monotonic()) > 0 and cell.process.poll() is None:
+        await asyncio.sleep(min(60.0, left))
+        memory = sum(looks[-1].private for looks in seen.looks.values())
+        placed = seen.placed[-1][1] if seen.placed else 0
+        print(f"{max(0.0, end - time.monotonic()) / 60:.0f} min left: {placed} placed, {seen.resets} resets, "
+              f"{memory / 1e6:.0f} MB, load {os.getloadavg()[0]:.1f}", flush=True)
+
+
+async def soak(options: argparse.Namespace, folder: Path) -> int:
     """Run, print what was seen, and 0 if all of it is good."""
-    seen, end = Seen(), time.monotonic() + minutes * 60
-    arguments = ("--speed", "1", "--set", "services.camera_simulator.rate=30")
-    with RunningCell(folder, "up", CELL, *arguments) as cell:
+    seen = Seen()
+    with RunningCell(folder, "up", CELL, "--set", "services.camera_simulator.rate=30") as cell:
         async with cell.listen() as bus:
-            await until(bus.reader(topics.MOTION_STATUS), lambda status: status.progress > 0)
+            await until(bus.reader(topics.MOTION_STATUS), lambda status: status.progress > 0, 120.0)
             losses = Losses(bus)
-            with Subscriber(cell.endpoint, f"{CELL}/**", 1.0) as slow, Subscriber(cell.endpoint, f"{CELL}/**", 0) as stuck:
-                if not disturbed:
-                    slow.process.kill()
-                async with asyncio.TaskGroup() as group:
-                    work = [group.create_task(one) for one in (
-                        watch_processes(cell, seen, period), keep_busy(bus, seen), count(bus, seen), losses.watch(),
-                        *([freeze_and_wake(stuck)] if disturbed else []),
-                    )]
-                    while time.monotonic() < end and cell.process.poll() is None:
-                        await asyncio.sleep(min(60.0, max(0.1, end - time.monotonic())))
-                        private = sum(looks[-1].private for looks in seen.looks.values() if looks)
-                        print(f"{(end - time.monotonic()) / 60:4.1f} min left: {seen.placed[-1][1] if seen.placed else 0} "
-                              f"placed, {seen.resets} resets, {private / 1e6:.0f} MB, load {os.getloadavg()[0]:.1f}",
-                              flush=True)
-                    for task in work:
-                        task.cancel()
+            end = time.monotonic() + options.minutes * 60
+            watching = (watch_processes(cell, seen, options.period), keep_busy(bus, seen), count(bus, seen))
+            beside_it = nullcontext() if options.alone else disturbed(cell.endpoint)
+            async with beside_it, beside(*watching):
+                await until_over(cell, seen, end)
+                losses.stop()
             ended_early = cell.process.poll() is not None
         cell.interrupt()
         code = await cell.ended(30.0)
-    lines, wrong = report(seen, losses, settle, period)
+    lines, wrong = report(seen, losses, options.settle * 60, options.period)
     placed = seen.placed[-1][1] - seen.placed[0][1] if seen.placed else 0
-    idle = max((b[0] - a[0] for a, b in zip(seen.placed, [*seen.placed[1:], (end, 0)], strict=True)), default=1e9)
+    times = [*(at for at, _ in seen.placed), end]
+    idle = max((b - a for a, b in pairwise(times)), default=math.inf)
     if idle > PLACING:
         wrong.append(f"nothing was placed for {idle:.0f} s")
     if ended_early or code:
-        wrong.append(f"the cell ended with {code}; its log is {folder / 'cell.log'}")
+        wrong.append(f"the cell ended with {code}; its log is {folder / LOG}")
     print("\n".join(lines))
-    print(f"\n{minutes:g} minutes: {placed} balls placed in {seen.resets + 1} rounds, at most {idle:.0f} s between two; "
-          f"{seen.failures} failures, {seen.restarts} processes started again; load of the machine "
+    print(f"\n{options.minutes:g} minutes: {placed} balls placed in {seen.resets + 1} rounds, at most {idle:.0f} s "
+          f"between two; {seen.failures} failures, {seen.restarts} processes started again; load of the machine "
           f"{min(seen.loads):.1f} to {max(seen.loads):.1f}, median {median(seen.loads):.1f}, {os.cpu_count()} cores")
-    (folder / "looks.json").write_text(json.dumps({n: [vars(x) for x in looks] for n, looks in seen.looks.items()}))
+    looks = {name: [asdict(look) for look in looks] for name, looks in seen.looks.items()}
+    (folder / "looks.json").write_text(json.dumps(looks))
     print("\n".join(wrong) or "nothing grows, nothing is lost")
     return 1 if wrong else 0
 
@@ -236,7 +251,7 @@ def main() -> int:
     options = parser.parse_args()
     folder = Path(options.folder or tempfile.mkdtemp(prefix="zencell-soak-"))
     print(f"log and looks are in {folder}", flush=True)
-    return asyncio.run(soak(options.minutes, options.settle * 60, options.period, folder, not options.alone))
+    return asyncio.run(soak(options, folder))
 
 
 if __name__ == "__main__":
