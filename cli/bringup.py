@@ -194,10 +194,10 @@ class Operation:
         self.cell: Cell = loaded
         self.summary = Summary(loaded.name, loaded.run.seed, self.launch.clock.speed)
         require_modules(loaded)
-        securing.require_secured(self.launch, loaded)
         if endpoint is None:
             require_free_port(endpoint_of(number))
         self.cell = share.part_of(loaded)
+        securing.require_secured(self.launch, self.cell)
         self._supervisor: Supervisor | None = None
         self._collector: Collector | None = None
         self._screen: Screen | None = None

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Certificates for a cell's processes, and who may do what.", no_args_is_help=True)
 
 DAYS = 365
-SHOWN = ("writes", "reads", "answers", "asks")
+SHOWN = ("writes", "reads", "answers", "asks", "passes on")
 LOCAL = ("localhost", "127.0.0.1", "::1")
 ACCESS_HEAD = "// Who may do what, as the services declare it; all else is denied. Made by `zencell secure init`.\n"
 
@@ -84,7 +84,7 @@ def show(folder: Folder, as_json: options.Json = False) -> None:
 
     place = Path(folder)
     allowed = allowances(read_access(place))
-    for name in [ROUTER_NAME, *allowed]:
+    for name in sorted(allowed, key=[ROUTER_NAME].__contains__, reverse=True):
         file = place / f"{name}.pem"
         try:
             until = f"{certificate_in(file).not_valid_after_utc:%Y-%m-%d}" if file.is_file() else ""
@@ -108,6 +108,7 @@ def check(
     overrides: options.Overrides = None,
     world: options.WorldName = None,
     no_viewer: Annotated[bool, typer.Option("--no-viewer", hidden=True)] = False,
+    only_rules: Annotated[bool, typer.Option("--only-rules", hidden=True)] = False,
 ) -> None:
     """Say whether the certificates are valid, and the rules those that the cells' services need now."""
     from common.config import load_cell, names_of
@@ -119,7 +120,8 @@ def check(
         cell = without_viewer(load_cell(given, overrides or (), world=world), no_viewer)
         again = renewal(folder, given)
         rights = rights_in(cell)
-        require_valid(place, [ROUTER_NAME, OPERATOR, *(common_name(cell.name, process) for process in rights)], again)
+        names = [ROUTER_NAME, OPERATOR, *(common_name(cell.name, process) for process in rights)]
+        require_valid(place, [] if only_rules else names, again)
         require_current(place, read_access(place), cell.name, rights, again)
         typer.echo(f"{cell.name}: {len(rights)} processes, certificates and rules are as they need them")
 
@@ -151,9 +153,11 @@ def rights_in(cell: Cell) -> dict[str, Rights]:
     async def find() -> dict[str, Rights]:
         found = {}
         for entry in cell.services.values():
+            given = dict(entry.parameters)
             if entry.name == VIEWER:  # it listens while it is looked at: where nobody else does
-                entry = entry.model_copy(update={"parameters": {**entry.parameters, "host": "127.0.0.1", "port": 0}})
-            found[entry.name] = rights_of(entry.name, await wiring_of(cell, entry))
+                given |= {"host": "127.0.0.1", "port": 0}
+            wired = await wiring_of(cell, entry.model_copy(update={"parameters": given}))
+            found[entry.name] = rights_of(entry.name, wired)
         return found
 
     return {**asyncio.run(find()), SUPERVISOR: rights_of_supervisor(), RECORDER: rights_of_recorder()}

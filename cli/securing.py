@@ -47,11 +47,12 @@ def require_secured(launch: Launch, cell: Cell) -> None:
         ConfigError, NotSecured: one line that names the process, what is wrong and what would do.
     """
     from common.security.credentials import OPERATOR, ROUTER_NAME, SUPERVISOR, common_name, secure_folder
+    from common.transport.endpoint import is_encrypted
 
     folder = secure_folder()
     if folder is None:
         return
-    if launch.connect and not launch.connect.startswith(("tls/", "quic/")):
+    if launch.connect and not is_encrypted(launch.connect):
         raise ConfigError("--connect", launch.connect, "is an open endpoint: with --secure it must be tls/HOST:PORT")
     from common.security.checking import require_valid
 
@@ -68,7 +69,7 @@ def _require_rules(launch: Launch, cell: Cell, folder: Path) -> None:
     from cli.viewing import VIEWER
     from common.supervision.launch import python_module
 
-    command = [*python_module("cli.main"), "secure", "check", str(folder), "--cell", launch.cell]
+    command = [*python_module("cli.main"), "secure", "check", str(folder), "--only-rules", "--cell", launch.cell]
     for text in launch.overrides:
         command += ["--set", text]
     if launch.world is not None:

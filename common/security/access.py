@@ -10,9 +10,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from common.security.credentials import OBSERVER, OPERATOR, common_name
+from common.security.credentials import OBSERVER, OPERATOR, ROUTER_NAME, common_name
 from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, all_topics, parameters_of
 from common.transport.keys import alive_key, serves_key
+
+MESSAGES = [
+    "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
+    "liveliness_query", "declare_liveliness_subscriber",
+]
 
 
 class Declares(Protocol):
@@ -91,6 +96,13 @@ def access_control(cells: Mapping[str, Mapping[str, Rights]]) -> dict[str, Any]:
             rules += own
             subjects.append({"id": name, "cert_common_names": [name]})
             policies.append({"id": name, "rules": [rule["id"] for rule in own], "subjects": [name]})
+    # The router of another host has let through only what its own rules allow.
+    rules.append({
+        "id": f"{ROUTER_NAME} passes on", "permission": "allow", "flows": ["ingress", "egress"], "messages": MESSAGES,
+        "key_exprs": ["**"],
+    })
+    subjects.append({"id": ROUTER_NAME, "cert_common_names": [ROUTER_NAME]})
+    policies.append({"id": ROUTER_NAME, "rules": [f"{ROUTER_NAME} passes on"], "subjects": [ROUTER_NAME]})
     return {
         "enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies,
     }

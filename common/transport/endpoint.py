@@ -123,6 +123,11 @@ def is_loopback(endpoint: str) -> bool:
     return host in {"localhost", "::1"} or host.startswith("127.")
 
 
+def is_encrypted(endpoint: str) -> bool:
+    """Whether both ends of a connection prove who they are there, and nobody between them can read."""
+    return endpoint.startswith(("tls/", "quic/"))
+
+
 def client_config(endpoint: str, *, connect_ms: int, credentials: Credentials | None = None) -> zenoh.Config:
     """Configuration of a client of the router at an endpoint, which tries for `connect_ms` to reach it at first."""
     return _config(

@@ -22,6 +22,7 @@ from common.transport.endpoint import (
     LISTEN_VARIABLE,
     endpoint_of,
     endpoints_of,
+    is_encrypted,
     is_loopback,
     port_of,
     router_config,
@@ -77,6 +78,10 @@ def open_router(endpoints: Sequence[str], secured: Path | None = None, links: Se
         PortInUse: names the port, the domain and the process that holds it.
         ConfigError: the router can not listen there for another reason.
     """
+    for option, given in (("--listen", endpoints), ("--link", links)):
+        for each in given:
+            if secured is not None and not is_encrypted(each):
+                raise ConfigError(option, each, "is an open endpoint: with certificates it must be tls/HOST:PORT")
     try:
         if secured is None:
             return zenoh.open(router_config(endpoints, links=links))

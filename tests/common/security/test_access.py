@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from common import topics
+from common.errors import ConfigError
+from common.security.access import Rights, access_control, rights_of, rights_of_recorder, rights_of_supervisor
+from common.security.checking import allowances, require_current
+from common.topics import Request, Topic
+
+RENEW = "zencell secure init DIR --renew"
+PLACE = Path("certs")
+
+
+@dataclass
+class Declared:
+    reads: set[Topic[Any]] = field(default_factory=set)
+    writes: set[Topic[Any]] = field(default_factory=set)
+    serves: set[Request[Any, Any]] = field(default_factory=set)
+    calls: set[Request[Any, Any]] = field(default_factory=set)
+
+
+CAMERA = Declared(reads={topics.SCENE_BALLS}, writes={topics.CAMERA_IMAGE, topics.CAMERA_INFO})
+TASK = Declared(reads={topics.GRIPPER_STATE}, calls={topics.GRIPPER_COMMAND, topics.PARAMETERS})
+EXECUTOR = Declared(writes={topics.GRIPPER_STATE}, serves={topics.GRIPPER_COMMAND})
+
+
+def cell(**declared: Declared) -> dict[str, Rights]:
+    return {name: rights_of(name, what) for name, what in declared.items()}
+
+
+def allowed(**declared: Declared) -> dict[str, dict[str, set[str]]]:
+    return allowances(access_control({"panda": cell(**declared)}))
+
+
+def test_a_service_may_do_exactly_what_it_declares() -> None:
+    camera = allowed(camera=CAMERA)["panda.camera"]
+    assert camera["writes"] == {"panda/camera/image_raw", "panda/camera/camera_info", "panda/log", "panda/counters"}
+    assert camera["answers"] == {"panda/camera/camera_info", "panda/param/camera"}
+    assert camera["reads"] == camera["asks"] == {"panda/scene_balls"}
+    assert camera["is there"] == {"panda/alive/camera", "panda/serves/param/camera/camera"}
+
+
+def test_who_calls_may_ask_and_who_serves_may_answer() -> None:
+    both = allowed(task=TASK, executor=EXECUTOR)
+    assert both["panda.task"]["asks"] == {"panda/gripper/command", "panda/gripper/state", "panda/param/*"}
+    assert both["panda.task"]["answers"] == {"panda/param/task"}
+    assert both["panda.executor"]["answers"] == {"panda/gripper/command", "panda/gripper/state", "panda/param/executor"}
+    assert "asks" not in both["panda.executor"]
+
+
+def test_everything_else_is_denied_and_every_rule_names_its_cell() -> None:
+    control = access_control({"panda": {**cell(camera=CAMERA), "supervisor": rights_of_supervisor()}})
+    assert control["enabled"] and control["default_permission"] == "deny"
+    for rule in control["rules"]:
+        assert rule["permission"] == "allow"
+        if rule["id"].startswith("panda."):
+            assert all(key.startswith("panda/") for key in rule["key_exprs"])
+
+
+@pytest.mark.parametrize("name", ["observer", "panda.recorder"])
+def test_who_only_listens_can_ask_for_states_and_for_no_request(name: str) -> None:
+    asks = allowances(access_control({"panda": {"recorder": rights_of_recorder()}}))[name]["asks"]
+    keys = {key.partition("/")[2] for key in asks}
+    assert keys == {topic.key for topic in topics.all_topics().values() if topic.kind == "state"}
+
+
+def test_rules_that_are_those_of_the_services_are_current() -> None:
+    rights = cell(camera=CAMERA, task=TASK)
+    rules = access_control({"panda": rights, "ur5": cell(other=EXECUTOR)})
+    require_current(PLACE, rules, "panda", rights, RENEW)
+    require_current(PLACE, rules, "panda", cell(camera=CAMERA), RENEW)  # fewer are started
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "reason"),
+    [
+        ({"camera": CAMERA}, {"camera": CAMERA, "task": TASK}, "has no rules for panda.task"),
+        ({"task": Declared()}, {"task": TASK}, r"panda\.task than it declares now.*gripper/command is not allowed"),
+        ({"task": TASK}, {"task": Declared()}, r"panda\.task than it declares now.*is allowed and not needed"),
+    ],
+)
+def test_a_service_that_is_missing_or_different_is_named(
+    before: dict[str, Declared], now: dict[str, Declared], reason: str
+) -> None:
+    with pytest.raises(ConfigError, match=reason) as caught:
+        require_current(PLACE, access_control({"panda": cell(**before)}), "panda", cell(**now), RENEW)
+    assert RENEW in str(caught.value)
