@@ -74,7 +74,7 @@ def compose_dev() -> str:
     for name, container in names.items():
         started = " ".join([*container.command, *container.arguments])
         watched = ["/app/common", f"/app/services/{container.name}.py"]
-        blocks.append(_lines(name, {
+        blocks.append(lines_of(name, {
             "image": f"{IMAGE}-dev",
             "build": {"context": ".", "target": "dev"},
             "volumes": [f"./{folder}:/app/{folder}:ro" for folder in SOURCE],
@@ -114,10 +114,10 @@ def _extras(container: Container, before: list[str]) -> dict[str, Any]:
 
 def _block(name: str, container: dict[str, Any]) -> str:
     """A service that takes over what is shared."""
-    return _lines(name, container, "<<: *service")
+    return lines_of(name, container, "<<: *service")
 
 
-def _lines(name: str, container: dict[str, Any], *first: str) -> str:
+def lines_of(name: str, container: dict[str, Any], *first: str) -> str:
     """A service, indented as an entry of `services`."""
     lines = [f"{name}:", *(f"  {line}" for line in first)]
     for key, value in container.items():

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from deploy.compose import compose, compose_dev
 from deploy.manifests import manifests
+from deploy.secured import compose_secure
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -19,6 +20,7 @@ def generated() -> dict[Path, str]:
     return {
         ROOT / "compose.yaml": compose(),
         ROOT / "compose.dev.yaml": compose_dev(),
+        ROOT / "compose.secure.yaml": compose_secure(),
         **{kubernetes / name: text for name, text in manifests().items()},
     }
 
