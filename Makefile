@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup run up test containers check bench chaos docs deploy clean
+.PHONY: setup run up test containers check audit bench chaos docs deploy clean
 
 setup: $(STAMP)
 
@@ -29,6 +29,9 @@ containers: setup  ## build the image and run a cell in containers; needs a cont
 check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+audit: setup  ## known vulnerabilities in the dependencies, where the database can be reached
+	.ci/audit $(BIN)
 
 bench: setup  ## every published figure, one module each
 	@for script in $$(grep -l __main__ benchmarks/*.py); do module=benchmarks.$$(basename $$script .py); \
