@@ -68,9 +68,13 @@ def _send(
     connect: str | None,
 ) -> None:
     from cli.inspection import inspect
+    from cli.presence import cell_clock
     from cli.rendering import to_json
+    from common.messages import Header
 
     async def visit(bus: Bus) -> Message:
+        if isinstance(header := getattr(message, "header", None), Header) and not header.stamp:
+            header.stamp = (await cell_clock(bus)).now_ns()  # decided now
         answer: Message = await bus.client(request).call(message, timeout)
         return answer
 
@@ -127,6 +131,9 @@ def home(
     from common.transport.operator_motion import OperatorMotion
 
     async def visit(bus: Bus) -> Message:
+        from cli.presence import cell_clock
+
+        bus.clock = await cell_clock(bus)  # requests to move say when they were decided
         return await OperatorMotion(bus).move(JointGoal(named="home"), planner=planner)
 
     typer.echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))

@@ -12,11 +12,13 @@ import numpy as np
 from pydantic import Field
 
 from common import topics
-from common.config import Grasp, Parameters, RobotConfig, Run, Tunable, World
+from common.config import Grasp, Members, Parameters, RobotConfig, Run, Tunable, World
+from common.hardware.alone import Alone, WhenAlone
 from common.hardware.checks import Tolerances
 from common.hardware.cycle import ControlCycle
 from common.hardware.interface import Limits
 from common.hardware.loading import find_backend, load_hardware
+from common.hardware.timely import objection
 from common.messages import (
     ExecuteRequest,
     GripperCommand,
@@ -51,6 +53,17 @@ class Config(Parameters):
     joint_state_rate: float = Field(100.0, ge=10, le=1000, description="control cycles in cell time [Hz]")
     speed_scaling: Tunable[float] = Field(1.0, ge=0.05, le=1, description="trajectories are followed at this share "
                                                                            "of their speed")
+    members: Members
+    request_timeout: Tunable[float] = Field(
+        2.0, ge=0.1, le=60, description="a motion that was decided longer ago is refused [s, wall time]"
+    )
+    clock_tolerance: Tunable[float] = Field(
+        0.2, ge=0.01, le=10, description="one that was decided so far in the future is refused too [s, wall time]"
+    )
+    when_alone: Tunable[WhenAlone] = Field(
+        "finish", description="what the arm does when the task is gone in the middle of a motion: finish it, or hold "
+                              "on the path until the task is back"
+    )
     tolerances: Tolerances = Tolerances()
     grasp_tolerances: GraspTolerances = Field(GraspTolerances(), description="simulated hardware only")
 
@@ -103,7 +116,9 @@ async def run(bus: Bus, config: Config) -> None:
         bus.writer(topics.SCENE_OBJECTS).put(WorldObjects(header=bus.header("world"), objects=objects))
 
     async def execute(request: ExecuteRequest) -> MotionStatus:
-        status = cycle.execute(request, bus.clock.now())
+        age = bus.clock.age_ms(request.header.stamp) * 1e-3
+        late = objection(age, config.request_timeout, config.clock_tolerance)
+        status = cycle.execute(request, bus.clock.now(), late)
         if status.state == "rejected":
             bus.log.warning("goal %s rejected: %s [%s]", request.id, status.message, status.error)
         return status.model_copy(update={"header": bus.header()})
@@ -133,6 +148,7 @@ async def run(bus: Bus, config: Config) -> None:
     cycle = await asyncio.to_thread(make_cycle, config, simulated, kept, bus.clock.now())
     if kept is not None:
         bus.log.info("the arm and what is about it are as they were")
+    alone, task = Alone(), config.members.task
     loop = asyncio.get_running_loop()
     period = 1 / bus.clock.wall_rate(config.joint_state_rate, MOST_CYCLES)
     try:
@@ -140,6 +156,7 @@ async def run(bus: Bus, config: Config) -> None:
         due = loop.time()
         while True:
             cycle.speed_scaling = config.speed_scaling
+            cycle.wait(alone.look(task in bus.alive, cycle.goal, config.when_alone), f"{task} is gone")
             report = cycle.step(bus.header("world"))
             if memory is not None and (standing := cycle.standing()) is not None:
                 memory.save(standing)

@@ -76,6 +76,11 @@ class TrajectoryController:
         """What became of the newest goal, and whether and how fast the robot may move."""
         return self._as_of_now(self._status)
 
+    @property
+    def goal(self) -> str:
+        """Id of the goal that moves the robot; empty when there is none."""
+        return self._goal.id if self._goal else ""
+
     def _as_of_now(self, status: MotionStatus) -> MotionStatus:
         now: dict[str, object] = {
             "held": bool(self._holds), "held_by": sorted(self._holds), "speed_scaling": self.speed_scaling,
@@ -84,7 +89,9 @@ class TrajectoryController:
             now["message"] = _told("held", self._holds.values())
         return status.model_copy(update=now)
 
-    def accept(self, goal: str, trajectory: JointTrajectory, now: float, measured: Vector) -> MotionStatus:
+    def accept(
+        self, goal: str, trajectory: JointTrajectory, now: float, measured: Vector, objection: Refused | None = None
+    ) -> MotionStatus:
         """The state of the goal: active, or rejected with code and message; for a known id what became of it.
 
         Args:
@@ -92,11 +99,14 @@ class TrajectoryController:
             trajectory: what to follow.
             now: cell time [s].
             measured: where the robot is, (dof,) [rad].
+            objection: what speaks against a new goal from the start.
         """
         known = self._memory.get(goal)
         if known is not None:
             return self._as_of_now(known)
         try:
+            if objection is not None:
+                raise objection
             if self._fault:
                 raise Refused("hardware_fault", self._fault)
             if self._goal is not None:

@@ -131,6 +131,7 @@ class ControlCycle:
         self._told_gripper: GripperState | None = None
         self._told_version = -1
         self._kept: object = None
+        self._waits = False  # held by ourselves
 
     def step(self, header: Header) -> Report:
         """Do one cycle at the header's time and say what is new."""
@@ -179,9 +180,9 @@ class ControlCycle:
         self._gripper.resume(state.width if state.told_width is None else state.told_width, now)
         self._gripper.update(self._obstructible.read(now))
 
-    def execute(self, request: ExecuteRequest, now: float) -> MotionStatus:
+    def execute(self, request: ExecuteRequest, now: float, objection: Refused | None = None) -> MotionStatus:
         """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
-        return self._arm.accept(request.id, request.trajectory, now, self._q)
+        return self._arm.accept(request.id, request.trajectory, now, self._q, objection)
 
     def stop(self, request: StopRequest, now: float) -> MotionStatus:
         """The state of the goal, which is being brought to rest if it was moving the robot."""
@@ -190,6 +191,17 @@ class ControlCycle:
     def hold(self, request: HoldRequest) -> MotionStatus:
         """The status, with the arm being brought to rest on its path, or going on; the fingers finish their motion."""
         return self._arm.hold(request.hold, request.reason, request.by)
+
+    def wait(self, wait: bool, reason: str = "") -> None:
+        """Bring the arm to rest on its path of our own accord, or let it go on."""
+        if wait != self._waits:
+            self._waits = wait
+            self._arm.hold(wait, reason, "controller")
+
+    @property
+    def goal(self) -> str:
+        """Id of the goal that is followed; empty when there is none."""
+        return self._arm.goal
 
     @property
     def speed_scaling(self) -> float:

@@ -10,12 +10,16 @@ from common.messages.basics import Finite, Fraction, Header, Message, Name
 from common.messages.robot import JointTrajectory
 
 GoalState = Literal["none", "rejected", "active", "succeeded", "aborted", "cancelled"]
-Holder = Literal["person", "watchdog"]
+Holder = Literal["person", "watchdog", "controller"]
 
 
 class ExecuteRequest(Message):
-    """Follow a trajectory. The requester mints `id`; the same id never moves the robot twice."""
+    """Follow a trajectory. The requester mints `id`; the same id never moves the robot twice.
 
+    The header says when that was decided: a request that comes too late is refused.
+    """
+
+    header: Header = Header()
     id: Name
     trajectory: JointTrajectory
 
@@ -32,7 +36,9 @@ class HoldRequest(Message):
 
     hold: bool
     reason: str = ""
-    by: Holder = Field("person", description="each lets go only of its own hold; the robot moves when nobody holds it")
+    by: Literal["person", "watchdog"] = Field(
+        "person", description="each lets go only of its own hold; the robot moves when nobody holds it"
+    )
 
 
 class MotionStatus(Message):
@@ -51,8 +57,8 @@ class MotionStatus(Message):
 
     @property
     def paused(self) -> bool:
-        """Whether somebody has to let go of the robot: a watchdog does so by itself."""
-        return self.held and self.held_by != ["watchdog"]
+        """Whether somebody has to let go of the robot: watchdog and controller do so by themselves."""
+        return self.held and (not self.held_by or "person" in self.held_by)
 
 
 class GripperCommand(Message):

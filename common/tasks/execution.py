@@ -10,6 +10,7 @@ from common import messages as m
 S = TypeVar("S")
 
 Report = m.MotionStatus | m.GripperState
+ANEW = ("busy", "stale_request", "clock_ahead")  # refusals of a motion that have nothing to do with the motion
 FOUND_HELD = "the robot was found held; resume or start to go on"
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 

@@ -14,8 +14,9 @@ from pydantic import Field
 
 from common import messages as m
 from common.config import GripperConfig, Tunable
-from common.tasks.execution import FOUND_HELD, Execution, note_plan
+from common.tasks.execution import ANEW, FOUND_HELD, Execution, note_plan
 from common.tasks.outline_legs import Close, Leg, Legs, OutlineView, TracingParameters, closed, length
+from common.tasks.pictures import Pictures
 
 Stage = Leg | Close
 Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
@@ -33,6 +34,10 @@ class OutlineParameters(TracingParameters):
     )
     frame_timeout: Tunable[float] = Field(
         3.0, ge=0.1, le=60, description="a contour from an older picture starts no motion [s, wall time]"
+    )
+    clock_tolerance: Tunable[float] = Field(
+        0.2, ge=0.01, le=10, description="a picture from so far in the future starts no motion: the clocks of camera "
+                                         "and task differ [s, wall time]"
     )
     joint_states_timeout: Tunable[float] = Field(
         0.2, ge=0.05, le=60, description="without joint states for so long the arm is held on its path [s, wall time]"
@@ -62,6 +67,7 @@ class Outline:
         self.p, self.legs = parameters, Legs(parameters, gripper)
         self.status = m.OutlineStatus(started=started, standoff=parameters.standoff)
         self._home, self._speed = home, speed
+        self._pictures = Pictures(speed)
         self._ids = (f"{prefix}-{n}" for n in itertools.count(1))
         self._stages: deque[Stage] = deque()
         self._running: Execution[Stage] | None = None
@@ -128,7 +134,8 @@ class Outline:
         if self._running is None or self._running.command.id != answer.id or self._running.accept(answer):
             return
         stage, self._running = self._running.stage, None
-        if isinstance(answer, m.MotionStatus) and answer.error == "busy":  # with what somebody else asked for
+        # What somebody else asked for, or that it came too late, is no failure: it is decided anew.
+        if isinstance(answer, m.MotionStatus) and answer.error in ANEW:
             self._clear()
             self._returned, self.status.message = False, f"{stage.name} has to wait: {answer.message}"
             return
@@ -212,11 +219,11 @@ class Outline:
         if path is not None and path.header.stamp * 1e-9 < self._still_since:
             path = None
         solid = view.solid()
-        if path is not None and len(path.poses) > 1 and solid is not None and self._is_fresh(path, view):
+        if path is not None and len(path.poses) > 1 and solid is not None and not self._unseen(path, view):
             self._take(path, solid, view)
             return
-        if path is not None and not self._is_fresh(path, view):
-            problem = "no fresh picture"
+        if path is not None and (unseen := self._unseen(path, view)):
+            problem = unseen
         elif path is None:
             problem = "no contour came from the camera"
         elif not path.poses:
@@ -242,10 +249,10 @@ class Outline:
             self._stages.append(Close())
         self._stages += self.legs.outline(points, solid)
 
-    def _is_fresh(self, path: m.OutlinePoints, view: OutlineView) -> bool:
-        """Whether the picture in which a contour was found is new enough to decide by."""
-        # A picture that is late by the clock on the wall is later still by that of a fast cell.
-        return view.now - path.header.stamp * 1e-9 < self.p.frame_timeout * self._speed
+    def _unseen(self, path: m.OutlinePoints, view: OutlineView) -> str:
+        """Why the picture in which a contour was found can not be decided by; empty when it can."""
+        stamps = (path.header.stamp * 1e-9,)
+        return self._pictures.problem(view.now, stamps, self.p.frame_timeout, self.p.clock_tolerance)
 
     def _is_home(self, view: OutlineView) -> bool:
         assert view.q is not None
@@ -280,7 +287,7 @@ class Outline:
             command = m.GripperCommand(id=next(self._ids), width=0.0)
         elif all(leg.trajectory is not None for leg in self._stages if isinstance(leg, Leg)):
             assert stage.trajectory is not None
-            if stage.name == "approach" and (view.path is None or not self._is_fresh(view.path, view)):
+            if stage.name == "approach" and (view.path is None or self._unseen(view.path, view)):
                 self._clear()  # look again: what was planned around may have moved
                 self._selecting_since = None
                 return

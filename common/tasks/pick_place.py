@@ -15,8 +15,9 @@ from collections.abc import Iterator
 from common import messages as m
 from common.config import Grasp, GripperConfig, Surroundings
 from common.tasks.choice import Choice
-from common.tasks.execution import FOUND_HELD, Execution, Report, note_plan
+from common.tasks.execution import ANEW, FOUND_HELD, Execution, Report, note_plan
 from common.tasks.pick_place_parameters import PickPlaceParameters
+from common.tasks.pictures import Pictures
 from common.tasks.row import Rows
 from common.tasks.stages import Command, Cycle, Grip, Move, Stage, Target, View, appeared
 
@@ -39,7 +40,8 @@ class PickPlace:
             started: whether to begin without being told.
             speed: cell time that passes per wall time.
         """
-        self.p, self.around, self.gripper, self.prefix, self._speed = parameters, around, gripper, prefix, speed
+        self.p, self.around, self.gripper, self.prefix = parameters, around, gripper, prefix
+        self._pictures = Pictures(speed)
         self.rows = Rows(grasp, around, gripper, parameters)
         self.choice = Choice(parameters, around.container, around.ball_radius)
         self.status = m.PickPlaceStatus(started=started)
@@ -92,7 +94,8 @@ class PickPlace:
         if self._running is None or self._running.command.id != answer.id or self._running.accept(answer):
             return
         stage, self._running = self._running.stage, None
-        if isinstance(answer, m.MotionStatus) and answer.error == "busy":  # with what somebody else asked for
+        # What somebody else asked for, or that it came too late, is no failure: it is decided anew.
+        if isinstance(answer, m.MotionStatus) and answer.error in ANEW:
             self._clear()
             self._look_after = view.now
             self.status.message = f"{stage.name} has to wait: {answer.message}"
@@ -260,7 +263,7 @@ class PickPlace:
     def _queue_next(self, view: View) -> bool:
         """Append the stages for the nearest ball that can be taken; whether there is one."""
         assert view.tcp is not None and view.gripper is not None
-        if min(view.targets_stamp, view.scene_stamp) <= self._look_after or not self._is_fresh(view):
+        if min(view.targets_stamp, view.scene_stamp) <= self._look_after or self._unseen(view):
             return False
         under_way = [self._running.stage.cycle] if self._running and self._running.stage.cycle else []
         box = self.around.container
@@ -280,8 +283,8 @@ class PickPlace:
         left = max(len(view.balls()), len(view.targets))  # one of the two may have just begun to look
         # Time of pictures, not of the clock: that nobody looks any more is no sign of an empty table.
         seen = max(self._look_after, min(view.targets_stamp, view.scene_stamp))
-        if not self._is_fresh(view):
-            self._quiet, self.status.message = None, "no fresh picture"
+        if unseen := self._unseen(view):
+            self._quiet, self.status.message = None, unseen
         elif self._quiet is None or self._quiet[1] != bool(left):
             self._quiet = (seen, bool(left))
             self.status.message = f"{left} objects are left that can not be taken" if left else "the table looks empty"
@@ -346,8 +349,8 @@ class PickPlace:
             if not self._is_planned(stage):
                 return
             if stage.name in ("pre-grasp", "descend"):
-                if not self._is_fresh(view):
-                    self.status.message = f"{stage.name} waits for a fresh picture"
+                if unseen := self._unseen(view):
+                    self.status.message = f"{stage.name} waits: {unseen}"
                     return
                 if not self._is_still_there(stage, view):
                     self.status.message = f"{stage.name}: the ball is no longer where it was seen"
@@ -385,10 +388,10 @@ class PickPlace:
         place = move.cycle.target.position if move.cycle else (0.0, 0.0, 0.0)
         return any(math.dist(t[:2], place[:2]) <= self.p.moved for t in view.targets)
 
-    def _is_fresh(self, view: View) -> bool:
-        """Whether the newest picture is new enough to decide by."""
-        # A picture that is late by the clock on the wall is later still by that of a fast cell.
-        return view.fresh(self.p.frame_timeout * self._speed)
+    def _unseen(self, view: View) -> str:
+        """Why the newest picture can not be decided by; empty when it can."""
+        stamps = (view.targets_stamp, view.scene_stamp)
+        return self._pictures.problem(view.now, stamps, self.p.frame_timeout, self.p.clock_tolerance)
 
     def _mint(self) -> str:
         self._minted += 1

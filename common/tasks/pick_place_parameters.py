@@ -34,6 +34,10 @@ class PickPlaceParameters(Parameters):
     frame_timeout: Tunable[float] = Field(
         1.0, ge=0.1, le=60, description="an older picture starts no motion [s, wall time]"
     )
+    clock_tolerance: Tunable[float] = Field(
+        0.2, ge=0.01, le=10, description="a picture from so far in the future starts no motion: the clocks of camera "
+                                         "and task differ [s, wall time]"
+    )
     joint_states_timeout: Tunable[float] = Field(
         0.2, ge=0.05, le=60, description="without joint states for so long the arm is held on its path [s, wall time]"
     )

@@ -92,10 +92,6 @@ class View:
         """Time of the newest frame that the planning scene holds [s]."""
         return self.scene.header.stamp * 1e-9 if self.scene else 0.0
 
-    def fresh(self, longest: float) -> bool:
-        """Whether picture and planning scene are younger than `longest` [s]."""
-        return self.now - self.targets_stamp < longest and self.now - self.scene_stamp < longest
-
     def objects(self, role: str) -> list[m.CollisionObject]:
         """Objects of the planning scene with that role."""
         return [o for o in self.scene.objects if o.role == role] if self.scene else []

@@ -104,7 +104,7 @@ class OperatorMotion:
         held = (await self._require_free()).held
         if held:  # with nothing under way, letting go moves nothing
             await self._hold.call(m.HoldRequest(hold=False, reason="a person moves the robot"), REQUEST_TIMEOUT)
-        request = m.ExecuteRequest(id=_mint(), trajectory=trajectory)
+        request = m.ExecuteRequest(header=self._bus.header(), id=_mint(), trajectory=trajectory)
         try:
             answer = await self._execute.call(request, REQUEST_TIMEOUT)
             if answer.state == "rejected":

@@ -141,6 +141,8 @@ class TaskRunner:
 
     def _begin(self, group: asyncio.TaskGroup, command: Command) -> None:
         """Send a command; what it makes void is not asked for again, should it still be without an answer."""
+        if isinstance(command, m.ExecuteRequest):
+            command.header = self._bus.header()  # of the decision, however often it is sent
         void = self._asking.pop(_voided(command), None)
         if void is not None:
             void.cancel()

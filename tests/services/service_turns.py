@@ -192,7 +192,8 @@ async def execute(bus: Bus) -> AsyncIterator[m.MotionStatus]:
                 velocities=[sign * distance * ds, *[0.0] * 6], accelerations=[sign * distance * dds, *[0.0] * 6]))
         trajectory = m.JointTrajectory(joint_names=PANDA.robot.joints, points=points)
         turn += 1
-        answer = await call.call(m.ExecuteRequest(id=f"goal-{turn}", trajectory=trajectory), PATIENCE)
+        request = m.ExecuteRequest(header=bus.header(), id=f"goal-{turn}", trajectory=trajectory)
+        answer = await call.call(request, PATIENCE)
         if answer.state == "active":
             answer = await heard(status, lambda s, turn=turn: s.id == f"goal-{turn}" and s.state != "active")
         yield answer

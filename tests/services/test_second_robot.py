@@ -84,11 +84,11 @@ async def test_it_follows_a_trajectory_and_signs_with_its_name(robot: RobotModel
     home, there = robot.named("home"), robot.named("default")
     async with executor() as bus:
         motion, execute = bus.reader(topics.MOTION_STATUS), bus.client(topics.MOTION_EXECUTE)
-        answer = await execute.call(ExecuteRequest(id="up", trajectory=move(robot, home, there)))
+        answer = await execute.call(ExecuteRequest(header=bus.header(), id="up", trajectory=move(robot, home, there)))
         assert answer.state == "active", answer.message
         done = await see(motion, lambda m: m.id == "up" and m.state != "active")
         joints = await bus.reader(topics.JOINT_STATES).next()
-        again = await execute.call(ExecuteRequest(id="again", trajectory=move(robot, home, there)))
+        again = await execute.call(ExecuteRequest(header=bus.header(), id="again", trajectory=move(robot, home, there)))
     assert (done.state, done.source) == ("succeeded", "joint_trajectory_controller")
     assert joints.position[:6] == pytest.approx(there, abs=1e-6)
     assert (again.state, again.error, again.source) == ("rejected", "start_mismatch", "joint_trajectory_controller")

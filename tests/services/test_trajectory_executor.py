@@ -14,6 +14,7 @@ from common.errors import ConfigError, RemoteError, UnknownName
 from common.messages import (
     ExecuteRequest,
     GripperCommand,
+    Header,
     HoldRequest,
     JointTrajectory,
     JointTrajectoryPoint,
@@ -35,8 +36,11 @@ CELL = "test"
 SPEED = 10.0
 
 
+PATIENT = "services.trajectory_executor.request_timeout=60"  # a busy machine is no reason to refuse
+
+
 def config(*overrides: str) -> Config:
-    return service_config(load_cell("panda", list(overrides)), "trajectory_executor", Config)
+    return service_config(load_cell("panda", [PATIENT, *overrides]), "trajectory_executor", Config)
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +72,11 @@ class Person:
                 message = await reader.next()
             return message
 
+    def asks(self, **fields):
+        return ExecuteRequest(header=self.bus.header(), **fields)
+
     async def follow(self, goal, trajectory):
-        answer = await self.execute.call(ExecuteRequest(id=goal, trajectory=trajectory))
+        answer = await self.execute.call(self.asks(id=goal, trajectory=trajectory))
         assert answer.state == "active", answer.message
         return await self.see(self.motion, lambda m: m.id == goal and m.state != "active")
 
@@ -148,7 +155,7 @@ async def test_same_goal_again_is_answered_and_not_done_twice(robot: RobotModel)
     there = move(robot, home, home + 0.2)
     async with executor() as person:
         await person.follow("a", there)
-        again = await person.execute.call(ExecuteRequest(id="a", trajectory=there))
+        again = await person.execute.call(person.asks(id="a", trajectory=there))
         assert (again.id, again.state) == ("a", "succeeded")
         state = await person.see(person.joints, lambda s: s.header.stamp > again.header.stamp)
         assert np.allclose(state.position[:7], home + 0.2) and not any(state.velocity)
@@ -162,7 +169,7 @@ async def test_refused_trajectories_are_answered_with_the_reason_and_the_next_is
     backwards = good.model_copy(update={"points": [*good.points[:5], good.points[3], *good.points[6:]]})
     async with executor() as person:
         for code, trajectory in (("start_mismatch", elsewhere), ("joint_names", other), ("bad_times", backwards)):
-            answer = await person.execute.call(ExecuteRequest(id=code, trajectory=trajectory))
+            answer = await person.execute.call(person.asks(id=code, trajectory=trajectory))
             assert (answer.state, answer.error) == ("rejected", code) and answer.message
         assert (await person.follow("good", good)).state == "succeeded"
 
@@ -170,7 +177,7 @@ async def test_refused_trajectories_are_answered_with_the_reason_and_the_next_is
 async def test_stop_brings_the_arm_to_rest(robot: RobotModel) -> None:
     home = robot.named("home")
     async with executor() as person:
-        await person.execute.call(ExecuteRequest(id="a", trajectory=move(robot, home, home + 0.5, 0.02)))
+        await person.execute.call(person.asks(id="a", trajectory=move(robot, home, home + 0.5, 0.02)))
         await person.see(person.motion, lambda m: m.progress > 0.2)
         await person.stop.call(StopRequest(reason="tested"))
         status = await person.see(person.motion, lambda m: m.state != "active")
@@ -182,7 +189,7 @@ async def test_stop_brings_the_arm_to_rest(robot: RobotModel) -> None:
 async def test_held_arm_stands_still_whoever_asked_for_it_and_goes_on_when_let_go(robot: RobotModel) -> None:
     home = robot.named("home")
     async with executor() as person:
-        await person.execute.call(ExecuteRequest(id="a", trajectory=move(robot, home, home + 0.5, 0.02)))
+        await person.execute.call(person.asks(id="a", trajectory=move(robot, home, home + 0.5, 0.02)))
         await person.see(person.motion, lambda m: m.progress > 0.2)
         asking = asyncio.create_task(person.hold.call(HoldRequest(hold=True, reason="tested")))
         status = await person.see(person.motion, lambda m: m.message == "held: tested")
@@ -209,7 +216,7 @@ async def test_speed_scaling_that_is_set_while_it_moves_slows_the_arm_down(robot
     async with net.running(trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
         person = Person(net, clock)
         trajectory = move(robot, home, home + 0.5, 0.02)
-        await person.execute.call(ExecuteRequest(id="a", trajectory=trajectory))
+        await person.execute.call(person.asks(id="a", trajectory=trajectory))
         began = clock.now()
         await person.see(person.motion, lambda m: m.progress > 0.1)
         given.speed_scaling = 0.2
@@ -231,11 +238,76 @@ async def test_world_edits_show_in_the_truth_and_bad_ones_are_refused() -> None:
         await person.see(person.balls, lambda b: len(b.ids) == 2)
 
 
+@pytest.mark.parametrize(("age", "code", "said"), [
+    (70.0, "stale_request", "s old"), (-30.0, "clock_ahead", "s ahead"), (None, "stale_request", "header.stamp"),
+])
+async def test_request_that_is_late_or_from_the_future_moves_nothing(
+    robot: RobotModel, age: float | None, code: str, said: str
+) -> None:
+    home = robot.named("home")
+    async with executor() as person:
+        stamp = 0 if age is None else person.bus.clock.now_ns() - int(age * SPEED * 1e9)
+        request = ExecuteRequest(header=Header(stamp=stamp), id="a", trajectory=move(robot, home, home + 0.2))
+        answer = await person.execute.call(request)
+        assert (answer.state, answer.error) == ("rejected", code) and said in answer.message
+        assert (await person.follow("b", move(robot, home, home + 0.2))).state == "succeeded"
+
+
+async def test_request_that_was_carried_out_is_not_again_when_it_is_replayed_later(robot: RobotModel) -> None:
+    home = robot.named("home")
+    net, clock, given = LocalNetwork(), Clock(SPEED), config()
+    async with net.running(trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
+        person = Person(net, clock)
+        there = person.asks(id="a", trajectory=move(robot, home, home + 0.2))
+        assert (await person.execute.call(there)).state == "active"
+        await person.see(person.motion, lambda m: m.id == "a" and m.state == "succeeded")
+        await person.follow("b", move(robot, home + 0.2, home))
+        given.request_timeout = 0.1
+        late = there.header.stamp + 0.2 * SPEED * 1e9
+        await person.see(person.joints, lambda s: s.header.stamp > late)
+        assert (await person.execute.call(there)).state == "succeeded", "what became of it"
+        again = there.model_copy(update={"id": "c"})
+        assert (await person.execute.call(again)).error == "stale_request"
+
+
+async def alone(net: LocalNetwork, clock: Clock, given: object, robot: RobotModel) -> tuple[Person, object]:
+    """A person who sees an arm in the middle of a motion, whose task is still there."""
+    person, task = Person(net, clock), net.bus("smart_pick_place", cell=CELL, clock=clock)
+    await task.ready()
+    await person.see(person.joints, lambda s: True)
+    home = robot.named("home")
+    assert (await person.execute.call(person.asks(id="a", trajectory=move(robot, home, home + 0.5, 0.02)))).error == ""
+    await person.see(person.motion, lambda m: m.progress > 0.1)
+    return person, task
+
+
+async def test_arm_that_is_to_hold_when_alone_waits_on_its_path_for_the_task_and_goes_on(robot: RobotModel) -> None:
+    net, clock, given = LocalNetwork(), Clock(SPEED), config("services.trajectory_executor.when_alone=hold")
+    async with net.running(trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
+        person, task = await alone(net, clock, given, robot)
+        await task.close()
+        held = await person.see(person.motion, lambda m: m.message == "held: smart_pick_place is gone")
+        assert held.held_by == ["controller"] and held.progress < 0.9 and not held.paused
+        back = net.bus("smart_pick_place", cell=CELL, clock=clock)
+        await back.ready()
+        done = await person.see(person.motion, lambda m: m.state != "active")
+        assert (done.id, done.state, done.held) == ("a", "succeeded", False)
+
+
+async def test_arm_that_is_alone_finishes_its_motion_unless_told_otherwise(robot: RobotModel) -> None:
+    net, clock, given = LocalNetwork(), Clock(SPEED), config()
+    async with net.running(trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
+        person, task = await alone(net, clock, given, robot)
+        await task.close()
+        done = await person.see(person.motion, lambda m: m.state != "active" or m.held)
+        assert (done.id, done.state) == ("a", "succeeded")
+
+
 async def test_goal_outlives_its_requester(robot: RobotModel) -> None:
     home = robot.named("home")
     async with executor() as person:
         asking = asyncio.create_task(
-            person.execute.call(ExecuteRequest(id="a", trajectory=move(robot, home, home + 0.3, 0.1))))
+            person.execute.call(person.asks(id="a", trajectory=move(robot, home, home + 0.3, 0.1))))
         await person.see(person.motion, lambda m: m.id == "a" and m.state == "active")
         asking.cancel()
         assert (await person.see(person.motion, lambda m: m.state != "active")).state == "succeeded"
