@@ -1,0 +1,248 @@
+"""The telemetry of many cells through one router: latency, losses, and what the router needs.
+
+`python -m benchmarks.fleet` replays what the services of a Panda cell really said, as often each second as they say it,
+for 1, 2, 5, 10, 25, 50 and 100 cells: joint states at 100 Hz, transforms at 30 Hz, scene, targets, status, counters,
+and each state again every second; about 240 messages or 220 kB a second for a cell. Pictures stay in their cell
+unless `--pictures` says how many of each cell go through every second. Loopback only, about two minutes.
+
+Every cell is two clients of the router, one that writes and one that reads all of it; two processes hold the writers,
+two the readers. Latency is from the put in one process to the callback in another.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import heapq
+import multiprocessing
+import os
+import random
+import struct
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import zenoh
+
+from benchmarks.runs import RunningCell, free_domain
+from benchmarks.transport import router
+from common import topics
+from common.messages import Header, Image
+from common.topics import Topic
+from common.transport.codec import encode
+from common.transport.connect import connect
+from common.transport.endpoint import client_config, endpoint_of
+from common.transport.session import RawSample
+from common.transport.zenoh_session import ZenohSession
+
+CELL = "panda"
+CELLS = (1, 2, 5, 10, 25, 50, 100)
+PROCESSES = 2  # that write, and as many that read
+# How often a working cell says what [Hz], repetitions of states included; the rest once a second.
+RATES = {
+    "joint_states": 100.0, "tf": 30.0, "planning_scene": 20.0, "detected_objects": 10.0, "validated_targets": 10.0,
+    "counters": 10.0, "scene_balls": 8.0, "motion/status": 8.0, "display_trajectory": 2.0, "pick_place_status": 2.0,
+    "gripper/state": 1.0, "supervisor/status": 1.0, "camera/camera_info": 1.0, "workspace_markers": 1.0,
+    "tf_static": 1.0, "log": 1.0,
+}
+SETTLE, MEASURED, REST = 3.0, 6.0, 0.5  # [s]
+CONNECT_MS = 60_000
+GATHERING = 120.0  # [s] for a cell to say all of it
+NOTE = struct.Struct("<qI")  # when it was put [ns, monotonic] and its number
+
+
+@dataclass
+class Spoken:
+    """What one topic of a cell says, again and again."""
+
+    key: str
+    payload: bytes
+    rate: float  # [Hz]
+    reliable: bool
+
+
+async def gather(folder: Path) -> list[Spoken]:
+    """The largest of the first messages of each topic of a working cell.
+
+    Raises:
+        TimeoutError: not all came.
+    """
+    found: dict[str, bytes] = {}
+    with RunningCell(folder, "run", CELL) as cell:
+        async with asyncio.timeout(GATHERING), connect(
+            cell=CELL, service="watcher", endpoint=cell.endpoint, timeout=GATHERING
+        ) as bus:
+            settled: float | None = None
+            async for sample in bus.raw_reader(f"{CELL}/**"):
+                key = sample.key.removeprefix(f"{CELL}/")
+                if key in RATES and len(sample.payload) > len(found.get(key, b"")):
+                    found[key] = sample.payload
+                if settled is None and found.keys() == RATES.keys():
+                    settled = time.monotonic() + REST
+                if settled is not None and time.monotonic() > settled:
+                    break
+        cell.interrupt()
+        await cell.ended(30.0)
+    kinds = {key: topic.kind for key, topic in topics.all_topics().items()}
+    return [Spoken(key, found[key], rate, kinds[key] != "stream") for key, rate in RATES.items()]
+
+
+def picture(rate: float) -> Spoken:
+    """A picture of the camera."""
+    topic: Topic[Image] = topics.CAMERA_IMAGE
+    data = random.Random(0).randbytes(640 * 480 * 3)
+    message = Image(header=Header(), width=640, height=480, encoding="bgr8", data=data)
+    return Spoken(topic.key, encode(message), rate, reliable=False)
+
+
+def _sessions(endpoint: str, names: list[str]) -> Iterator[tuple[str, ZenohSession]]:
+    for name in names:
+        yield name, ZenohSession(zenoh.open(client_config(endpoint, connect_ms=CONNECT_MS)))
+
+
+def write(endpoint: str, names: list[str], spoken: list[Spoken], parent: Connection) -> None:
+    """Be a process that speaks for some cells until it is told to stop."""
+    sys.setswitchinterval(0.0005)
+    due: list[tuple[float, int, float, Any, bytes]] = []
+    offsets = random.Random(1)
+    for name, session in _sessions(endpoint, names):
+        for one in spoken:
+            publisher = session.publisher(f"{name}/{one.key}", "application/msgpack", reliable=one.reliable)
+            due.append((offsets.random() / one.rate, len(due), 1 / one.rate, publisher, one.payload))
+    heapq.heapify(due)
+    numbers = [0] * len(due)
+    parent.send("ready")
+    parent.recv()
+    start, sent, asked, late = time.monotonic(), 0, False, 0.0
+    while not asked:
+        now = time.monotonic() - start
+        while due[0][0] <= now:
+            at, which, period, publisher, payload = due[0]
+            late = max(late, now - at)
+            numbers[which] += 1
+            publisher.put(payload, NOTE.pack(time.monotonic_ns(), numbers[which]))
+            heapq.heapreplace(due, (at + period, which, period, publisher, payload))
+            sent += 1
+            now = time.monotonic() - start
+            if not sent % 256 and parent.poll():
+                break
+        asked = parent.poll(max(0.0, min(0.05, due[0][0] - now)))
+    parent.send((sent / (time.monotonic() - start), late))
+    os._exit(0)
+
+
+class Ear:
+    """Times and gaps of what comes in."""
+
+    def __init__(self) -> None:
+        self.on = False
+        self.times: list[int] = []  # [ns]
+        self.lost = 0
+        self.size = 0
+        self._newest: dict[str, int] = {}
+
+    def hear(self, sample: RawSample) -> None:
+        """Take note of a message."""
+        now = time.monotonic_ns()
+        assert sample.attachment is not None
+        put, number = NOTE.unpack(sample.attachment)
+        before = self._newest.get(sample.key)
+        self._newest[sample.key] = number
+        if self.on:
+            self.times.append(now - put)
+            self.size += len(sample.payload)
+            if before is not None:
+                self.lost += number - before - 1
+
+
+def read(endpoint: str, names: list[str], parent: Connection) -> None:
+    """Be a process that hears some cells: told to begin, it counts; told to stop, it sends what it found."""
+    sys.setswitchinterval(0.0005)
+    ear = Ear()
+    kept = [session.subscriber(f"{name}/**", ear.hear) for name, session in _sessions(endpoint, names)]
+    parent.send("ready")
+    parent.recv()
+    ear.on = True
+    parent.recv()
+    ear.on = False
+    parent.send((np.array(ear.times) * 1e-6, ear.lost, ear.size, len(kept)))
+    os._exit(0)
+
+
+def fleet(cells: int, spoken: list[Spoken]) -> str:
+    """A line of the table: so many cells through a new router."""
+    domain = free_domain()
+    endpoint = endpoint_of(domain)
+    names = [f"cell_{number}" for number in range(cells)]
+    shares = [share for part in range(PROCESSES) if (share := names[part::PROCESSES])]
+    context = multiprocessing.get_context("spawn")
+    with router(domain) as routing, ExitStack() as stack:
+
+        def start(target: Any, *arguments: Any) -> Connection:
+            ours, theirs = context.Pipe()
+            process = context.Process(target=target, args=(endpoint, *arguments, theirs), daemon=True)
+            process.start()
+            stack.callback(process.join)
+            stack.callback(process.kill)
+            return ours
+
+        readers = [start(read, share) for share in shares]
+        writers = [start(write, share, spoken) for share in shares]
+        for one in (*readers, *writers):
+            one.recv()
+        for writer in writers:
+            writer.send("go")
+        time.sleep(SETTLE)
+        process = psutil.Process(routing.pid)
+        before, began = sum(process.cpu_times()[:2]), time.monotonic()
+        for reader in readers:
+            reader.send("begin")
+        time.sleep(MEASURED)
+        for reader in readers:
+            reader.send("stop")
+        took = time.monotonic() - began
+        share, memory = (sum(process.cpu_times()[:2]) - before) / took, process.memory_full_info().pss / 1e6
+        heard = [reader.recv() for reader in readers]
+        for writer in writers:
+            writer.send("stop")
+        told = [writer.recv() for writer in writers]
+    times = np.concatenate([one[0] for one in heard])
+    lost, size = sum(one[1] for one in heard), sum(one[2] for one in heard)
+    p50, p99 = np.percentile(times, [50, 99])
+    wanted, sent = cells * sum(one.rate for one in spoken), sum(one[0] for one in told)
+    return (f"| {cells} | {sent:.0f} of {wanted:.0f} | {len(times) / took:.0f} | {size / took / 1e6:.1f} | {p50:.2f} | "
+            f"{p99:.1f} | {lost} ({lost / (lost + len(times)):.2%}) | {share:.0%} | {memory:.0f} | "
+            f"{os.getloadavg()[0]:.0f} |")
+
+
+def main() -> int:
+    """Read the options and measure."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.fleet", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--cells", type=int, nargs="+", default=CELLS)
+    parser.add_argument("--pictures", type=float, default=0.0, metavar="HZ", help="of each cell [0]")
+    options = parser.parse_args()
+    spoken = asyncio.run(gather(Path(tempfile.mkdtemp(prefix="zencell-fleet-"))))
+    if options.pictures:
+        spoken.append(picture(options.pictures))
+    print("| topic | bytes | Hz |\n|---|---|---|")
+    for one in spoken:
+        print(f"| {one.key} | {len(one.payload):,} | {one.rate:g} |")
+    print(f"| together | {sum(len(one.payload) * one.rate for one in spoken):,.0f} a second | "
+          f"{sum(one.rate for one in spoken):g} |\n")
+    print("| cells | sent each second | heard each second | MB/s | p50 [ms] | p99 [ms] | lost | router, of one core | "
+          "router, PSS [MB] | load |\n|---|---|---|---|---|---|---|---|---|---|")
+    for cells in options.cells:
+        print(fleet(cells, spoken), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
