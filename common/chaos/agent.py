@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from common.transport.bus import Bus, Reader
     from common.transport.session import RawSample
 
-PATIENCE = 4.0  # [s]
+PATIENCE = 4.0  # [s] that a fault of a process waits for a ball in the hand
+SLIP_PATIENCE = 20.0  # [s] that a ball has to be taken before it slips
 SAMPLE_SECONDS = 1.5  # within which a state is repeated
 DROP_TIMEOUT = 1.0  # [s]
 SPACING = 0.02  # [s] between bad messages in a row
@@ -50,7 +51,7 @@ class Chaos:
 
     def __init__(
         self, bus: Bus, plan: Iterable[Fault], pids: Callable[[], dict[str, int]], container: Container | None,
-        patience: float = PATIENCE,
+        patience: float = SLIP_PATIENCE,
     ) -> None:
         """Declare what is listened to.
 
@@ -59,7 +60,7 @@ class Chaos:
             plan: faults in order of time.
             pids: the processes that run now, by name.
             container: balls are let slip clear of its edge; None when there are no balls.
-            patience: that a fault waits for a ball in the hand [s, wall time].
+            patience: that there has to be a ball in the hand before it slips [s, wall time].
         """
         self.happened: list[Happened] = []
         self._bus, self._plan, self._pids, self._container = bus, plan, pids, container
@@ -78,7 +79,7 @@ class Chaos:
                 for fault in self._plan:
                     await asyncio.sleep(max(0.0, self._began + fault.at - time.monotonic()))
                     if fault.holding:
-                        await _until(self._gripper, self._is_holding, self._patience)
+                        await _until(self._gripper, self._is_holding, PATIENCE)
                     await self._begin(fault, lasting)
             if self._stopped:  # and stays so until somebody else ends it, or us
                 await asyncio.Event().wait()
@@ -93,7 +94,7 @@ class Chaos:
     async def _begin(self, fault: Fault, lasting: asyncio.TaskGroup) -> None:
         """Carry out a fault; one that lasts goes on beside those that follow."""
         if fault.kind == "drop":
-            await self._drop(fault)
+            lasting.create_task(self._drop(fault))  # others need not wait until a ball is in the hand
         elif fault.kind in ("corrupt", "replay"):
             lasting.create_task(self._disturb(fault))
         elif (pid := self._pids().get(fault.target)) is None:
@@ -140,13 +141,13 @@ class Chaos:
 
     async def _drop(self, fault: Fault) -> None:
         rng = np.random.default_rng(fault.seed)
-        if self._edit is None or not await _until(self._balls, self._may_slip, self._patience):
-            log.info("there is no ball in the hand to be let slip")
+        if self._edit is None:
             return
-        await asyncio.sleep(float(rng.uniform(0, 0.3)))
-        if not self._may_slip():
-            log.info("there is no ball in the hand to be let slip any more")
-            return
+        for wait in (float(rng.uniform(0, 0.3)), 0.0):
+            if not await _until(self._balls, self._may_slip, self._patience):
+                log.info("there is no ball in the hand to be let slip")
+                return
+            await asyncio.sleep(wait)  # not always as soon as it may
         try:
             await self._edit.call(WorldEdit(op="drop"), DROP_TIMEOUT)
         except RequestFailed as error:
