@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, JsonValue
 
-from common.messages.basics import Finite, Message, Name
+from common.messages.basics import Finite, Header, Message, Name
 
 
 class Parameter(Message):
@@ -34,7 +34,8 @@ class ParameterRequest(Message):
 
 
 class ParameterReply(Message):
-    """All parameters of the service, after the change."""
+    """All parameters of the service, after the change. The stamp tells how the clocks of two hosts differ."""
 
+    header: Header = Header()
     service: str
     parameters: list[Parameter]

@@ -21,6 +21,7 @@ def serve_parameters(bus: Bus, config: Parameters) -> None:
             for line in lines:
                 bus.log.info("%s (by %s)", line, request.by or "somebody")
             bus.parameters_changed()
-        return ParameterReply(service=bus.service, parameters=describe(config, bus.service, started))
+        parameters = describe(config, bus.service, started)
+        return ParameterReply(header=bus.header(), service=bus.service, parameters=parameters)
 
     bus.serve(topics.parameters_of(bus.service), handle)

@@ -31,6 +31,8 @@ class CellDouble:
         self.unplannable = lambda request: ""  # noqa: E731 - replaced by tests
         self.slips = 0  # closes that will hold nothing
         self.camera_on = True
+        self.camera_ahead = 0.0  # [s] its clock
+        self.late = 0  # motions that will reach the controller too late
         self._stamp = self.now
         self._arrival = 0.0
         self._ends: list[m.ExecuteRequest] = []
@@ -38,7 +40,7 @@ class CellDouble:
 
     def view(self) -> View:
         if self.camera_on:
-            self._stamp = self.now
+            self._stamp = self.now + self.camera_ahead
         objects = [self._sphere(name, "target", p) for name, p in self.balls.items()]
         objects += [self._sphere(f"slot_{k}", "contained", (0.55, 0.25, 0.035)) for k in range(self.contained)]
         attached = []
@@ -87,6 +89,10 @@ class CellDouble:
             self.task.on_plan(m.PlanResponse(id=request.id, ok=not error, trajectory=None if error else trajectory,
                                              error=error, message=error and f"{request.stage}: {error}",
                                              planner="double", seconds=0.01, fraction=1.0), self.view())
+        elif isinstance(request, m.ExecuteRequest) and self.late:
+            self.late -= 1
+            refused = m.MotionStatus(id=request.id, state="rejected", error="stale_request", message="it is 10 s old")
+            self.task.on_goal(refused, self.view())
         elif isinstance(request, m.ExecuteRequest):
             self.motion = m.MotionStatus(header=header, id=request.id, state="active", held=self.motion.held)
             self.task.on_goal(self.motion, self.view())

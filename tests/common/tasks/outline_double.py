@@ -48,6 +48,8 @@ class OutlineDouble:
         self.abort = ""  # stage whose motion the controller gives up
         self.refuse = ""  # stage whose motion the controller does not begin
         self.camera_on = True
+        self.camera_ahead = 0.0  # [s] its clock
+        self.late = 0  # motions that will reach the controller too late
         self._arrival = 0.0
         self._ends: list[m.ExecuteRequest] = []
 
@@ -61,7 +63,8 @@ class OutlineDouble:
 
     def view(self) -> OutlineView:
         if self.camera_on and self.path is not None and self.q == HOME:
-            self.path = self.path.model_copy(update={"header": m.Header(stamp=self.stamp, frame_id="world")})
+            stamp = self.stamp + int(self.camera_ahead * 1e9)
+            self.path = self.path.model_copy(update={"header": m.Header(stamp=stamp, frame_id="world")})
         scene = m.PlanningScene(header=m.Header(stamp=self.stamp, frame_id="world"), objects=self.objects)
         tcp = m.Pose(position=m.Vector3(x=0.5, z=1.1))
         return OutlineView(self.now, self.path, scene, self.gripper, self.motion, list(self.q), tcp)
@@ -102,6 +105,10 @@ class OutlineDouble:
                 fraction=0.5 if error else self.fraction, colliding=self.colliding if error else None), self.view())
         elif isinstance(request, m.ExecuteRequest) and request.trajectory.header.frame_id == self.refuse:
             self.task.on_goal(m.MotionStatus(id=request.id, state="rejected", message="no"), self.view())
+        elif isinstance(request, m.ExecuteRequest) and self.late:
+            self.late -= 1
+            refused = m.MotionStatus(id=request.id, state="rejected", error="stale_request", message="it is 10 s old")
+            self.task.on_goal(refused, self.view())
         elif isinstance(request, m.ExecuteRequest):
             self.motion = m.MotionStatus(header=header, id=request.id, state="active", held=self.motion.held)
             self.q = [0.3, *HOME[1:]]
