@@ -1,0 +1,46 @@
+"""Says on stdout what is heard on a host: motion, targets, and who of the perception is there, with the time."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import time
+from typing import Any
+
+from common import topics
+from common.transport.bus import Bus
+from common.transport.connect import connect
+from common.transport.endpoint import endpoint_of
+
+
+def say(what: str, **values: Any) -> None:
+    """Write an event; the clock is the same in all network namespaces."""
+    sys.stdout.write(json.dumps({"what": what, "at": time.monotonic(), **values}) + "\n")
+    sys.stdout.flush()
+
+
+async def motions(bus: Bus) -> None:
+    """Say each state of the motion."""
+    async for status in bus.reader(topics.MOTION_STATUS):
+        say("motion", id=status.id, state=status.state, progress=status.progress, held=status.held_by)
+
+
+async def targets(bus: Bus) -> None:
+    """Say each time that targets came."""
+    async for seen in bus.reader(topics.VALIDATED_TARGETS):
+        say("targets", age=bus.clock.age_ms(seen.header.stamp))
+
+
+async def main(domain: str) -> None:
+    """Listen until ended."""
+    async with connect(cell="panda", service="observer", endpoint=endpoint_of(domain), timeout=60) as bus:
+        bus.alive.on_change(lambda name, there: say("there" if there else "gone", service=name))
+        await asyncio.gather(motions(bus), targets(bus))
+
+
+if __name__ == "__main__":
+    try:
+        asyncio.run(main(sys.argv[1]))
+    except KeyboardInterrupt:
+        sys.exit(0)
