@@ -5,21 +5,18 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, cast
 
-import coal
 import fast_simplification
 import numpy as np
-import pinocchio as pin
 import trimesh
 from numpy.typing import NDArray
 
 from common.errors import ConfigError
 from common.robot.model import RobotModel
+from common.viewer.urdf_visuals import Rgb, Visual, visuals_of
 
-Rgb = tuple[int, int, int]
-
+_PLAIN: Rgb = (230, 230, 230)  # where neither URDF nor file give a colour
 _FEW = 150  # triangles of a connected part that are always kept
 _SHRINKS = 2e-3  # [m] the box about a part may change by less
 _SHARP = 0.6  # [rad] triangles that meet at more than this have an edge between them
@@ -47,11 +44,9 @@ def visual_pieces(robot: RobotModel, triangles: int = 40_000) -> list[Piece]:
         ConfigError: a mesh is not there or can not be read.
     """
     found: dict[tuple[str, Rgb], list[trimesh.Trimesh]] = defaultdict(list)
-    for item in robot.full_geometry(pin.GeometryType.VISUAL).geometryObjects:
-        frame = robot.full_model.frames[item.parentFrame]
-        T_link_shape = (frame.placement.inverse() * item.placement).homogeneous
-        for color, mesh in _coloured(item):
-            found[frame.name, color].append(mesh.apply_transform(T_link_shape))
+    for visual in visuals_of(robot):
+        for color, mesh in _coloured(visual):
+            found[visual.link, color].append(mesh.apply_transform(visual.T_link_shape))
     joined = [_merged(trimesh.util.concatenate(meshes)) for meshes in found.values()]
     kept = triangles / max(1, sum(len(mesh.faces) for mesh in joined))
     return [_piece(link, color, _simplified(mesh, kept)) for (link, color), mesh in zip(found, joined, strict=True)]
@@ -96,22 +91,20 @@ def _piece(link: str, color: Rgb, mesh: trimesh.Trimesh) -> Piece:
     return Piece(link, color, np.asarray(smooth.vertices, dtype=np.float32), np.asarray(smooth.faces, dtype=np.uint32))
 
 
-def _coloured(item: Any) -> list[tuple[Rgb, trimesh.Trimesh]]:
-    """The triangles of a visual shape by colour; that of the URDF counts more than that of the file."""
-    given = _rgb(item.meshColor[:3] * 255)
-    path = Path(item.meshPath)
-    if not path.is_file():
-        return [(given, _primitive(item.geometry))]
+def _coloured(visual: Visual) -> list[tuple[Rgb, trimesh.Trimesh]]:
+    """The triangles of a visual by colour; that of the URDF counts more than that of the file."""
+    if visual.path is None:
+        return [(visual.color or _PLAIN, _merged(visual.primitive))]
     try:
-        scene = trimesh.load_scene(path)
+        scene = trimesh.load_scene(visual.path)
     except (ValueError, OSError, NotImplementedError) as error:
-        raise ConfigError("robot.urdf", str(path), f"is a mesh that can not be read: {error}") from None
+        raise ConfigError("robot.urdf", str(visual.path), f"is a mesh that can not be read: {error}") from None
     meshes = []
     for mesh in scene.dump():
         if isinstance(mesh, trimesh.Trimesh):
-            own = None if item.overrideMaterial else _own_color(mesh)
-            mesh.vertices = mesh.vertices * item.meshScale
-            meshes.append((own or given, _merged(mesh)))
+            color = visual.color or _own_color(mesh) or _PLAIN
+            mesh.vertices = mesh.vertices * np.array(visual.scale)
+            meshes.append((color, _merged(mesh)))
     return meshes
 
 
@@ -122,22 +115,6 @@ def _own_color(mesh: trimesh.Trimesh) -> Rgb | None:
     if material is not None:
         return _rgb(material.main_color[:3])
     return _rgb(look.main_color[:3]) if look.defined else None
-
-
-def _primitive(shape: coal.CollisionGeometry) -> Any:
-    """A shape that the URDF describes by its dimensions [m]."""
-    if isinstance(shape, coal.Box):
-        mesh = trimesh.creation.box(extents=2 * np.array(shape.halfSide))
-    elif isinstance(shape, coal.Cylinder):
-        mesh = trimesh.creation.cylinder(radius=shape.radius, height=2 * shape.halfLength, sections=32)
-    elif isinstance(shape, coal.Capsule):
-        mesh = trimesh.creation.capsule(radius=shape.radius, height=2 * shape.halfLength)
-        mesh.apply_translation(-mesh.bounds.mean(axis=0))
-    elif isinstance(shape, coal.Sphere):
-        mesh = trimesh.creation.icosphere(subdivisions=3, radius=shape.radius)
-    else:
-        raise ConfigError("robot.urdf", type(shape).__name__, "is a visual shape that is not known")
-    return mesh
 
 
 def _rgb(values: Iterable[float]) -> Rgb:

@@ -126,11 +126,18 @@ def test_file_without_colours_takes_those_of_the_urdf_and_its_scale(tmp_path: Pa
 def test_mesh_that_can_not_be_read_is_named(tmp_path: Path) -> None:
     trimesh.creation.box().export(tmp_path / "box.stl")
     robot = post(tmp_path, '<visual><geometry><mesh filename="box.stl"/></geometry></visual>')
-    loaded = robot.full_geometry(pin.GeometryType.VISUAL)
-    for item in loaded.geometryObjects:
-        if item.meshPath.endswith("box.stl"):
-            item.meshPath = str(tmp_path / "box.unknown")
+    robot.urdf = robot.urdf.replace("box.stl", "box.unknown")
     (tmp_path / "box.unknown").write_text("no mesh")
-    robot.full_geometry = lambda _kind: loaded  # type: ignore[method-assign]
     with pytest.raises(ConfigError, match=r"box\.unknown"):
+        visual_pieces(robot)
+
+
+def test_mesh_that_is_not_there_and_shape_that_is_not_known_are_named(tmp_path: Path) -> None:
+    robot = post(tmp_path)
+    good = robot.urdf
+    robot.urdf = good.replace('<box size="0.2 0.4 1.0" />', '<mesh filename="/nowhere/box.stl"/>')
+    with pytest.raises(ConfigError, match=r"nowhere/box\.stl"):
+        visual_pieces(robot)
+    robot.urdf = good.replace('<box size="0.2 0.4 1.0" />', "<torus/>")
+    with pytest.raises(ConfigError, match="'torus' is no visual shape; choices: box, capsule"):
         visual_pieces(robot)
