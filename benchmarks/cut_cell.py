@@ -21,6 +21,7 @@ SPLITS = {  # by name: what runs on the first host; the rest, with the task, on 
 }
 ZENCELL = str(Path(sys.executable).with_name("zencell"))
 LOOK = 0.01  # [s]
+PATIENCE = 180.0  # [s] for an event, the first of which come when both parts are up
 
 Event = dict[str, Any]
 
@@ -68,7 +69,7 @@ class CutCell:
         for host in self.two.hosts:
             host.stop()
 
-    def until(self, wanted: Callable[[Event], bool], timeout: float = 60.0) -> Event:
+    def until(self, wanted: Callable[[Event], bool], timeout: float = PATIENCE) -> Event:
         """The first event from now on that is wanted.
 
         Raises:

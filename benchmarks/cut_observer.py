@@ -29,7 +29,7 @@ async def motions(bus: Bus) -> None:
 async def targets(bus: Bus) -> None:
     """Say each time that targets came."""
     async for seen in bus.reader(topics.VALIDATED_TARGETS):
-        say("targets", age=bus.clock.age_ms(seen.header.stamp))
+        say("targets", count=len(seen.poses))
 
 
 async def main(domain: str) -> None:

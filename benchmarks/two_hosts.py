@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -58,17 +57,25 @@ class Host:
         ).stdout
 
     def stop(self) -> None:
-        """End what still runs, as Ctrl-C would."""
+        """End what still runs.
+
+        Raises:
+            TimeoutError: some of it had to be killed.
+        """
+        stuck = []
         for process in self.processes:
             if process.poll() is None:
-                process.send_signal(signal.SIGINT)
+                process.terminate()  # not Ctrl-C: what a shell starts in the background ignores that
         for process in self.processes:
             try:
                 process.wait(timeout=END)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-                raise
+                stuck.append(process.args)
+        self.processes.clear()
+        if stuck:
+            raise TimeoutError(f"had to be killed: {stuck}")
 
 
 @dataclass
