@@ -352,6 +352,8 @@ class PickPlace:
                 if unseen := self._unseen(view):
                     self.status.message = f"{stage.name} waits: {unseen}"
                     return
+                if self.status.message.startswith(f"{stage.name} waits"):
+                    self.status.message = ""
                 if not self._is_still_there(stage, view):
                     self.status.message = f"{stage.name}: the ball is no longer where it was seen"
                     self._clear()

@@ -59,6 +59,8 @@ def test_clock_that_goes_wrong_after_the_plan_stops_the_motion_before_it_begins(
         cell.step()
     assert motions(cell) == [] and AHEAD in cell.task.status.message
     cell.unplannable, cell.camera_ahead = plan, 0.0
+    cell.step()
+    assert len(motions(cell)) == 1 and cell.task.status.message == "", "what it waited for is over"
     cell.until("DONE")
     assert cell.contained == 1
 
