@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup run up test containers check audit bench chaos docs deploy clean
+.PHONY: setup run up test containers check audit bench chaos soak docs deploy clean
 
 setup: $(STAMP)
 
@@ -34,11 +34,14 @@ audit: setup  ## known vulnerabilities in the dependencies, where the database c
 	.ci/audit $(BIN)
 
 bench: setup  ## every published figure, one module each
-	@for script in $$(grep -l __main__ benchmarks/*.py); do module=benchmarks.$$(basename $$script .py); \
+	@for script in $$(grep -l __main__ benchmarks/*.py | grep -v subscribers); do module=benchmarks.$$(basename $$script .py); \
 	  echo "== $$module"; $(BIN)/python -m $$module || exit 1; done
 
 chaos: setup  ## fifty runs, each under a plan of faults of its own: all of them have to end well
 	$(BIN)/python -m benchmarks.chaos
+
+soak: setup  ## thirty minutes of work beside a slow and a stuck subscriber: nothing may grow or get lost
+	$(BIN)/python -m benchmarks.soak
 
 docs: setup  ## write the generated tables and pages again
 	$(BIN)/python -m docs.generate
