@@ -11,7 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -67,7 +67,9 @@ def environment() -> dict[str, str]:
 class RunningCell:
     """A `zencell run` or `zencell up` in a domain of its own; its log and its summary are files in a folder."""
 
-    def __init__(self, folder: Path, verb: str, cell: str, *arguments: str) -> None:
+    def __init__(
+        self, folder: Path, verb: str, cell: str, *arguments: str, secrets: Mapping[str, str] | None = None
+    ) -> None:
         """Start it; use it in a `with` block, at the end of which everything it started is gone.
 
         Args:
@@ -75,6 +77,7 @@ class RunningCell:
             verb: run or up.
             cell: name of the cell.
             arguments: further options, but for domain and summary; without `--viewer-port` there is no page.
+            secrets: environment variables that no command line may show.
         """
         if "--viewer-port" not in arguments:
             arguments = (*arguments, "--no-viewer")
@@ -84,8 +87,8 @@ class RunningCell:
         command = command_line(verb, cell, *arguments, "--domain", str(self.domain), "--summary", str(folder / SUMMARY))
         with (folder / LOG).open("wb") as log:
             self.process = subprocess.Popen(
-                command, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
-                start_new_session=True,
+                command, cwd=folder, env={**environment(), **(secrets or {})}, stdin=subprocess.DEVNULL, stdout=log,
+                stderr=subprocess.STDOUT, start_new_session=True,
             )
 
     def __enter__(self) -> RunningCell:

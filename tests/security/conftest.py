@@ -1,0 +1,21 @@
+"""A folder of certificates for both cells, made by the command that people use."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from benchmarks.runs import command_line, environment
+
+
+@pytest.fixture(scope="session")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("secured") / "certificates"
+    made = subprocess.run(
+        command_line("secure", "init", str(folder)), env=environment(), umask=0, capture_output=True, text=True,
+        timeout=100, check=False,
+    )
+    assert made.returncode == 0, made.stderr
+    return folder

@@ -1,0 +1,88 @@
+"""Secured routers without a cell: two that are linked, and endpoints that are not encrypted."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from benchmarks.runs import ROOT, environment
+from common.errors import ConfigError
+from common.security.access import Rights, access_control
+from common.security.certificates import Authority
+from common.security.credentials import ACCESS, ROUTER_NAME, credentials_of
+from common.transport.router import open_router
+from tests.security.holders import Holder
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Certificates of a cell with a writer of `seen` and `secret`, a reader of `seen`, and the rules for them."""
+    authority = Authority.new(10)
+    authority.write(tmp_path / "ca.pem", tmp_path / "ca.key")
+    for name, hosts in ((ROUTER_NAME, ["127.0.0.1"]), ("cell.writer", []), ("cell.reader", [])):
+        authority.issue(name, hosts, 10, tmp_path / f"{name}.pem", tmp_path / f"{name}.key")
+    rights = {"writer": Rights(write={"seen", "secret"}), "reader": Rights(read={"seen"})}
+    (tmp_path / ACCESS).write_text(json.dumps(access_control({"cell": rights})))
+    return tmp_path
+
+
+def test_linked_routers_pass_on_what_each_lets_through_and_no_more(folder: Path) -> None:
+    here, there = (f"tls/127.0.0.1:{free_port()}" for _ in range(2))
+    with ExitStack() as stack:
+        stack.enter_context(open_router([here], folder))
+        stack.enter_context(open_router([there], folder, [here]))
+        writer = stack.enter_context(Holder(here, credentials_of("cell.writer", folder)))
+        reader = stack.enter_context(Holder(there, credentials_of("cell.reader", folder)))
+        other = stack.enter_context(Holder(there, credentials_of("cell.reader", folder)))
+        heard = reader.hear("cell/**", "cell/seen", "cell/secret")
+        for _ in range(100):
+            writer.put("cell/secret", b"not for all")
+            writer.put("cell/seen", b"for all")
+            other.put("cell/seen", b"by a reader")
+            if heard.samples:
+                break
+            heard.soon(0.1)
+        assert set(heard.samples) == {("cell/seen", b"for all")}
+
+
+@pytest.mark.parametrize("option", ["--listen", "--link"])
+def test_an_open_endpoint_is_refused_beside_certificates(folder: Path, option: str) -> None:
+    open_one, tls = f"tcp/127.0.0.1:{free_port()}", f"tls/127.0.0.1:{free_port()}"
+    listen, link = ([open_one], []) if option == "--listen" else ([tls], [open_one])
+    with pytest.raises(ConfigError, match=f"^{option}: .*must be tls/"):
+        open_router(listen, folder, link)
+
+
+@pytest.mark.parametrize("secured", [False, True])
+def test_a_router_that_is_reached_from_elsewhere_names_the_remedy_unless_it_is_secured(
+    folder: Path, secured: bool
+) -> None:
+    protocol, extra = ("tls", {"ZENCELL_SECURE": str(folder)}) if secured else ("tcp", {})
+    listen = f"{protocol}/0.0.0.0:{free_port()}"
+    with subprocess.Popen(
+        [sys.executable, "-m", "services.router", "--gate", "--listen", listen], cwd=ROOT, text=True,
+        stdin=subprocess.PIPE, stderr=subprocess.PIPE, env={**environment(), **extra},
+    ) as router:
+        assert router.stdin is not None
+        assert router.stderr is not None
+        router.stdin.write("go\n")
+        router.stdin.flush()
+        said = [router.stderr.readline()]
+        router.stdin.close()  # its supervisor is gone: it ends
+        said += router.stderr.readlines()
+    warnings = [line for line in said if "WARNING" in line]
+    assert len(warnings) == (0 if secured else 1)
+    assert all("zencell secure init DIR" in line for line in warnings)
