@@ -1,0 +1,51 @@
+"""Subscribers that do not keep up beside a whole cell: it does not notice."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from benchmarks.losses import Losses
+from benchmarks.runs import RunningCell, beside, until
+from benchmarks.subscribers import Subscriber
+from common import topics
+from common.messages import ServiceCounters, TaskCommand
+from common.transport.bus import Bus
+
+pytestmark = pytest.mark.cell
+
+
+async def newest_counters(bus: Bus, told: dict[str, ServiceCounters]) -> None:
+    async for counters in bus.reader(topics.COUNTERS):
+        told[counters.service] = counters
+
+
+async def test_a_slow_and_a_frozen_subscriber_keep_nobody_from_anything(tmp_path: Path) -> None:
+    told: dict[str, ServiceCounters] = {}
+    settings = ("autostart=false", "world.count=2", "services.camera_simulator.rate=30")
+    with RunningCell(tmp_path, "up", "panda", "--speed", "5", *(f"--set={one}" for one in settings)) as cell:
+        async with cell.listen() as bus:
+            losses, task, status = Losses(bus), bus.client(topics.TASK_COMMAND), bus.reader(topics.PICK_PLACE_STATUS)
+            await task.wait_available(60.0)
+            slow, stuck = await asyncio.gather(
+                *(asyncio.to_thread(Subscriber, cell.endpoint, "panda/**", rest) for rest in (0.5, 0.0))
+            )
+            with slow, stuck:
+                stuck.freeze()
+                async with beside(newest_counters(bus, told)):
+                    await task.call(TaskCommand(command="start"), 10.0)
+                    await until(status, lambda one: one.state in ("DONE", "ERROR"), 90.0)
+                    losses.stop()
+        cell.interrupt()
+        assert await cell.ended(20) == 0, cell.tail()
+        summary = cell.summary
+    assert (summary["state"], summary["truth"]) == ("DONE", {"in_box": 2, "on_table": 0, "elsewhere": 0})
+    assert not any(summary["restarts"].values())
+    came = {key: one for key, one in losses.of.items() if one.came}
+    assert came.keys() >= {"scene_object_updates", "planning_scene", "motion/status", "gripper/state", "counters"}
+    assert not {key: one.lost for key, one in came.items() if one.lost and losses.kind(key) in ("state", "event")}
+    overflow = sum((Counter(counters.overflow) for counters in told.values()), Counter())
+    assert told and not overflow
