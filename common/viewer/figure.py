@@ -8,7 +8,8 @@ import numpy as np
 import viser
 
 from common.viewer.link_poses import LinkPoses
-from common.viewer.robot_meshes import Piece, Rgb
+from common.viewer.robot_meshes import Piece
+from common.viewer.urdf_visuals import Rgb
 
 _STILL = 1e-7  # [m or of a unit quaternion]
 

@@ -54,7 +54,8 @@ def wait_for(what: str, seen: Any, seconds: float) -> None:
 
 @pytest.fixture(scope="module")
 def cell() -> Iterator[None]:
-    if shutil.which("docker") is None or subprocess.run(["docker", "info"], capture_output=True, check=False).returncode:
+    answers = shutil.which("docker") and subprocess.run(["docker", "info"], capture_output=True, check=False)
+    if not answers or answers.returncode:
         pytest.skip("no container engine answers `docker info`")
     compose("build", timeout=800)
     try:
