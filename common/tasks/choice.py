@@ -12,6 +12,7 @@ from common.tasks.grasp import grasp_yaws
 from common.tasks.pick_place_parameters import PickPlaceParameters
 from common.tasks.stages import Cycle, Place, Spots, Target, View, appeared, same_place
 
+FULL = "the container is full"
 SETTLING = 1.5  # [s] from letting go until the ball lies in the container and was seen there
 
 
@@ -42,14 +43,16 @@ class Choice:
         self._given_up = [
             g for g in self._given_up if not appeared(spots, g[2], moved) and not appeared(g[2], spots, moved)
         ]
+        full = self._is_full(view, bool(under_way))
+        if not full:  # it was emptied, or only expected to be full
+            self._given_up = [g for g in self._given_up if g[1] != FULL]
         candidates = [ball for ball in view.balls() if self._is_open(ball, view, under_way)]
         candidates.sort(key=lambda ball: math.dist(ball.position[:2], origin[:2]))
-        full = self._is_full(view, bool(under_way))
         for ball in candidates:
             others = view.spots(ball, self.radius)
             yaws = grasp_yaws(self.p.hand, ball.position, others, self.radius, self.container)
             if full:
-                self.give_up(ball, "the container is full", view)
+                self.give_up(ball, FULL, view)
             elif not yaws:
                 self.give_up(ball, "no turn of the hand clears what stands beside it", view)
             else:

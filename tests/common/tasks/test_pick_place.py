@@ -180,6 +180,17 @@ def test_ninth_ball_is_reported_because_the_container_is_full() -> None:
     assert cell.task.status.skipped[0].reason == "the container is full"
 
 
+def test_balls_are_taken_again_once_the_container_is_emptied_and_nothing_on_the_table_has_changed() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.contained = 8
+    cell.until("DONE")
+    cell.contained = 0
+    cell.until("pre-grasp")
+    assert not cell.task.status.skipped
+    cell.until("DONE")
+    assert cell.contained == 1
+
+
 def test_restart_while_holding_carries_the_ball_to_the_container() -> None:
     cell = CellDouble([(0.52, -0.04)])
     cell.balls["track_5"] = (0.40, -0.30, 0.03)
