@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import subprocess
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from common.topics import Topic
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
 
-pytestmark = pytest.mark.cell
+pytestmark = [pytest.mark.cell, pytest.mark.timeout(240)]
 
 LEAST = 5  # pictures whose results are compared
 PATIENCE = 60.0  # [s]
@@ -30,10 +30,16 @@ CASES = [
 ]
 
 
-def started(folder: Path, *arguments: str) -> subprocess.Popen[bytes]:
-    """A zencell command under way."""
-    return subprocess.Popen(
-        command_line(*arguments), cwd=folder, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+@contextmanager
+def started(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A zencell command under way, which does not outlive the block."""
+    with (folder / f"{arguments[0]}.log").open("wb") as log, subprocess.Popen(
+        command_line(*arguments), cwd=folder, env=environment(), stdout=subprocess.PIPE, stderr=log
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def found_in(path: Path, topic: str) -> dict[int, Any]:
@@ -97,7 +103,8 @@ def test_replayed_pictures_give_what_they_gave_live(
     live = found_in(recording, topic.key)
     replayed = asyncio.run(replay(tmp_path, cell, service, topic, wanted))
     both = live.keys() & replayed.keys()
-    assert len(both) >= LEAST, (len(live), len(replayed), os.listdir(tmp_path))
+    logs = {path.name: path.read_text() for path in tmp_path.glob("*.log") if path.name != "cell.log"}
+    assert len(both) >= LEAST, (len(live), len(replayed), logs)
     for stamp in both:
         first, again = live[stamp], replayed[stamp]
         if topic is topics.CONTOURS:  # which one is chosen depends on all pictures before
