@@ -55,13 +55,15 @@ def _file_of(module: str) -> Path | None:
 
 
 def fields_of(model: Model) -> Iterator[ModelField]:
-    """The fields of a model, inherited ones first."""
+    """The fields of a model, inherited ones first, without those that are shown nowhere."""
     for base in model.node.bases:
         inherited = find_model(model.path, base.id) if isinstance(base, ast.Name) else None
         if inherited is not None:
             yield from fields_of(inherited)
     for node in model.node.body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            if _is_secret(node.value):
+                continue
             kind = _type_name(node.annotation)
             yield ModelField(node.target.id, _description(node.value), find_model(model.path, kind) if kind else None)
 
@@ -82,6 +84,14 @@ def _type_name(annotation: ast.expr) -> str:
         case ast.Subscript(value=ast.Name(id="Tunable"), slice=inner):
             return _type_name(inner)
     return annotation.id if isinstance(annotation, ast.Name) else ""
+
+
+def _is_secret(value: ast.expr | None) -> bool:
+    """Whether a field is kept out of its model's repr, as passwords and tokens are."""
+    return isinstance(value, ast.Call) and any(
+        keyword.arg == "repr" and isinstance(keyword.value, ast.Constant) and keyword.value.value is False
+        for keyword in value.keywords
+    )
 
 
 def _description(value: ast.expr | None) -> str:

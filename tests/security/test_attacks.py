@@ -374,14 +374,16 @@ async def test_a_command_that_is_sent_again_moves_nothing(secured: Secured) -> N
             goal = m.PlanRequest(id="plan", stage="replay", goal=m.JointGoal(positions=there), planning_time=5.0)
             plan = decode(m.PlanResponse, await asyncio.to_thread(tell, task, "motion/plan", goal))
             assert plan.trajectory is not None, plan.message
-            captured = m.ExecuteRequest(id="captured", trajectory=plan.trajectory)
+            captured = m.ExecuteRequest(header=bus.header(), id="captured", trajectory=plan.trajectory)
             await asyncio.to_thread(tell, task, "motion/execute", captured)
             await until(motion, lambda status: status.id == "captured" and status.state == "succeeded")
             again = decode(m.MotionStatus, await asyncio.to_thread(tell, task, "motion/execute", captured))
             assert (again.id, again.state) == ("captured", "succeeded")
-            renamed = captured.model_copy(update={"id": "renamed"})
-            refused = decode(m.MotionStatus, await asyncio.to_thread(tell, task, "motion/execute", renamed))
-            assert (refused.state, refused.error) == ("rejected", "start_mismatch")
+            long_ago = m.Header(stamp=captured.header.stamp - 10_000_000_000)
+            for header, error in ((long_ago, "stale_request"), (bus.header(), "start_mismatch")):
+                renamed = captured.model_copy(update={"id": f"renamed {error}", "header": header})
+                refused = decode(m.MotionStatus, await asyncio.to_thread(tell, task, "motion/execute", renamed))
+                assert (refused.state, refused.error) == ("rejected", error)
             assert motion.latest is not None
             assert motion.latest.state != "active"
             end = await joints.next()
