@@ -32,6 +32,8 @@ def slim(packages: Path, robots: set[str]) -> None:
     for folder in (packages / ROBOTS).iterdir():
         if folder.name not in robots:
             shutil.rmtree(folder)
+    for folder in list(packages.rglob("tests")):
+        shutil.rmtree(folder, ignore_errors=True)
     for pattern in ("*.a", "*.pyi"):
         for path in packages.rglob(pattern):
             path.unlink()
