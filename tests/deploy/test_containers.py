@@ -62,6 +62,9 @@ def cell() -> Iterator[None]:
         compose("up", "-d", "--no-build", timeout=180)
         yield
     finally:
+        # A container that is just being started again can hold its network for a moment longer.
+        run("docker", "compose", "-p", PROJECT, "down", "-v", "-t", "10", timeout=120, check=False)
+        time.sleep(3)
         compose("down", "-v", "-t", "10", timeout=120)
     assert compose("ps", "-a", "-q") == ""
 
