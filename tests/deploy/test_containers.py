@@ -62,7 +62,7 @@ def cell() -> Iterator[None]:
         compose("up", "-d", "--no-build", timeout=180)
         yield
     finally:
-        # Old engines keep the network of a container that was killed and started again: what counts is that none is left.
+        # Old engines can keep the network of a container that was started again: what counts is that none is left.
         run("docker", "compose", "-p", PROJECT, "down", "-v", "-t", "10", timeout=120, check=False)
     assert compose("ps", "-a", "-q") == ""
 
