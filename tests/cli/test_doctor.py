@@ -1,7 +1,8 @@
 import resource
+import shlex
 import shutil
-import signal
 import socket
+import subprocess
 import sys
 import time
 from collections import namedtuple
@@ -282,21 +283,32 @@ def test_other_programs_are_none_of_our_business() -> None:
     assert list(leftovers.judge(others)) == [Finding("ok", "no process is left over from an earlier run")]
 
 
-def test_service_that_was_stopped_when_its_supervisor_was_killed_is_found(
-    zencell: Callable[..., Zencell]
-) -> None:
+def test_stopped_service_of_a_cell_is_found_until_the_cell_is_gone(zencell: Callable[..., Zencell]) -> None:
     command = zencell("up", "tiny.yaml")
     command.until("zenoh --mode client")
     middle = command.children()["middle"]
-    middle.send_signal(signal.SIGSTOP)
+    middle.suspend()
+    (found,) = (f for f in leftovers.processes() if f"middle ({middle.pid})" in f.what)
+    not_well(found, "stopped (SIGSTOP)", "kill -CONT", str(middle.pid))
     command.process.kill()
     command.end()
-    wanted = [f for f in leftovers.processes() if f"middle ({middle.pid})" in f.what]
-    assert len(wanted) == 1
-    not_well(wanted[0], "without a supervisor", "kill -9", str(middle.pid))
-    middle.kill()
-    command.until_childless()
+    command.until_childless()  # the system wakes it when its supervisor dies
     assert not [f for f in leftovers.processes() if f"({middle.pid})" in f.what]
+
+
+def test_service_that_outlived_its_supervisor_is_found() -> None:
+    waits = "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
+    deaf = [sys.executable, "-c", waits, "-m", "services.deaf", "--gate"]
+    shell = subprocess.Popen(["sh", "-c", f"{shlex.join(deaf)} &"], stdout=subprocess.PIPE, text=True)
+    with shell:
+        assert shell.stdout is not None
+        process = psutil.Process(int(shell.stdout.readline()))
+        shell.wait()  # now somebody else is its parent
+        try:
+            (found,) = (f for f in leftovers.processes() if f"deaf ({process.pid})" in f.what)
+        finally:
+            process.kill()
+    not_well(found, "without a supervisor", "kill -9", str(process.pid))
 
 
 # --- machine ----------------------------------------------------------------------------------------------------
