@@ -43,7 +43,12 @@ class OutlineParameters(TracingParameters):
         0.2, ge=0.05, le=60, description="without joint states for so long the arm is held on its path [s, wall time]"
     )
     selection_timeout: Tunable[float] = Field(
-        10.0, ge=0, le=3600, description="wait for a contour before giving up; 0: for ever [s, wall time]"
+        10.0, ge=0, le=3600, description="wait for a usable contour while pictures come, before giving up; 0: for "
+                                         "ever [s, wall time]"
+    )
+    picture_timeout: Tunable[float] = Field(
+        60.0, ge=0, le=3600, description="wait for pictures while none comes, before giving up; longer than a camera "
+                                         "or detector takes to be started again; 0: for ever [s, wall time]"
     )
 
 
@@ -73,7 +78,7 @@ class Outline:
         self._running: Execution[Stage] | None = None
         self._stopping = False
         self._planning: tuple[Leg, str] | None = None
-        self._selecting_since: float | None = None
+        self._selecting: tuple[bool, float] | None = None  # whether no pictures come, and since when
         self._began: float | None = None
         self._traced = False
         self._found = False  # whether the robot was looked at, or a person has said what to do
@@ -90,7 +95,7 @@ class Outline:
         After a stop the arm goes home and outlines the object anew: half an outline is no outline.
         """
         status = self.status
-        self._selecting_since, self._found = None, True
+        self._selecting, self._found = None, True
         if command == "pause":
             status.paused = True
             return [m.HoldRequest(hold=True, reason="the task is paused")]
@@ -213,19 +218,17 @@ class Outline:
 
     def _select(self, view: OutlineView) -> None:
         """Take the chosen contour once the planning scene holds its object; give up after a while without one."""
-        self._selecting_since = since = view.now if self._selecting_since is None else self._selecting_since
         self.status.state, self.status.stage = "SELECTING", ""
         path = view.path
         if path is not None and path.header.stamp * 1e-9 < self._still_since:
             path = None
         solid = view.solid()
-        if path is not None and len(path.poses) > 1 and solid is not None and not self._unseen(path, view):
+        unseen = "no contour came from the camera" if path is None else self._unseen(path, view)
+        if path is not None and len(path.poses) > 1 and solid is not None and not unseen:
             self._take(path, solid, view)
             return
-        if path is not None and (unseen := self._unseen(path, view)):
+        if path is None or unseen:
             problem = unseen
-        elif path is None:
-            problem = "no contour came from the camera"
         elif not path.poses:
             problem = path.message or "no object is chosen"
         elif len(path.poses) < 2:  # noqa: PLR2004 - a point has no outline
@@ -233,8 +236,11 @@ class Outline:
         else:
             problem = f"the planning scene does not hold {path.object or 'the object'} around which the contour goes"
         self.status.message = problem
+        if self._selecting is None or self._selecting[0] != bool(unseen):
+            self._selecting = bool(unseen), view.now
         # Waiting for a person or for pictures is by the clock on the wall, also in a fast cell.
-        if 0 < self.p.selection_timeout * self._speed < view.now - since:
+        limit = self.p.picture_timeout if unseen else self.p.selection_timeout
+        if 0 < limit * self._speed < view.now - self._selecting[1]:
             self._fail(problem, view)
 
     def _take(self, path: m.OutlinePoints, solid: str, view: OutlineView) -> None:
@@ -289,7 +295,7 @@ class Outline:
             assert stage.trajectory is not None
             if stage.name == "approach" and (view.path is None or self._unseen(view.path, view)):
                 self._clear()  # look again: what was planned around may have moved
-                self._selecting_since = None
+                self._selecting = None
                 return
             command = m.ExecuteRequest(id=next(self._ids), trajectory=stage.trajectory)
             self.status.state, self._returned = stage.state, False
@@ -308,7 +314,7 @@ class Outline:
         self.status.failures += 1
         first, self._error = self._error, self._error or message
         self.status.message = self._error
-        self._selecting_since = None
+        self._selecting = None
         if self._running is not None:  # the fingers are still closing: they may finish
             return
         if first:

@@ -13,7 +13,7 @@ import pytest
 from common import topics
 from common.config import Parameters, World
 from common.config.tunables import apply, checked, leaves, tunable_sections
-from common.messages import PlanRequest
+from common.messages import OutlinePoints, PlanRequest
 from common.robot.transforms import tool_down
 from common.sim.world import GraspTolerances, SimulatedWorld
 from tests.common.tasks.cell_double import CellDouble
@@ -87,13 +87,14 @@ def test_the_task_gives_up_after_fewer_failures() -> None:
     assert "that makes 2 failures in a row" in cell.task.status.message
 
 
-def test_the_outline_waits_for_a_contour_as_long_as_it_is_told_while_it_waits() -> None:
-    cell = OutlineDouble(selection_timeout=0.0)
-    cell.path = None
+@pytest.mark.parametrize("camera_on", [True, False])
+def test_the_outline_waits_for_a_contour_as_long_as_it_is_told_while_it_waits(camera_on: bool) -> None:
+    cell = OutlineDouble(selection_timeout=0.0, picture_timeout=0.0)
+    cell.path = OutlinePoints(message="no object is chosen") if camera_on else None
     for _ in range(200):
         cell.step()
     assert cell.status.state == "SELECTING"
-    change(cell.task.p, selection_timeout=1.0)
+    change(cell.task.p, **{"selection_timeout" if camera_on else "picture_timeout": 1.0})
     cell.step()
     assert cell.status.state == "ERROR"
 
@@ -170,6 +171,8 @@ RARE: dict[str, Callable[..., Any]] = {
     "services.smart_pick_place.goal_timeout": test_a_motion_under_way_is_stopped_after_a_shorter_time,
     "services.smart_pick_place.max_failures": test_the_task_gives_up_after_fewer_failures,
     "services.contour_tracer.overtime": test_an_outline_under_way_is_stopped_after_a_shorter_time,
+    "services.contour_tracer.picture_timeout":
+        test_the_outline_waits_for_a_contour_as_long_as_it_is_told_while_it_waits,
     "services.contour_tracer.selection_timeout":
         test_the_outline_waits_for_a_contour_as_long_as_it_is_told_while_it_waits,
     "services.trajectory_executor.grasp_tolerances.sideways":

@@ -142,7 +142,7 @@ def test_arm_that_can_not_go_home_stays_and_says_so() -> None:
     ],
 )
 def test_without_a_usable_contour_it_ends_in_error_with_the_reason(path: m.OutlinePoints | None, message: str) -> None:
-    cell = OutlineDouble(selection_timeout=3.0)
+    cell = OutlineDouble(selection_timeout=3.0, picture_timeout=3.0)
     cell.path = path
     cell.until("SELECTING")
     assert message in cell.status.message
@@ -151,6 +151,22 @@ def test_without_a_usable_contour_it_ends_in_error_with_the_reason(path: m.Outli
     assert cell.now - began >= 2.9
     assert message in cell.status.message
     assert cell.requests == []
+
+
+def test_camera_that_is_started_again_costs_no_time_of_the_selection() -> None:
+    cell = OutlineDouble(selection_timeout=3.0, picture_timeout=30.0)
+    chosen, cell.path = cell.path, m.OutlinePoints(message="no object is chosen")
+    cell.until("SELECTING")
+    came_back = cell.now + 20
+    while cell.now < came_back:
+        cell.camera_on = False
+        cell.step()
+    cell.camera_on = True
+    for _ in range(10):
+        cell.step()
+    assert cell.status.state == "SELECTING"
+    cell.path = chosen
+    cell.until("DONE")
 
 
 def test_selection_is_waited_for_as_long_as_it_takes_when_asked_to() -> None:
