@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from pathlib import Path
@@ -64,6 +65,12 @@ def environment() -> dict[str, str]:
     return {**kept, "PYTHONPATH": str(ROOT)}
 
 
+def end_in_order() -> None:
+    """Have SIGTERM end this process as Ctrl-C does, through its `with` blocks, so that no cell stays behind."""
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
 class RunningCell:
     """A `zencell run` or `zencell up` in a domain of its own; its log and its summary are files in a folder."""
 
@@ -79,6 +86,7 @@ class RunningCell:
             arguments: further options, but for domain and summary; without `--viewer-port` there is no page.
             secrets: environment variables that no command line may show.
         """
+        end_in_order()
         if "--viewer-port" not in arguments:
             arguments = (*arguments, "--no-viewer")
         self.folder, self.name = folder, cell
