@@ -28,11 +28,14 @@ USER zencell
 HEALTHCHECK --interval=3s --timeout=10s --start-period=90s --retries=5 CMD ["python", "-m", "common.transport.health"]
 CMD ["zencell", "--help"]
 
-# For compose.dev.yaml: restarts a service when its source changes.
+# For compose.dev.yaml: restarts a service when its source changes. The base image's pip: this one's environment has none.
 FROM run AS dev
 USER root
+COPY constraints.txt /tmp/
 RUN --mount=type=cache,target=/root/.cache/pip --mount=type=secret,id=pip,target=/etc/pip.conf \
-    python -m ensurepip -q && python -m pip install -q --disable-pip-version-check watchfiles
+    /usr/local/bin/python -m pip --python /opt/zencell/bin/python install -q --disable-pip-version-check \
+      -c /tmp/constraints.txt watchfiles
+COPY deploy/__init__.py deploy/watched.py deploy/
 USER zencell
 
 FROM run

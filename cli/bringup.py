@@ -232,6 +232,7 @@ class Operation:
 
         path = Path(file).absolute()
         require_new(path, "--record")
+        securing.require_recorder(self.launch, self.cell)
         place = ["--connect", self.launch.connect] if self.launch.connect else ["--domain", str(self.launch.domain)]
         self._watchers[NAME] = [
             *python_module("cli.main"), "record", "--cell", self.cell.name, "-o", str(path), *place, "--gate",

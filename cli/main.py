@@ -30,6 +30,7 @@ from cli import (
     recording,
     report,
     robot,
+    router,
     secure,
     tf,
     top,
@@ -112,6 +113,7 @@ app.command()(recording.recover)
 app.command()(report.report)
 app.command()(exporting.export)
 app.add_typer(secure.app, name="secure")
+app.add_typer(router.app, name="router")
 app.command()(doctor.doctor)
 
 

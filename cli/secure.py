@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
+from cli.hosts import Share
 from cli.viewing import VIEWER
+from cli.wired import Unwired
+from common.errors import ZencellError
 
 if TYPE_CHECKING:
     from common.config import Cell
@@ -107,21 +110,27 @@ def check(
                                                     "repeatable")] = None,
     overrides: options.Overrides = None,
     world: options.WorldName = None,
-    no_viewer: Annotated[bool, typer.Option("--no-viewer", hidden=True)] = False,
+    seed: options.Seed = None,
+    only: options.Only = None,
     only_rules: Annotated[bool, typer.Option("--only-rules", hidden=True)] = False,
 ) -> None:
     """Say whether the certificates are valid, and the rules those that the cells' services need now."""
     from common.config import load_cell, names_of
+    from common.errors import ConfigError
     from common.security.checking import require_current, require_valid
-    from common.security.credentials import OPERATOR, ROUTER_NAME, common_name, read_access
+    from common.security.credentials import OPERATOR, RECORDER, ROUTER_NAME, common_name, read_access
 
-    place = Path(folder)
+    if only and len(cells or ()) != 1:
+        raise ConfigError("--only", ",".join(only), "needs the one cell that they are services of: --cell CELL")
+    place, number = Path(folder), options.whole("--seed", seed, 0)
     for given in cells or names_of("cells"):
-        cell = without_viewer(load_cell(given, overrides or (), world=world), no_viewer)
+        cell = Share(only=only).part_of(load_cell(given, overrides or (), world=world, seed=number))
         again = renewal(folder, given)
         rights = rights_in(cell)
-        names = [ROUTER_NAME, OPERATOR, *(common_name(cell.name, process) for process in rights)]
-        require_valid(place, [] if only_rules else names, again)
+        if not only_rules:
+            processes = [process for process in rights if not only or process != RECORDER]
+            names = [ROUTER_NAME, *([] if only else [OPERATOR]), *(common_name(cell.name, one) for one in processes)]
+            require_valid(place, names, again)
         require_current(place, read_access(place), cell.name, rights, again)
         typer.echo(f"{cell.name}: {len(rights)} processes, certificates and rules are as they need them")
 
@@ -134,30 +143,34 @@ def renewal(folder: str, cell: str) -> str:
     return f"zencell secure init {folder} --renew{chosen}"
 
 
-def without_viewer(cell: Cell, wanted: bool) -> Cell:
-    """The cell, without its page if that is wanted."""
-    kept = {key: entry for key, entry in cell.services.items() if not wanted or entry.name != VIEWER}
-    return cell.model_copy(update={"services": kept})
-
-
 def rights_in(cell: Cell) -> dict[str, Rights]:
     """What each process of a cell may do, found by letting its services declare what they need.
 
     Raises:
         ConfigError: one of them can not be configured so.
+        Unwired: one of them does not get so far.
     """
     from common.security.access import rights_of, rights_of_recorder, rights_of_supervisor
     from common.security.credentials import RECORDER, SUPERVISOR
+    from common.supervision.launch import require_modules
     from common.transport.wiring import wiring_of
+
+    require_modules(cell)
+    looked_at = cell.model_copy(update={"services": {
+        # The page listens while it is looked at: where nobody else does, for the cell may be up.
+        key: entry.model_copy(update={"parameters": {**entry.parameters, "host": "127.0.0.1", "port": 0}})
+        if entry.name == VIEWER else entry for key, entry in cell.services.items()
+    }})
 
     async def find() -> dict[str, Rights]:
         found = {}
-        for entry in cell.services.values():
-            given = dict(entry.parameters)
-            if entry.name == VIEWER:  # it listens while it is looked at: where nobody else does
-                given |= {"host": "127.0.0.1", "port": 0}
-            wired = await wiring_of(cell, entry.model_copy(update={"parameters": given}))
-            found[entry.name] = rights_of(entry.name, wired)
+        for entry in looked_at.services.values():
+            try:
+                found[entry.name] = rights_of(entry.name, await wiring_of(looked_at, entry))
+            except ZencellError:
+                raise
+            except Exception as error:  # whatever a service does that can not run so
+                raise Unwired(entry.name, error) from error
         return found
 
     return {**asyncio.run(find()), SUPERVISOR: rights_of_supervisor(), RECORDER: rights_of_recorder()}

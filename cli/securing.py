@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from common.supervision.launch import Launch
 
 LOOK_TIMEOUT = 120.0  # [s] for the services to declare what they need
+SAID = "zencell: "  # before the line in which a command says what is wrong
 
 
 class NotSecured(ZencellError):
@@ -37,16 +39,16 @@ def choose(folder: str | None) -> None:
 
 
 def require_secured(launch: Launch, cell: Cell) -> None:
-    """Return when the cell is an open one, or its certificates and rules are such that it can be brought up.
+    """Return when the cell is an open one, or what this host starts of it can be: router, supervisor, its services.
 
     Args:
         launch: how the cell was asked for.
-        cell: resolved, with the services that are to be started.
+        cell: resolved, with the services that are to be started here.
 
     Raises:
         ConfigError, NotSecured: one line that names the process, what is wrong and what would do.
     """
-    from common.security.credentials import OPERATOR, ROUTER_NAME, SUPERVISOR, common_name, secure_folder
+    from common.security.credentials import ROUTER_NAME, SUPERVISOR, common_name, read_access, secure_folder
     from common.transport.endpoint import is_encrypted
 
     folder = secure_folder()
@@ -56,26 +58,41 @@ def require_secured(launch: Launch, cell: Cell) -> None:
         raise ConfigError("--connect", launch.connect, "is an open endpoint: with --secure it must be tls/HOST:PORT")
     from common.security.checking import require_valid
 
-    processes = [SUPERVISOR, *(entry.name for entry in cell.services.values())]
-    names = [OPERATOR, *(common_name(cell.name, process) for process in processes)]
-    again = renewal(str(folder), launch.cell)
-    require_valid(folder, names if launch.connect else [ROUTER_NAME, *names], again)
+    services = [entry.name for entry in cell.services.values()]
+    names = [common_name(cell.name, process) for process in (SUPERVISOR, *services)]
+    require_valid(folder, names if launch.connect else [ROUTER_NAME, *names], renewal(str(folder), launch.cell))
     if not launch.connect:
-        _require_rules(launch, cell, folder)
+        read_access(folder)
+        _require_rules(launch, services, folder)
 
 
-def _require_rules(launch: Launch, cell: Cell, folder: Path) -> None:
+def require_recorder(launch: Launch, cell: Cell) -> None:
+    """Return when the cell is an open one, or its recorder has a certificate.
+
+    Raises:
+        ConfigError: it has none that is valid.
+    """
+    from common.security.credentials import RECORDER, common_name, secure_folder
+
+    folder = secure_folder()
+    if folder is not None:
+        from common.security.checking import require_valid
+
+        require_valid(folder, [common_name(cell.name, RECORDER)], renewal(str(folder), launch.cell))
+
+
+def _require_rules(launch: Launch, services: Sequence[str], folder: Path) -> None:
     # In a process of its own: what the services import would stay in this one for as long as the cell is up.
-    from cli.viewing import VIEWER
     from common.supervision.launch import python_module
 
-    command = [*python_module("cli.main"), "secure", "check", str(folder), "--only-rules", "--cell", launch.cell]
+    command = [*python_module("cli.main"), "secure", "check", str(folder), "--only-rules", "--cell", launch.cell,
+               "--only", ",".join(services)]
     for text in launch.overrides:
         command += ["--set", text]
     if launch.world is not None:
         command += ["--world", launch.world]
-    if all(entry.name != VIEWER for entry in cell.services.values()):
-        command += ["--no-viewer"]
+    if launch.seed is not None:
+        command += ["--seed", str(launch.seed)]
     try:
         done = subprocess.run(
             command, env=launch.environment(), capture_output=True, text=True, timeout=LOOK_TIMEOUT, check=False,
@@ -83,5 +100,6 @@ def _require_rules(launch: Launch, cell: Cell, folder: Path) -> None:
     except subprocess.TimeoutExpired:
         raise NotSecured(f"--secure: the services did not declare what they need within {LOOK_TIMEOUT:g} s") from None
     if done.returncode:
-        lines = done.stderr.strip().splitlines() or [f"`secure check` ended with {done.returncode}"]
-        raise NotSecured(lines[-1].removeprefix("zencell: "))
+        said = [line.removeprefix(SAID) for line in done.stderr.splitlines() if line.startswith(SAID)]
+        raise NotSecured(said[-1] if said else f"--secure: looking at the rules ended with {done.returncode}: "
+                                               f"{(done.stderr.strip().splitlines() or ['nothing was said'])[-1]}")

@@ -33,6 +33,7 @@ x-service: &service
   image: {IMAGE}
   build: .
   restart: unless-stopped
+  init: true   # so that the health check can kill a service that is frozen
   read_only: true
   tmpfs: [/tmp]
   cap_drop: [ALL]
@@ -73,12 +74,11 @@ def compose_dev() -> str:
     blocks = []
     for name, container in names.items():
         started = " ".join([*container.command, *container.arguments])
-        watched = ["/app/common", f"/app/services/{container.name}.py"]
         blocks.append(lines_of(name, {
             "image": f"{IMAGE}-dev",
             "build": {"context": ".", "target": "dev"},
             "volumes": [f"./{folder}:/app/{folder}:ro" for folder in SOURCE],
-            "command": ["watchfiles", "--filter", "python", started, *watched],
+            "command": ["watchfiles", "--filter", "deploy.watched.concerns", started, "/app/common", "/app/services"],
         }))
     return DEV_HEAD + "\n".join(blocks)
 

@@ -6,6 +6,7 @@ import uuid
 
 from common import topics
 from common.config import RobotConfig, Run
+from common.errors import ConfigError
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.tasks.outline import Outline, OutlineParameters
@@ -31,7 +32,7 @@ async def run(bus: Bus, config: Config) -> None:
     status = bus.writer(topics.OUTLINE_STATUS)
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
-        raise ValueError("the task needs a robot with a gripper")
+        raise ConfigError("robot.gripper", ..., "is missing: contour_tracer needs a robot with one")
     home, prefix = config.robot.named_poses["home"], uuid.uuid4().hex[:8]
     task = Outline(config, config.robot.gripper, home, prefix, config.run.autostart, bus.clock.speed)
     view = OutlineView(now=bus.clock.now())

@@ -6,6 +6,7 @@ import asyncio
 
 from common import topics
 from common.config import RobotConfig, Surroundings
+from common.errors import ConfigError
 from common.perception.intake import Cameras, Unusable
 from common.robot.model import RobotModel
 from common.scene.perceived import PerceivedScene
@@ -31,7 +32,7 @@ async def run(bus: Bus, config: Config) -> None:
     out = bus.writer(topics.PLANNING_SCENE)
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
-        raise ValueError("the scene manager needs a robot with a gripper")
+        raise ConfigError("robot.gripper", ..., "is missing: scene_manager needs a robot with one")
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
     unusable: set[str] = set()
     out.put(scene.scene())

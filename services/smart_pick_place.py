@@ -6,6 +6,7 @@ import uuid
 
 from common import topics
 from common.config import Grasp, RobotConfig, Run, Surroundings
+from common.errors import ConfigError
 from common.robot.model import RobotModel
 from common.tasks.pick_place import PickPlace
 from common.tasks.pick_place_parameters import PickPlaceParameters
@@ -33,7 +34,7 @@ async def run(bus: Bus, config: Config) -> None:
     status = bus.writer(topics.PICK_PLACE_STATUS)
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
-        raise ValueError("the task needs a robot with a gripper")
+        raise ConfigError("robot.gripper", ..., "is missing: smart_pick_place needs a robot with one")
     prefix = uuid.uuid4().hex[:8]
     task = PickPlace(
         config, config.grasp, config.world, config.robot.gripper, prefix, config.run.autostart, bus.clock.speed

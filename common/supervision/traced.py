@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 BEFORE = ("IDLE", "SELECTING", "PLANNING")
 UNDER_WAY = ("APPROACHING", "TRACING", "RETREATING")
-CLOSED = 1e-3  # [m] first and last place of a closed outline are no farther apart
+CLOSED = 1e-3  # [m] first and last place of a closed outline are no farther apart, but for what lies between two looks
 MOST_STATES = 100_000  # joint states of one tracing that are kept: a quarter of an hour at 100 Hz
 
 
@@ -76,7 +76,7 @@ class Traced:
             "points": self._status.points,
             "fraction": round(self._fraction(tips), 4),
             "length_m": round(self._status.length_m, 4),
-            "closed": self._status.closed and len(tips) > 0 and float(np.linalg.norm(tips[0] - tips[-1])) <= CLOSED,
+            "closed": self._status.closed and _is_closed(tips),
             "deviation_mm": _millimetres(min(near, key=lambda d: float(d.mean()), default=None)),
             "tracking_mm": _millimetres(distances(tips, path) if len(tips) and len(path) > 1 else None),
         }
@@ -114,6 +114,14 @@ class Traced:
         for thing in objects:
             edges += [(edge, thing.base + thing.height) for edge in (thing.outline, thing.hole) if len(edge) > 2]
         return [np.column_stack([np.array(edge), np.full(len(edge), top)]) for edge, top in edges]
+
+
+def _is_closed(tips: Array) -> bool:
+    """Whether the first and the last place (N, 3) are the same, as well as joint states that come now and then show."""
+    if len(tips) < 2:
+        return False
+    steps = np.linalg.norm(np.diff(tips, axis=0), axis=1)
+    return float(np.linalg.norm(tips[0] - tips[-1])) <= CLOSED + float(steps.max())
 
 
 def distances(places: Array, corners: Array) -> Array:

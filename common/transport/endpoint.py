@@ -130,21 +130,29 @@ def is_encrypted(endpoint: str) -> bool:
 
 def client_config(endpoint: str, *, connect_ms: int, credentials: Credentials | None = None) -> zenoh.Config:
     """Configuration of a client of the router at an endpoint, which tries for `connect_ms` to reach it at first."""
-    return _config(
+    return _config(_settings(
         **({"transport__link__tls": credentials.tls()} if credentials else {}),
         mode="client",
         listen__endpoints=[],
         connect__endpoints=[endpoint],
         connect__timeout_ms=connect_ms,
         connect__retry={"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
-    )
+    ))
 
 
 def router_config(
     endpoints: Sequence[str], credentials: Credentials | None = None, access: dict[str, Any] | None = None,
     links: Sequence[str] = (),
 ) -> zenoh.Config:
-    """Configuration of a router that listens at these endpoints only.
+    """Configuration of a router that listens at these endpoints only: that of `router_settings`."""
+    return _config(router_settings(endpoints, credentials, access, links))
+
+
+def router_settings(
+    endpoints: Sequence[str], credentials: Credentials | None = None, access: dict[str, Any] | None = None,
+    links: Sequence[str] = (),
+) -> dict[str, Any]:
+    """What a router is told, as the tree of a Zenoh configuration file; all else is as Zenoh has it.
 
     Args:
         endpoints: where.
@@ -162,7 +170,7 @@ def router_config(
         "messages": ["put"], "flows": ["egress"], "qos": {"congestion_control": "block"},
         "overwrite": {"congestion_control": "block_first", "express": False},
     }
-    return _config(
+    return _settings(
         qos__network=[patient],
         transport__link__tx__queue__size__data_high=STATE_BATCHES,
         mode="router", listen__endpoints=list(endpoints), connect__endpoints=list(links),
@@ -188,10 +196,8 @@ def size_limit() -> dict[str, Any]:
     }
 
 
-def _config(**values: Any) -> zenoh.Config:
-    import zenoh  # here: the command line asks for endpoints before it has started anything
-
-    config = zenoh.Config()
+def _settings(**values: Any) -> dict[str, Any]:
+    """A tree of settings, those that all processes share among them; `__` in a name goes down one level."""
     common = {
         "scouting__multicast__enabled": False,
         "scouting__gossip__enabled": False,
@@ -208,6 +214,17 @@ def _config(**values: Any) -> zenoh.Config:
         # What is longer ends the link that it comes from; by default a message may have 1 GB.
         "transport__link__rx__max_message_size": MOST_BYTES,
     }
-    for key, value in {**common, **values}.items():
-        config.insert_json5(key.replace("__", "/"), json.dumps(value))
-    return config
+    tree: dict[str, Any] = {}
+    for path, value in {**common, **values}.items():
+        *parents, name = path.split("__")
+        node = tree
+        for parent in parents:
+            node = node.setdefault(parent, {})
+        node[name] = value
+    return tree
+
+
+def _config(settings: dict[str, Any]) -> zenoh.Config:
+    import zenoh  # here: the command line asks for endpoints before it has started anything
+
+    return zenoh.Config.from_json5(json.dumps(settings))

@@ -1,7 +1,8 @@
 """Whether the service of a container is ready: `python -m common.transport.health`, exit code 0 or 1.
 
-It asks the router for the service's readiness token, which also vanishes when the process is frozen or cut off. It
-imports nothing but Zenoh, because it is started every few seconds beside every service.
+It asks the router for the service's readiness token, which also vanishes when the process is frozen or cut off. One that
+is frozen it ends, for the engine to start it again. It imports nothing but Zenoh, because it is started every few seconds
+beside every service.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import zenoh
 
 from common.security.credentials import ROUTER_NAME, common_name, credentials_of, secure_folder
 from common.transport.endpoint import client_config, endpoint_of
+from common.transport.frozen import end_if_frozen
 from common.transport.keys import ROUTER, alive_key
 
 TIMEOUT = 1.0  # [s]
@@ -52,6 +54,9 @@ def main() -> int:
     parser.add_argument("--service", help="that of the container's first process if not given")
     options = parser.parse_args()
     service = options.service or first_service()
+    if end_if_frozen():
+        sys.stderr.write(f"{options.cell}/{service} was frozen and is killed\n")
+        return 1
     endpoint = endpoint_of()
     if is_ready(endpoint, options.cell, service):
         return 0
