@@ -39,8 +39,8 @@ def snapshot(
 
     A cell that is up is asked; else its services are started for it, without the task, and stopped again.
     """
-    from cli.bringup import Operation
     from cli.inspection import inspect
+    from cli.operation import Operation
     from common.config import load_cell
     from common.perception.contours_choice import parse_choice
     from common.supervision.launch import place_of, require_free_port

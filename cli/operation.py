@@ -1,0 +1,319 @@
+"""One cell that is up at this terminal: checked, started, watched, told of, and ended."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import signal
+import tempfile
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
+
+import typer
+
+from cli import hosts, options, securing, viewing
+
+if TYPE_CHECKING:
+    from cli.screens import Content, Screen
+    from common.chaos.agent import Chaos
+    from common.config import Cell
+    from common.supervision.collector import Collector
+    from common.supervision.supervisor import Supervisor
+    from common.transport.bus import Bus
+
+T = TypeVar("T")
+
+START_REQUEST_TIMEOUT = 5.0  # [s]
+
+
+class Disturbance(NamedTuple):
+    """Faults that were asked for."""
+
+    seed: int
+    per_minute: float
+    until_ended: bool  # rather than without end
+
+
+class Operation:
+    """One bring-up, as a person asked for it."""
+
+    def __init__(
+        self, cell: str, overrides: list[str] | None, world: str | None, seed: str | None, speed: str,
+        domain: str | None, connect: str | None, no_viewer: bool, summary: str | None = None, log_json: bool = False,
+        share: hosts.Share | None = None,
+    ) -> None:
+        """Check everything that was asked for; nothing is started yet.
+
+        Raises:
+            ConfigError, UnknownName: one line naming the option, the value and the choices.
+        """
+        from common.config import expanded, load_cell
+        from common.errors import ConfigError
+        from common.supervision.launch import (
+            Launch,
+            clock_of,
+            place_of,
+            process_began,
+            require_free_port,
+            require_modules,
+        )
+        from common.supervision.summary import Summary
+        from common.transport.endpoint import endpoint_of
+
+        self.began = process_began()
+        self.file = Path(summary) if summary else None
+        if self.file and not self.file.absolute().parent.is_dir():
+            raise ConfigError("--summary", summary, "is in a folder that does not exist")
+        share = share or hosts.Share()
+        number, endpoint = place_of(domain, connect)
+        factor = options.number("--speed", speed)
+        self.launch = share.linked(Launch(
+            cell=cell, overrides=tuple(expanded(overrides or ())), world=world, seed=options.whole("--seed", seed, 0),
+            domain=number, connect=endpoint, log_json=log_json, clock=clock_of(factor, share.epoch(factor)),
+        ))
+        loaded = load_cell(cell, self.launch.overrides, world=world, seed=self.launch.seed)
+        if no_viewer:
+            kept = {name: entry for name, entry in loaded.services.items() if entry.name != viewing.VIEWER}
+            loaded = loaded.model_copy(update={"services": kept})
+        self.cell: Cell = loaded
+        self.summary = Summary(loaded.name, loaded.run.seed, self.launch.clock.speed)
+        require_modules(loaded)
+        if endpoint is None:
+            require_free_port(endpoint_of(number))
+        self.cell = share.part_of(loaded)
+        securing.require_secured(self.launch, self.cell)
+        self._supervisor: Supervisor | None = None
+        self._collector: Collector | None = None
+        self._screen: Screen | None = None
+        self._page = ""  # address
+        self._watchers: dict[str, list[str]] = {}  # commands by name
+        self._disturbance: Disturbance | None = None
+        self._chaos: Chaos | None = None
+        self.ask = False  # the person at the terminal which object is to be outlined
+
+    def serve_page(self, host: str | None, port: str | None) -> None:
+        """Say where the operator's page is to be, if the cell has one; without this the cell's own words hold.
+
+        Raises:
+            ConfigError: there is no page, the port is taken, or host or port can not be used.
+        """
+        page = viewing.page_of(self.cell, host, port)
+        if page is not None:
+            overrides = (*self.launch.overrides, *page.overrides)
+            self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
+            self._page = page.address
+
+    def record_to(self, file: str | None) -> None:
+        """Have a process beside the services record all that travels, from before they are ready to after their end.
+
+        Raises:
+            ConfigError: no recording can be made there.
+        """
+        if file is None:
+            return
+        from cli.recording import NAME, require_new
+        from common.supervision.launch import python_module
+
+        path = Path(file).absolute()
+        require_new(path, "--record")
+        securing.require_recorder(self.launch, self.cell)
+        place = ["--connect", self.launch.connect] if self.launch.connect else ["--domain", str(self.launch.domain)]
+        self._watchers[NAME] = [
+            *python_module("cli.main"), "record", "--cell", self.cell.name, "-o", str(path), *place, "--gate",
+        ]
+
+    def disturb(self, seed: str | None, rate: str | None, *, until_ended: bool) -> None:
+        """Have faults made on purpose once the cell is up: without end, or until a run has time left to finish.
+
+        Raises:
+            ConfigError: seed or rate can not be used.
+        """
+        from common.chaos.plan import MOST_PER_MINUTE, PER_MINUTE
+        from common.errors import ConfigError
+
+        number = options.whole("--chaos", seed, 0)
+        per_minute = PER_MINUTE if rate is None else options.number("--chaos-rate", rate)
+        if not 0 < per_minute <= MOST_PER_MINUTE:
+            raise ConfigError("--chaos-rate", rate, f"must be more than 0 and at most {MOST_PER_MINUTE:g} [1/min]")
+        if rate is not None and number is None:
+            raise ConfigError("--chaos-rate", rate, "needs --chaos SEED")
+        self._disturbance = None if number is None else Disturbance(number, per_minute, until_ended)
+
+    def leave_out(self, name: str) -> None:
+        """Do not start a service."""
+        kept = {key: entry for key, entry in self.cell.services.items() if entry.name != name}
+        self.cell = self.cell.model_copy(update={"services": kept})
+
+    def visit(self, visit: Callable[[Bus], Awaitable[T]]) -> T:
+        """What a visit to the cell returns that is brought up for it.
+
+        Raises:
+            KeyboardInterrupt: a signal ended it.
+        """
+        results: list[T] = []
+
+        async def work(bus: Bus) -> int:
+            results.append(await visit(bus))
+            return 0
+
+        if asyncio.run(self._operate(work)) or not results:
+            raise KeyboardInterrupt
+        return results[0]
+
+    def run_to_end(self) -> int:
+        """Exit code of a run: 0 when the task is DONE, 1 when it is not, 130 after Ctrl-C."""
+        from common.supervision.summary import describe
+        from common.supervision.supervisor import StartFailed
+
+        try:
+            code = asyncio.run(self._operate(self._until_ended))
+        except StartFailed:
+            self.summary.failed = True
+            self._write_summary()
+            raise
+        self._write_summary()
+        for line in describe(self.summary.as_dict()):
+            typer.echo(line)
+        return code
+
+    def stay(self) -> int:
+        """Exit code of staying up until a signal: 0 when that came after the cell was up."""
+        code = asyncio.run(self._operate(self._until_interrupted))
+        self._write_summary()
+        return 0 if self.summary.ready is not None else code
+
+    async def _operate(self, work: Callable[[Bus], Awaitable[int]]) -> int:
+        """Exit code of the work, done in the cell. What is simulated stays as it is through restarts, until the end."""
+        from common.sim.standing import STATE_VARIABLE
+
+        if STATE_VARIABLE in os.environ:
+            return await self._in_cell(work)
+        with tempfile.TemporaryDirectory(prefix="zencell-") as folder:
+            self.launch = replace(self.launch, extra={**self.launch.extra, STATE_VARIABLE: folder})
+            return await self._in_cell(work)
+
+    async def _in_cell(self, work: Callable[[Bus], Awaitable[int]]) -> int:
+        from common.supervision.interrupts import Interrupts
+        from common.supervision.operation import Interrupted, operate
+        from common.supervision.supervisor import Supervisor
+
+        interrupts = Interrupts()
+        interrupts.install()
+        early: list[tuple[str, str]] = []
+
+        def show(name: str, text: str) -> None:
+            if self._screen is None:
+                early.append((name, text))
+            else:
+                self._screen.line(name, text)
+
+        self._supervisor = Supervisor(self.cell, self.launch, show, self._watchers)
+        self._supervisor.begin()  # before the rest of our own imports, which take as long as theirs
+        try:
+            self._open_screen(early)
+            return await operate(self.cell, self.launch, self._supervisor, interrupts, work, self._prepare)
+        except Interrupted:
+            return 128 + (interrupts.signal or signal.SIGINT)
+        finally:
+            if self._collector:
+                self._collector.read_truth()
+            self.summary.restarts = self._supervisor.restarts
+            self.summary.chaos = self._chaos.as_dicts() if self._chaos else None
+            if self._screen:
+                self._screen.close()
+
+    def _open_screen(self, early: list[tuple[str, str]]) -> None:
+        from cli.screens import ScreenHandler, open_screen
+
+        self._screen = open_screen(self._content, log_json=self.launch.log_json, plain=self.ask)
+        for name, text in early:
+            self._screen.line(name, text)
+        root = logging.getLogger()
+        root.addHandler(ScreenHandler(self._screen, log_json=self.launch.log_json))
+        root.setLevel(logging.INFO)
+
+    def _content(self) -> Content:
+        from cli.screens import Content
+
+        assert self._supervisor is not None
+        statuses = self._supervisor.statuses
+        if self._collector is None:
+            return Content(statuses, {}, None)
+        rates = {status.name: self._collector.rates.busiest_of(status.name) for status in statuses}
+        return Content(statuses, {name: rate for name, rate in rates.items() if rate}, self._collector.task_status)
+
+    def _prepare(self, bus: Bus) -> None:
+        from common.supervision.collector import Collector
+
+        assert self._screen is not None
+        self._collector = Collector(bus, self.cell.task, self.summary, self.began, self._screen.progress,
+                                    self.cell.robot)
+
+    async def _until_ended(self, bus: Bus) -> int:
+        from common import topics
+        from common.messages import TaskCommand
+        from common.supervision.operation import beside
+
+        collector = self._came_up(bus)
+        if not self.cell.run.autostart:
+            await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"), START_REQUEST_TIMEOUT)
+
+        async def end() -> None:
+            if self.ask:
+                from cli.asking import ask
+
+                await ask(bus, Path.cwd())
+            await collector.ended.wait()
+            await collector.settle()
+
+        await beside(self._disturbing(), beside(collector.run(), end()))
+        return 0 if self.summary.state == "DONE" else 1
+
+    async def _until_interrupted(self, bus: Bus) -> int:
+        from common.supervision.operation import beside
+        from common.transport.endpoint import endpoint_of
+
+        collector = self._came_up(bus)
+        assert self._screen is not None
+        endpoint = endpoint_of(None if self.launch.connect else self.launch.domain, self.launch.connect)
+        took = f"{self.summary.ready:.1f} s"
+        self._screen.note(f"{self.cell.name} is up at {endpoint} after {took}. Read it from outside:")
+        self._screen.note(zenoh_cli_line(endpoint, self.cell.name))
+        await beside(self._disturbing(), collector.run())
+        return 0
+
+    async def _disturbing(self) -> None:
+        if self._chaos is not None:
+            await self._chaos.run()
+
+    def _came_up(self, bus: Bus) -> Collector:
+        assert self._collector is not None
+        self.summary.ready = time.monotonic() - self.began
+        if self._page and self._screen:
+            self._screen.note(f"Open {self._page}")
+        if self._disturbance is not None:
+            from common.chaos.setting import chaos_in
+
+            assert self._supervisor is not None
+            seed, per_minute, until_ended = self._disturbance
+            self._chaos = chaos_in(bus, self.cell, self._supervisor, seed, per_minute, until_ended=until_ended)
+        return self._collector
+
+    def _write_summary(self) -> None:
+        if self.file is None:
+            return
+        text = json.dumps(self.summary.as_dict(), indent=2) + "\n"
+        beside_it = self.file.with_name(self.file.name + ".part")
+        beside_it.write_text(text, encoding="utf-8")
+        beside_it.replace(self.file)  # a reader sees all of it or none
+
+
+def zenoh_cli_line(endpoint: str, cell: str) -> str:
+    """A command line to paste that shows all of a cell with zenoh-cli."""
+    line = "{key} {value}"
+    return f"zenoh --mode client --connect {endpoint} subscribe -k '{cell}/**' --decoder msgpack --line '{line}'"
