@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -124,9 +125,9 @@ def check(
         raise ConfigError("--only", ",".join(only), "needs the one cell that they are services of: --cell CELL")
     place, number = Path(folder), options.whole("--seed", seed, 0)
     for given in cells or names_of("cells"):
-        cell = Share(only=only).part_of(load_cell(given, overrides or (), world=world, seed=number))
+        cell = load_cell(given, overrides or (), world=world, seed=number)
         again = renewal(folder, given)
-        rights = rights_in(cell)
+        rights = rights_in(cell, [entry.name for entry in Share(only=only).part_of(cell).services.values()])
         if not only_rules:
             processes = [process for process in rights if not only or process != RECORDER]
             names = [ROUTER_NAME, *([] if only else [OPERATOR]), *(common_name(cell.name, one) for one in processes)]
@@ -143,8 +144,12 @@ def renewal(folder: str, cell: str) -> str:
     return f"zencell secure init {folder} --renew{chosen}"
 
 
-def rights_in(cell: Cell) -> dict[str, Rights]:
+def rights_in(cell: Cell, names: Collection[str] | None = None) -> dict[str, Rights]:
     """What each process of a cell may do, found by letting its services declare what they need.
+
+    Args:
+        cell: resolved; the whole of it, because what a service declares may depend on who else is there.
+        names: of the services that are looked at; all when not given.
 
     Raises:
         ConfigError: one of them can not be configured so.
@@ -156,7 +161,7 @@ def rights_in(cell: Cell) -> dict[str, Rights]:
     from common.transport.wiring import wiring_of
 
     require_modules(cell)
-    looked_at = cell.model_copy(update={"services": {
+    apart = cell.model_copy(update={"services": {
         # The page listens while it is looked at: where nobody else does, for the cell may be up.
         key: entry.model_copy(update={"parameters": {**entry.parameters, "host": "127.0.0.1", "port": 0}})
         if entry.name == VIEWER else entry for key, entry in cell.services.items()
@@ -164,9 +169,11 @@ def rights_in(cell: Cell) -> dict[str, Rights]:
 
     async def find() -> dict[str, Rights]:
         found = {}
-        for entry in looked_at.services.values():
+        for entry in apart.services.values():
+            if names is not None and entry.name not in names:
+                continue
             try:
-                found[entry.name] = rights_of(entry.name, await wiring_of(looked_at, entry))
+                found[entry.name] = rights_of(entry.name, await wiring_of(apart, entry))
             except ZencellError:
                 raise
             except Exception as error:  # whatever a service does that can not run so

@@ -20,7 +20,11 @@ SAID = "zencell: "  # before the line in which a command says what is wrong
 
 
 class NotSecured(ZencellError):
-    """The certificates do not fit the cell."""
+    """The certificates do not fit the cell, or its services can not say what they need."""
+
+    def __init__(self, message: str, exit_code: int = 2) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
 
 
 def choose(folder: str | None) -> None:
@@ -100,6 +104,6 @@ def _require_rules(launch: Launch, services: Sequence[str], folder: Path) -> Non
     except subprocess.TimeoutExpired:
         raise NotSecured(f"--secure: the services did not declare what they need within {LOOK_TIMEOUT:g} s") from None
     if done.returncode:
-        said = [line.removeprefix(SAID) for line in done.stderr.splitlines() if line.startswith(SAID)]
-        raise NotSecured(said[-1] if said else f"--secure: looking at the rules ended with {done.returncode}: "
-                                               f"{(done.stderr.strip().splitlines() or ['nothing was said'])[-1]}")
+        lines = done.stderr.strip().splitlines() or [f"`secure check` ended with {done.returncode}"]
+        said = [line.removeprefix(SAID) for line in lines if line.startswith(SAID)] or lines
+        raise NotSecured(said[-1], done.returncode)

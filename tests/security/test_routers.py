@@ -1,4 +1,4 @@
-"""Secured routers without a cell: two that are linked, and endpoints that are not encrypted."""
+"""Secured routers without a cell: two that are linked, endpoints that are not encrypted, and one made of a file."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+import zenoh
 
-from benchmarks.runs import ROOT, environment
+from benchmarks.runs import ROOT, environment, free_domain
+from cli.main import app
 from common.errors import ConfigError
 from common.security.access import Rights, access_control
 from common.security.certificates import Authority
-from common.security.credentials import ACCESS, ROUTER_NAME, credentials_of
+from common.security.credentials import ACCESS, ROUTER_NAME, credentials_of, read_access
+from common.transport.endpoint import port_of, router_config
 from common.transport.router import open_router
-from tests.security.holders import Holder
+from tests.security.holders import REFUSED, Holder
 
 
 def free_port() -> int:
@@ -86,3 +89,73 @@ def test_a_router_that_is_reached_from_elsewhere_names_the_remedy_unless_it_is_s
     warnings = [line for line in said if "WARNING" in line]
     assert len(warnings) == (0 if secured else 1)
     assert all("zencell secure init DIR" in line for line in warnings)
+
+
+# --- the router's configuration as a file, for a router that is not ours ----------------------------------------------
+
+
+def written(capsys: pytest.CaptureFixture[str], place: Path, *arguments: str) -> Path:
+    """What `zencell router config` prints, as a file."""
+    assert app.execute(["router", "config", *arguments]) == 0
+    place.write_text(capsys.readouterr().out)
+    return place
+
+
+@pytest.fixture
+def nothing_handed_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    for variable in ("ZENCELL_SECURE", "ZENCELL_LISTEN", "ZENCELL_LINK", "ZENCELL_DOMAIN"):
+        monkeypatch.setenv(variable, "42" if variable == "ZENCELL_DOMAIN" else "")
+
+
+@pytest.mark.usefixtures("nothing_handed_down")
+def test_the_file_says_what_our_own_router_is_told(
+    capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
+) -> None:
+    file = written(capsys, tmp_path / "open.json5", "--link", "tcp/192.168.1.10:7489")
+    told = router_config(["tcp/127.0.0.1:7489"], links=["tcp/192.168.1.10:7489"])
+    assert str(zenoh.Config.from_file(file)) == str(told)
+    file = written(capsys, tmp_path / "secured.json5", "--secure", str(folder), "--listen", "tls/0.0.0.0:7449",
+                   "--domain", "2")
+    told = router_config(["tls/0.0.0.0:7449"], credentials_of(ROUTER_NAME, folder), read_access(folder))
+    assert str(zenoh.Config.from_file(file)) == str(told)
+
+
+@pytest.mark.usefixtures("nothing_handed_down")
+def test_a_router_that_was_given_the_file_lets_in_and_passes_on_what_ours_does(
+    capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
+) -> None:
+    domain = free_domain()
+    file = written(capsys, tmp_path / "router.json5", "--secure", str(folder), "--domain", str(domain))
+    endpoint = f"tls/127.0.0.1:{port_of(domain)}"
+    with zenoh.open(zenoh.Config.from_file(file)):
+        with pytest.raises(zenoh.ZError):
+            Holder(endpoint, None, connect_ms=REFUSED)
+        with (Holder(endpoint, credentials_of("cell.writer", folder)) as writer,
+              Holder(endpoint, credentials_of("cell.reader", folder)) as reader):
+            heard = reader.hear("cell/**", "cell/seen", "cell/secret")
+            for _ in range(100):
+                writer.put("cell/secret", b"not for all")
+                writer.put("cell/seen", b"for all")
+                if heard.samples:
+                    break
+                heard.soon(0.1)
+            assert set(heard.samples) == {("cell/seen", b"for all")}
+
+
+@pytest.mark.usefixtures("nothing_handed_down")
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        (["--domain", "233"], "--domain: '233'"),
+        (["--secure", "nowhere"], "'nowhere' is not a folder"),
+        (["--listen", "here"], "--listen: 'here' must be an endpoint"),
+    ],
+)
+def test_a_file_that_no_router_could_use_is_not_written(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], wanted: str
+) -> None:
+    assert app.execute(["router", "config", *arguments]) == 2
+    shown = capsys.readouterr()
+    (line,) = shown.err.splitlines()
+    assert shown.out == ""
+    assert wanted in line

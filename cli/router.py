@@ -1,0 +1,53 @@
+"""What a cell's router is told, for a router that is not the project's own."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import typer
+
+from cli import options, securing
+from cli.hosts import Share
+
+app = typer.Typer(help="What a cell's router is told.", no_args_is_help=True)
+
+HEAD = "// A router for work cells, as `zencell up` would start it: zenohd --config THIS_FILE\n"
+
+
+@app.callback()
+def router() -> None:
+    """What a cell's router is told."""
+
+
+@app.command()
+def config(
+    domain: options.Domain = None,
+    listen: options.Listen = None,
+    link: options.Link = None,
+    secure: options.Secure = None,
+) -> None:
+    """Print the router's configuration as JSON5, for zenohd or the image eclipse/zenoh."""
+    from common.security.checking import require_valid
+    from common.security.credentials import ROUTER_NAME, credentials_of, read_access, secure_folder
+    from common.supervision.launch import Launch
+    from common.transport.endpoint import (
+        DEFAULT_DOMAIN,
+        DOMAIN_VARIABLE,
+        endpoint_of,
+        parse_domain,
+        router_settings,
+    )
+
+    securing.choose(secure)
+    given = os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN) if domain is None else domain
+    number = parse_domain(given, DOMAIN_VARIABLE if domain is None else "--domain")
+    launch = Share(listen, link).linked(Launch(cell="", domain=number))
+    endpoints = launch.listen or (endpoint_of(number),)
+    folder = secure_folder()
+    if folder is None:
+        settings = router_settings(endpoints, links=launch.link)
+    else:
+        require_valid(folder, [ROUTER_NAME], f"zencell secure init {folder} --renew")
+        settings = router_settings(endpoints, credentials_of(ROUTER_NAME, folder), read_access(folder), launch.link)
+    typer.echo(HEAD + json.dumps(settings, indent=1))
