@@ -28,7 +28,7 @@ class Figure:
         opacity: float | None = None,
         visible: bool = True,
     ) -> None:
-        """Add the meshes to the scene under `root`, where `poses` says.
+        """Add the links to the scene under `root`, where `poses` says, and their meshes once it is shown.
 
         Args:
             scene: to which they are added.
@@ -47,16 +47,27 @@ class Figure:
             self._joints.append(scene.add_frame(paths[index], show_axes=False))
         self._placed = np.full((len(self._joints), 7), np.nan)
         self.links: dict[str, viser.FrameHandle] = {}
-        for number, piece in enumerate(pieces):
+        self._scene, self._color, self._opacity = scene, color, opacity
+        self._undrawn = list(pieces)
+        for piece in self._undrawn:
             joint, position, wxyz = poses.carrier(piece.link)
-            name = f"{paths[joint]}/{piece.link}"
             if piece.link not in self.links:
-                self.links[piece.link] = scene.add_frame(name, show_axes=False, position=position, wxyz=wxyz)
-            scene.add_mesh_simple(
-                f"{name}/{number}", piece.vertices, piece.faces, color=color or piece.color, opacity=opacity,
-                cast_shadow=False, receive_shadow=False,
-            )
+                self.links[piece.link] = scene.add_frame(
+                    f"{paths[joint]}/{piece.link}", show_axes=False, position=position, wxyz=wxyz)
+        if visible:
+            self._draw()
         self._place()
+
+    @property
+    def visible(self) -> bool:
+        """Whether it is shown."""
+        return self.root.visible
+
+    @visible.setter
+    def visible(self, on: bool) -> None:
+        if on:
+            self._draw()
+        self.root.visible = on
 
     def move(self, names: Sequence[str], positions: Sequence[float]) -> bool:
         """Move to joint positions [rad or m]; whether anything moved."""
@@ -64,6 +75,15 @@ class Figure:
         if moved:
             self._place()
         return moved
+
+    def _draw(self) -> None:
+        """Send the meshes, once: a browser takes its time over meshes that are hidden, too."""
+        for number, piece in enumerate(self._undrawn):
+            self._scene.add_mesh_simple(
+                f"{self.links[piece.link].name}/{number}", piece.vertices, piece.faces,
+                color=self._color or piece.color, opacity=self._opacity, cast_shadow=False, receive_shadow=False,
+            )
+        self._undrawn.clear()
 
     def _place(self) -> None:
         """Say only what moved: of a joint that turns just the rotation, which moves everything beyond it."""

@@ -43,12 +43,9 @@ class GoalMarker:
             name, scale=_SIZE, depth_test=False, opacity=0.9, visible=False, position=T_world_tcp[:3, 3],
             wxyz=matrix_wxyz(T_world_tcp), line_width=3.0,
         )
-        for number, piece in enumerate(piece for piece in pieces if piece.link in _hand(robot)):
-            T_tcp_link = invert(T_world_tcp) @ links[piece.link]
-            scene.add_mesh_simple(
-                f"{name}/{number}", piece.vertices, piece.faces, color=HAND, opacity=0.45, cast_shadow=False,
-                position=T_tcp_link[:3, 3], wxyz=matrix_wxyz(T_tcp_link), receive_shadow=False,
-            )
+        hand = _hand(robot)
+        self._scene = scene
+        self._undrawn = [(piece, invert(T_world_tcp) @ links[piece.link]) for piece in pieces if piece.link in hand]
 
         @self._node.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
@@ -62,6 +59,8 @@ class GoalMarker:
 
     @visible.setter
     def visible(self, on: bool) -> None:
+        if on:
+            self._draw()
         self._node.visible = on
 
     @property
@@ -72,6 +71,15 @@ class GoalMarker:
     @pose.setter
     def pose(self, pose: Pose) -> None:
         self._node.position, self._node.wxyz = position_of(pose), wxyz_of(pose)
+
+    def _draw(self) -> None:
+        """Send the meshes, once: a browser takes its time over meshes that are hidden, too."""
+        for number, (piece, T_tcp_link) in enumerate(self._undrawn):
+            self._scene.add_mesh_simple(
+                f"{self._node.name}/{number}", piece.vertices, piece.faces, color=HAND, opacity=0.45,
+                cast_shadow=False, position=T_tcp_link[:3, 3], wxyz=matrix_wxyz(T_tcp_link), receive_shadow=False,
+            )
+        self._undrawn.clear()
 
 
 def _hand(robot: RobotModel) -> set[str]:

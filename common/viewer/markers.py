@@ -53,25 +53,23 @@ class Targets:
         self._scene = scene
         self._root = root
         self._ring = ring(radius)
-        self._node: viser.BatchedMeshHandle | None = None
-        self._at: Array = np.empty((0, 3))
+        # A mesh each: their shader is that of everything else, and a browser without a graphics card needs a moment
+        # for one of their own.
+        self._nodes: list[viser.MeshHandle] = []
 
     def show(self, m: PoseArray) -> None:
         """Show these targets and no others."""
         at = np.array([position_of(pose) for pose in m.poses]).reshape(-1, 3)
-        if at.shape == self._at.shape and (np.abs(at - self._at) < _STILL).all():
-            return
-        upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(at), 1))
-        if self._node is not None and len(at) == len(self._at):
-            self._node.batched_positions = at.astype(np.float32)
-        else:
-            if self._node is not None:
-                self._node.remove()
-            self._node = self._scene.add_batched_meshes_simple(
-                f"{self._root}/rings", self._ring.vertices, self._ring.faces, upright, at, batched_colors=TARGET,
-                lod="off", cast_shadow=False, receive_shadow=False,
-            ) if len(at) else None
-        self._at = at
+        while len(self._nodes) > len(at):
+            self._nodes.pop().remove()
+        for node, place in zip(self._nodes, at, strict=False):
+            if np.abs(node.position - place).max() >= _STILL:
+                node.position = place
+        for place in at[len(self._nodes) :]:
+            self._nodes.append(self._scene.add_mesh_simple(
+                f"{self._root}/{len(self._nodes)}", self._ring.vertices, self._ring.faces, color=TARGET,
+                position=place, cast_shadow=False, receive_shadow=False,
+            ))
 
 
 @dataclass
@@ -179,7 +177,7 @@ class Workspace:
             ))
             return self._scene.add_mesh_simple(name, wall.vertices, wall.faces, **look | {"side": "back"}, **place)
         if marker.type == "box":
-            return self._scene.add_box(name, dimensions=size, **look, **place)
+            return self._scene.add_box(name, dimensions=size, flat_shading=False, **look, **place)
         if marker.type == "sphere":
             return self._scene.add_icosphere(name, size[0] / 2, **look, **place)
         return self._scene.add_label(name, marker.text, **place)

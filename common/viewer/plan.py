@@ -66,7 +66,7 @@ class Plan:
         self._positions = np.array([point.positions for point in m.points]).reshape(len(m.points), len(self._names))
         self._playing = None
         self._draw()
-        self.ghost.root.visible = len(m.points) > 0
+        self.ghost.visible = len(m.points) > 0
         if len(m.points):
             self.ghost.move(self._names, self._positions[-1].tolist())
 
@@ -74,11 +74,11 @@ class Plan:
         """Let the ghost move along the trajectory, over and over."""
         if len(self._times):
             self._playing = (self._clock(), None)
-            self.ghost.root.visible = True
+            self.ghost.visible = True
 
     def follow(self, robot: LinkPoses) -> None:
         """Move the ghost on; it stops playing when the robot moves, and goes when the robot is where the plan ends."""
-        if not len(self._times) or not self.ghost.root.visible:
+        if not len(self._times) or not self.ghost.visible:
             return
         known = [name for name in self._names if robot.has_joint(name)]
         now = robot.joint_positions(known)
@@ -95,7 +95,7 @@ class Plan:
             return
         end = self._positions[-1][[self._names.index(name) for name in known]]
         if np.abs(now - end).max(initial=0.0) < _THERE:
-            self.ghost.root.visible = False
+            self.ghost.visible = False
         self._part(robot)
 
     @property

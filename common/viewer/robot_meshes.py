@@ -53,9 +53,16 @@ def visual_pieces(robot: RobotModel, triangles: int = 40_000) -> list[Piece]:
 
 
 def coarse(pieces: Iterable[Piece], kept: float) -> list[Piece]:
-    """The same pieces with a share of their triangles."""
-    meshes = [(p, _merged(trimesh.Trimesh(p.vertices, p.faces, process=False))) for p in pieces]
-    return [_piece(piece.link, piece.color, _simplified(mesh, kept)) for piece, mesh in meshes]
+    """One piece for each link with a share of its triangles, for what is shown in one colour: that of the first."""
+    found: dict[str, list[Piece]] = defaultdict(list)
+    for piece in pieces:
+        found[piece.link].append(piece)
+    joined = []
+    for link, parts in found.items():
+        meshes = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts]
+        mesh = _simplified(_merged(trimesh.util.concatenate(meshes)), kept)
+        joined.append(_piece(link, parts[0].color, mesh))
+    return joined
 
 
 def _merged(mesh: Any) -> trimesh.Trimesh:

@@ -22,7 +22,7 @@ def add_solid(scene: viser.SceneApi, name: str, solid: CollisionObject) -> Solid
     if solid.shape == "box":
         return scene.add_box(
             name, color, (sizes[0], sizes[1], sizes[2]), opacity=opacity, position=position, wxyz=wxyz,
-            cast_shadow=False, receive_shadow=False,
+            cast_shadow=False, receive_shadow=False, flat_shading=False,  # its sides are flat, with one shader less
         )
     if solid.shape == "sphere":
         return scene.add_icosphere(

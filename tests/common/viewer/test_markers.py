@@ -26,11 +26,10 @@ def detection(stamp: int, *places: tuple[float, float]) -> m.MarkerArray:
 def test_each_target_has_a_ring(panda: Stage) -> None:
     for places in ([(0.4, 0.1)], [(0.4, 0.1), (0.5, -0.1)], [(0.3, 0.2), (0.5, -0.1)]):
         panda.view.show_targets(m.PoseArray(header=WORLD, poses=[at(x, y, 0.03) for x, y in places]))
-        node = panda.view.targets._node
-        assert node is not None
-        np.testing.assert_allclose(node.batched_positions[:, :2], places, atol=1e-6)
+        np.testing.assert_allclose([node.position[:2] for node in panda.view.targets._nodes], places, atol=1e-6)
     panda.view.show_targets(m.PoseArray(header=WORLD))
-    assert panda.view.targets._node is None
+    assert panda.view.targets._nodes == []
+    assert not [name for name in panda.server.scene._handle_from_node_name if name.startswith("/targets/")]
 
 
 def test_rejected_place_is_labelled_with_the_reason(panda: Stage) -> None:

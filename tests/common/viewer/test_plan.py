@@ -32,10 +32,25 @@ def tool_of_ghost(stage: Stage) -> NDArray[np.float64]:
 
 
 def test_ghost_stands_where_the_plan_ends(panda: Stage, there: NDArray[np.float64]) -> None:
-    assert not panda.view.plan.ghost.root.visible
+    assert not panda.view.plan.ghost.visible
     panda.view.show_plan(plan(panda, there))
-    assert panda.view.plan.ghost.root.visible
+    assert panda.view.plan.ghost.visible
     np.testing.assert_allclose(tool_of_ghost(panda), panda.robot.link_poses(there)["panda_hand"], atol=1e-6)
+
+
+def test_meshes_of_the_ghost_are_sent_with_the_first_plan_and_once(
+    panda: Stage, there: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[str] = []
+    add = panda.server.scene.add_mesh_simple
+    monkeypatch.setattr(panda.server.scene, "add_mesh_simple",
+                        lambda name, *args, **options: (sent.append(name), add(name, *args, **options))[1])
+    panda.view.show_joints(panda.joints(there - 0.05))
+    assert not [name for name in sent if name.startswith("/plan/")]
+    for _ in range(2):
+        panda.view.show_plan(plan(panda, there))
+    links = {name.split("/")[-2] for name in sent}
+    assert len(sent) == len(links) == len(panda.view.plan.ghost.links)
 
 
 def test_line_is_the_path_of_the_tool(panda: Stage, there: NDArray[np.float64]) -> None:
@@ -50,9 +65,9 @@ def test_line_is_the_path_of_the_tool(panda: Stage, there: NDArray[np.float64]) 
 def test_ghost_goes_when_the_robot_has_come(panda: Stage, there: NDArray[np.float64]) -> None:
     panda.view.show_plan(plan(panda, there))
     panda.view.show_joints(panda.joints(there - 0.05))
-    assert panda.view.plan.ghost.root.visible
+    assert panda.view.plan.ghost.visible
     panda.view.show_joints(panda.joints(there))
-    assert not panda.view.plan.ghost.root.visible
+    assert not panda.view.plan.ghost.visible
 
 
 def test_links_of_the_ghost_that_lie_in_the_robot_are_not_drawn(panda: Stage, there: NDArray[np.float64]) -> None:
@@ -88,7 +103,7 @@ def test_ghost_stops_playing_when_the_robot_moves(panda: Stage, there: NDArray[n
 def test_plan_without_points_clears_the_last(panda: Stage, there: NDArray[np.float64]) -> None:
     panda.view.show_plan(plan(panda, there))
     panda.view.show_plan(m.JointTrajectory(joint_names=panda.robot.joint_names, points=[]))
-    assert not panda.view.plan.ghost.root.visible and panda.view.plan._line is None
+    assert not panda.view.plan.ghost.visible and panda.view.plan._line is None
 
 
 def test_plan_of_other_joints_does_no_harm(panda: Stage, there: NDArray[np.float64]) -> None:

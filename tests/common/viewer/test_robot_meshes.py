@@ -100,7 +100,7 @@ def test_few_triangles_are_left_and_no_part_is_lost(cell: str) -> None:
 def test_ghost_has_fewer_triangles_of_the_same_links() -> None:
     pieces = pieces_of("panda")
     ghost = coarse(pieces, 0.3)
-    assert [piece.link for piece in ghost] == [piece.link for piece in pieces]
+    assert [piece.link for piece in ghost] == list(dict.fromkeys(piece.link for piece in pieces))
     assert sum(len(piece.faces) for piece in ghost) < 0.6 * sum(len(piece.faces) for piece in pieces)
 
 
