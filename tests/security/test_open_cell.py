@@ -1,0 +1,71 @@
+"""What a cell without certificates opens to others: nothing, unless it is told to, and then it says so."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from pathlib import Path
+
+import psutil
+import pytest
+
+from benchmarks.runs import RunningCell, until
+from common import topics
+from common.messages import SupervisorStatus
+from common.transport.endpoint import port_of
+from tests.security.test_routers import free_port
+
+pytestmark = [pytest.mark.cell, pytest.mark.timeout(300)]
+
+SMALL = ("--only", "robot_state_publisher,viewer")  # one that only connects, and the page
+Socket = tuple[str, str, int]
+
+
+def all_ready(status: SupervisorStatus) -> bool:
+    return len(status.services) > 2 and all(service.state == "ready" for service in status.services)
+
+
+async def until_ready(cell: RunningCell) -> None:
+    async with cell.listen() as bus:
+        await until(bus.reader(topics.SUPERVISOR_STATUS), all_ready, timeout=120)
+
+
+def sockets_of(cell: RunningCell) -> tuple[set[Socket], set[Socket]]:
+    """By process, address and port: where the cell listens, and what datagrams could come in by."""
+    listening, datagrams = set(), set()
+    for name, process in {**cell.processes(), "supervisor": psutil.Process(cell.process.pid)}.items():
+        for found in process.net_connections("inet"):
+            if found.type == socket.SOCK_DGRAM:
+                datagrams.add((name, *found.laddr))
+            elif found.status == psutil.CONN_LISTEN:
+                listening.add((name, *found.laddr))
+    return listening, datagrams
+
+
+def test_an_open_cell_is_reached_from_its_own_machine_only_and_scouts_for_nobody(tmp_path: Path) -> None:
+    page = free_port()
+    with RunningCell(tmp_path, "up", "panda", *SMALL, "--viewer-port", str(page)) as cell:
+        asyncio.run(until_ready(cell))
+        listening, datagrams = sockets_of(cell)
+        assert set(cell.processes()) == {"router", "robot_state_publisher", "viewer"}
+        assert listening == {("router", "127.0.0.1", port_of(cell.domain)), ("viewer", "127.0.0.1", page)}
+        assert datagrams == set()
+        assert "secure init" not in cell.text
+        cell.interrupt()
+        assert asyncio.run(cell.ended(60)) == 0
+
+
+def test_an_open_cell_that_listens_wider_warns_and_names_what_closes_it(tmp_path: Path) -> None:
+    endpoint = f"tcp/0.0.0.0:{free_port()}"
+    with RunningCell(tmp_path, "up", "panda", "--only", "robot_state_publisher,vision_detector", "--listen",
+                     endpoint) as cell:
+        asyncio.run(until_ready(cell))
+        listening, datagrams = sockets_of(cell)
+        assert listening == {("router", "127.0.0.1", port_of(cell.domain)),
+                             ("router", "0.0.0.0", int(endpoint.rpartition(":")[2]))}
+        assert datagrams == set()
+        (warning,) = [line for line in cell.text.splitlines() if "WARNING" in line and "router" in line]
+        assert f"whoever reaches {endpoint} can read and command every cell behind it" in warning
+        assert "`zencell secure init DIR`, then --secure DIR" in warning
+        cell.interrupt()
+        assert asyncio.run(cell.ended(60)) == 0

@@ -1,0 +1,66 @@
+"""A secured cell on two hosts, each with a router and no more certificates than it needs; the routers are linked."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+from benchmarks.runs import RunningCell
+from common.config import load_cell
+from common.security.credentials import credentials_of
+from common.transport.endpoint import port_of
+from tests.security.holders import Holder
+
+pytestmark = [pytest.mark.cell, pytest.mark.timeout(300)]
+
+EYE = ["camera_simulator", "vision_detector", "workspace_validator"]
+ARM = [entry.name for entry in load_cell("panda").services.values() if entry.name not in (*EYE, "viewer")]
+
+
+def given_to(host: Path, certificates: Path, services: Iterable[str]) -> Path:
+    """The certificates of one host."""
+    host.mkdir()
+    for name in ("router", *(f"panda.{process}" for process in ("supervisor", *services))):
+        for kind in ("pem", "key"):
+            shutil.copy(certificates / f"{name}.{kind}", host)
+    for name in ("ca.pem", "access.json5"):
+        shutil.copy(certificates / name, host)
+    return host
+
+
+def test_a_run_completes_with_perception_behind_one_router_and_the_arm_behind_another(
+    certificates: Path, tmp_path: Path
+) -> None:
+    folders = [tmp_path / "eye", tmp_path / "arm"]
+    for folder in folders:
+        folder.mkdir()
+    secured = [given_to(folder / "certs", certificates, part) for folder, part in zip(folders, (EYE, ARM), strict=True)]
+    same = ("--speed", "5", "--set", "world.count=1")
+    epoch = {"ZENCELL_EPOCH": str(time.time_ns())}
+    with RunningCell(
+        folders[0], "up", "panda", "--only", ",".join(EYE), "--secure", str(secured[0]), *same, secrets=epoch
+    ) as eye:
+        reached = f"tls/127.0.0.1:{port_of(eye.domain)}"
+        with (
+            Holder(reached, credentials_of("operator", certificates)) as operator,
+            Holder(reached, credentials_of("panda.camera_simulator", certificates)) as camera,
+        ):
+            heard = operator.hear("panda/joint_states", "panda/detected_objects")
+            with RunningCell(
+                folders[1], "run", "panda", "--without", ",".join(EYE), "--secure", str(secured[1]), "--link", reached,
+                *same, secrets=epoch,
+            ) as arm:
+                heard.wait_for("panda/joint_states")  # which come over the link
+                assert operator.ask("panda/motion/status")
+                assert camera.ask("panda/motion/status", timeout=1.0) == []
+                assert asyncio.run(arm.ended(240)) == 0, f"{arm.tail()}\nand the eye:\n{eye.tail()}"
+        assert arm.summary["state"] == "DONE"
+        assert arm.summary["truth"] == {"in_box": 1, "on_table": 0, "elsewhere": 0}
+        eye.interrupt()
+        assert asyncio.run(eye.ended(60)) == 0
+    assert "panda/detected_objects" in heard.keys
