@@ -28,12 +28,10 @@ from common.messages import (
     StopRequest,
     WorldEdit,
     WorldEditReply,
-    WorldObjects,
 )
 from common.robot.model import RobotModel
 from common.scene.workspace import reach_reason
 from common.sim.layout import layout
-from common.sim.objects import world_object
 from common.sim.standing import Standing, state_file
 from common.sim.world import GraspTolerances, SimulatedWorld
 from common.transport.bus import Bus
@@ -69,7 +67,7 @@ class Config(Parameters):
 
 
 def make_cycle(config: Config, simulated: bool, kept: Standing | None, now: float) -> ControlCycle:
-    """The controller with its hardware at the home pose and, when simulated, the balls laid out.
+    """The controller with its hardware at the home pose and, when simulated, everything laid out.
 
     Simulated hardware is found as it was `kept`, if that was of the same world.
     """
@@ -83,7 +81,8 @@ def make_cycle(config: Config, simulated: bool, kept: Standing | None, now: floa
     if simulated:
         places = layout(config.world, config.run.seed, lambda x, y: within_reach(robot, x, y, config))
         world = SimulatedWorld(config.world, places, config.grasp_tolerances)
-        if kept is not None and (kept.layout != world.layout or len(kept.q) != robot.dof):
+        layouts = world.layout, world.objects_layout
+        if kept is not None and ((kept.layout, kept.objects_layout) != layouts or len(kept.q) != robot.dof):
             kept = None
         if kept is not None:
             start = np.array(kept.q)
@@ -111,9 +110,7 @@ async def run(bus: Bus, config: Config) -> None:
     gripper = bus.writer(topics.GRIPPER_STATE) if config.robot.gripper else None
     balls = bus.writer(topics.SCENE_BALLS) if simulated else None
     updates = bus.writer(topics.SCENE_OBJECT_UPDATES) if simulated else None
-    if simulated:
-        objects = [world_object(thing) for thing in config.world.objects]
-        bus.writer(topics.SCENE_OBJECTS).put(WorldObjects(header=bus.header("world"), objects=objects))
+    objects = bus.writer(topics.SCENE_OBJECTS) if simulated else None
 
     async def execute(request: ExecuteRequest) -> MotionStatus:
         age = bus.clock.age_ms(request.header.stamp) * 1e-3
@@ -170,6 +167,8 @@ async def run(bus: Bus, config: Config) -> None:
                 gripper.put(report.gripper)
             if report.balls is not None and balls is not None:
                 balls.put(report.balls)
+            if report.objects is not None and objects is not None:
+                objects.put(report.objects)
             if updates is not None:
                 for update in report.updates:
                     updates.put(update)

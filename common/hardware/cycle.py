@@ -28,6 +28,7 @@ from common.messages import (
     StopRequest,
     WorldEdit,
     WorldEditReply,
+    WorldObjects,
 )
 from common.robot.finger_joints import finger_positions, finger_velocities
 from common.sim.standing import Standing, StandingBall
@@ -47,6 +48,7 @@ class Truth(Protocol):
     """What is asked of the simulated world (common.sim.world)."""
 
     version: int
+    objects_version: int
 
     def obstruction(self, T_world_tcp: NDArray[np.float64], width: float) -> float:
         """Width that the fingers can not close below [m]."""
@@ -71,8 +73,19 @@ class Truth(Protocol):
     def standing(self) -> dict[str, StandingBall]:
         """Everything as it is, for `restore`."""
 
-    def restore(self, balls: Mapping[str, StandingBall]) -> None:
+    @property
+    def objects_layout(self) -> dict[str, tuple[float, float]]:
+        """Where everything else was at first."""
+
+    @property
+    def places(self) -> dict[str, tuple[float, float]]:
+        """Where everything else is, for `restore`."""
+
+    def restore(self, balls: Mapping[str, StandingBall], places: Mapping[str, tuple[float, float]]) -> None:
         """Put everything where it was."""
+
+    def scene_objects(self, header: Header) -> WorldObjects:
+        """Where everything is that is no ball."""
 
     def take_events(self) -> list[SceneUpdate]:
         """What happened since the last call."""
@@ -86,6 +99,7 @@ class Report:
     motion: MotionStatus | None = None
     gripper: GripperState | None = None
     balls: PoseArray | None = None
+    objects: WorldObjects | None = None
     updates: list[SceneUpdate] = field(default_factory=list)
 
 
@@ -129,7 +143,7 @@ class ControlCycle:
         self._told_motion: MotionStatus | None = None
         self._told_motion_at = self._told_gripper_at = self._told_world_at = -np.inf
         self._told_gripper: GripperState | None = None
-        self._told_version = -1
+        self._told_version = self._told_objects_version = -1
         self._kept: object = None
         self._waits = False  # held by ourselves
 
@@ -153,6 +167,9 @@ class ControlCycle:
             if self._world.version != self._told_version and due:
                 report.balls = self._world.scene_balls(header)
                 self._told_version, self._told_world_at = self._world.version, now
+            if self._world.objects_version != self._told_objects_version:
+                report.objects = self._world.scene_objects(header)
+                self._told_objects_version = self._world.objects_version
         return report
 
     def standing(self) -> Standing | None:
@@ -166,13 +183,14 @@ class ControlCycle:
             return None
         self._kept = mark
         return Standing(
-            layout=self._world.layout, q=self._q.tolist(), width=width, told_width=told, balls=self._world.standing()
+            layout=self._world.layout, q=self._q.tolist(), width=width, told_width=told, balls=self._world.standing(),
+            objects_layout=self._world.objects_layout, objects=self._world.places,
         )
 
     def restore(self, state: Standing, now: float) -> None:
         """Find fingers and world as they were; the arm was begun where it stood."""
         assert self._world is not None
-        self._world.restore(state.balls)
+        self._world.restore(state.balls, state.objects)
         if self._gripper is None or self._obstructible is None or self._kinematics is None or state.width is None:
             return
         self._obstructible.place(state.width)

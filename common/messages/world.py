@@ -21,7 +21,7 @@ class SceneUpdate(Message):
 class WorldEdit(Message):
     """Change the simulated world. `reset` brings the first layout back, `drop` lets what is held slip.
 
-    `id` may be empty for `add` and `drop`.
+    Balls may be added, moved and removed, other objects be moved. `id` may be empty for `add` and `drop`.
     """
 
     op: Literal["add", "move", "remove", "reset", "drop"]

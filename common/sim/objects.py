@@ -30,6 +30,13 @@ def world_object(thing: ObjectConfig) -> WorldObject:
     )
 
 
+def centre_of(thing: WorldObject) -> tuple[float, float, float]:
+    """Middle [m] of the box about an object."""
+    outline = np.array(thing.outline)
+    x, y = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    return float(x), float(y), thing.base + thing.height / 2
+
+
 def cross_section(thing: ObjectConfig) -> Array:
     """Outer edge (N, 2) [m] about the object's own origin, anticlockwise."""
     if thing.size is not None and thing.shape == "box":

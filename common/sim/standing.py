@@ -34,7 +34,7 @@ class StandingBall(BaseModel):
 
 
 class Standing(BaseModel):
-    """Joints (dof,) [rad], fingers [m] and balls at one moment."""
+    """Joints (dof,) [rad], fingers [m], balls and places of other objects at one moment; the layouts as at first."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -43,6 +43,8 @@ class Standing(BaseModel):
     width: float | None = None
     told_width: float | None = None
     balls: dict[str, StandingBall] = {}
+    objects_layout: dict[str, tuple[float, float]] = {}
+    objects: dict[str, tuple[float, float]] = {}
 
 
 class StateFile:

@@ -1,4 +1,4 @@
-"""The truth beside simulated hardware: where the balls really are. Read by the camera, by nothing that decides.
+"""The truth beside simulated hardware: where everything really is. Read by the camera, by nothing that decides.
 
 Grasping, carrying, falling and coming to rest are simulated; pushing a ball aside, and rolling, are not: a ball that
 can not stay where it falls appears at the nearest place where it can.
@@ -17,14 +17,16 @@ from pydantic import Field
 
 from common.config import Parameters, Tunable, World
 from common.errors import ConfigError, Refused, UnknownName
-from common.messages import Header, Pose, PoseArray, SceneUpdate, Vector3, WorldEdit
+from common.messages import Header, Pose, PoseArray, SceneUpdate, Vector3, WorldEdit, WorldObjects
 from common.sim.places import Slot, Slots, Table
 from common.sim.standing import StandingBall
+from common.sim.standing_objects import Place, StandingObjects
 
 Array = NDArray[np.float64]
 BallState = Literal["table", "held", "falling", "box", "elsewhere"]
 
 GRAVITY = 9.81  # [m/s^2]
+OPS = {"add": "added", "remove": "removed", "drop": "dropped"}  # what is done to it, by the name of an edit
 FLOOR_BELOW_TABLE = 0.75  # what falls off the table lies this far below its surface [m]
 
 
@@ -57,10 +59,11 @@ class _Ball:
 
 
 class SimulatedWorld:
-    """The balls, and what becomes of them while a hand moves among them.
+    """The balls, and what becomes of them while a hand moves among them; and other objects, which only a person moves.
 
     Attributes:
         version: grows whenever something has changed.
+        objects_version: grows whenever an object other than a ball stands elsewhere.
     """
 
     def __init__(
@@ -71,13 +74,14 @@ class SimulatedWorld:
         Raises:
             ConfigError: a place where no ball can lie.
         """
-        self.version = 0
+        self.version = self.objects_version = 0
         self._config = world
         self._radius = world.ball_radius
         self._tolerances = tolerances or GraspTolerances()
         self._table, self._slots = Table(world), Slots(world)
         self._layout = [(float(x), float(y)) for x, y in layout]
         self._balls: dict[str, _Ball] = {}
+        self._objects = StandingObjects(world)
         self._between: set[str] = set()
         self._events: list[SceneUpdate] = []
         try:
@@ -93,6 +97,16 @@ class SimulatedWorld:
         """Where the balls lay at first (x, y) [m]."""
         return self._layout
 
+    @property
+    def objects_layout(self) -> dict[str, Place]:
+        """Where the other objects stood at first (x, y) [m]."""
+        return self._objects.layout
+
+    @property
+    def places(self) -> dict[str, Place]:
+        """Where the other objects stand now (x, y) [m]."""
+        return self._objects.places
+
     def standing(self) -> dict[str, StandingBall]:
         """All balls, for `restore`."""
         return {
@@ -104,8 +118,10 @@ class SimulatedWorld:
             for name, ball in self._balls.items()
         }
 
-    def restore(self, balls: Mapping[str, StandingBall]) -> None:
-        """Put all balls where they were."""
+    def restore(self, balls: Mapping[str, StandingBall], places: Mapping[str, Place]) -> None:
+        """Put all balls, and the other objects at `places`, where they were."""
+        self._objects.restore(places)
+        self.objects_version += 1
         self._balls = {
             name: _Ball(
                 np.array(ball.position), ball.state, ball.slot, None if ball.grip is None else np.array(ball.grip),
@@ -227,16 +243,19 @@ class SimulatedWorld:
     # --- edits ---
 
     def edit(self, request: WorldEdit, now: float) -> str:
-        """Change the world as a person asks; the id of the ball that was changed, empty for a reset.
+        """Change the world as a person asks; the id of what was changed, empty for a reset.
 
         Raises:
             Refused: says why, and what would do. Nothing has changed then.
         """
         if request.op == "reset":
             return self._reset()
-        if self._config.objects and not self._layout:
-            raise Refused("no_balls", "this world has objects and no balls; objects are placed by world.objects")
         name = request.id
+        if name in self._objects:
+            return self._move_object(request)
+        if self._config.objects and not self._layout and request.op in ("add", "drop"):
+            raise Refused("no_balls", f"this world has objects and no balls: {', '.join(self._objects.places)} can be "
+                                      "moved, nothing be added")
         if request.op == "drop":
             return self._slip(name, now)
         if request.op == "add":
@@ -246,7 +265,8 @@ class SimulatedWorld:
             if not re.fullmatch(r"[A-Za-z0-9_.-]{1,60}", name):
                 raise Refused("bad_id", f"id: {name[:60]!r} must be letters, digits, '_', '.' and '-', at most 60")
         elif name not in self._balls:
-            raise Refused("unknown_id", str(UnknownName("ball", name, self._balls)))
+            movable = [*self._balls, *self._objects.places] if request.op == "move" else list(self._balls)
+            raise Refused("unknown_id", str(UnknownName("object" if self._objects.places else "ball", name, movable)))
         new = None
         if request.op != "remove":
             if request.position is None:
@@ -266,6 +286,17 @@ class SimulatedWorld:
         self.version += 1
         return name
 
+    def _move_object(self, request: WorldEdit) -> str:
+        """Move an object that is no ball; its id."""
+        if request.op != "move":
+            raise Refused("no_ball", f"{request.id} is no ball: it can be moved, but not be {OPS[request.op]}")
+        if request.position is None:
+            raise Refused("no_position", "position: move needs one, for example {x: 0.5, y: 0.0}")
+        self._objects.move(request.id, request.position.x, request.position.y)
+        self.objects_version += 1
+        self.version += 1
+        return request.id
+
     def _slip(self, name: str, now: float) -> str:
         """Let the held ball slip out of the fingers, which close on without it; its id. Raises Refused without one."""
         held = self.held
@@ -280,6 +311,8 @@ class SimulatedWorld:
                 self._say("remove", name)
         self._balls, self._between = {}, set()
         self._lay_out()
+        self._objects.reset()
+        self.objects_version += 1
         return ""
 
     def _lay_out(self) -> None:
@@ -312,8 +345,8 @@ class SimulatedWorld:
 
     @property
     def ids(self) -> list[str]:
-        """The balls' ids."""
-        return list(self._balls)
+        """The ids of the balls, then those of the other objects."""
+        return [*self._balls, *self._objects.places]
 
     @property
     def held(self) -> str:
@@ -333,6 +366,10 @@ class SimulatedWorld:
             ids=list(self._balls),
             labels=[ball.state for ball in self._balls.values()],
         )
+
+    def scene_objects(self, header: Header) -> WorldObjects:
+        """Where the other objects stand."""
+        return WorldObjects(header=header, objects=self._objects.solids)
 
     def take_events(self) -> list[SceneUpdate]:
         """What was taken away or came to lie since the last call, in order."""

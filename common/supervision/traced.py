@@ -34,7 +34,8 @@ class Traced:
         self._robot = robot
         self._status = OutlineStatus()
         self._path: OutlinePoints | None = None
-        self._truth: WorldObjects | None = None
+        self._truth: WorldObjects | None = None  # when the arm began to approach
+        self._newest_truth: WorldObjects | None = None
         self._states: list[JointState] = []
         self._began: int | None = None  # stamps [ns] of the statuses between which the outline was traced
         self._ended: int | None = None
@@ -46,6 +47,7 @@ class Traced:
             return
         if status.state == "APPROACHING":
             self._states, self._began, self._ended = [], None, None
+            self._truth = self._newest_truth  # a person may move what was traced
         elif status.state == "TRACING":
             self._began = status.header.stamp
         elif before == "TRACING":
@@ -58,7 +60,7 @@ class Traced:
 
     def on_truth(self, truth: WorldObjects) -> None:
         """Take note of where everything really is."""
-        self._truth = truth
+        self._newest_truth = truth
 
     def on_joints(self, state: JointState) -> None:
         """Take note of where the joints are. Statuses and joint states overtake each other: their stamps decide."""
@@ -109,7 +111,8 @@ class Traced:
 
     def _outlines(self) -> list[Array]:
         """Edges (n, 3) [m] of the true top faces, outer and inner."""
-        objects = self._truth.objects if self._truth else []
+        truth = self._truth or self._newest_truth
+        objects = truth.objects if truth else []
         edges: list[tuple[Sequence[tuple[float, float]], float]] = []
         for thing in objects:
             edges += [(edge, thing.base + thing.height) for edge in (thing.outline, thing.hole) if len(edge) > 2]

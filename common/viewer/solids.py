@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from common.messages import CollisionObject, WorldObject
 from common.planning.prism import convex_hull
+from common.sim.objects import centre_of
 from common.sim.solids import object_mesh, upright
 from common.viewer.poses import Rgb, position_of, rgb_of, wxyz_of
 
@@ -55,13 +56,6 @@ def add_triangles(
         name, triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), color=color, opacity=opacity,
         wireframe=wireframe, side="double", position=position, wxyz=wxyz, cast_shadow=False, receive_shadow=False,
     )
-
-
-def centre_of(thing: WorldObject) -> tuple[float, float, float]:
-    """Middle [m] of the box about an object of the simulated world."""
-    outline = np.array(thing.outline)
-    x, y = (outline.min(axis=0) + outline.max(axis=0)) / 2
-    return float(x), float(y), thing.base + thing.height / 2
 
 
 def add_world_object(scene: viser.SceneApi, name: str, thing: WorldObject, color: Rgb) -> viser.MeshHandle:

@@ -8,10 +8,11 @@ from typing import Any
 
 import viser
 
-from common.messages import PoseArray, WorldObjects
+from common.messages import PoseArray, WorldObject, WorldObjects
+from common.sim.objects import centre_of
 from common.viewer.dragging import Drag
 from common.viewer.poses import position_of
-from common.viewer.solids import add_world_object, centre_of
+from common.viewer.solids import add_world_object
 
 TRUTH = (0, 229, 255)
 EDITED = (255, 255, 0)
@@ -63,7 +64,7 @@ class Truth:
     def objects(self, m: WorldObjects) -> None:
         """Show these objects and no others."""
         things = {thing.id: thing for thing in m.objects}
-        looks = {name: thing.model_dump_json() for name, thing in things.items()}
+        looks = {name: _look(thing) for name, thing in things.items()}
         self._keep([name for name, (look, _) in self._nodes.items() if look == "ball" or looks.get(name) == look])
         for name, thing in things.items():
             if name not in self._nodes:
@@ -102,3 +103,13 @@ class Truth:
                 self._drags[name] = Drag(node, lambda x, y, name=name: self._dragged(name, x, y))  # type: ignore[misc]
             elif not wanted and name in self._drags:
                 self._drags.pop(name).stop()
+
+
+def _look(thing: WorldObject) -> str:
+    """What tells an object from others, wherever it stands."""
+    x, y, _ = centre_of(thing)
+
+    def about(edge: list[tuple[float, float]]) -> list[tuple[float, float]]:
+        return [(round(a - x, 6), round(b - y, 6)) for a, b in edge]
+
+    return thing.model_copy(update={"outline": about(thing.outline), "hole": about(thing.hole)}).model_dump_json()

@@ -21,11 +21,12 @@ from common.config import (
     read_yaml,
 )
 from common.errors import ConfigError, RemoteError
-from common.messages import Header, JointState, OutlineSelect, TFMessage, WorldObjects
+from common.messages import Header, JointState, OutlineSelect, TFMessage, Vector3, WorldEdit, WorldObjects
 from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import rpy_to_matrix, transform
 from common.sim.objects import world_object
+from common.sim.world import SimulatedWorld
 from common.transport.local import LocalNetwork
 from common.transport.wiring import wiring
 from services import contour_detector, depth_camera, duplicate_remover, pixel_to_world
@@ -85,6 +86,22 @@ async def test_the_largest_object_is_chosen_and_its_outline_becomes_a_path():
         assert points.invalid_depth == 0 and points.header.frame_id == "world"
         assert 4 <= len(path.poses) < len(points.poses) / 4
         assert path.object == points.object
+
+
+async def test_object_that_was_moved_is_seen_and_outlined_where_it_lies_now():
+    world = SimulatedWorld(W5, [])
+    async with AsyncExitStack() as stack:
+        cell = Cell()
+        await running(stack, cell)
+        cell.say(W5.objects)
+        await until(cell.paths, lambda p: bool(p.poses))
+        world.edit(WorldEdit(op="move", id="green_box", position=Vector3(x=0.5, y=-0.15)), 0.0)
+        cell.truth.put(world.scene_objects(Header()))
+        moved = await until(cell.points, lambda p: bool(p.poses) and abs(middle(p)[0] - 0.46) > 0.02)
+        np.testing.assert_allclose(middle(moved), (0.5, -0.15, 1.05), atol=1e-3)
+        path = await until(cell.paths, lambda p: p.header.stamp >= moved.header.stamp)
+        corners = np.array([(p.position.x, p.position.y) for p in path.poses])
+        np.testing.assert_allclose((corners.min(axis=0) + corners.max(axis=0)) / 2, (0.5, -0.15), atol=1e-3)
 
 
 async def test_another_object_can_be_chosen_by_colour_and_stays_chosen():

@@ -2,6 +2,7 @@
 
 import asyncio
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from common.messages import ExecuteRequest, GripperCommand, JointState, TFMessag
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
+from common.sim.objects import centre_of
+from common.sim.standing import STATE_VARIABLE
 from common.transport.local import LocalNetwork
 from services import robot_state_publisher, trajectory_executor
 from tests.services.test_trajectory_executor import move
@@ -98,6 +101,24 @@ async def test_ball_can_not_be_put_into_a_world_of_objects() -> None:
     async with executor() as bus:
         with pytest.raises(RemoteError, match="no balls"):
             await bus.client(topics.WORLD_EDIT).call(WorldEdit(op="add", position=Vector3(x=0.5, y=0.0)))
+
+
+async def test_object_that_is_moved_stands_there_and_still_does_when_the_process_is_started_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv(STATE_VARIABLE, str(tmp_path))
+    async with executor() as bus:
+        objects = bus.reader(topics.SCENE_OBJECTS)
+        edit = bus.client(topics.WORLD_EDIT)
+        reply = await edit.call(WorldEdit(op="move", id="cube", position=Vector3(x=0.55, y=0.1)))
+        assert (reply.id, reply.ids) == ("cube", ["cube"])
+        moved = await see(objects, lambda m: centre_of(m.objects[0])[:2] == pytest.approx((0.55, 0.1)))
+        with pytest.raises(RemoteError, match="not on the table for cube") as refusal:
+            await edit.call(WorldEdit(op="move", id="cube", position=Vector3(x=0.9, y=0.1)))
+        assert refusal.value.code == "off_table"
+    async with executor() as bus:
+        again = await see(bus.reader(topics.SCENE_OBJECTS), lambda m: True)
+    np.testing.assert_allclose(again.objects[0].outline, moved.objects[0].outline, atol=1e-12)
 
 
 async def test_frames_agree_with_forward_kinematics_from_world_to_the_finger_tips(robot: RobotModel) -> None:

@@ -59,7 +59,7 @@ def test_balls_that_are_held_that_fall_and_that_lie_in_the_box_go_on_where_they_
     found = StateFile(tmp_path / "state").load()
     assert found is not None
     again = SimulatedWorld(world_config, PLACES)
-    again.restore(found.balls)
+    again.restore(found.balls, found.objects)
     assert again.held == world.held != ""
     hand = tool_down(0.45, 0.0, 0.3)
     for k in range(100):  # the falling one comes to rest, the held one moves with the hand

@@ -78,6 +78,25 @@ def test_object_of_the_world_is_shown_in_its_size(ur5: Stage) -> None:
     np.testing.assert_allclose(np.ptp(node.vertices, axis=0), [0.04, 0.04, 0.02], atol=1e-4)
     ur5.view.show_truth(objects=m.WorldObjects(header=WORLD, objects=[disc(0.6)]))
     np.testing.assert_allclose(ur5.view.truth.node("disc").position, [0.6, 0.0, 1.01], atol=1e-6)
+    assert ur5.view.truth.node("disc") is node  # moved and not sent again
+
+
+async def test_object_is_dropped_where_it_was_pulled_to_and_can_be_pulled_again(ur5: Stage) -> None:
+    moved: list[tuple[str, float, float]] = []
+    ur5.view.on_object_dragged = lambda name, x, y: moved.append((name, round(x, 6), round(y, 6)))
+    ur5.view.set_editing(True)
+    for x, to in ((0.5, 0.55), (0.55, 0.45)):
+        ur5.view.show_truth(objects=m.WorldObjects(header=WORLD, objects=[disc(x)]))
+        node = ur5.view.truth.node("disc")
+        assert is_shown(ur5.server, node)
+        np.testing.assert_allclose(node.position, [x, 0.0, 1.01], atol=1e-6)
+        eye = EYE + np.array([0, 0, 1])
+        for entry in list(node._impl.drag_cb):
+            for phase, place in (("start", x), ("update", to), ("end", to)):
+                drag = event(phase, (x, 0.0, 1.01), (place, 0.1, 1.01) if phase != "start" else (x, 0.0, 1.01))
+                drag.client.camera.position = eye
+                await entry.callback(drag)
+    assert moved == [("disc", 0.55, 0.1), ("disc", 0.45, 0.1)]
 
 
 async def test_ball_is_dropped_where_it_was_pulled_to(panda: Stage, moved: list[tuple[str, float, float]]) -> None:

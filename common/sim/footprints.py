@@ -1,0 +1,82 @@
+"""What solids cover, seen from above: whether one lies within another, or reaches into it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.config import Fixture
+from common.sim.objects import circle
+from common.sim.solids import triangulate
+
+Array = NDArray[np.float64]
+
+TOUCH = 1e-6  # [m] what reaches into another by less only touches it
+
+
+def footprint(fixture: Fixture) -> Array:
+    """Outline (N, 2) [m] of a fixture seen from above; a tilted one counts as round."""
+    x, y, _ = fixture.position
+    if fixture.shape == "box" and not any(fixture.rpy[:2]):
+        cos, sin = math.cos(fixture.rpy[2]), math.sin(fixture.rpy[2])
+        a, b = fixture.dimensions[0] / 2, fixture.dimensions[1] / 2
+        corners = np.array([(-a, -b), (a, -b), (a, b), (-a, b)])
+        return np.asarray(corners @ np.array([[cos, sin], [-sin, cos]]) + (x, y))
+    round_one = fixture.shape != "box" and not any(fixture.rpy[:2])
+    return circle(fixture.dimensions[0] if round_one else math.hypot(*fixture.dimensions)) + np.array([x, y])
+
+
+def heights(fixture: Fixture) -> tuple[float, float]:
+    """z of the lowest and of the highest point of a fixture [m]."""
+    if fixture.shape == "sphere":
+        half = fixture.dimensions[0]
+    elif any(fixture.rpy[:2]):
+        half = math.hypot(*fixture.dimensions)
+    else:
+        half = fixture.dimensions[-1] / 2
+    return fixture.position[2] - half, fixture.position[2] + half
+
+
+def within(inner: Array, outer: Array) -> bool:
+    """Whether an outline (N, 2) lies in a convex one (K, 2), anticlockwise; it may touch its edge."""
+    side = np.roll(outer, -1, axis=0) - outer
+    way = inner[:, None] - outer
+    beyond = (side[:, 0] * way[..., 1] - side[:, 1] * way[..., 0]) / np.hypot(*side.T)
+    return bool((beyond >= -TOUCH).all())
+
+
+def overlap(a: Array, b: Array) -> bool:
+    """Whether two outlines (N, 2) and (K, 2), anticlockwise, have an area in common; touching does not count."""
+    if (a.max(axis=0) < b.min(axis=0) + TOUCH).any() or (b.max(axis=0) < a.min(axis=0) + TOUCH).any():
+        return False
+    return _cross(a, b) or _covers(a, b) or _covers(b, a)
+
+
+def _cross(a: Array, b: Array) -> bool:
+    """Whether any side of one crosses a side of the other."""
+    p, q = a[:, None], b[None]
+    r, s = np.roll(a, -1, axis=0)[:, None], np.roll(b, -1, axis=0)[None]
+    one = _side(p, r, q) * _side(p, r, s)
+    other = _side(q, s, p) * _side(q, s, r)
+    return bool(((one < 0) & (other < 0)).any())
+
+
+def _side(start: Array, end: Array, point: Array) -> Array:
+    """On which side of a line a point lies: 1 or -1, 0 for one that is on it to within `TOUCH`."""
+    way, to = end - start, point - start
+    length = np.maximum(np.hypot(way[..., 0], way[..., 1]), 1e-12)
+    distance = (way[..., 0] * to[..., 1] - way[..., 1] * to[..., 0]) / length
+    return np.asarray(np.where(np.abs(distance) < TOUCH, 0.0, np.sign(distance)))
+
+
+def _covers(a: Array, b: Array) -> bool:
+    """Whether a covers a point that is well within b: of outlines that do not cross, one may lie in the other."""
+    points = triangulate(b).mean(axis=1)
+    following = np.roll(a, -1, axis=0)
+    x, y = points[:, :1], points[:, 1:]
+    above, above_next = a[:, 1] > y, following[:, 1] > y
+    rise = np.where(following[:, 1] == a[:, 1], 1.0, following[:, 1] - a[:, 1])
+    crossing = a[:, 0] + (y - a[:, 1]) * (following[:, 0] - a[:, 0]) / rise
+    return bool((((above != above_next) & (x < crossing)).sum(axis=1) % 2 == 1).any())
