@@ -1,8 +1,8 @@
 """Whether the service of a container is ready: `python -m common.transport.health`, exit code 0 or 1.
 
-It asks the router for the service's readiness token, which also vanishes when the process is frozen or cut off. One that
-is frozen it ends, for the engine to start it again. It imports nothing but Zenoh, because it is started every few seconds
-beside every service.
+It asks the router for the service's readiness token, which also vanishes when the process is frozen or cut off. One
+that is frozen it ends, for the engine to start it again. It imports nothing but Zenoh, because it is started every
+few seconds beside every service.
 """
 
 from __future__ import annotations

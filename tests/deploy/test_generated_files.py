@@ -12,6 +12,7 @@ import yaml
 
 from common.config import load_cell, names_of
 from deploy.generate import ROOT, generated
+from deploy.watched import concerns, own_file
 
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
 CELLS = names_of("cells")
@@ -42,6 +43,7 @@ def test_container_is_locked_down(name: str) -> None:
     assert service["read_only"] and service["cap_drop"] == ["ALL"]
     assert service["security_opt"] == ["no-new-privileges:true"]
     assert service["mem_limit"] and service["restart"] == "unless-stopped"
+    assert service["init"], "the health check can not kill a service that is the container's first process"
     assert "./config:/app/config:ro" in service["volumes"]
 
 
@@ -58,6 +60,15 @@ def test_task_starts_when_everybody_else_is_ready(cell: str) -> None:
     others = {name for name, s in COMPOSE["services"].items() if cell in s["profiles"] and s is not task}
     assert set(task["depends_on"]) == others
     assert {wait["condition"] for wait in task["depends_on"].values()} == {"service_healthy"}
+
+
+@pytest.mark.parametrize(("path", "wanted"), [
+    ("/app/services/viewer.py", True), ("/app/services/router.py", False), ("/app/common/sim/world.py", True),
+    ("/app/services/viewer.py~", False), ("/app/common/README.md", False),
+])
+def test_service_is_started_again_for_its_own_file_and_for_what_all_share(path: str, wanted: bool) -> None:
+    services = yaml.safe_load((ROOT / "compose.dev.yaml").read_text(encoding="utf-8"))["services"]
+    assert concerns("modified", path, own_file(services["ur5-viewer"]["command"])) is wanted
 
 
 @pytest.mark.parametrize("document", MANIFESTS, ids=lambda d: f"{d['kind']} {d['metadata']['name']}")

@@ -1,0 +1,78 @@
+"""What the health check of a container does about a service that is stopped, shown on children of this process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from common.transport.frozen import end_if_frozen, stopped_service
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc, as in a container")
+
+
+@pytest.fixture
+def service() -> Iterator[subprocess.Popen[bytes]]:
+    """A process that was started as services are, up."""
+    started = subprocess.Popen([sys.executable, "-m", "http.server", "--bind", "127.0.0.1", "0"],
+                               stdout=subprocess.PIPE, env={**os.environ, "PYTHONUNBUFFERED": "1"})
+    assert started.stdout is not None
+    started.stdout.readline()
+    yield started
+    started.kill()
+    started.wait()
+    started.stdout.close()
+
+
+def stop(process: subprocess.Popen[bytes]) -> None:
+    process.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOWAIT)
+
+
+def test_service_that_runs_is_left_alone(service: subprocess.Popen[bytes]) -> None:
+    assert stopped_service(os.getpid()) is None
+    assert not end_if_frozen(os.getpid())
+    assert service.poll() is None
+
+
+def test_stopped_service_is_killed(service: subprocess.Popen[bytes]) -> None:
+    stop(service)
+    waited: list[float] = []
+    assert end_if_frozen(os.getpid(), waited.append)
+    assert service.wait(10) == -signal.SIGKILL
+    assert sum(waited) == pytest.approx(3.0)
+
+
+def test_service_that_goes_on_in_time_is_left_alone(service: subprocess.Popen[bytes]) -> None:
+    stop(service)
+    waited: list[float] = []
+
+    def wait(seconds: float) -> None:
+        waited.append(seconds)
+        if len(waited) == 3:
+            service.send_signal(signal.SIGCONT)
+            os.waitid(os.P_PID, service.pid, os.WCONTINUED | os.WNOWAIT)
+
+    assert not end_if_frozen(os.getpid(), wait)
+    assert len(waited) == 3
+    assert service.poll() is None
+
+
+def test_stopped_process_that_somebody_else_started_is_left_alone(service: subprocess.Popen[bytes]) -> None:
+    stop(service)
+    assert stopped_service(parent=service.pid) is None
+    assert stopped_service(os.getpid()) == service.pid
+
+
+def test_stopped_program_that_is_no_service_is_left_alone() -> None:
+    program = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    try:
+        stop(program)
+        assert stopped_service(os.getpid()) is None
+    finally:
+        program.kill()
+        program.communicate()

@@ -1,0 +1,105 @@
+"""Containers of a compose project under a name of its own, as a test brings them up, asks about them and ends them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deploy.generate import ROOT
+
+HEALTH = ("python", "-m", "common.transport.health")
+
+
+def require_engine() -> None:
+    """Skip the test where no container engine answers."""
+    answers = shutil.which("docker") and subprocess.run(["docker", "info"], capture_output=True, check=False)
+    if not answers or answers.returncode:
+        pytest.skip("no container engine answers `docker info`")
+
+
+def run(
+    *command: str, timeout: float = 60, check: bool = True, folder: Path = ROOT,
+    environment: Mapping[str, str] | None = None,
+) -> str:
+    done = subprocess.run(
+        command, cwd=folder, env={**os.environ, **(environment or {})}, capture_output=True, text=True,
+        timeout=timeout, check=False,
+    )
+    assert done.returncode == 0 or not check, f"{' '.join(command)}:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+    return done.stdout
+
+
+@dataclass
+class Containers:
+    """A compose project; a `with` block leaves nothing of it behind."""
+
+    project: str
+    files: Sequence[str] = ("compose.yaml",)
+    folder: Path = ROOT  # of the files
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    def __enter__(self) -> Containers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        run(*self._command("down", "-v", "-t", "10"), timeout=180, folder=self.folder, environment=self.environment)
+        left = ("--filter", f"label=com.docker.compose.project={self.project}", "-q")
+        assert run("docker", "ps", "-a", *left) == run("docker", "network", "ls", *left) == ""
+
+    def compose(self, *arguments: str, timeout: float = 60, check: bool = True) -> str:
+        return run(*self._command(*arguments), timeout=timeout, check=check, folder=self.folder,
+                   environment=self.environment)
+
+    def inspect(self, service: str) -> dict[str, Any]:
+        container = self.compose("ps", "-a", "-q", service).strip()
+        found: list[dict[str, Any]] = json.loads(run("docker", "inspect", container))
+        return found[0]
+
+    def health(self, service: str) -> str:
+        """What the engine thinks of it: starting, healthy or unhealthy."""
+        return str(self.inspect(service)["State"]["Health"]["Status"])
+
+    def is_ready(self, service: str) -> bool:
+        """What its own health check says now, which the engine asks every few seconds only."""
+        container = self.compose("ps", "-q", service).strip()
+        return bool(container) and subprocess.run(
+            ["docker", "exec", container, *HEALTH], capture_output=True, timeout=60, check=False,
+        ).returncode == 0
+
+    def process(self, service: str) -> int:
+        """The process id, on the host, of the service itself; 0 if there is none."""
+        container = self.compose("ps", "-q", service).strip()
+        listed = run("docker", "top", container, "-eo", "pid,args", check=False).splitlines()[1:] if container else []
+        found = [int(line.split()[0]) for line in listed if line.split()[1:4] == ["python", "-m", _module(service)]]
+        return found[0] if found else 0
+
+    def address(self, service: str) -> str:
+        """Its address in the cell's network, which the host reaches too."""
+        networks = self.inspect(service)["NetworkSettings"]["Networks"]
+        return str(networks[f"{self.project}_cell"]["IPAddress"])
+
+    def wait_for(self, what: str, seen: Callable[[], bool], seconds: float) -> None:
+        """Return when it is so. An engine tells no events of what is inside a container: it is asked twice a second."""
+        deadline = time.monotonic() + seconds
+        while not seen():
+            assert time.monotonic() < deadline, (
+                f"{what}: not within {seconds:g} s\n{self.compose('logs', '--tail', '5', check=False)}"
+            )
+            time.sleep(0.5)
+
+    def _command(self, *arguments: str) -> list[str]:
+        chosen = [word for name in self.files for word in ("-f", name)]
+        return ["docker", "compose", "-p", self.project, *chosen, *arguments]
+
+
+def _module(service: str) -> str:
+    return f"services.{service.partition('-')[2] or service}"
