@@ -41,7 +41,8 @@ def init(
     cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="all of config/cells if not given; "
                                                     "repeatable")] = None,
     hosts: Annotated[list[str] | None, typer.Option("--host", metavar="NAME", help="name or address at which the "
-                                                    "router is reached from elsewhere; repeatable")] = None,
+                                                    "router is reached from elsewhere; repeatable; with --renew those "
+                                                    "of before if not given")] = None,
     days: Annotated[str, typer.Option("--days", metavar="N", help="for which the certificates are valid")] = str(DAYS),
     overrides: options.Overrides = None,
     renew: Annotated[bool, typer.Option("--renew", help="keep the authority, make the rest anew")] = False,
@@ -51,6 +52,7 @@ def init(
     from common.errors import ConfigError
     from common.security.access import access_control
     from common.security.certificates import Authority
+    from common.security.checking import certificate_in, hosts_in
     from common.security.credentials import ACCESS, AUTHORITY, OBSERVER, OPERATOR, ROUTER_NAME, common_name
 
     valid = options.whole("--days", days, 1)
@@ -68,8 +70,9 @@ def init(
     if not renew:
         authority.write(certificate, key)
     names = [OPERATOR, OBSERVER, *(common_name(cell, process) for cell, all_ in rights.items() for process in all_)]
-    authority.issue(ROUTER_NAME, [*LOCAL, *(hosts or ())], valid, place / f"{ROUTER_NAME}.pem",
-                    place / f"{ROUTER_NAME}.key")
+    router = place / f"{ROUTER_NAME}.pem"
+    reached = hosts or (hosts_in(certificate_in(router)) if renew and router.is_file() else [])
+    authority.issue(ROUTER_NAME, list(dict.fromkeys([*LOCAL, *reached])), valid, router, router.with_suffix(".key"))
     for name in names:
         authority.issue(name, [], valid, place / f"{name}.pem", place / f"{name}.key")
     text = ACCESS_HEAD + json.dumps(access_control(rights), indent=1) + "\n"

@@ -96,6 +96,15 @@ def common_name_in(certificate: x509.Certificate) -> str:
     return str(names[0].value) if names else ""
 
 
+def hosts_in(certificate: x509.Certificate) -> list[str]:
+    """The names and addresses at which the holder of a certificate is reached."""
+    try:
+        found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return []
+    return [str(name.value) for name in found if isinstance(name, (x509.DNSName, x509.IPAddress))]
+
+
 def certificate_in(path: Path) -> x509.Certificate:
     """The certificate that a file holds.
 
