@@ -25,7 +25,8 @@ def footprint(fixture: Fixture) -> Array:
         corners = np.array([(-a, -b), (a, -b), (a, b), (-a, b)])
         return np.asarray(corners @ np.array([[cos, sin], [-sin, cos]]) + (x, y))
     round_one = fixture.shape != "box" and not any(fixture.rpy[:2])
-    return np.asarray(circle(fixture.dimensions[0] if round_one else math.hypot(*fixture.dimensions)) + np.array([x, y]))
+    radius = fixture.dimensions[0] if round_one else math.hypot(*fixture.dimensions)
+    return np.asarray(circle(radius) + np.array([x, y]))
 
 
 def heights(fixture: Fixture) -> tuple[float, float]:
