@@ -27,24 +27,26 @@ from common.transport.endpoint import BASE_PORT, endpoint_of
 M = TypeVar("M", bound=Message)
 
 ROOT = Path(__file__).resolve().parent.parent
-DOMAINS = range(120, 233)
+DOMAINS = range(60, 233)
 logging.getLogger("watcher").addHandler(logging.NullHandler())  # that the router goes at the end is no news
 SUMMARY, LOG = "summary.json", "cell.log"
 
 
 def free_domain() -> int:
-    """A domain whose port is free.
+    """A domain whose port is free. Tests that run beside each other have shares of their own, so that none meet.
 
     Raises:
         RuntimeError: none is.
     """
-    for number in random.sample(DOMAINS, len(DOMAINS)):
+    share = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    domains = DOMAINS[share :: int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))]
+    for number in random.sample(domains, len(domains)):
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             with suppress(OSError):
                 probe.bind(("127.0.0.1", BASE_PORT + number))
                 return number
-    raise RuntimeError(f"no domain from {DOMAINS[0]} to {DOMAINS[-1]} is free")
+    raise RuntimeError(f"no domain from {domains[0]} to {domains[-1]} is free")
 
 
 def folder_for(parent: Path, label: str) -> Path:

@@ -6,13 +6,14 @@ import os
 import re
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from benchmarks.runs import free_domain
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
@@ -26,15 +27,6 @@ LINES = [
 RUNS = [line for line in LINES if line.startswith(".venv/bin/zencell run")]
 BESIDE = [line for line in LINES if line.startswith(".venv/bin/") and line not in RUNS and " up " not in line]
 PATIENCE = 60  # [s]
-
-
-def free_domain() -> int:
-    """A domain whose port nobody listens on."""
-    for domain in range(100 + os.getpid() % 60, 232):
-        with socket.socket() as probe:
-            if probe.connect_ex(("127.0.0.1", 7447 + domain)):
-                return domain
-    raise AssertionError("no free domain")
 
 
 def command(line: str, *more: str) -> list[str]:

@@ -2,9 +2,7 @@
 
 import os
 import queue
-import random
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -14,6 +12,8 @@ from pathlib import Path
 
 import psutil
 import pytest
+
+from benchmarks.runs import free_domain
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PATIENCE = 40.0  # [s] until a test gives up waiting for an event
@@ -110,19 +110,6 @@ def make_folder(path: Path) -> Path:
 def folder(tmp_path: Path) -> Path:
     """A folder of its own for each test."""
     return make_folder(tmp_path)
-
-
-def free_domain() -> int:
-    """A domain whose port is free."""
-    for number in random.sample(range(60, 233), 100):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(("127.0.0.1", 7447 + number))
-            except OSError:
-                continue
-            return number
-    pytest.skip("no domain is free")
 
 
 @pytest.fixture

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import CELL, PATIENCE, Zencell, ask, environment, free_domain, make_folder
+from benchmarks.runs import free_domain
+from tests.cli.conftest import CELL, PATIENCE, Zencell, ask, environment, make_folder
 
 ZENOH = Path(sys.executable).parent / "zenoh"
 needs_zenoh_cli = pytest.mark.skipif(not ZENOH.exists(), reason="zenoh-cli is not installed beside this Python")

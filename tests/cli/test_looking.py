@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import CELL, Zencell, command_line, environment, free_domain, make_folder
+from benchmarks.runs import free_domain
+from tests.cli.conftest import CELL, Zencell, command_line, environment, make_folder
 
 SPEED = "2"
 LONGEST = 100.0  # [s] until a command is taken for hanging, on a machine however busy

@@ -14,12 +14,13 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.runs import free_domain
 from cli.keys import names_of
 from cli.recording import in_bytes, outcome, progress
 from common.recording.reading import Recording
 from common.recording.sink import Figures
 from common.recording.summary import summarise
-from tests.cli.conftest import CELL, PATIENCE, Zencell, ask, command_line, environment, free_domain, make_folder
+from tests.cli.conftest import CELL, PATIENCE, Zencell, ask, command_line, environment, make_folder
 from tests.common.recording.samples import joints, status, write
 
 Start = Callable[..., Zencell]

@@ -2,9 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-import random
 import signal
-import socket
 import subprocess
 import sys
 import uuid
@@ -15,26 +13,16 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.runs import free_domain
 from common.clock import Clock
 from common.transport.bus import Bus
 from common.transport.connect import connect
-from common.transport.endpoint import endpoint_of, port_of
+from common.transport.endpoint import endpoint_of
 from common.transport.local import LocalNetwork
 from common.transport.zenoh_session import wait_router
 
 ROOT = Path(__file__).resolve().parents[3]
 PATIENCE = 20.0  # only ever waited for by a test that fails
-
-
-def find_domain() -> int:
-    for domain in random.SystemRandom().sample(range(100, 233), 100):
-        with socket.socket() as probe:
-            try:
-                probe.bind(("127.0.0.1", port_of(domain)))
-            except OSError:
-                continue
-            return domain
-    raise RuntimeError("no domain is free")
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -82,7 +70,7 @@ class Processes:
 
 @pytest.fixture
 def domain() -> int:
-    return find_domain()
+    return free_domain()
 
 
 @pytest.fixture
@@ -96,7 +84,7 @@ def processes(tmp_path: Path) -> Iterator[Processes]:
 def shared_router(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Endpoint of a router for all tests that leave it alone; they keep apart by the names of their cells."""
     processes = Processes(tmp_path_factory.mktemp("router"))
-    domain = find_domain()
+    domain = free_domain()
     processes.start("services.router", "--domain", str(domain))
     try:
         with ThreadPoolExecutor(1) as thread:  # this thread may already run a loop
