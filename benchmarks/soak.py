@@ -5,8 +5,9 @@
 states keep their rate and the task goes on placing.
 
 Memory is what a process has for itself (anonymous and shared pages, also those swapped out): pages of files, such as
-libraries, come and go with whatever else runs on the machine. Growth is the median of the last fifth of the looks
-against that of the first fifth, of those after the first minutes.
+libraries, come and go with whatever else runs on the machine. Growth is the lower quartile of the last fifth of the
+looks against that of the first fifth, of those after the first minutes: what a process holds between two pictures, and
+not the two or three of 0.9 MB that happen to be under way.
 """
 
 from __future__ import annotations
@@ -132,9 +133,10 @@ async def freeze_and_wake(subscriber: Subscriber) -> None:
 
 
 def growth(values: list[float]) -> tuple[float, float]:
-    """Median of the first and of the last part of the values."""
+    """Lower quartile of the first and of the last part of the values."""
     size = max(1, len(values) // WINDOW)
-    return median(values[:size]), median(values[-size:])
+    first, last = (sorted(part)[size // 4] for part in (values[:size], values[-size:]))
+    return first, last
 
 
 def report(seen: Seen, losses: Losses, settle: float, period: float) -> tuple[list[str], list[str]]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from common.errors import Refused
 from common.hardware.checks import Tolerances, checked_trajectory
-from common.hardware.goals import GoalMemory
+from common.hardware.goals import REMEMBERED, GoalMemory
 from common.hardware.interface import Limits, Vector
 from common.hardware.pacing import next_rate, way
 from common.hardware.trajectory import Trajectory
@@ -56,7 +56,7 @@ class TrajectoryController:
     """Follows one trajectory at a time, and holds still between them."""
 
     def __init__(
-        self, limits: Limits, start: Vector, tolerances: Tolerances | None = None, remember: int = 1000,
+        self, limits: Limits, start: Vector, tolerances: Tolerances | None = None, remember: int = REMEMBERED,
         name: str = "controller",
     ) -> None:
         """Hold at `start` (dof,) [rad]; `remember` so many goals by their ids; sign reports with the name."""

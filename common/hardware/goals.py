@@ -7,11 +7,13 @@ from typing import Generic, TypeVar
 
 S = TypeVar("S")
 
+REMEMBERED = 100  # goals: minutes of them, where a request that is older than seconds is refused for its age
+
 
 class GoalMemory(Generic[S]):
     """The newest states of the last goals."""
 
-    def __init__(self, most: int = 1000) -> None:
+    def __init__(self, most: int = REMEMBERED) -> None:
         """Remember at most so many goals; the one heard of longest ago is forgotten first."""
         self._most = most
         self._states: OrderedDict[str, S] = OrderedDict()

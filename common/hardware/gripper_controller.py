@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from common.config import GripperConfig
-from common.hardware.goals import GoalMemory
+from common.hardware.goals import REMEMBERED, GoalMemory
 from common.hardware.interface import Gripper, GripperReading
 from common.messages import GripperCommand, GripperState
 from common.robot.finger_joints import driven_position
@@ -14,7 +14,7 @@ SETTLED = 1e-3  # fingers that stop this near to the width they were told are th
 class GripperController:
     """Commands the fingers and reports what became of it."""
 
-    def __init__(self, gripper: Gripper, config: GripperConfig, remember: int = 1000) -> None:
+    def __init__(self, gripper: Gripper, config: GripperConfig, remember: int = REMEMBERED) -> None:
         """Command this gripper; `remember` so many goals by their ids."""
         self._gripper = gripper
         self._config = config

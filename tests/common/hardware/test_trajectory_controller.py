@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.hardware.controller import LARGEST_STEP
+from common.hardware.goals import REMEMBERED
 from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware
 from tests.common.hardware.rig import START, STEP, T0, Rig
@@ -66,16 +67,16 @@ def test_same_id_again_gives_the_state_of_that_goal_and_moves_nothing(rig, rest_
         assert np.array_equal(rig.q, before)
 
 
-def test_a_thousand_goals_are_remembered_and_a_running_one_always(rig, rest_to_rest):
+def test_the_last_goals_are_remembered_and_a_running_one_always(rig, rest_to_rest):
     there, back = rest_to_rest([0, 0], [0.01, 0], 0.5), rest_to_rest([0.01, 0], [0, 0], 0.5)
     rig.accept("first", there)
     rig.until_over()
     rig.accept("running", back)
-    for number in range(999):
+    for number in range(REMEMBERED - 1):
         rig.accept(f"busy {number}", there)
         rig.step(1e-4)
     assert rig.accept("running", there).state == "active"
-    assert rig.accept("busy 500", there).error == "busy"
+    assert rig.accept(f"busy {REMEMBERED // 2}", there).error == "busy"
     rig.until_over()
     assert rig.accept("first", there).state == "active", "forgotten by now: a new goal"
 
