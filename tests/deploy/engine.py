@@ -59,6 +59,15 @@ class Containers:
         return run(*self._command(*arguments), timeout=timeout, check=check, folder=self.folder,
                    environment=self.environment)
 
+    def refused(self, *arguments: str, timeout: float = 60) -> str:
+        """What a command that has to fail says on stderr."""
+        done = subprocess.run(
+            self._command(*arguments), cwd=self.folder, env={**os.environ, **self.environment}, capture_output=True,
+            text=True, timeout=timeout, check=False,
+        )
+        assert done.returncode, f"{' '.join(arguments)} did not fail: {done.stdout[-2000:]}"
+        return done.stderr
+
     def inspect(self, service: str) -> dict[str, Any]:
         container = self.compose("ps", "-a", "-q", service).strip()
         found: list[dict[str, Any]] = json.loads(run("docker", "inspect", container))
