@@ -1,16 +1,17 @@
 """What the operator's page costs, how soon it is there and how soon its stop button works, on a cell as it is run.
 
-    python -m benchmarks.page [--cell panda] [--stops 10]
+    python -m benchmarks.page [--cell panda] [--stops 10] [--openings 3]
 
-A page is played by a client that speaks the protocol of the page and draws nothing, so that a browser's own work does
-not count. The click is timed from the client's message to the first motion status that says so, and to the first
-joint state at rest.
+A browser opens the page first, without a graphics card (benchmarks.first_picture); after that a page is played by a
+client that speaks its protocol and draws nothing, so that a browser's own work does not count. The click is timed from
+the client's message to the first motion status that says so, and to the first joint state at rest.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import os
 import re
 import socket
 import statistics
@@ -22,6 +23,7 @@ from pathlib import Path
 
 import psutil
 
+from benchmarks.first_picture import chromium, openings
 from benchmarks.runs import RunningCell, until
 from common import topics
 from common.messages import SupervisorStatus
@@ -64,7 +66,7 @@ def all_ready(status: SupervisorStatus) -> bool:
     return all(service.state == "ready" for service in status.services)
 
 
-async def measure(name: str, stops: int) -> None:
+async def measure(name: str, stops: int, opened_times: int) -> None:
     """Bring a cell up and write a line for each figure."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
@@ -77,6 +79,7 @@ async def measure(name: str, stops: int) -> None:
         say(f"{name} ready after {ready[1] if ready else '?'} s, with its page")
         process = cell.processes()["viewer"]
         say(f"memory {process.memory_info().rss / 1e6:.0f} MB")
+        await say_openings(port, opened_times)
         for count in (0, 1, 10):
             async with AsyncExitStack() as stack:
                 began = time.monotonic()
@@ -95,6 +98,17 @@ async def measure(name: str, stops: int) -> None:
             say(f"{what}: median {1e3 * statistics.median(values):.0f} ms, most {1e3 * max(values):.0f} ms")
 
 
+async def say_openings(port: int, count: int) -> None:
+    """Write how soon a browser shows the page, if there is one."""
+    program = chromium()
+    if program is None:
+        say("no first picture: Chromium is not installed")
+        return
+    for number, opening in enumerate(await openings(program, f"http://127.0.0.1:{port}", count), 1):
+        say(f"opening {number}: panels after {opening.panels:.1f} s, everything drawn after {opening.picture:.1f} s, "
+            f"{opening.processor:.1f} s of processor; load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+
+
 def say(line: str) -> None:
     """Write a line at once."""
     sys.stdout.write(f"{line}\n")
@@ -106,8 +120,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cell", default="panda")
     parser.add_argument("--stops", type=int, default=10)
+    parser.add_argument("--openings", type=int, default=3, help="in one browser that has just started")
     options = parser.parse_args()
-    asyncio.run(measure(options.cell, options.stops))
+    asyncio.run(measure(options.cell, options.stops, options.openings))
 
 
 if __name__ == "__main__":

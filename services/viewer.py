@@ -51,8 +51,10 @@ def load(server: viser.ViserServer, config: Config, layers: dict[str, bool]) -> 
     """The scene with its meshes, the limits of the joints and the names of the planners; takes seconds."""
     from common.planning.planners import planner_names
     from common.robot.model import RobotModel
+    from common.viewer.client_files import client_files
     from common.viewer.scene_view import SceneView
 
+    client_files()  # kept from now on
     robot = RobotModel.load(config.robot)
     limits = Limits(robot.joint_names, robot.lower, robot.upper, robot.velocity)
     return SceneView(server, robot, config.world, visible=layers), limits, planner_names()

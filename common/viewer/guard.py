@@ -2,12 +2,13 @@
 
 viser has no authentication, and takes a WebSocket from any web page. Its server is one call of `websockets`' `serve`,
 which can ask a function about each request before anything else reads it. viser gives its own function there, which
-sends the page; ours is put in front of it, while the server is made. Nothing is copied through a second process and
-nothing else listens, so that no port is left unguarded.
+sends the page; ours is put in front of it, while the server is made, and sends the page itself. Nothing is copied
+through a second process and nothing else listens, so that no port is left unguarded.
 """
 
 from __future__ import annotations
 
+import gzip
 import inspect
 import logging
 import os
@@ -16,6 +17,7 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import viser
 import websockets.asyncio.server as websocket_server
@@ -26,6 +28,7 @@ from websockets.http11 import Request, Response
 
 from common.errors import ConfigError
 from common.viewer.access import SHORTEST_TOKEN, TOKEN, TOKEN_VARIABLE, Access, Answer, is_loopback
+from common.viewer.client_files import File, client_files
 from common.viewer.listening import open_socket, refusal
 
 if TYPE_CHECKING:
@@ -127,6 +130,9 @@ class Guard:
                 if answer.status is not HTTPStatus.OK:
                     log.debug("refused %s: %s", connection.remote_address, answer.text)
                 return _protected(_response(answer), said["host"])
+            file = None if upgrade else client_files().get(urlsplit(request.path).path)
+            if file is not None:
+                return _protected(_sent(file, request), said["host"], lasts=file.lasts)
             response = process(connection, request) if process else None
             if inspect.isawaitable(response):
                 response = await response
@@ -165,14 +171,26 @@ def _response(answer: Answer) -> Response:
     return Response(answer.status.value, answer.status.phrase, headers, body)
 
 
-def _protected(response: Response, hosts: list[str]) -> Response:
+def _sent(file: File, request: Request) -> Response:
+    """A file of the page, compressed for those who understand it."""
+    headers = Headers({"Content-Type": file.kind, "Vary": "Accept-Encoding", "Connection": "close"})
+    body = file.body
+    if "gzip" in request.headers.get("Accept-Encoding", ""):
+        headers["Content-Encoding"] = "gzip"
+    else:
+        body = gzip.decompress(body)
+    headers["Content-Length"] = str(len(body))
+    return Response(HTTPStatus.OK.value, HTTPStatus.OK.phrase, headers, body)
+
+
+def _protected(response: Response, hosts: list[str], *, lasts: bool = False) -> Response:
     # Safari before 15.4 does not take 'self' for a WebSocket. The name was checked if this is the page itself.
     own = f"ws://{hosts[0]} wss://{hosts[0]}" if response.status_code == HTTPStatus.OK and len(hosts) == 1 else ""
     response.headers["Content-Security-Policy"] = POLICY.format(own=own)
     response.headers["X-Content-Type-Options"] = "nosniff"
     response.headers["Referrer-Policy"] = "no-referrer"
     response.headers["Cross-Origin-Resource-Policy"] = "same-origin"
-    response.headers["Cache-Control"] = "no-store"
+    response.headers["Cache-Control"] = "private, max-age=31536000, immutable" if lasts else "no-store"
     return response
 
 

@@ -26,6 +26,7 @@ from common.viewer.pictures import ANNOTATED, LIVE, PicturePanel
 from common.viewer.plots import Limits, PlotPanel
 from common.viewer.requests import Requests
 from common.viewer.scene_feed import SceneFeed
+from common.viewer.surface import furnish
 from common.viewer.task_panel import TaskPanel
 from common.viewer.tuning import TuningPanel
 from common.viewer.view_panel import ViewPanel
@@ -78,6 +79,7 @@ class Page:
         self.pages = 0
         self.visited = asyncio.Event()
         self.desk = Desk(asyncio.get_running_loop(), self._tell)
+        furnish(server)
         gui = server.gui
         gui.configure_theme(dark_mode=layout.dark, show_logo=False, show_share_button=False)
         gui.set_panel_label(f"zencell · {cell}")

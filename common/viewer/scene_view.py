@@ -42,7 +42,6 @@ from common.viewer.outline import ContourChoice, Outline
 from common.viewer.plan import Plan
 from common.viewer.robot_meshes import coarse, visual_pieces
 from common.viewer.scene_objects import SceneObjects
-from common.viewer.surface import furnish
 from common.viewer.truth import Truth
 
 _GHOST = 0.3  # share of the robot's triangles that its ghost has
@@ -117,7 +116,6 @@ class SceneView:
         self._editing = False
         self._tf_applied = -math.inf
         self._build(server.scene, robot, around)
-        furnish(server, around, robot)
         server.on_client_connect(lambda _client: self._show_all())
 
     def _build(self, scene: viser.SceneApi, robot: RobotModel, around: Surroundings) -> None:

@@ -259,6 +259,15 @@ async def test_odd_messages_leave_the_page_and_the_service_as_they_are(
     capfd.readouterr()  # viser prints what it could not convert
 
 
+async def test_light_comes_before_what_it_falls_on() -> None:
+    """Else a browser makes the shaders of everything twice, which takes it seconds without a graphics card."""
+    async with page_of("panda") as played, opened(played.port) as page:
+        await page.until(lambda: page.label("STOP"))
+        first = next(number for number, kind in enumerate(page.kinds) if kind in ("GuiButtonMessage", "MeshMessage"))
+        lights = ("EnableLightsMessage", "EnvironmentMapMessage", "HemisphereLightMessage")
+        assert max(map(page.kinds.index, lights)) < first
+
+
 async def test_saved_layout_opens_with_what_was_on(tmp_path: Path) -> None:
     file = tmp_path / "layout.yaml"
     file.write_text("tabs: [Log, View]\n")

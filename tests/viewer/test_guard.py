@@ -24,6 +24,7 @@ from common.config.tunables import describe
 from common.errors import ConfigError
 from common.viewer import guard
 from common.viewer.access import TOKEN_VARIABLE
+from common.viewer.client_files import client_files
 from common.viewer.guard import close_server, make_server
 from services.viewer import Config
 
@@ -130,6 +131,24 @@ def test_refused_request_gets_one_line_and_no_page(make: Make) -> None:
     answer = get(make(token=SECRET), "/index.html")
     assert answer.status == 401 and answer.text.count("\n") == 1 and len(answer.text) < 300
     assert answer.headers["Cache-Control"] == "no-store"
+
+
+def test_parts_of_the_page_are_kept_by_browsers_and_the_page_is_not(make: Make) -> None:
+    server = make()
+    page = get(server)
+    parts = re.findall(r'"(/[0-9a-f]+\.(?:css|js))"', page.text)
+    assert page.headers["Cache-Control"] == "no-store" and len(set(parts)) == 2
+    for part in parts:
+        answer = get(server, part)
+        assert answer.status == 200 and "immutable" in answer.headers["Cache-Control"]
+        assert answer.headers["X-Content-Type-Options"] == "nosniff" and len(answer.text) > 50_000
+    assert get(server, "/0.js").status == 404
+
+
+def test_parts_of_the_page_need_the_token_too(make: Make) -> None:
+    server = make("0.0.0.0", token=SECRET)
+    for path in client_files():
+        assert get(server, path).status == 401
 
 
 async def test_beyond_this_machine_the_token_opens_the_page_and_nothing_else_does(make: Make) -> None:

@@ -21,12 +21,16 @@ CAMERA = {
 
 
 class BrowserDouble:
-    """What a browser would show: `parts` are the fields and texts of the panels by their uuid."""
+    """What a browser would show: `parts` are the fields and texts of the panels by their uuid.
+
+    `kinds` are the types of the messages, in the order in which they came.
+    """
 
     def __init__(self, connection: ClientConnection) -> None:
         self._connection = connection
         self.parts: dict[str, dict[str, Any]] = {}
         self.values: dict[str, Any] = {}
+        self.kinds: list[str] = []
         self._changed = asyncio.Event()
 
     @property
@@ -54,6 +58,7 @@ class BrowserDouble:
 
     def _take(self, message: dict[str, Any]) -> None:
         uuid = str(message.get("uuid"))
+        self.kinds.append(message["type"])
         if "props" in message and str(message["type"]).startswith("Gui"):
             self.parts[uuid] = message["props"]
             self.values[uuid] = message.get("value")

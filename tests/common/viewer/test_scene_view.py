@@ -198,6 +198,8 @@ def test_messages_without_content_do_no_harm(ur5: Stage) -> None:
     view.show_joints(m.JointState(header=WORLD, name=ur5.robot.joint_names, position=[0.0] * 6))
 
 
-def test_a_browser_is_met_with_plain_lights_and_a_view_of_the_cell(ur5: Stage) -> None:
-    assert ur5.server.initial_camera.look_at[2] == pytest.approx(1.0)  # the base is 0.75 m above the floor
-    assert not ur5.server.scene.world_axes.visible
+def test_scene_leaves_it_to_the_page_from_where_it_is_seen(server: viser.ViserServer) -> None:
+    server.initial_camera.position, server.initial_camera.look_at = (3.0, 2.0, 1.0), (0.3, 0.2, 0.1)
+    Stage(server, "panda")
+    np.testing.assert_allclose(server.initial_camera.position, (3.0, 2.0, 1.0))
+    np.testing.assert_allclose(server.initial_camera.look_at, (0.3, 0.2, 0.1))

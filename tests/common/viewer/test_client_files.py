@@ -1,0 +1,61 @@
+"""The page's files: what the packed page holds, in parts that a browser can keep."""
+
+from __future__ import annotations
+
+import gzip
+import re
+from pathlib import Path
+
+import pytest
+import viser
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.viewer.client_files import ALPHABET, client_files, decoded, files_of
+
+PAGE = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text(encoding="utf-8")
+
+
+def encoded(data: bytes) -> str:
+    """As viser's build writes it."""
+    text = ""
+    for start in range(0, len(data), 4):
+        group = data[start : start + 4]
+        value, letters = int.from_bytes(group, "big"), ""
+        for _ in range(len(group) + 1):
+            value, digit = divmod(value, len(ALPHABET))
+            letters = ALPHABET[digit] + letters
+        text += letters
+    return text
+
+
+@given(st.binary(max_size=40))
+def test_what_was_written_in_letters_is_read_again(data: bytes) -> None:
+    assert decoded(encoded(data)) == data
+
+
+def test_client_of_the_installed_viser_is_taken_apart() -> None:
+    files = client_files()
+    page = gzip.decompress(files["/"].body).decode()
+    parts = set(re.findall(r'"(/[0-9a-f]+\.(?:css|js|wasm))"', page))
+    contents = {path.rsplit(".")[1]: gzip.decompress(files[path].body) for path in parts}
+    assert set(contents) == {"css", "js", "wasm"} and parts | {"/", "/index.html"} == set(files)
+    assert len(page) < 10_000 < len(PAGE) and "data-p=" not in page
+    assert b"WebSocket" in contents["js"] and contents["wasm"].startswith(b"\0asm") and b"mantine" in contents["css"]
+    assert all(files[path].lasts for path in parts) and not files["/"].lasts
+
+
+def test_name_of_a_part_tells_its_contents() -> None:
+    changed = PAGE.replace('data-ss="', 'data-ss="0', 1)
+    assert set(files_of(changed)) == set(client_files())
+    size = int(re.search(r'data-ss="(\d+)"', PAGE)[1])  # type: ignore[index]
+    other = PAGE.replace(f'data-ss="{size}"', f'data-ss="{size - 1}"', 1)
+    assert not {path for path in files_of(other) if path.endswith("css")} & set(client_files())
+
+
+@pytest.mark.parametrize("page", ["<html><head><title>x</title></head></html>", PAGE.replace("data-p=", "data-q=")])
+def test_page_that_is_packed_in_another_way_is_sent_as_it_is(page: str) -> None:
+    files = files_of(page)
+    assert set(files) == {"/", "/index.html"}
+    sent = gzip.decompress(files["/"].body).decode()
+    assert re.sub(r"<head><script>.*?</script>", "<head>", sent, count=1, flags=re.DOTALL) == page
