@@ -35,7 +35,7 @@ class Piece:
     faces: NDArray[np.uint32]  # (m, 3)
 
 
-def visual_pieces(robot: RobotModel, triangles: int = 40_000) -> list[Piece]:
+def visual_pieces(robot: RobotModel, triangles: int = 25_000) -> list[Piece]:
     """The visual shapes of all links with about so many triangles in all, in the order of the links.
 
     Descriptions come with 100 000 and more, which a browser without a graphics card draws once a second.
