@@ -1,5 +1,11 @@
+import signal
+
 import pytest
 from hypothesis import settings
+
+# Who is started in the background of a script has Ctrl-C ignored, and so would all that the tests start.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A machine that is busy is no failure: what must be fast has a benchmark.
 settings.register_profile("zencell", deadline=None)

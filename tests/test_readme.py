@@ -46,8 +46,10 @@ def cell() -> Iterator[dict[str, str]]:
         env["PASTE"] = process.stdout.readline().strip()
         yield env
         process.send_signal(signal.SIGINT)
-        process.stdout.read()
-        process.wait(PATIENCE)
+        try:
+            process.communicate(timeout=PATIENCE)
+        finally:
+            process.kill()
 
 
 def test_readme_names_the_two_commands_first() -> None:
@@ -78,8 +80,10 @@ def test_command_of_the_readme_answers_beside_a_running_cell(line: str, cell: di
         assert process.stdout is not None
         first = process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        process.stdout.read()
-        process.wait(PATIENCE)
+        try:
+            process.communicate(timeout=PATIENCE)
+        finally:
+            process.kill()
     wanted = {"hz": "Hz", "status": '"state"', "targets": '"poses"', "list": "panda/", "zenoh": "panda/",
               "add": '"ids"', "pause": '"paused": true', " top ": "panda at speed", " tf ": "position",
               "param set": "400.0 -> 350.0", "param dump": "# Parameters of panda", "record": ""}
