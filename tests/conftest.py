@@ -11,14 +11,9 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 settings.register_profile("zencell", deadline=None)
 settings.load_profile("zencell")
 
-LAST = "tests/common/"  # many short ones: they fill up what is left when the long ones have been dealt out
+LAST = "tests/common/"  # many short ones
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """With `pytest -n 2 --dist loadgroup` a file stays with one worker, because its tests share a cell."""
-    if not hasattr(config, "workerinput"):
-        return
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with what takes long: `make test` deals the files out to two workers in this order."""
     items.sort(key=lambda item: item.nodeid.startswith(LAST))
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
