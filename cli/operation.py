@@ -90,7 +90,7 @@ class Operation:
         self._supervisor: Supervisor | None = None
         self._collector: Collector | None = None
         self._screen: Screen | None = None
-        self._page = ""  # address
+        self._page: viewing.Page | None = None
         self._watchers: dict[str, list[str]] = {}  # commands by name
         self._disturbance: Disturbance | None = None
         self._chaos: Chaos | None = None
@@ -102,11 +102,10 @@ class Operation:
         Raises:
             ConfigError: there is no page, the port is taken, or host or port can not be used.
         """
-        page = viewing.page_of(self.cell, host, port)
+        self._page = page = viewing.page_of(self.cell, host, port)
         if page is not None:
             overrides = (*self.launch.overrides, *page.overrides)
             self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
-            self._page = page.address
 
     def record_to(self, file: str | None) -> None:
         """Have a process beside the services record all that travels, from before they are ready to after their end.
@@ -295,7 +294,7 @@ class Operation:
         assert self._collector is not None
         self.summary.ready = time.monotonic() - self.began
         if self._page and self._screen:
-            self._screen.note(f"Open {self._page}")
+            self._screen.note(f"Open {self._page.address}")
         if self._disturbance is not None:
             from common.chaos.setting import chaos_in
 

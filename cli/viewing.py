@@ -10,6 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from common.config import Cell
+    from common.viewer.listening import FreePort
 
 VIEWER = "viewer"
 HIGHEST_PORT = 65535
@@ -29,6 +30,7 @@ class Page:
     address: str  # for the person, with the token if that was made here
     overrides: tuple[str, ...]
     environment: dict[str, str] = field(repr=False)
+    port: FreePort | None = None  # kept for it, if none was named
 
 
 def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
@@ -54,8 +56,10 @@ def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
         return None
     at = str(entry.parameters.get("host", "127.0.0.1")) if host is None else host
     wanted = entry.parameters.get("port") if port is None else _port(port)
+    free = None
     if wanted is None:
-        number = first_free_port(at)
+        free = first_free_port(at)
+        number = free.number
     elif isinstance(wanted, int):
         number = wanted
         try:
@@ -69,7 +73,7 @@ def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
     if not (is_loopback(at) or entry.parameters.get("token") or os.environ.get(TOKEN_VARIABLE)):
         environment[TOKEN_VARIABLE] = make_token()
         address += f"/?token={environment[TOKEN_VARIABLE]}"
-    return Page(address, (*overrides, f"services.viewer.port={number}"), environment)
+    return Page(address, (*overrides, f"services.viewer.port={number}"), environment, free)
 
 
 def _port(text: str) -> int:

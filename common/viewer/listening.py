@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import ipaddress
 import socket
+import sys
 
 from common.errors import ConfigError
 
@@ -45,18 +46,44 @@ def refusal(error: OSError, host: str, port: int, field: str = "") -> ConfigErro
     return ConfigError("services.viewer.host", host, f"can not be listened at: {reason}")
 
 
-def first_free_port(host: str) -> int:
+class FreePort:
+    """A port that nobody else who starts a cell takes before its page is there, for as long as this object lives."""
+
+    def __init__(self, number: int) -> None:
+        """Claim the port.
+
+        Raises:
+            OSError: somebody else has.
+        """
+        self.number = number
+        self._claim: socket.socket | None = None
+        if sys.platform == "linux":  # a name that vanishes with its process; elsewhere two at once may meet
+            self._claim = socket.socket(socket.AF_UNIX)
+            try:
+                self._claim.bind(f"\0zencell-page-{number}")
+            except OSError:
+                self._claim.close()
+                raise
+
+    def __del__(self) -> None:
+        """Let go of it."""
+        if self._claim is not None:
+            self._claim.close()
+
+
+def first_free_port(host: str) -> FreePort:
     """The first port from 8080 on that can be listened at.
 
     Raises:
         ConfigError: none can, or the host is none of this machine's.
     """
-    for port in range(FIRST_PORT, LAST_PORT + 1):
+    for number in range(FIRST_PORT, LAST_PORT + 1):
         try:
-            open_socket(host, port).close()
+            port = FreePort(number)
+            open_socket(host, number).close()
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
-                raise refusal(error, host, port) from None
+                raise refusal(error, host, number) from None
             continue
         return port
     raise ConfigError("--viewer-port", ..., f"ports {FIRST_PORT} to {LAST_PORT} are all in use; name another")

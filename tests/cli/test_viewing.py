@@ -67,6 +67,15 @@ def test_next_free_port_is_taken_when_none_was_named(cell: Cell, monkeypatch: py
     assert page is not None and taken < int(page.address.rpartition(":")[2]) <= taken + 50
 
 
+def test_two_cells_that_come_up_at_the_same_time_have_pages_of_their_own(cell: Cell) -> None:
+    one, other = page_of(cell, None, None), page_of(cell, None, None)
+    assert one is not None and other is not None and one.address != other.address
+    address = one.address
+    del one
+    again = page_of(cell, None, None)
+    assert again is not None and again.address == address
+
+
 def test_no_free_port_is_said(cell: Cell, monkeypatch: pytest.MonkeyPatch, taken: int) -> None:
     monkeypatch.setattr("common.viewer.listening.FIRST_PORT", taken)
     monkeypatch.setattr("common.viewer.listening.LAST_PORT", taken)
