@@ -180,22 +180,24 @@ class Chaos:
                 if real is not None and fault.kind == "replay":
                     publisher.put(real.payload, real.attachment or b"")
                 else:
-                    publisher.put(*self._damaged(real, fault, rng))
+                    publisher.put(*self._damaged(key, real, fault, rng))
                 await asyncio.sleep(SPACING)
         finally:
             publisher.undeclare()
 
-    def _damaged(self, real: RawSample | None, fault: Fault, rng: np.random.Generator) -> tuple[bytes, bytes]:
+    def _damaged(
+        self, key: str, real: RawSample | None, fault: Fault, rng: np.random.Generator
+    ) -> tuple[bytes, bytes]:
         """A damaged payload and what rides beside it: damaged on its way, or put by a stranger."""
         attachment = decode_attachment(real.attachment) if real else None
         if real is None or attachment is None:
             payload = damaged(b"", _stateless(fault, rng), rng)
-            own = Attachment("chaos", int(rng.integers(2**31)), checksum=checksum_of(payload))
+            own = Attachment("chaos", int(rng.integers(2**31)), checksum=checksum_of(key, payload))
             return payload, encode_attachment(own) if rng.random() < 0.5 else b""
         # The next message of this writer, as it would look had it been damaged on the way.
         following = Attachment(
             attachment.writer, attachment.sequence + int(rng.integers(1, 50)), trace=attachment.trace,
-            checksum=checksum_of(real.payload),
+            checksum=checksum_of(real.key, real.payload),
         )
         return damaged(real.payload, fault.form, rng), encode_attachment(following)
 

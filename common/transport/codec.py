@@ -96,22 +96,22 @@ class Attachment:
     sequence: int
     schema: int = SCHEMA_VERSION
     trace: str = ""
-    checksum: int | None = None  # `checksum_of` the payload
+    checksum: int | None = None  # `checksum_of` key and payload
 
 
-def checksum_of(payload: bytes) -> int:
-    """CRC-32 of a payload's first 64 kB, begun with its length: tells damage, not intent."""
-    return zlib.crc32(payload[:CHECKED_BYTES], len(payload) & 0xFFFFFFFF)
+def checksum_of(key: str, payload: bytes) -> int:
+    """CRC-32 of the full key and a payload's first 64 kB, begun with its length: tells damage, not intent."""
+    return zlib.crc32(payload[:CHECKED_BYTES], zlib.crc32(key.encode(), len(payload) & 0xFFFFFFFF))
 
 
-def require_whole(attachment: Attachment | None, payload: bytes) -> None:
-    """Return when the payload is the one that was sent, or nothing is known of that.
+def require_whole(attachment: Attachment | None, key: str, payload: bytes) -> None:
+    """Return when the payload is the one that was sent under this full key, or nothing is known of that.
 
     Raises:
-        DecodeError: it was damaged on the way.
+        DecodeError: it was damaged on the way, or came under another key.
     """
-    if attachment is not None and attachment.checksum is not None and attachment.checksum != checksum_of(payload):
-        raise DecodeError("payload does not fit its checksum: damaged on the way")
+    if attachment is not None and attachment.checksum not in (None, checksum_of(key, payload)):
+        raise DecodeError("payload does not fit its checksum: damaged on the way, or sent under another key")
 
 
 def encode_attachment(attachment: Attachment) -> bytes:

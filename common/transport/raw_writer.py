@@ -45,7 +45,7 @@ class RawWriter:
         with self._lock:
             self._sequence += 1
             attachment = encode_attachment(
-                Attachment(self._id, self._sequence, trace=trace, checksum=checksum_of(payload))
+                Attachment(self._id, self._sequence, trace=trace, checksum=checksum_of(self._key, payload))
             )
             if self.kind == "state":
                 self._last = (payload, attachment)

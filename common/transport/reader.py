@@ -105,7 +105,7 @@ class Reader(Generic[M]):
         attachment = None
         try:
             attachment = decode_attachment(sample.attachment)
-            require_whole(attachment, sample.payload)
+            require_whole(attachment, sample.key, sample.payload)
         except DecodeError as error:
             with self._lock:
                 self._refusals.add(attachment.writer if attachment else NO_SENDER, error)

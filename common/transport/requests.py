@@ -81,7 +81,7 @@ class Server(Generic[Q, A]):
             try:
                 attachment = decode_attachment(query.attachment)
                 sender = attachment.writer if attachment else NO_SENDER
-                require_whole(attachment, payload)
+                require_whole(attachment, self._key, payload)
                 request = decode(self.topic.message, payload, self._limit)
             except DecodeError as error:
                 self._refuse(query, "invalid", error, sender)
@@ -123,7 +123,7 @@ class Server(Generic[Q, A]):
         else:
             self._sequence += 1
             attachment = encode_attachment(Attachment(
-                self._service, self._sequence, trace=current_trace(), checksum=checksum_of(payload)))
+                self._service, self._sequence, trace=current_trace(), checksum=checksum_of(self._key, payload)))
             query.reply(self._key, payload, encoding_of(self.topic.answer), attachment)
 
     async def close(self) -> None:
@@ -204,7 +204,7 @@ class Client(Generic[Q, A]):
                 raise RequestTimeout(self.topic.key, timeout)
             raise RemoteError(self.topic.key, *refusal)
         try:
-            require_whole(decode_attachment(reply.sample.attachment), reply.sample.payload)
+            require_whole(decode_attachment(reply.sample.attachment), self._key, reply.sample.payload)
             return decode(self.topic.answer, reply.sample.payload, self._limit)
         except DecodeError as error:
             raise RemoteError(self.topic.key, "bad_answer", f"the answer can not be read: {error}") from None
@@ -213,7 +213,7 @@ class Client(Generic[Q, A]):
         future: asyncio.Future[RawReply | None] = self._loop.create_future()
         self._sequence += 1
         attachment = encode_attachment(Attachment(
-            self._service, self._sequence, trace=current_trace(), checksum=checksum_of(payload)))
+            self._service, self._sequence, trace=current_trace(), checksum=checksum_of(self._key, payload)))
 
         def settle(reply: RawReply | None) -> None:
             call_on_loop(self._loop, lambda: _settle(future, reply))

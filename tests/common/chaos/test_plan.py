@@ -78,12 +78,12 @@ def test_keys_are_those_that_the_services_write_or_answer() -> None:
 @pytest.mark.parametrize("form", [form for form in get_args(Form) if form])
 def test_damaged_messages_are_refused(form: Form) -> None:
     payload = encode(PickPlaceStatus(placed=3))
-    attachment = Attachment("smart_pick_place.1", 7, checksum=checksum_of(payload))
-    require_whole(attachment, payload)
+    attachment = Attachment("smart_pick_place.1", 7, checksum=checksum_of("panda/pick_place_status", payload))
+    require_whole(attachment, "panda/pick_place_status", payload)
     for seed in range(50):
         bad = damaged(payload, form, np.random.default_rng(seed))
         with pytest.raises(DecodeError):
-            require_whole(attachment, bad)
+            require_whole(attachment, "panda/pick_place_status", bad)
             decode(PickPlaceStatus, bad)
         if form == "huge":
             break

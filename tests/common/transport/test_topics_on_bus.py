@@ -7,7 +7,7 @@ import msgpack
 import pytest
 
 from common import topics
-from common.messages import Image, LogLine, PickPlaceStatus, Rejections
+from common.messages import Image, LogLine, PickPlaceStatus, Rejections, TFMessage
 from common.transport.bus import Bus, Reader, Writer
 from common.transport.codec import Attachment, checksum_of, encode, encode_attachment
 from common.transport.log import BusLog
@@ -195,15 +195,26 @@ async def test_a_message_that_was_damaged_on_its_way_is_refused_and_the_next_rea
     bus = await new_bus()
     reader, writer = bus.reader(topics.PICK_PLACE_STATUS), bus.writer(topics.PICK_PLACE_STATUS)
     await matched(writer, until)
-    sent = encode(status(3))
+    sent, key = encode(status(3)), f"{bus.cell}/{topics.PICK_PLACE_STATUS.key}"
     for damaged in (sent[:-1], encode(status(4)), b"x" + sent[1:]):
         put_raw(bus, topics.PICK_PLACE_STATUS, damaged,
-                encode_attachment(Attachment("somebody", 9, checksum=checksum_of(sent))))
+                encode_attachment(Attachment("somebody", 9, checksum=checksum_of(key, sent))))
     await until(lambda: reader.invalid == 3)
     put_raw(bus, topics.PICK_PLACE_STATUS, sent,
-            encode_attachment(Attachment("somebody", 5, checksum=checksum_of(sent))))
+            encode_attachment(Attachment("somebody", 5, checksum=checksum_of(key, sent))))
     assert (await next_of(reader)).placed == 3
     assert reader.invalid == 3
+
+
+async def test_a_message_that_was_sent_under_another_key_is_refused(new_bus, until) -> None:
+    bus = await new_bus()
+    reader, writer = bus.reader(topics.TF_STATIC), bus.writer(topics.TF_STATIC)
+    await matched(writer, until)
+    sent = encode(TFMessage(transforms=[]))
+    put_raw(bus, topics.TF_STATIC, sent,
+            encode_attachment(Attachment("somebody", 1, checksum=checksum_of(f"{bus.cell}/{topics.TF.key}", sent))))
+    await until(lambda: reader.invalid == 1)
+    assert reader.latest is None
 
 
 async def test_rubbish_does_not_displace_a_state_that_was_not_read_yet(new_bus, until) -> None:
