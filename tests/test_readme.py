@@ -62,7 +62,7 @@ def test_readme_names_the_two_commands_first() -> None:
 @pytest.mark.cell
 @pytest.mark.parametrize("line", RUNS)
 def test_run_of_the_readme_ends_with_everything_done(line: str) -> None:
-    faster = () if "--speed" in line else ("--speed", "8")
+    faster = () if "--speed" in line else ("--speed", "10")
     ran = subprocess.run(command(line, *faster, "--domain", str(free_domain())), cwd=ROOT, text=True,
                          capture_output=True, timeout=2 * PATIENCE, check=False)
     count = "8" if "count=8" in line else "7"

@@ -23,7 +23,7 @@ def empty(state: GripperState) -> bool:
 
 
 async def test_task_and_scene_manager_are_killed_with_a_ball_in_the_hand(tmp_path: Path) -> None:
-    with RunningCell(tmp_path, "run", "panda", "--speed", "5", "--set", "world.count=4") as cell:
+    with RunningCell(tmp_path, "run", "panda", "--speed", "5", "--set", "world.count=3") as cell:
         async with cell.listen() as bus:
             gripper = bus.reader(topics.GRIPPER_STATE)
             for victim in ("smart_pick_place", "scene_manager"):
@@ -34,8 +34,8 @@ async def test_task_and_scene_manager_are_killed_with_a_ball_in_the_hand(tmp_pat
             assert await cell.ended(90) == 0, cell.tail()
         summary = cell.summary
         assert not cell.processes()
-    assert summary["truth"] == {"in_box": 4, "on_table": 0, "elsewhere": 0}
-    assert (summary["state"], summary["placed"]) == ("DONE", 4)
+    assert summary["truth"] == {"in_box": 3, "on_table": 0, "elsewhere": 0}
+    assert (summary["state"], summary["placed"]) == ("DONE", 3)
     assert {name: n for name, n in summary["restarts"].items() if n} == {"smart_pick_place": 1, "scene_manager": 1}
 
 
@@ -43,7 +43,7 @@ async def test_the_router_is_killed_in_the_middle_of_a_motion(tmp_path: Path) ->
     def halfway(status: MotionStatus) -> bool:
         return status.state == "active" and status.progress > 0.3
 
-    with RunningCell(tmp_path, "run", "panda", "--speed", "5", "--set", "world.count=3") as cell:
+    with RunningCell(tmp_path, "run", "panda", "--speed", "5", "--set", "world.count=2") as cell:
         async with cell.listen() as bus:
             await until(bus.reader(topics.GRIPPER_STATE), holding)
             await until(bus.reader(topics.MOTION_STATUS), halfway)
@@ -51,7 +51,7 @@ async def test_the_router_is_killed_in_the_middle_of_a_motion(tmp_path: Path) ->
             assert await cell.ended(90) == 0, cell.tail()
         summary = cell.summary
         assert not cell.processes()
-    assert summary["truth"] == {"in_box": 3, "on_table": 0, "elsewhere": 0}
+    assert summary["truth"] == {"in_box": 2, "on_table": 0, "elsewhere": 0}
     assert summary["state"] == "DONE"
     assert {name: n for name, n in summary["restarts"].items() if n} == {"router": 1}
 

@@ -67,11 +67,11 @@ async def pause_in_motion(cell: RunningCell, stage: str) -> Any:
 
 
 def test_panda_paused_on_its_way_goes_on_and_puts_every_ball_in_the_box(tmp_path: Path) -> None:
-    with RunningCell(tmp_path, "run", "panda", "--no-viewer", "--speed", "4", "--set", "world.count=3") as cell:
+    with RunningCell(tmp_path, "run", "panda", "--no-viewer", "--speed", "4", "--set", "world.count=2") as cell:
         asyncio.run(pause_in_motion(cell, "across"))
         assert asyncio.run(cell.ended(120)) == 0, cell.tail()
         summary = cell.summary
-    assert summary["state"] == "DONE" and summary["truth"] == {"in_box": 3, "on_table": 0, "elsewhere": 0}
+    assert summary["state"] == "DONE" and summary["truth"] == {"in_box": 2, "on_table": 0, "elsewhere": 0}
     assert (summary["failures"], summary["retries"]) == (0, 0)
     assert summary["seconds"]["moving"] < summary["seconds"]["task"]
 
