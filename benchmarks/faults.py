@@ -1,6 +1,6 @@
 """Kills processes of running cells at random moments, also while a ball is held, and looks how the runs end.
 
-`python -m benchmarks.faults --runs 3` makes three runs for the router and for each service but trajectory_executor.
+`python -m benchmarks.faults --runs 3` makes three runs for the router and for each service but the page.
 In each of them the process gets a kill -9 twice: at any moment, and with a ball in the hand.
 """
 
@@ -22,12 +22,10 @@ from common.messages import SupervisorStatus
 from common.transport.bus import Bus
 
 CELL = "panda"
-SPARED = "trajectory_executor"  # it is the robot
+SPARED = "viewer"  # nothing depends on it
 TIMEOUT = 240.0  # [s] for one run
 ANY_MOMENT = 8.0  # [s] after the first motion, at most
 WHILE_HOLDING = 0.8  # [s] after a ball was taken, at most; it is held for about one second at speed 5
-
-
 @dataclass
 class Outcome:
     """What became of the runs in which one process was killed."""
@@ -147,7 +145,7 @@ def table(outcomes: list[Outcome]) -> str:
 def main() -> int:
     """Read the options and run."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.faults", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("services", nargs="*", help="router or services to kill; all but trajectory_executor")
+    parser.add_argument("services", nargs="*", help="router or services to kill; all but viewer")
     parser.add_argument("--runs", type=int, default=2, help="for each of them")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--speed", type=float, default=5.0, help="cell time per wall time")
