@@ -26,6 +26,8 @@ SPARED = "viewer"  # nothing depends on it
 TIMEOUT = 240.0  # [s] for one run
 ANY_MOMENT = 8.0  # [s] after the first motion, at most
 WHILE_HOLDING = 0.8  # [s] after a ball was taken, at most; it is held for about one second at speed 5
+
+
 @dataclass
 class Outcome:
     """What became of the runs in which one process was killed."""
