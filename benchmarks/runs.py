@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import threading
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from pathlib import Path
@@ -29,6 +30,7 @@ M = TypeVar("M", bound=Message)
 ROOT = Path(__file__).resolve().parent.parent
 DOMAINS = range(60, 233)
 logging.getLogger("watcher").addHandler(logging.NullHandler())  # that the router goes at the end is no news
+_given: deque[int] = deque(maxlen=len(DOMAINS) // 4)  # lately, and perhaps not yet listened at
 SUMMARY, LOG = "summary.json", "cell.log"
 
 
@@ -40,11 +42,14 @@ def free_domain() -> int:
     """
     share = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     domains = DOMAINS[share :: int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))]
-    for number in random.sample(domains, len(domains)):
+    choices = [number for number in domains if number not in _given]
+    random.shuffle(choices)
+    for number in choices:
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             with suppress(OSError):
                 probe.bind(("127.0.0.1", BASE_PORT + number))
+                _given.append(number)
                 return number
     raise RuntimeError(f"no domain from {domains[0]} to {domains[-1]} is free")
 

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from common import topics
-from common.chaos.damage import damaged
+from common.chaos.damage import damaged, nonsense
 from common.chaos.plan import STATELESS_FORMS, Fault
 from common.config import Container
 from common.errors import RequestFailed
-from common.messages import WorldEdit
+from common.messages import Message, WorldEdit
 from common.transport.codec import Attachment, checksum_of, decode_attachment, encode_attachment, encoding_of
 
 if TYPE_CHECKING:
@@ -165,7 +165,8 @@ class Chaos:
         if topic.kind == "request":
             self._note(fault)
             for _ in range(fault.count):
-                await self._bus.raw_get(key, 0.5, payload=damaged(b"", _stateless(fault, rng), rng), encoding=encoding)
+                payload = nonsense(topic.message, _stateless(fault, rng), rng)
+                await self._bus.raw_get(key, 0.5, payload=payload, encoding=encoding)
             return
         real = None if fault.form in STATELESS_FORMS else await self._sample(key)
         if fault.kind == "replay":
@@ -180,18 +181,18 @@ class Chaos:
                 if real is not None and fault.kind == "replay":
                     publisher.put(real.payload, real.attachment or b"")
                 else:
-                    publisher.put(*self._damaged(key, real, fault, rng))
+                    publisher.put(*self._damaged(key, topic.message, real, fault, rng))
                 await asyncio.sleep(SPACING)
         finally:
             publisher.undeclare()
 
     def _damaged(
-        self, key: str, real: RawSample | None, fault: Fault, rng: np.random.Generator
+        self, key: str, model: type[Message], real: RawSample | None, fault: Fault, rng: np.random.Generator
     ) -> tuple[bytes, bytes]:
         """A damaged payload and what rides beside it: damaged on its way, or put by a stranger."""
         attachment = decode_attachment(real.attachment) if real else None
         if real is None or attachment is None:
-            payload = damaged(b"", _stateless(fault, rng), rng)
+            payload = nonsense(model, _stateless(fault, rng), rng)
             own = Attachment("chaos", int(rng.integers(2**31)), checksum=checksum_of(key, payload))
             return payload, encode_attachment(own) if rng.random() < 0.5 else b""
         # The next message of this writer, as it would look had it been damaged on the way.

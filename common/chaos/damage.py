@@ -6,7 +6,9 @@ import msgpack
 import numpy as np
 
 from common.chaos.plan import Form
-from common.transport.codec import DEFAULT_LIMIT
+from common.errors import DecodeError
+from common.messages import Message
+from common.transport.codec import DEFAULT_LIMIT, decode
 
 
 def damaged(payload: bytes, form: Form, rng: np.random.Generator) -> bytes:
@@ -31,3 +33,19 @@ def damaged(payload: bytes, form: Form, rng: np.random.Generator) -> bytes:
     for _ in range(int(rng.integers(1, 9))):
         flipped[int(rng.integers(len(flipped)))] ^= 1 << int(rng.integers(8))
     return bytes(flipped)
+
+
+def nonsense(model: type[Message], form: Form, rng: np.random.Generator) -> bytes:
+    """Bytes in a form that needs no real payload, and no message of the model: an empty map is a valid request to stop.
+
+    Args:
+        model: what should be there.
+        form: huge, wrong type or noise.
+        rng: makes them up.
+    """
+    while True:
+        payload = damaged(b"", form, rng)
+        try:
+            decode(model, payload)
+        except DecodeError:
+            return payload

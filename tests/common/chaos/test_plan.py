@@ -10,11 +10,11 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from common.chaos.damage import damaged
+from common.chaos.damage import damaged, nonsense
 from common.chaos.plan import CELL_SECONDS, LABELS, Fault, Form, Kind, faults, plan
 from common.chaos.setting import keys_of
 from common.errors import DecodeError
-from common.messages import PickPlaceStatus
+from common.messages import PickPlaceStatus, StopRequest
 from common.transport.codec import Attachment, checksum_of, decode, encode, require_whole
 
 PROCESSES = ["router", "motion_planner", "trajectory_executor", "smart_pick_place"]
@@ -87,6 +87,13 @@ def test_damaged_messages_are_refused(form: Form) -> None:
             decode(PickPlaceStatus, bad)
         if form == "huge":
             break
+
+
+@pytest.mark.parametrize("form", ["wrong type", "noise"])
+def test_nonsense_is_never_a_request_that_somebody_could_have_made(form: Form) -> None:
+    for seed in range(200):
+        with pytest.raises(DecodeError):
+            decode(StopRequest, nonsense(StopRequest, form, np.random.default_rng(seed)))
 
 
 def test_bytes_from_nowhere_are_refused_without_a_checksum_too() -> None:
