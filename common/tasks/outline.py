@@ -22,6 +22,7 @@ Stage = Leg | Close
 Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
 
 AT_HOME = 0.01  # [rad] from it
+MOST_FORGOTTEN = 5  # motions in a row, each by a controller that was started again
 SHUT = 0.002  # [m] fingers this close together count as closed
 
 
@@ -85,6 +86,7 @@ class Outline:
         self._returned = False  # home was reached and not left since
         self._still_since = 0.0  # only a later picture shows everything without the arm in it
         self._error = ""  # what went wrong, while the arm is brought home
+        self._forgotten = 0  # motions since the last that ended well
         self._excused: tuple[str, str] | None = None  # contact from which the arm has to be freed
 
     # --- what a person says ----------------------------------------------------------------------------------
@@ -190,18 +192,35 @@ class Outline:
                 self.status.message = f"{stage.name} was stopped from outside ({reported.message}); resume to go on"
             elif reported.state != "succeeded":
                 self._fail(f"{stage.name} {reported.state}: {reported.message}", view)
-            elif stage.name == "trace":
-                self._traced, self.status.closed = True, self.status.fraction >= 1
-            elif stage.name == "home":
-                self._returned, self._still_since = True, view.now
+            else:
+                self._succeed(stage, view)
         elif outcome == "forgotten":
             self._running = None
-            self._fail(f"{stage.name} was forgotten by the controller", view)
+            self._forget(stage, view)
         elif running.spent > longest:
             stop = self._stop(view, "it takes too long")
             self._fail(f"{stage.name} took longer than {longest:.0f} s", view)
             return stop
         return []
+
+    def _succeed(self, stage: Stage, view: OutlineView) -> None:
+        """Take note of what a stage has done."""
+        self._forgotten = 0
+        if stage.name == "trace":
+            self._traced, self.status.closed = True, self.status.fraction >= 1
+        elif stage.name == "home":
+            self._returned, self._still_since = True, view.now
+
+    def _forget(self, stage: Stage, view: OutlineView) -> None:
+        """Decide anew, from home: the controller was started again, and what it was asked for was no mistake."""
+        self._forgotten += 1
+        problem = f"{stage.name} was forgotten by the controller"
+        if self._forgotten > MOST_FORGOTTEN:
+            self._fail(problem, view)
+            return
+        self._clear()
+        self.status.failures += 1
+        self._returned, self._selecting, self.status.message = False, None, problem
 
     # --- what to do next -------------------------------------------------------------------------------------
 

@@ -134,6 +134,11 @@ class OutlineDouble:
         self.motion = m.MotionStatus.model_validate(
             {"header": m.Header(stamp=self.stamp), "id": request.id, "state": state, "message": message})
 
+    def restart_controller(self) -> None:
+        """The controller is another process now, which knows of no motion; the arm stands where it was."""
+        self._ends.clear()
+        self.motion = m.MotionStatus(header=m.Header(stamp=self.stamp + 1))
+
     def until(self, *wanted: str, most: int = 2000) -> None:
         """Step until the task is in one of these states or stages."""
         for _ in range(most):

@@ -6,6 +6,7 @@ import pytest
 
 from common import messages as m
 from common.robot.transforms import pose_to_matrix, rpy_to_matrix
+from common.tasks.outline import MOST_FORGOTTEN
 from tests.common.tasks.outline_double import AWAY, HOME, ROBOT, SQUARE, TOP, OutlineDouble, outline_of, prism
 
 WHOLE = ["approach", "descend", "trace", "retreat", "home"]
@@ -108,6 +109,32 @@ def test_motion_that_fails_brings_the_arm_home_and_ends_in_error() -> None:
     assert cell.q == HOME
     assert cell.status.message == "trace aborted: path tolerance"
     assert not cell.status.closed
+
+
+@pytest.mark.parametrize("stage", WHOLE)
+def test_outline_is_traced_whole_although_the_controller_was_started_again(stage: str) -> None:
+    cell = OutlineDouble()
+    cell.until(stage)
+    cell.step()
+    cell.restart_controller()
+    cell.until("DONE")
+    traced = stage in ("retreat", "home")
+    before = WHOLE[: WHOLE.index(stage) + 1]
+    assert cell.moves() == [*before, "retreat", "home", *([] if traced else WHOLE)]
+    assert cell.status.closed and cell.status.failures == 1 and cell.status.message == ""
+    assert cell.q == HOME
+
+
+def test_controller_that_is_started_again_and_again_is_given_up() -> None:
+    cell = OutlineDouble()
+    for _ in range(100):
+        cell.step()
+        if cell.status.state == "ERROR":
+            break
+        if cell.motion.state == "active":
+            cell.restart_controller()
+    assert cell.status.state == "ERROR" and cell.status.message.endswith("was forgotten by the controller")
+    assert len(cell.moves()) == MOST_FORGOTTEN + 2
 
 
 def test_arm_that_stands_against_something_is_freed_from_it() -> None:
