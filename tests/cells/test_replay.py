@@ -58,7 +58,7 @@ async def record_live(folder: Path, cell: str, topic: Topic[Any], wanted: list[s
             recorder = at_end.enter_context(
                 started(folder, "record", *wanted, topic.key, "-o", "live.mcap", "--domain", str(live.domain)))
             assert recorder.stdout is not None and b"recording" in recorder.stdout.readline()
-            for _ in range(3 * LEAST):
+            for _ in range(2 * LEAST):
                 await found.next()
         recorder.terminate()
         recorder.wait(PATIENCE)

@@ -38,7 +38,8 @@ async def freeze(bus: Bus, cell: RunningCell, name: str) -> None:
 
 @pytest.mark.parametrize("victim", ["vision_detector", "router"])
 async def test_a_process_that_is_frozen_is_started_again_and_no_other(tmp_path: Path, victim: str) -> None:
-    with RunningCell(tmp_path, "run", "panda", "--speed", "3", "--set", "world.count=2") as cell:
+    options = ("--speed", "3", "--set", "world.count=2", "--set", "watchdogs.silence=4")
+    with RunningCell(tmp_path, "run", "panda", *options) as cell:
         async with cell.listen() as bus:
             await until(bus.reader(topics.MOTION_STATUS), halfway, 60)
             await freeze(bus, cell, victim)
