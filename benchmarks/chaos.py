@@ -1,7 +1,8 @@
-"""Runs of the Panda cell under faults on purpose: each has to end DONE with every ball in the box and nothing left.
+"""Runs of a cell under faults on purpose: each has to end DONE with every ball in the box and nothing left.
 
-`python -m benchmarks.chaos` makes fifty runs at speed 5, the first with seed 1. What became of each run is a line in
-a JSON lines file: seeds that are in there are not run again.
+`python -m benchmarks.chaos` makes fifty runs of the Panda at speed 5, the first with seed 1; with `--cell ur5` an object
+is outlined in each, and has to be as a whole, within a millimetre. What became of each run is a line in a JSON lines
+file: seeds that are in there are not run again.
 """
 
 from __future__ import annotations
@@ -19,18 +20,23 @@ from typing import Any
 from benchmarks.runs import LOG, SUMMARY, RunningCell, folder_for
 from common.chaos.plan import LABELS
 
-CELL = "panda"
+USUAL = "panda"
+WORLD = {USUAL: [], "ur5": ["--world", "w2"]}
+ASKED = ("cell", "speed", "balls", "rate")  # what makes a run with a seed the same as another
+MOST_OFF = 1.0  # [mm] from the true outline
 TIMEOUT = 300.0  # [s] for one run
 
 
 async def run_once(seed: int, folder: Path, options: argparse.Namespace) -> dict[str, Any]:
     """What became of the run with the faults of a seed; its log stays in the folder if it was not good."""
     began = time.monotonic()
-    arguments = ["--speed", f"{options.speed:g}", "--chaos", str(seed), "--set", f"world.count={options.balls}"]
+    arguments = ["--speed", f"{options.speed:g}", "--chaos", str(seed), *WORLD[options.cell]]
+    if options.cell == USUAL:
+        arguments += ["--set", f"world.count={options.balls}"]
     if options.rate:
         arguments += ["--chaos-rate", f"{options.rate:g}"]
-    outcome: dict[str, Any] = {"seed": seed, "speed": options.speed, "balls": options.balls, "rate": options.rate}
-    with RunningCell(folder, "run", CELL, *arguments) as cell:
+    outcome: dict[str, Any] = {"seed": seed, **{name: getattr(options, name) for name in ASKED}}
+    with RunningCell(folder, "run", options.cell, *arguments) as cell:
         try:
             outcome["code"] = await cell.ended(TIMEOUT)
         except TimeoutError:
@@ -59,6 +65,11 @@ def problems(outcome: dict[str, Any]) -> list[str]:
         return [*found, "no summary"]
     if summary["state"] != "DONE" or outcome["code"] != 0:
         found.append(f"ended {summary['state']} with exit code {outcome['code']}")
+    if (outline := summary.get("outline")) is not None:
+        off = outline["deviation_mm"]
+        if not (outline["fraction"] == 1 and off and off["max"] < MOST_OFF):
+            found.append(f"{outline['fraction']:.1%} outlined, off by {off} mm")
+        return found
     truth = summary["truth"] or {"in_box": 0, "on_table": 0, "elsewhere": 0}
     if truth != {"in_box": outcome["balls"], "on_table": 0, "elsewhere": 0}:
         found.append(f"{truth['in_box']} of {outcome['balls']} in the box, {truth['on_table']} on the table, "
@@ -76,8 +87,8 @@ def table(outcomes: list[dict[str, Any]]) -> str:
     lines += [f"| {label.removesuffix(' on')} | {happened[label]} |" for label in LABELS.values()]
     lines += [
         "", f"| runs | {len(outcomes)} |", "|---|---|",
-        f"| DONE, every ball in the box, no process left | {good} |",
-        f"| balls in the box | {in_box} of {sum(outcome['balls'] for outcome in outcomes)} |",
+        f"| DONE as a whole, no process left | {good} |",
+        f"| balls in the box | {in_box} of {sum(o['balls'] for o in outcomes if o.get('cell', USUAL) == USUAL)} |",
         f"| faults in a run, median (least to most) | {_spread([len(s.get('chaos', [])) for s in summaries])} |",
         f"| processes started again | {sum(sum(s['restarts'].values()) for s in summaries)} |",
         f"| failures and retries of the task | {sum(s['failures'] + s['retries'] for s in summaries)} |",
@@ -95,8 +106,8 @@ def earlier(file: Path, options: argparse.Namespace) -> list[dict[str, Any]]:
     if not file.exists():
         return []
     found = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    asked = {name: getattr(options, name) for name in ("speed", "balls", "rate")}
-    same = [one for one in found if all(one[name] == value for name, value in asked.items())]
+    asked = {name: getattr(options, name) for name in ASKED}
+    same = [one for one in found if all(one.get(name, USUAL) == value for name, value in asked.items())]
     return list({one["seed"]: one for one in same}.values())
 
 
@@ -132,6 +143,7 @@ async def run_all(options: argparse.Namespace, file: Path, folder: Path) -> int:
 def main() -> int:
     """Read the options and run."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.chaos", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--cell", choices=WORLD, default=USUAL)
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1, help="of the first run")
     parser.add_argument("--parallel", type=int, default=1, help="runs at the same time")
