@@ -1,6 +1,6 @@
 """Runs of a cell under faults on purpose: each has to end DONE with every ball in the box and nothing left.
 
-`python -m benchmarks.chaos` makes fifty runs of the Panda at speed 5, the first with seed 1; with `--cell ur5` an object
+`python -m benchmarks.chaos` makes fifty runs of the Panda at speed 5, from seed 1 on; with `--cell ur5` an object
 is outlined in each, and has to be as a whole, within a millimetre. What became of each run is a line in a JSON lines
 file: seeds that are in there are not run again.
 """
