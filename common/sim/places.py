@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from common.config import Fixture, World
 from common.scene.slots import slot_positions
+from common.sim.footprints import heights
 
 Array = NDArray[np.float64]
 Slot = tuple[int, int]  # layer, index within the layer
@@ -120,13 +121,7 @@ class Slots:
 
 def _rises_through(fixture: Fixture, world: World) -> bool:
     """Whether a fixture is anywhere as high as a ball on the table."""
-    if fixture.shape == "sphere":
-        half = fixture.dimensions[0]
-    elif any(fixture.rpy[:2]):
-        half = math.hypot(*fixture.dimensions)
-    else:
-        half = fixture.dimensions[-1] / 2
-    bottom, top = fixture.position[2] - half, fixture.position[2] + half
+    bottom, top = heights(fixture)
     return bottom < world.table_height + 2 * world.ball_radius - 1e-6 and top > world.table_height + 1e-6
 
 
