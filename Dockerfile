@@ -25,7 +25,7 @@ COPY services services
 COPY cli cli
 COPY config config
 USER zencell
-HEALTHCHECK --interval=3s --timeout=10s --start-period=90s --retries=5 CMD ["python", "-m", "common.transport.health"]
+HEALTHCHECK --interval=3s --timeout=10s --start-period=90s --retries=5 CMD ["python", "-m", "common.process.health"]
 CMD ["zencell", "--help"]
 
 # For compose.dev.yaml: restarts a service when its source changes. The base image's pip: this one's environment has none.

@@ -18,7 +18,7 @@ import psutil
 import zenoh
 
 from benchmarks.runs import command_line, environment, free_domain
-from common.security.credentials import Credentials, credentials_of
+from common.transport.credentials import Credentials, credentials_of
 from common.transport.endpoint import client_config, endpoint_of
 
 SESSIONS, MESSAGES, PERIOD = 20, 300, 0.01

@@ -13,8 +13,8 @@ from common.messages import SupervisorStatus
 from common.recording.sample import Sample, message_of
 from common.recording.sequences import Sequences
 from common.recording.writing import RUN
-from common.security.credentials import secure_folder
 from common.transport.codec import decode, decode_attachment
+from common.transport.credentials import secure_folder
 
 if TYPE_CHECKING:
     from common.recording.selection import Selection

@@ -128,7 +128,7 @@ def home(
     from cli.inspection import inspect
     from cli.rendering import to_json
     from common.messages import JointGoal
-    from common.transport.operator_motion import OperatorMotion
+    from common.process.operator_motion import OperatorMotion
 
     async def visit(bus: Bus) -> Message:
         from cli.presence import cell_clock

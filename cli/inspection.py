@@ -55,8 +55,8 @@ async def _inspect(
 ) -> T:
     from common.clock import Clock
     from common.errors import NoRouter
-    from common.security.credentials import OPERATOR
     from common.transport.connect import connect as connect_to
+    from common.transport.credentials import OPERATOR
     from common.transport.endpoint import endpoint_of
 
     endpoint = endpoint_of(domain, connect)

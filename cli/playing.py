@@ -63,7 +63,7 @@ def play(
     """
     from common.recording.reading import Recording
     from common.recording.selection import Selection
-    from common.security.credentials import refuse_to_publish
+    from common.transport.credentials import refuse_to_publish
 
     refuse_to_publish("play")
     selection = Selection.of([*(keys or ()), *(topics or ())], None, exclude)

@@ -43,7 +43,7 @@ def pub(
     A state can be asked for while this runs. A key of your own services takes any JSON; {"base64": "..."} is bytes.
     """
     from cli.inspection import inspect
-    from common.security.credentials import refuse_to_publish
+    from common.transport.credentials import refuse_to_publish
 
     refuse_to_publish("topic pub")
     period = 1 / options.rate(rate)

@@ -52,7 +52,7 @@ def record(
     """Record what travels in a cell, all keys if none are given, until Ctrl-C."""
     from cli.inspection import inspect
     from common.recording.selection import Selection
-    from common.security.credentials import identity_of_listener
+    from common.transport.credentials import identity_of_listener
 
     selection = Selection.of(keys or (), regex, exclude)
     _require_published(selection)
@@ -117,8 +117,8 @@ async def _gated(
     selection: Selection, asked: _Asked, cell: str | None, domain: str | None, connect: str | None
 ) -> None:
     """Record under a supervisor: be ready before its services are let through, end with its SIGTERM or with it."""
-    from common.security.credentials import RECORDER
     from common.transport.connect import connect as connect_to
+    from common.transport.credentials import RECORDER
     from common.transport.endpoint import endpoint_of
 
     endpoint = endpoint_of(domain, connect)

@@ -29,8 +29,8 @@ def config(
 ) -> None:
     """Print the router's configuration as JSON5, for zenohd or the image eclipse/zenoh."""
     from common.security.checking import require_valid
-    from common.security.credentials import ROUTER_NAME, credentials_of, read_access, secure_folder
     from common.supervision.launch import Launch
+    from common.transport.credentials import ROUTER_NAME, credentials_of, read_access, secure_folder
     from common.transport.endpoint import (
         DEFAULT_DOMAIN,
         DOMAIN_VARIABLE,

@@ -53,7 +53,7 @@ def init(
     from common.security.access import access_control
     from common.security.certificates import Authority
     from common.security.checking import certificate_in, hosts_in
-    from common.security.credentials import ACCESS, AUTHORITY, OBSERVER, OPERATOR, ROUTER_NAME, common_name
+    from common.transport.credentials import ACCESS, AUTHORITY, OBSERVER, OPERATOR, ROUTER_NAME, common_name
 
     valid = options.whole("--days", days, 1)
     assert valid is not None
@@ -87,7 +87,7 @@ def show(folder: Folder, as_json: options.Json = False) -> None:
     """Show who may do what, as the router enforces it, and until when each certificate is valid."""
     from common.errors import ConfigError
     from common.security.checking import allowances, certificate_in
-    from common.security.credentials import ROUTER_NAME, read_access
+    from common.transport.credentials import ROUTER_NAME, read_access
 
     place = Path(folder)
     allowed = allowances(read_access(place))
@@ -122,7 +122,7 @@ def check(
     from common.config import load_cell, names_of
     from common.errors import ConfigError
     from common.security.checking import require_current, require_valid
-    from common.security.credentials import OPERATOR, RECORDER, ROUTER_NAME, common_name, read_access
+    from common.transport.credentials import OPERATOR, RECORDER, ROUTER_NAME, common_name, read_access
 
     if only and len(cells or ()) != 1:
         raise ConfigError("--only", ",".join(only), "needs the one cell that they are services of: --cell CELL")
@@ -158,10 +158,10 @@ def rights_in(cell: Cell, names: Collection[str] | None = None) -> dict[str, Rig
         ConfigError: one of them can not be configured so.
         Unwired: one of them does not get so far.
     """
+    from common.process.wiring import wiring_of
     from common.security.access import rights_of, rights_of_recorder, rights_of_supervisor
-    from common.security.credentials import RECORDER, SUPERVISOR
     from common.supervision.launch import require_modules
-    from common.transport.wiring import wiring_of
+    from common.transport.credentials import RECORDER, SUPERVISOR
 
     require_modules(cell)
     apart = cell.model_copy(update={"services": {

@@ -33,7 +33,7 @@ def choose(folder: str | None) -> None:
     Raises:
         ConfigError: it is not there.
     """
-    from common.transport.endpoint import SECURE_VARIABLE
+    from common.transport.credentials import SECURE_VARIABLE
 
     if folder is None:
         return
@@ -52,7 +52,7 @@ def require_secured(launch: Launch, cell: Cell) -> None:
     Raises:
         ConfigError, NotSecured: one line that names the process, what is wrong and what would do.
     """
-    from common.security.credentials import ROUTER_NAME, SUPERVISOR, common_name, read_access, secure_folder
+    from common.transport.credentials import ROUTER_NAME, SUPERVISOR, common_name, read_access, secure_folder
     from common.transport.endpoint import is_encrypted
 
     folder = secure_folder()
@@ -76,7 +76,7 @@ def require_recorder(launch: Launch, cell: Cell) -> None:
     Raises:
         ConfigError: it has none that is valid.
     """
-    from common.security.credentials import RECORDER, common_name, secure_folder
+    from common.transport.credentials import RECORDER, common_name, secure_folder
 
     folder = secure_folder()
     if folder is not None:

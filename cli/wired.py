@@ -48,8 +48,8 @@ def wired(cell: Cell, entry: ServiceEntry) -> Wired:
         Unwired: it does not get so far.
     """
     from common.config import service_config
+    from common.process.wiring import wiring
     from common.supervision.launch import require_module
-    from common.transport.wiring import wiring
 
     require_module(entry.name, entry)
     try:

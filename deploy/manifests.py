@@ -22,7 +22,7 @@ from deploy.containers import (
 HEAD = "# Made by `make deploy` from config/cells: change those, or put an overlay on it.\n"
 PART_OF = {"app.kubernetes.io/part-of": "zencell"}
 # A service that is frozen or cut off loses its readiness token within the lease of 2 s, and is then restarted.
-CHECK = {"exec": {"command": ["python", "-m", "common.transport.health"]}, "timeoutSeconds": 3}
+CHECK = {"exec": {"command": ["python", "-m", "common.process.health"]}, "timeoutSeconds": 3}
 CPU_OF_A_SERVICE = "100m"
 
 

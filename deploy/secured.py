@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from common.security.credentials import ACCESS, AUTHORITY, OPERATOR, ROUTER_NAME, common_name
+from common.transport.credentials import ACCESS, AUTHORITY, OPERATOR, ROUTER_NAME, common_name
 from deploy.compose import lines_of
 from deploy.containers import IMAGE, ROUTER, ROUTER_PORT, cells, containers_of
 

@@ -18,7 +18,7 @@ from common import config as c
 from common import topics
 from common.config.tunables import bounds_of, is_tunable
 from common.planning.planners import load_planner
-from common.transport.wiring import wiring
+from common.process.wiring import wiring
 from docs.seed_parameters import CAMERA, CONTROLLER, VALIDATOR, SeedParameter
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -15,9 +15,9 @@ from common.perception.calibration_file import CameraFile
 from common.perception.image import array_to_image
 from common.perception.rectification import Rectifier, require_size
 from common.perception.sources import Source, open_source
+from common.process.pace import Pace
+from common.process.service import main
 from common.transport.bus import Bus
-from common.transport.pace import Pace
-from common.transport.service import main
 
 MOST_DOUBLINGS = 30  # of a wait, which has long reached its limit then
 

@@ -11,9 +11,9 @@ from common.messages import PoseArray
 from common.perception.drawing import draw
 from common.perception.image import array_to_image
 from common.perception.pinhole import Pinhole
+from common.process.pace import Pace
+from common.process.service import main
 from common.transport.bus import Bus
-from common.transport.pace import Pace
-from common.transport.service import main
 
 UNSEEN = ("held", "elsewhere")  # hidden by the hand; off the table
 

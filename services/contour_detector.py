@@ -17,8 +17,8 @@ from common.perception.contours_drawing import annotate_contours
 from common.perception.contours_following import Following
 from common.perception.image import array_to_image
 from common.perception.intake import Unusable, colour_picture
+from common.process.service import main
 from common.transport.bus import Bus
-from common.transport.service import main
 
 
 class Config(ContourOptions):

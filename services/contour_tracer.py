@@ -7,14 +7,14 @@ import uuid
 from common import topics
 from common.config import RobotConfig, Run
 from common.errors import ConfigError
+from common.process.service import main
+from common.process.task_runner import TaskRunner
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.tasks.outline import Outline, OutlineParameters
 from common.tasks.outline_legs import OutlineView
 from common.tasks.reliance import Reliance
 from common.transport.bus import Bus
-from common.transport.service import main
-from common.transport.task_runner import TaskRunner
 
 
 class Config(OutlineParameters):

@@ -12,11 +12,11 @@ from common.config import Parameters, RobotConfig, Run, Surroundings, Tunable
 from common.messages import WorldObjects
 from common.perception.image import array_to_image
 from common.perception.point_cloud import point_cloud
+from common.process.pace import Pace
+from common.process.service import main
 from common.robot.model import RobotModel
 from common.sim.depth_view import DepthView, disturbed
 from common.transport.bus import Bus
-from common.transport.pace import Pace
-from common.transport.service import main
 
 
 class Config(Parameters):

@@ -13,8 +13,8 @@ from common.errors import ConfigError
 from common.messages import OutlinePoints, Pose, Vector3
 from common.perception.duplicates import simplified, without_duplicates
 from common.perception.stage_files import StageFileError, read_coordinates
+from common.process.service import main
 from common.transport.bus import Bus
-from common.transport.service import main
 
 
 class Config(Parameters):

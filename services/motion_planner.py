@@ -10,9 +10,9 @@ from common.errors import Refused
 from common.messages import PlanningScene, PlanRequest, PlanResponse
 from common.planning.pipeline import PlanningPipeline
 from common.planning.problem import Cancel
+from common.process.service import main
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
-from common.transport.service import main
 
 
 class Config(Parameters):

@@ -11,9 +11,9 @@ from common.messages import Contours, Image
 from common.perception.image import ImageError, image_to_array
 from common.perception.intake import Cameras, Unusable
 from common.perception.perceived_solids import perceived_solids
+from common.process.service import main
 from common.scene.outline_scene import HomeWatch, planning_scene
 from common.transport.bus import Bus
-from common.transport.service import main
 
 KEPT = 5  # depth images that wait for their contours
 

@@ -14,8 +14,8 @@ from common.perception.depth_intake import depth_of
 from common.perception.intake import camera_of
 from common.perception.pinhole import Pinhole
 from common.perception.top_face import TopFace, TopFaceOptions, top_face
+from common.process.service import main
 from common.transport.bus import Bus
-from common.transport.service import main
 
 WORLD = "world"
 KEPT = 4  # depth images that wait for the contours of their picture

@@ -9,10 +9,10 @@ from pydantic import Field
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import Header, JointState, TFMessage, TransformStamped
+from common.process.service import main
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_pose, rpy_to_matrix, transform
 from common.transport.bus import Bus
-from common.transport.service import main
 
 MOST_MESSAGES = 250.0  # per second of wall time
 WORLD = "world"

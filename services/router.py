@@ -1,6 +1,81 @@
 """The router of a domain, as a process: `python -m services.router --domain 42`."""
 
-from common.transport.router import main
+from __future__ import annotations
+
+import argparse
+import os
+import threading
+from typing import NoReturn
+
+from common.errors import ConfigError, ZencellError
+from common.process.lifeline import Lifeline, fail, leave
+from common.process.log import log_to_stderr
+from common.process.service import add_process_options
+from common.transport.credentials import secure_folder
+from common.transport.endpoint import (
+    DEFAULT_DOMAIN,
+    DOMAIN_VARIABLE,
+    LINK_VARIABLE,
+    LISTEN_VARIABLE,
+    endpoint_of,
+    endpoints_of,
+    is_loopback,
+)
+from common.transport.router import log, open_router, tell_of_links
+
+OPEN = (
+    "whoever reaches %s can read and command every cell behind it: `zencell secure init DIR`, then --secure DIR "
+    "(docs/security.md)"
+)
+_CLOSE_SECONDS = 0.4
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        fail(ConfigError(self.prog, message, "can not be used; --help lists the options"))
+
+
+def main() -> NoReturn:
+    """Be the router until SIGINT, SIGTERM or the end of the supervisor; exit 2 when it can not listen."""
+    parser = _Parser(prog="router")
+    parser.add_argument("--domain", help="0 to 232 (ZENCELL_DOMAIN, 42)")
+    parser.add_argument("--listen", metavar="ENDPOINT", action="append", default=[],
+                        help="instead of 127.0.0.1; repeatable (ZENCELL_LISTEN)")
+    parser.add_argument("--link", metavar="ENDPOINT", action="append", default=[],
+                        help="router of another host to be linked with; repeatable (ZENCELL_LINK)")
+    add_process_options(parser)
+    options = parser.parse_args()
+    lifeline = Lifeline(gate=options.gate)
+    stop = threading.Event()
+    lifeline.start()
+    lifeline.on_stop(stop.set)
+    log_to_stderr("router", as_json=options.log_json)
+    gate = threading.Event()
+    lifeline.on_gate(gate.set)
+    while not gate.wait(0.02):
+        if stop.is_set():
+            leave(0)
+    try:
+        domain = options.domain if options.domain is not None else os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN)
+        endpoints = endpoints_of("--listen", options.listen, LISTEN_VARIABLE) or [endpoint_of(domain)]
+        links = endpoints_of("--link", options.link, LINK_VARIABLE)
+        secured = secure_folder()
+        session = open_router(endpoints, secured, links)
+    except ZencellError as error:
+        fail(error)
+    log.info("listening at %s", " and ".join(endpoints))
+    for endpoint in endpoints:
+        if secured is None and not is_loopback(endpoint):
+            log.warning(OPEN, endpoint)
+    for link in links:
+        log.info("to be linked with the router at %s", link)
+    tell_of_links(session, stop)
+    log.info("stopped: %s", lifeline.reason)
+    closing = threading.Thread(target=session.close, daemon=True)
+    closing.start()
+    closing.join(_CLOSE_SECONDS)
+    leave(0)
+
 
 if __name__ == "__main__":
     main()

@@ -8,11 +8,11 @@ from common import topics
 from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError
 from common.perception.intake import Cameras, Unusable
+from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.perceived import PerceivedScene
 from common.scene.tracks import SceneParameters
 from common.transport.bus import Bus
-from common.transport.service import main
 
 
 class Config(SceneParameters):

@@ -7,14 +7,14 @@ import uuid
 from common import topics
 from common.config import Grasp, RobotConfig, Run, Surroundings
 from common.errors import ConfigError
+from common.process.service import main
+from common.process.task_runner import TaskRunner
 from common.robot.model import RobotModel
 from common.tasks.pick_place import PickPlace
 from common.tasks.pick_place_parameters import PickPlaceParameters
 from common.tasks.reliance import Reliance
 from common.tasks.stages import View
 from common.transport.bus import Bus
-from common.transport.service import main
-from common.transport.task_runner import TaskRunner
 
 
 class Config(PickPlaceParameters):

@@ -13,12 +13,12 @@ from pydantic import Field
 
 from common import topics
 from common.config import Grasp, Members, Parameters, RobotConfig, Run, Tunable, World
-from common.hardware.alone import Alone, WhenAlone
-from common.hardware.checks import Tolerances
-from common.hardware.cycle import ControlCycle
+from common.control.alone import Alone, WhenAlone
+from common.control.checks import Tolerances
+from common.control.cycle import ControlCycle
+from common.control.timely import objection
 from common.hardware.interface import Limits
 from common.hardware.loading import find_backend, load_hardware
-from common.hardware.timely import objection
 from common.messages import (
     ExecuteRequest,
     GripperCommand,
@@ -29,13 +29,13 @@ from common.messages import (
     WorldEdit,
     WorldEditReply,
 )
+from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.workspace import reach_reason
 from common.sim.layout import layout
 from common.sim.standing import Standing, state_file
 from common.sim.world import GraspTolerances, SimulatedWorld
 from common.transport.bus import Bus
-from common.transport.service import main
 
 MOST_CYCLES = 250.0  # per second of wall time
 REACH_MARGIN = 0.008  # [m] random places keep from the ends of the reach: what is seen is a few millimetres off

@@ -10,9 +10,9 @@ from pydantic import Field
 
 from common import topics
 from common.config import Members, Parameters, RobotConfig, Run, Surroundings
+from common.process.operator_motion import OperatorMotion
+from common.process.service import main
 from common.transport.bus import Bus
-from common.transport.operator_motion import OperatorMotion
-from common.transport.service import main
 from common.viewer.access import address_of
 from common.viewer.feeds import Feeds
 from common.viewer.guard import close_server, make_server

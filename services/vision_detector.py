@@ -13,8 +13,8 @@ from common.perception.annotation import annotate
 from common.perception.detector import Detection, Detector, DetectorOptions
 from common.perception.image import array_to_image
 from common.perception.intake import Cameras, Unusable, picture_of
+from common.process.service import main
 from common.transport.bus import Bus
-from common.transport.service import main
 
 WORLD = "world"
 

@@ -13,11 +13,11 @@ from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
 from common.perception.intake import Cameras, Unusable
 from common.perception.pinhole import Pinhole
+from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.validation import Validation
 from common.scene.workspace import ReachCache, WorkspaceBounds
 from common.transport.bus import Bus
-from common.transport.service import main
 
 WORLD = "world"
 PATIENCE = 0.008  # wall time for which a frame with new places waits for their inverse kinematics [s]

@@ -24,10 +24,11 @@ from common.hardware.interface import Limits
 from common.hardware.loading import find_backend, load_hardware
 from common.messages import CameraInfo, Image, Pose, PoseArray, Vector3
 from common.planning.planners import load_planner
+from common.process.in_process import running_service
+from common.process.wiring import wiring
 from common.robot.model import RobotModel
 from common.topics import CAMERA_IMAGE, CAMERA_INFO, SCENE_BALLS
 from common.transport.local import LocalNetwork
-from common.transport.wiring import wiring
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
@@ -155,7 +156,7 @@ async def test_camera_sends_pictures_with_less_blue(folder: Path) -> None:
     net = LocalNetwork()
     bus = net.bus()
     images, infos = bus.reader(CAMERA_IMAGE), bus.reader(CAMERA_INFO)
-    async with net.running(module.run, config):
+    async with running_service(net, module.run, config):
         ball = Pose(position=Vector3(x=0.5, y=0.0, z=0.03))
         bus.writer(SCENE_BALLS).put(PoseArray(header=bus.header("world"), poses=[ball], labels=["table"]))
         image: Image = await images.next()

@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from common.security.credentials import OBSERVER, OPERATOR, ROUTER_NAME, common_name
 from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, all_topics, parameters_of
+from common.transport.credentials import OBSERVER, OPERATOR, ROUTER_NAME, common_name
 from common.transport.keys import alive_key, serves_key
 
 MESSAGES = [
@@ -21,7 +21,7 @@ MESSAGES = [
 
 
 class Declares(Protocol):
-    """What a service has declared (common.transport.wiring)."""
+    """What a service has declared (common.process.wiring)."""
 
     reads: set[Topic[Any]]
     writes: set[Topic[Any]]

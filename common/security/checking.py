@@ -14,7 +14,7 @@ from cryptography.x509.oid import NameOID
 
 from common.errors import ConfigError
 from common.security.access import Rights, access_control
-from common.security.credentials import credentials_of
+from common.transport.credentials import credentials_of
 
 FIELD = "--secure"
 AFRESH = "make it anew with `zencell secure init`"

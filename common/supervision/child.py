@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import psutil
 
-from common.transport.loop_watch import STUCK_EXIT
+from common.process.loop_watch import STUCK_EXIT
 
 TAIL_LINES = 50
 LONGEST_LINE = 4000  # [characters] the rest of a longer line is cut

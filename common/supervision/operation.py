@@ -14,12 +14,12 @@ from common import topics
 from common.config import Cell
 from common.errors import ConfigError, DecodeError, ZencellError
 from common.messages import ServiceStatus, SupervisorStatus
-from common.security.credentials import SUPERVISOR
 from common.supervision.elsewhere import Elsewhere
 from common.supervision.interrupts import Interrupts
 from common.supervision.launch import Launch
 from common.supervision.silence import PERIOD, Silence
 from common.supervision.supervisor import Supervisor
+from common.transport.credentials import SUPERVISOR
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -91,8 +91,8 @@ async def _work(
     cell: Cell, launch: Launch, endpoint: str, supervisor: Supervisor, work: Callable[[Bus], Awaitable[T]],
     prepare: Callable[[Bus], None],
 ) -> T:
+    from common.process.log import BusLog
     from common.transport.connect import connect
-    from common.transport.log import BusLog
 
     timeout = CONNECT_TIMEOUT if launch.connect else None  # our own router is watched by the supervisor
     connecting = connect(cell=cell.name, service=NAME, endpoint=endpoint, clock=launch.clock, timeout=timeout,

@@ -8,8 +8,8 @@ from contextlib import asynccontextmanager
 
 from common.clock import Clock
 from common.errors import NoRouter
-from common.security.credentials import OPERATOR, common_name, credentials_of, secure_folder
 from common.transport.bus import Bus
+from common.transport.credentials import OPERATOR, common_name, credentials_of, secure_folder
 from common.transport.zenoh_session import close_bounded, open_zenoh
 
 _CLOSE_SECONDS = 0.5

@@ -8,11 +8,10 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from common.errors import ConfigError
+from common.transport.credentials import SECURE_VARIABLE, Credentials
 
 if TYPE_CHECKING:
     import zenoh
-
-    from common.security.credentials import Credentials
 
 BASE_PORT = 7447
 DEFAULT_DOMAIN = 42
@@ -21,7 +20,6 @@ DOMAIN_VARIABLE = "ZENCELL_DOMAIN"
 CONNECT_VARIABLE = "ZENCELL_CONNECT"
 LISTEN_VARIABLE = "ZENCELL_LISTEN"
 LINK_VARIABLE = "ZENCELL_LINK"
-SECURE_VARIABLE = "ZENCELL_SECURE"  # folder of certificates, as `zencell secure init` makes it
 LEASE_MS = 2000  # a frozen process or cut link is noticed after this
 STUCK_MS = 1000  # so is a link that takes nothing
 LINK_RETRY_MS = (100, 1000)  # between two tries to reach the router of another host: at first, and at most

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import asyncio
-import logging
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
 import zenoh
 
 from common.clock import Clock
-from common.config import Parameters
 from common.transport.bus import Bus
 from common.transport.codec import DEFAULT_LIMIT
-from common.transport.log import BusLog
-from common.transport.parameters import serve_parameters
 from common.transport.session import Declared, OnQuery, OnReply, OnSample, OnToken, RawReply, RawSample
-
-C = TypeVar("C")
 
 
 @lru_cache(maxsize=4096)
@@ -246,60 +238,3 @@ class LocalNetwork:
             limit: int = DEFAULT_LIMIT) -> Bus:
         """A bus on this network; made on a running loop."""
         return Bus(self.session(), service=service, cell=cell, clock=clock or Clock(), limit=limit)
-
-    @asynccontextmanager
-    async def running(
-        self, run: Callable[[Bus, C], Awaitable[None]], config: C, *, name: str = "service", cell: str = "test",
-        clock: Clock | None = None,
-    ) -> AsyncIterator[Bus]:
-        """A service that runs inside the block, from its `ready` on; its crash ends the block and is raised there."""
-        session = self.session()
-        bus = Bus(session, service=name, cell=cell, clock=clock or Clock())
-        to_topic = BusLog(bus)
-        bus.log.addHandler(to_topic)
-        bus.log.setLevel(logging.INFO)
-        crash: BaseException | None = None
-        body = asyncio.current_task()
-        inside = False
-
-        async def life() -> None:
-            nonlocal crash
-            try:
-                if isinstance(config, Parameters):
-                    serve_parameters(bus, config)
-                await bus.run(_coroutine(run, bus, config))
-            except asyncio.CancelledError:
-                raise
-            except BaseException as error:
-                crash = error
-                if inside and body is not None:
-                    body.cancel()
-
-        task = asyncio.create_task(life(), name=f"running {name}")
-        is_ready = asyncio.create_task(bus.ready_event.wait())
-        try:
-            await asyncio.wait({task, is_ready}, return_when=asyncio.FIRST_COMPLETED)
-            if not is_ready.done() and crash is None:
-                raise RuntimeError(f"{name} ended before it was ready")
-            if crash is None:
-                inside = True
-                yield bus
-        except asyncio.CancelledError:
-            if crash is None:
-                raise
-            if body is not None:
-                body.uncancel()
-        finally:
-            inside = False
-            is_ready.cancel()
-            task.cancel()
-            await asyncio.wait({task})
-            bus.log.removeHandler(to_topic)
-            await bus.close()
-            session.close()
-            if crash is not None:
-                raise crash
-
-
-async def _coroutine(run: Callable[[Bus, C], Awaitable[None]], bus: Bus, config: C) -> None:
-    await run(bus, config)

@@ -1,43 +1,20 @@
-"""The router of a domain: one process that every service of the host is a client of."""
+"""The router of a domain: the one session that every service of the host is a client of."""
 
 from __future__ import annotations
 
-import argparse
 import logging
-import os
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
-import psutil
 import zenoh
 
 from common.errors import ConfigError, ZencellError
-from common.security.credentials import ROUTER_NAME, credentials_of, read_access, secure_folder
-from common.transport.endpoint import (
-    DEFAULT_DOMAIN,
-    DOMAIN_VARIABLE,
-    LINK_VARIABLE,
-    LISTEN_VARIABLE,
-    endpoint_of,
-    endpoints_of,
-    is_encrypted,
-    is_loopback,
-    port_of,
-    router_config,
-)
-from common.transport.lifeline import Lifeline, fail, leave
-from common.transport.log import log_to_stderr
-from common.transport.service import add_process_options
+from common.transport.credentials import ROUTER_NAME, Credentials, credentials_of, read_access
+from common.transport.endpoint import client_config, is_encrypted, port_of, router_config
 
 log = logging.getLogger("router")
 
-OPEN = (
-    "whoever reaches %s can read and command every cell behind it: `zencell secure init DIR`, then --secure DIR "
-    "(docs/security.md)"
-)
-_CLOSE_SECONDS = 0.4
 _LOOK_SECONDS = 0.5  # between looks at the links with other routers
 
 
@@ -55,6 +32,8 @@ class PortInUse(ZencellError):
 
 def holder_of(port: int) -> str:
     """Who listens on a TCP port of this host, as well as the system lets us know."""
+    import psutil  # here: a health check has to start fast
+
     try:
         found = [c.pid for c in psutil.net_connections("tcp")
                  if c.status == psutil.CONN_LISTEN and c.laddr and c.laddr.port == port and c.pid]
@@ -108,48 +87,11 @@ def tell_of_links(session: zenoh.Session, stop: threading.Event) -> None:
         linked = now
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        fail(ConfigError(self.prog, message, "can not be used; --help lists the options"))
-
-
-def main() -> NoReturn:
-    """Be the router until SIGINT, SIGTERM or the end of the supervisor; exit 2 when it can not listen."""
-    parser = _Parser(prog="router")
-    parser.add_argument("--domain", help="0 to 232 (ZENCELL_DOMAIN, 42)")
-    parser.add_argument("--listen", metavar="ENDPOINT", action="append", default=[],
-                        help="instead of 127.0.0.1; repeatable (ZENCELL_LISTEN)")
-    parser.add_argument("--link", metavar="ENDPOINT", action="append", default=[],
-                        help="router of another host to be linked with; repeatable (ZENCELL_LINK)")
-    add_process_options(parser)
-    options = parser.parse_args()
-    lifeline = Lifeline(gate=options.gate)
-    stop = threading.Event()
-    lifeline.start()
-    lifeline.on_stop(stop.set)
-    log_to_stderr("router", as_json=options.log_json)
-    gate = threading.Event()
-    lifeline.on_gate(gate.set)
-    while not gate.wait(0.02):
-        if stop.is_set():
-            leave(0)
+def is_reached(endpoint: str, token: str, timeout: float, credentials: Credentials | None = None) -> bool:
+    """Whether a router answers at the endpoint within a time-out [s] and, unless empty, has a liveliness token."""
     try:
-        domain = options.domain if options.domain is not None else os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN)
-        endpoints = endpoints_of("--listen", options.listen, LISTEN_VARIABLE) or [endpoint_of(domain)]
-        links = endpoints_of("--link", options.link, LINK_VARIABLE)
-        secured = secure_folder()
-        session = open_router(endpoints, secured, links)
-    except ZencellError as error:
-        fail(error)
-    log.info("listening at %s", " and ".join(endpoints))
-    for endpoint in endpoints:
-        if secured is None and not is_loopback(endpoint):
-            log.warning(OPEN, endpoint)
-    for link in links:
-        log.info("to be linked with the router at %s", link)
-    tell_of_links(session, stop)
-    log.info("stopped: %s", lifeline.reason)
-    closing = threading.Thread(target=session.close, daemon=True)
-    closing.start()
-    closing.join(_CLOSE_SECONDS)
-    leave(0)
+        session = zenoh.open(client_config(endpoint, connect_ms=int(timeout * 1000), credentials=credentials))
+    except zenoh.ZError:
+        return False
+    with session:
+        return not token or any(reply.ok is not None for reply in session.liveliness().get(token, timeout=timeout))

@@ -10,7 +10,7 @@ from typing import Any
 
 import zenoh
 
-from common.security.credentials import Credentials
+from common.transport.credentials import Credentials
 from common.transport.endpoint import client_config
 from common.transport.outbox import Outbox
 from common.transport.session import Declared, OnQuery, OnReply, OnSample, OnToken, RawReply, RawSample

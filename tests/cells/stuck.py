@@ -4,8 +4,8 @@ import asyncio
 import time
 
 from common.config import Parameters, Tunable
+from common.process.service import main
 from common.transport.bus import Bus
-from common.transport.service import main
 
 
 class Config(Parameters):

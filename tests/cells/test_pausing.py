@@ -12,8 +12,8 @@ from benchmarks.runs import RunningCell, until
 from common import topics
 from common.config import load_cell
 from common.messages import JointGoal, JointState, MotionStatus, TaskCommand
+from common.process.operator_motion import MotionFailed, OperatorMotion
 from common.transport.bus import Bus, Reader
-from common.transport.operator_motion import MotionFailed, OperatorMotion
 
 pytestmark = pytest.mark.cell
 

@@ -24,7 +24,7 @@ from common import topics
 from common.config import Parameters
 from common.errors import ConfigError
 from common.messages import PickPlaceStatus
-from common.transport.service import main
+from common.process.service import main
 
 class Config(Parameters):
     """What it does."""
@@ -58,7 +58,7 @@ from common import topics
 from common.config import Parameters
 from common.errors import Refused
 from common.messages import Image, TaskStatus
-from common.transport.service import main
+from common.process.service import main
 
 class Config(Parameters):
     """Nothing."""

@@ -10,9 +10,9 @@ import pytest
 from cli.doctor.clocks import Skew, judged, skews_of
 from common.clock import Clock
 from common.config import Parameters
+from common.process.parameters import serve_parameters
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
-from common.transport.parameters import serve_parameters
 
 
 class Shifted(Clock):

@@ -9,7 +9,8 @@ from common.clock import EPOCH_VARIABLE
 from common.config import load_cell
 from common.errors import ConfigError, UnknownName
 from common.supervision.launch import Launch
-from common.transport.endpoint import LINK_VARIABLE, LISTEN_VARIABLE, SECURE_VARIABLE
+from common.transport.credentials import SECURE_VARIABLE
+from common.transport.endpoint import LINK_VARIABLE, LISTEN_VARIABLE
 
 CELL = load_cell("panda")
 FAR = "tcp/192.168.1.10:7489"

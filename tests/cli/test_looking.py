@@ -20,7 +20,7 @@ import asyncio
 from common import topics
 from common.config import Parameters
 from common.messages import Header, Image, Pose, TFMessage, TransformStamped, Vector3
-from common.transport.service import main
+from common.process.service import main
 from pydantic import Field
 
 class Config(Parameters):

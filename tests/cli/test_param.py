@@ -28,7 +28,7 @@ from pydantic import Field
 from common import topics
 from common.config import Motion, Parameters, Tunable
 from common.messages import PickPlaceStatus
-from common.transport.service import main
+from common.process.service import main
 
 class Config(Parameters):
     """What it does."""

@@ -30,7 +30,7 @@ import asyncio, os
 from common import topics
 from common.config import Parameters
 from common.messages import Image
-from common.transport.service import main
+from common.process.service import main
 
 class Config(Parameters):
     """Nothing."""

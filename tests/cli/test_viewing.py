@@ -124,7 +124,7 @@ def test_token_that_a_person_gave_is_not_shown(cell: Cell, monkeypatch: pytest.M
 VIEWER = '''"""Says the fingerprint of the token that it was given, and serves nothing."""
 import asyncio, hashlib, os
 from common.config import Parameters
-from common.transport.service import main
+from common.process.service import main
 from common.viewer.access import TOKEN_VARIABLE
 
 class Config(Parameters):

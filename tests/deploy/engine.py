@@ -16,7 +16,7 @@ import pytest
 
 from deploy.generate import ROOT
 
-HEALTH = ("python", "-m", "common.transport.health")
+HEALTH = ("python", "-m", "common.process.health")
 
 
 def require_engine() -> None:

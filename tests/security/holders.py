@@ -8,7 +8,7 @@ from typing import Any
 
 import zenoh
 
-from common.security.credentials import Credentials
+from common.transport.credentials import Credentials
 from common.transport.endpoint import client_config
 
 PATIENCE = 30.0  # [s] only ever waited for by a test that fails

@@ -26,9 +26,9 @@ from common import topics
 from common.errors import NoRouter
 from common.recording.reading import Recording
 from common.security.certificates import Authority
-from common.security.credentials import ROUTER_NAME, Credentials, credentials_of
 from common.transport.codec import DEFAULT_LIMIT, decode, encode
 from common.transport.connect import connect
+from common.transport.credentials import ROUTER_NAME, Credentials, credentials_of
 from common.transport.endpoint import MOST_BYTES, MOST_BYTES_BESIDES, client_config, router_config
 from tests.security.holders import REFUSED, Heard, Holder
 

@@ -16,8 +16,8 @@ from cli.securing import require_secured
 from common.config import load_cell
 from common.errors import ConfigError
 from common.security.certificates import Authority
-from common.security.credentials import ACCESS, ROUTER_NAME
 from common.supervision.launch import Launch
+from common.transport.credentials import ACCESS, ROUTER_NAME
 
 CELL = load_cell("panda")
 

@@ -17,7 +17,7 @@ from cli.main import app
 from common.errors import ConfigError
 from common.security.access import Rights, access_control
 from common.security.certificates import Authority
-from common.security.credentials import ACCESS, ROUTER_NAME, credentials_of, read_access
+from common.transport.credentials import ACCESS, ROUTER_NAME, credentials_of, read_access
 from common.transport.endpoint import port_of, router_config
 from common.transport.router import open_router
 from tests.security.holders import REFUSED, Holder

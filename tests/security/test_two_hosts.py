@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.runs import RunningCell
 from common.config import load_cell
-from common.security.credentials import credentials_of
+from common.transport.credentials import credentials_of
 from common.transport.endpoint import port_of
 from tests.security.holders import PATIENCE, Heard, Holder
 

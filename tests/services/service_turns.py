@@ -21,6 +21,7 @@ from common.perception.contours import ContourOptions, find_contours
 from common.perception.drawing import draw
 from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
+from common.process.in_process import running_service
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.sim.objects import world_object
@@ -322,7 +323,7 @@ class Running:
 
     async def __aenter__(self) -> Running:
         self.bus = self.net.bus("tester", cell="test", clock=self.clock)
-        self._life = self.net.running(self.module.run, self.config, name=self.service, clock=self.clock)
+        self._life = running_service(self.net, self.module.run, self.config, name=self.service, clock=self.clock)
         await self._life.__aenter__()
         self._turns = SCENARIOS[self.service](self.bus)
         await self.bus.ready()

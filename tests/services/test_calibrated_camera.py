@@ -11,6 +11,7 @@ from cli.main import app
 from common import topics
 from common.config import load_cell, service_config
 from common.perception.image import image_to_array
+from common.process.in_process import running_service
 from common.robot.transforms import invert, rpy_to_matrix, transform
 from common.transport.local import LocalNetwork
 from services import camera_opencv, robot_state_publisher, vision_detector
@@ -65,7 +66,7 @@ async def test_balls_are_found_where_they_are_within_two_millimetres(cell):
         for module in (robot_state_publisher, vision_detector, camera_opencv):
             name = module.__name__.rpartition(".")[2]
             config = service_config(loaded, name, module.Config)
-            await stack.enter_async_context(net.running(module.run, config, name=name))
+            await stack.enter_async_context(running_service(net, module.run, config, name=name))
         message, info, image = await found.next(), await infos.next(), await images.next()
     places = np.array([(m.pose.position.x, m.pose.position.y) for m in message.markers])
     assert len(places) == len(BALLS)
@@ -80,7 +81,7 @@ async def test_pictures_as_they_come_are_sent_with_their_distortion_when_asked_f
     bus = net.bus()
     infos, images = bus.reader(topics.CAMERA_INFO), bus.reader(topics.CAMERA_IMAGE)
     config = service_config(loaded, "camera_opencv", camera_opencv.Config)
-    async with net.running(camera_opencv.run, config, name="camera_opencv"), asyncio.timeout(30):
+    async with running_service(net, camera_opencv.run, config, name="camera_opencv"), asyncio.timeout(30):
         info, image = await infos.next(), await images.next()
     assert info.distortion_model == "plumb_bob" and info.d == pytest.approx(LENS.d, abs=0.02)
     sent = cv2.imread(str(config.source) + "/0.png")

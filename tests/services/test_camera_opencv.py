@@ -14,8 +14,9 @@ from common.perception.calibration_file import CameraFile
 from common.perception.image import image_to_array
 from common.perception.rectification import Rectifier
 from common.perception.sources import Video, open_source
+from common.process.in_process import running_service
+from common.process.wiring import wiring
 from common.transport.local import LocalNetwork
-from common.transport.wiring import wiring
 from services import camera_opencv
 from services.camera_opencv import Config, calibrated, run
 
@@ -63,7 +64,7 @@ async def test_images_of_a_folder_are_sent_in_order_and_over_again(folder, intri
     net = LocalNetwork()
     bus = net.bus()
     images, infos = bus.reader(topics.CAMERA_IMAGE), bus.reader(topics.CAMERA_INFO)
-    async with net.running(run, config(source=folder, intrinsics=intrinsics, rate=50.0), name="camera_opencv"):
+    async with running_service(net, run, config(source=folder, intrinsics=intrinsics, rate=50.0), name="camera_opencv"):
         found = await read_until(images, lambda values: values[-3:] == [100, 10, 20])
         info = await asyncio.wait_for(infos.next(), 10)
     assert all(image.encoding == "bgr8" and image.header.frame_id == around.camera.frame for image in found)
@@ -76,7 +77,7 @@ async def test_images_of_a_folder_are_sent_in_order_and_over_again(folder, intri
 async def test_a_folder_that_does_not_loop_ends_and_the_service_stays(folder, intrinsics):
     net = LocalNetwork()
     images = net.bus().reader(topics.CAMERA_IMAGE)
-    async with net.running(run, config(source=folder, intrinsics=intrinsics, loop=False)):
+    async with running_service(net, run, config(source=folder, intrinsics=intrinsics, loop=False)):
         await read_until(images, lambda values: values[-1:] == [100])
         with pytest.raises(TimeoutError):
             await asyncio.wait_for(images.next(), 0.1)
@@ -92,14 +93,14 @@ async def test_a_video_file_is_sent(tmp_path, intrinsics):
     writer.release()
     net = LocalNetwork()
     images = net.bus().reader(topics.CAMERA_IMAGE)
-    async with net.running(run, config(source=path, intrinsics=intrinsics, rate=50.0)):
+    async with running_service(net, run, config(source=path, intrinsics=intrinsics, rate=50.0)):
         await read_until(images, lambda values: values[-3:] == pytest.approx([80, 160, 40], abs=4))
 
 
 async def test_pictures_of_another_size_than_the_intrinsics_are_refused_in_one_line(folder):
     net = LocalNetwork()
     with pytest.raises(ConfigError) as caught:
-        async with net.running(run, config(source=folder)):
+        async with running_service(net, run, config(source=folder)):
             await asyncio.sleep(10)
     line = str(caught.value)
     assert "640x480" in line and "64x48" in line and folder in line and "\n" not in line
@@ -136,7 +137,7 @@ async def test_a_device_that_vanishes_is_told_and_opened_again(monkeypatch, intr
     images = net.bus().reader(topics.CAMERA_IMAGE)
     quick = config(source=0, intrinsics=intrinsics, reopen_after=0.01, reopen_at_most=0.02)
     with caplog.at_level(logging.ERROR):
-        async with net.running(run, quick, name="camera_opencv"):
+        async with running_service(net, run, quick, name="camera_opencv"):
             seen = set()
             while device.opened < 5 or len(seen) < 3:
                 seen.add(value_of(await asyncio.wait_for(images.next(), 10)))

@@ -8,8 +8,9 @@ from common.clock import Clock
 from common.config import Run, Surroundings
 from common.messages import Pose, PoseArray, Vector3
 from common.perception.image import image_to_array
+from common.process.in_process import running_service
+from common.process.wiring import wiring
 from common.transport.local import LocalNetwork
-from common.transport.wiring import wiring
 from services.camera_simulator import Config, run, seen
 
 config = Config(world=Surroundings(), run=Run(cell="test", seed=4))
@@ -37,7 +38,7 @@ async def test_one_layout_in_pictures_and_camera_info_out():
     tester = net.bus()
     images, infos = tester.reader(topics.CAMERA_IMAGE), tester.reader(topics.CAMERA_INFO)
     truth = tester.writer(topics.SCENE_BALLS)
-    async with net.running(run, config, name="camera_simulator"):
+    async with running_service(net, run, config, name="camera_simulator"):
         truth.put(balls((0.5, -0.2, 0.03)))
         image, info = await next_of(images), await next_of(infos)
         assert (image.width, image.height, image.encoding) == (640, 480, "bgr8")
@@ -51,7 +52,7 @@ async def test_nothing_is_sent_before_the_world_says_where_its_balls_are():
     tester = net.bus()
     images, infos = tester.reader(topics.CAMERA_IMAGE), tester.reader(topics.CAMERA_INFO)
     truth = tester.writer(topics.SCENE_BALLS)
-    async with net.running(run, config.model_copy(update={"rate": 200.0, "max_rate": 200.0})):
+    async with running_service(net, run, config.model_copy(update={"rate": 200.0, "max_rate": 200.0})):
         await asyncio.sleep(0.1)
         assert images.latest is None and infos.latest is None
         truth.put(balls())
@@ -62,7 +63,7 @@ async def test_what_is_drawn_follows_the_world_and_leaves_out_what_can_not_be_se
     net = LocalNetwork()
     tester = net.bus()
     images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_BALLS)
-    async with net.running(run, config):
+    async with running_service(net, run, config):
         truth.put(balls((0.5, -0.2, 0.03), (0.6, 0.0, 0.03)))
         while not red_at(await next_of(images), 0.6, 0.0):
             pass
@@ -84,7 +85,7 @@ async def test_stamps_are_cell_time_at_the_rate_in_cell_time():
     clock = Clock(speed=5.0)
     tester = net.bus(clock=clock)
     images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_BALLS)
-    async with net.running(run, config, clock=clock):
+    async with running_service(net, run, config, clock=clock):
         truth.put(balls())
         stamps = [(await next_of(images)).header.stamp for _ in range(8)]
         assert stamps == sorted(set(stamps)) and stamps[-1] <= clock.now_ns()
@@ -99,7 +100,7 @@ async def test_noise_comes_from_the_seed_of_the_run():
         images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_BALLS)
         truth.put(balls())
         noisy = Config(world=Surroundings(), run=Run(cell="test", seed=seed), noise_std=8, brightness=-20)
-        async with net.running(run, noisy):
+        async with running_service(net, run, noisy):
             return image_to_array(await next_of(images))
 
     one, again, other = await first(1), await first(1), await first(2)

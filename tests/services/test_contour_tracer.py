@@ -7,6 +7,7 @@ from common import topics
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import Refused
+from common.process.in_process import running_service
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import contour_tracer
@@ -53,7 +54,7 @@ async def test_chosen_contour_makes_it_ask_for_plans_from_above_to_home() -> Non
     bus.serve(topics.MOTION_EXECUTE, execute)
     status = bus.reader(topics.OUTLINE_STATUS)
     await bus.ready()
-    async with net.running(contour_tracer.run, CONFIG, name="contour_tracer"):
+    async with running_service(net, contour_tracer.run, CONFIG, name="contour_tracer"):
         show(bus)
         async with asyncio.timeout(10):
             stages = [(await asked.get()).stage for _ in range(5)]
@@ -76,7 +77,7 @@ async def test_planner_that_does_not_know_the_scene_yet_is_asked_again() -> None
 
     bus.serve(topics.MOTION_PLAN, plan)
     await bus.ready()
-    async with net.running(contour_tracer.run, CONFIG, name="contour_tracer"):
+    async with running_service(net, contour_tracer.run, CONFIG, name="contour_tracer"):
         show(bus)
         async with asyncio.timeout(10):
             assert await asked.get() == await asked.get() == await asked.get()
@@ -85,7 +86,7 @@ async def test_planner_that_does_not_know_the_scene_yet_is_asked_again() -> None
 async def test_pause_is_answered_with_the_status() -> None:
     net = LocalNetwork()
     command = net.bus("tester", cell="test", clock=Clock()).client(topics.TASK_COMMAND)
-    async with net.running(contour_tracer.run, CONFIG, name="contour_tracer"):
+    async with running_service(net, contour_tracer.run, CONFIG, name="contour_tracer"):
         answer = await command.call(m.TaskCommand(command="pause"))
         assert (answer.state, answer.paused, answer.started) == ("IDLE", True, True)
         assert not (await command.call(m.TaskCommand(command="resume"))).paused
@@ -94,7 +95,7 @@ async def test_pause_is_answered_with_the_status() -> None:
 async def test_status_is_a_state_that_a_late_reader_gets() -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test", clock=Clock())
-    async with net.running(contour_tracer.run, CONFIG, name="contour_tracer"):
+    async with running_service(net, contour_tracer.run, CONFIG, name="contour_tracer"):
         async with asyncio.timeout(10):
             first = await bus.reader(topics.OUTLINE_STATUS).next()
             late = await bus.reader(topics.OUTLINE_STATUS).next()

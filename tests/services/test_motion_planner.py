@@ -17,10 +17,11 @@ from common.messages import (
     PoseGoal,
     Vector3,
 )
+from common.process.in_process import running_service
+from common.process.wiring import wiring
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, tool_down
 from common.transport.local import LocalNetwork
-from common.transport.wiring import wiring
 from services import motion_planner
 
 CELL = load_cell("panda")
@@ -64,7 +65,7 @@ async def planner():
     network = LocalNetwork()
     bus = network.bus("tester", cell="test", clock=Clock())
     user = Planner(bus)
-    async with network.running(motion_planner.run, CONFIG, name="motion_planner"):
+    async with running_service(network, motion_planner.run, CONFIG, name="motion_planner"):
         await user.plan.wait_available(10)
         yield user
 
@@ -147,7 +148,7 @@ async def test_service_that_is_stopped_ends_a_running_plan():
     down = [0.0, 0.5, 0, 0.1, 0, 0, 0]
     start, goal = ([a + b for a, b in zip(q, down, strict=True)] for q in (left, right))
     async with asyncio.timeout(30):
-        async with network.running(motion_planner.run, config, name="motion_planner"):
+        async with running_service(network, motion_planner.run, config, name="motion_planner"):
             await user.plan.wait_available(10)
             user.scenes.put(scene(wall))
             request = PlanRequest(id="1", start=start, goal=JointGoal(positions=goal), planning_time=300)

@@ -24,11 +24,12 @@ from common.errors import ConfigError, RemoteError
 from common.messages import Header, JointState, OutlineSelect, TFMessage, Vector3, WorldEdit, WorldObjects
 from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
+from common.process.in_process import running_service
+from common.process.wiring import wiring
 from common.robot.transforms import rpy_to_matrix, transform
 from common.sim.objects import world_object
 from common.sim.world import SimulatedWorld
 from common.transport.local import LocalNetwork
-from common.transport.wiring import wiring
 from services import contour_detector, depth_camera, duplicate_remover, pixel_to_world
 from services.robot_state_publisher import stamped
 
@@ -72,7 +73,8 @@ def middle(points):
 async def running(stack, cell, *, detector=DETECTOR, world=WORLD, camera=True):
     services = [(contour_detector, detector), (pixel_to_world, world), (duplicate_remover, REMOVER)]
     for module, config in ([(depth_camera, CAMERA)] if camera else []) + services:
-        await stack.enter_async_context(cell.net.running(module.run, config, name=module.__name__.rpartition(".")[2]))
+        name = module.__name__.rpartition(".")[2]
+        await stack.enter_async_context(running_service(cell.net, module.run, config, name=name))
 
 
 async def test_the_largest_object_is_chosen_and_its_outline_becomes_a_path():
@@ -149,7 +151,7 @@ async def test_exposure_stamps_picture_depth_and_points_alike_and_points_come_on
         cell = Cell()
         readers = [cell.bus.reader(t) for t in (
             topics.DEPTH_CAMERA_IMAGE, topics.DEPTH_CAMERA_DEPTH, topics.DEPTH_CAMERA_POINTS)]
-        await stack.enter_async_context(cell.net.running(depth_camera.run, CAMERA, name="depth_camera"))
+        await stack.enter_async_context(running_service(cell.net, depth_camera.run, CAMERA, name="depth_camera"))
         cell.say(W5.objects)
         stamps = [(await until(reader, lambda _: True)).header.stamp for reader in readers]
         assert len(set(stamps)) == 1

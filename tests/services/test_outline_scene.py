@@ -10,6 +10,7 @@ from common.clock import Clock
 from common.config import Surroundings, load_cell, service_config
 from common.perception.image import array_to_image
 from common.perception.pinhole import Pinhole
+from common.process.in_process import running_service
 from common.robot.transforms import matrix_to_pose
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
@@ -72,7 +73,7 @@ class Neighbours:
 
 async def test_fixtures_are_known_at_once_and_what_was_seen_with_the_arm_at_home() -> None:
     net = LocalNetwork()
-    async with net.running(outline_scene.run, CONFIG, name="outline_scene"):
+    async with running_service(net, outline_scene.run, CONFIG, name="outline_scene"):
         around = Neighbours(net)
         first = await around.scene()
         assert [o.id for o in first.objects] == ["robot_base", "target_base"]
@@ -87,7 +88,7 @@ async def test_fixtures_are_known_at_once_and_what_was_seen_with_the_arm_at_home
 
 async def test_picture_with_the_arm_in_it_is_left_out() -> None:
     net = LocalNetwork()
-    async with net.running(outline_scene.run, CONFIG, name="outline_scene"):
+    async with running_service(net, outline_scene.run, CONFIG, name="outline_scene"):
         around = Neighbours(net)
         await around.scene()
         around.arm([0.0] * 6, 1)

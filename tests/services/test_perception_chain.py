@@ -10,6 +10,7 @@ from common.clock import Clock
 from common.config import Run, Surroundings, load_cell, service_config
 from common.messages import Header, Pose, PoseArray, TFMessage, TransformStamped, Vector3
 from common.perception.pinhole import Pinhole
+from common.process.in_process import running_service
 from common.robot.transforms import matrix_to_pose
 from common.transport.local import LocalNetwork
 from services import camera_simulator, vision_detector, workspace_validator
@@ -34,10 +35,11 @@ def tf():
 
 async def start(stack, net, clock, **camera_parameters):
     config = camera_simulator.Config(world=around, run=Run(cell="test"), **camera_parameters)
-    await stack.enter_async_context(net.running(camera_simulator.run, config, name="camera_simulator", clock=clock))
+    camera = running_service(net, camera_simulator.run, config, name="camera_simulator", clock=clock)
+    await stack.enter_async_context(camera)
     for module in (vision_detector, workspace_validator):
         name = module.__name__.rpartition(".")[2]
-        service = net.running(module.run, service_config(cell, name, module.Config), name=name, clock=clock)
+        service = running_service(net, module.run, service_config(cell, name, module.Config), name=name, clock=clock)
         await stack.enter_async_context(service)
 
 

@@ -8,6 +8,7 @@ from common import topics
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.perception.pinhole import Pinhole
+from common.process.in_process import running_service
 from common.robot.transforms import matrix_to_pose
 from common.transport.local import LocalNetwork
 from services import scene_manager
@@ -45,7 +46,7 @@ async def test_seen_ball_becomes_an_object_with_an_id_and_moves_into_the_hand_th
     grip = bus.writer(topics.GRIPPER_STATE)
     grip.put(m.GripperState(header=bus.header(), width=0.08))
     config = service_config(CELL, "scene_manager", scene_manager.Config)
-    async with net.running(scene_manager.run, config, name="scene_manager"):
+    async with running_service(net, scene_manager.run, config, name="scene_manager"):
         first = await scene.next()
         assert {o.role for o in first.objects} == {"fixture", "container"}
         ball = (0.307, 0.0)  # below the hand at home, as far as the match radius is concerned not in it

@@ -12,6 +12,7 @@ from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import RemoteError
 from common.messages import ExecuteRequest, GripperCommand, JointState, TFMessage, Vector3, WorldEdit
+from common.process.in_process import running_service
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
@@ -37,7 +38,7 @@ def robot() -> RobotModel:
 async def executor(**parameters):
     net, clock = LocalNetwork(), Clock(SPEED)
     config = service_config(CELL, "trajectory_executor", trajectory_executor.Config).model_copy(update=parameters)
-    async with net.running(trajectory_executor.run, config, name="trajectory_executor", clock=clock):
+    async with running_service(net, trajectory_executor.run, config, name="trajectory_executor", clock=clock):
         yield net.bus("tester", clock=clock)
 
 
@@ -126,7 +127,7 @@ async def test_frames_agree_with_forward_kinematics_from_world_to_the_finger_tip
     bus = net.bus()
     config = service_config(CELL, "robot_state_publisher", robot_state_publisher.Config)
     fingers = finger_positions(GRIPPER, 0.03)
-    async with net.running(robot_state_publisher.run, config), asyncio.timeout(10):
+    async with running_service(net, robot_state_publisher.run, config), asyncio.timeout(10):
         tf, static = bus.reader(topics.TF), bus.reader(topics.TF_STATIC)
         q = robot.named("home") + 0.1
         state = JointState(header=bus.header("world"), name=[*robot.joint_names, *GRIPPER.joints],

@@ -6,6 +6,7 @@ from common import messages as m
 from common import topics
 from common.clock import Clock
 from common.config import load_cell, service_config
+from common.process.in_process import running_service
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import smart_pick_place
@@ -43,7 +44,7 @@ async def test_validated_target_makes_it_ask_for_a_plan_to_above_that_ball() -> 
 
     bus.serve(topics.MOTION_PLAN, plan)
     await bus.ready()
-    async with net.running(smart_pick_place.run, CONFIG, name="smart_pick_place"):
+    async with running_service(net, smart_pick_place.run, CONFIG, name="smart_pick_place"):
         show(bus, [(0.40, -0.17)])
         request = await asyncio.wait_for(asked.get(), 5)
         assert request.stage == "pre-grasp"
@@ -65,7 +66,7 @@ async def test_picture_that_is_late_by_the_fast_clock_of_the_cell_only_is_fresh(
     bus.serve(topics.MOTION_PLAN, plan)
     await bus.ready()
     patient = CONFIG.model_copy(update={"frame_timeout": 10.0})  # [s, wall]
-    async with net.running(smart_pick_place.run, patient, name="smart_pick_place", clock=clock):
+    async with running_service(net, smart_pick_place.run, patient, name="smart_pick_place", clock=clock):
         show(bus, [(0.40, -0.17)], age=30.0)
         assert (await asyncio.wait_for(asked.get(), 5)).stage == "pre-grasp"
 
@@ -73,7 +74,7 @@ async def test_picture_that_is_late_by_the_fast_clock_of_the_cell_only_is_fresh(
 async def test_status_is_a_state_that_a_late_reader_gets() -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test", clock=Clock())
-    async with net.running(smart_pick_place.run, CONFIG, name="smart_pick_place"):
+    async with running_service(net, smart_pick_place.run, CONFIG, name="smart_pick_place"):
         first = await asyncio.wait_for(bus.reader(topics.PICK_PLACE_STATUS).next(), 5)
         late = await asyncio.wait_for(bus.reader(topics.PICK_PLACE_STATUS).next(), 5)
         assert first.state == late.state == "IDLE"
@@ -84,6 +85,6 @@ async def test_pause_is_answered_with_the_status() -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test", clock=Clock())
     command = bus.client(topics.TASK_COMMAND)
-    async with net.running(smart_pick_place.run, CONFIG, name="smart_pick_place"):
+    async with running_service(net, smart_pick_place.run, CONFIG, name="smart_pick_place"):
         assert (await command.call(m.TaskCommand(command="pause"))).paused
         assert not (await command.call(m.TaskCommand(command="resume"))).paused

@@ -22,13 +22,14 @@ from common.messages import (
     Vector3,
     WorldEdit,
 )
+from common.process.in_process import running_service
+from common.process.wiring import wiring
 from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.scene.workspace import reach_reason
 from common.sim.standing import STATE_VARIABLE
 from common.transport.local import LocalNetwork
-from common.transport.wiring import wiring
 from services import trajectory_executor
 from services.trajectory_executor import Config
 
@@ -89,7 +90,7 @@ class Person:
 async def executor(*overrides: str):
     net, clock = LocalNetwork(), Clock(SPEED)
     given = config(*overrides)
-    async with net.running(trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
+    async with running_service(net, trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
         yield Person(net, clock)
 
 
@@ -213,7 +214,7 @@ async def test_restarted_executor_holds_nothing() -> None:
 async def test_speed_scaling_that_is_set_while_it_moves_slows_the_arm_down(robot: RobotModel) -> None:
     home = robot.named("home")
     net, clock, given = LocalNetwork(), Clock(SPEED), config()
-    async with net.running(trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
+    async with running_service(net, trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
         person = Person(net, clock)
         trajectory = move(robot, home, home + 0.5, 0.02)
         await person.execute.call(person.asks(id="a", trajectory=trajectory))
@@ -256,7 +257,7 @@ async def test_request_that_is_late_or_from_the_future_moves_nothing(
 async def test_request_that_was_carried_out_is_not_again_when_it_is_replayed_later(robot: RobotModel) -> None:
     home = robot.named("home")
     net, clock, given = LocalNetwork(), Clock(SPEED), config()
-    async with net.running(trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
+    async with running_service(net, trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
         person = Person(net, clock)
         there = person.asks(id="a", trajectory=move(robot, home, home + 0.2))
         assert (await person.execute.call(there)).state == "active"
@@ -283,7 +284,7 @@ async def alone(net: LocalNetwork, clock: Clock, given: object, robot: RobotMode
 
 async def test_arm_that_is_to_hold_when_alone_waits_on_its_path_for_the_task_and_goes_on(robot: RobotModel) -> None:
     net, clock, given = LocalNetwork(), Clock(SPEED), config("services.trajectory_executor.when_alone=hold")
-    async with net.running(trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
+    async with running_service(net, trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
         person, task = await alone(net, clock, given, robot)
         await task.close()
         held = await person.see(person.motion, lambda m: m.message == "held: smart_pick_place is gone")
@@ -296,7 +297,7 @@ async def test_arm_that_is_to_hold_when_alone_waits_on_its_path_for_the_task_and
 
 async def test_arm_that_is_alone_finishes_its_motion_unless_told_otherwise(robot: RobotModel) -> None:
     net, clock, given = LocalNetwork(), Clock(SPEED), config()
-    async with net.running(trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
+    async with running_service(net, trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
         person, task = await alone(net, clock, given, robot)
         await task.close()
         done = await person.see(person.motion, lambda m: m.state != "active" or m.held)
@@ -331,7 +332,8 @@ async def test_wrong_message_is_refused_and_the_next_one_served(robot: RobotMode
         "short point": bad_execute(robot, positions=[0.0] * 6),
     }[kind]
     net, clock = LocalNetwork(), Clock(SPEED)
-    async with net.running(trajectory_executor.run, config(), name="trajectory_executor", cell=CELL, clock=clock):
+    run = trajectory_executor.run
+    async with running_service(net, run, config(), name="trajectory_executor", cell=CELL, clock=clock):
         replies: asyncio.Queue = asyncio.Queue()
         loop, session = asyncio.get_running_loop(), net.session()
         session.get(f"{CELL}/motion/execute", lambda reply: loop.call_soon_threadsafe(replies.put_nowait, reply),

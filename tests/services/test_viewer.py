@@ -19,6 +19,7 @@ from common import topics
 from common.clock import Clock
 from common.config import Cell, load_cell, service_config
 from common.errors import Refused
+from common.process.in_process import running_service
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from common.viewer.layout import Layout
@@ -124,7 +125,7 @@ async def page_of(cell: str, serve: bool = True, **changes: object) -> AsyncIter
         played.serve()
     await played.bus.ready()
     lines = played.bus.reader(topics.LOG)
-    async with net.running(viewer.run, config_of(load_cell(cell), **changes), name="viewer"):
+    async with running_service(net, viewer.run, config_of(load_cell(cell), **changes), name="viewer"):
         async with asyncio.timeout(PATIENCE):
             while (found := re.search(r"page is at http://127\.0\.0\.1:(\d+)", (await lines.next()).message)) is None:
                 pass

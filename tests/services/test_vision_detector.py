@@ -11,9 +11,10 @@ from common.messages import Header, Image, TFMessage, TransformStamped
 from common.perception.drawing import draw
 from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
+from common.process.in_process import running_service
+from common.process.wiring import wiring
 from common.robot.transforms import matrix_to_pose
 from common.transport.local import LocalNetwork
-from common.transport.wiring import wiring
 from services.vision_detector import Config, run
 
 around = Surroundings()
@@ -55,7 +56,7 @@ async def test_one_picture_in_detections_in_world_out_under_the_same_stamp():
     net = LocalNetwork()
     rig = Rig(net)
     rig.calibrate()
-    async with net.running(run, config, name="vision_detector"):
+    async with running_service(net, run, config, name="vision_detector"):
         rig.images.put(picture(stamp=123_456_789))
         message = await rig.next()
     assert message.header == Header(stamp=123_456_789, frame_id="world")
@@ -77,7 +78,7 @@ async def test_pose_of_the_camera_comes_from_tf_and_from_nowhere_else():
     moved[:3, 3] += (0.1, -0.05, 0.0)
     rig.infos.put(camera.info(Header(frame_id=FRAME)))
     rig.statics.put(tf(moved))
-    async with net.running(run, config):
+    async with running_service(net, run, config):
         rig.images.put(picture(PLACES[:1]))
         (mark,) = (await rig.next()).markers
     assert (mark.pose.position.x, mark.pose.position.y) == pytest.approx((0.50, -0.35), abs=1e-3)
@@ -89,7 +90,7 @@ async def test_intrinsics_come_from_camera_info():
     other = Pinhole(600, 600, 300, 250, 640, 480, camera.T_world_optical)
     rig.infos.put(other.info(Header(frame_id=FRAME)))
     rig.statics.put(tf())
-    async with net.running(run, config):
+    async with running_service(net, run, config):
         rig.images.put(array_to_image(draw(PLACES[:1], other, around), "bgr8", Header(stamp=1, frame_id=FRAME)))
         (mark,) = (await rig.next()).markers
     assert (mark.pose.position.x, mark.pose.position.y) == pytest.approx((0.40, -0.30), abs=1e-3)
@@ -115,7 +116,7 @@ async def test_a_picture_that_can_not_be_looked_at_is_dropped_and_told_once(bad,
     rig = Rig(net)
     rig.calibrate()
     with caplog.at_level(logging.WARNING):
-        async with net.running(run, config, name="vision_detector"):
+        async with running_service(net, run, config, name="vision_detector"):
             for stamp in (1, 2):
                 rig.images.put(bad)
                 await asyncio.sleep(0)
@@ -133,7 +134,7 @@ async def test_a_picture_that_can_not_be_looked_at_is_dropped_and_told_once(bad,
 async def test_pictures_before_the_camera_is_known_are_dropped():
     net = LocalNetwork()
     rig = Rig(net)
-    async with net.running(run, config):
+    async with running_service(net, run, config):
         rig.images.put(picture(stamp=1))
         await asyncio.sleep(0.05)
         rig.calibrate()
@@ -147,7 +148,7 @@ async def test_a_camera_that_no_pinhole_is_does_not_end_the_service():
     bent = camera.info(Header(frame_id=FRAME)).model_copy(update={"d": [0.2, 0.0, 0.0, 0.0, 0.0]})
     rig.infos.put(bent)
     rig.statics.put(tf())
-    async with net.running(run, config):
+    async with running_service(net, run, config):
         rig.images.put(picture(stamp=1))
         await asyncio.sleep(0.05)
         rig.infos.put(camera.info(Header(frame_id=FRAME)))
@@ -161,7 +162,7 @@ async def test_annotated_picture_is_drawn_for_whoever_listens():
     rig = Rig(net)
     rig.calibrate()
     shown = rig.bus.reader(topics.DETECTION_IMAGE)
-    async with net.running(run, config):
+    async with running_service(net, run, config):
         rig.images.put(picture(stamp=7))
         image = await asyncio.wait_for(shown.next(), 10)
     assert image.header == Header(stamp=7, frame_id=FRAME)
@@ -173,7 +174,7 @@ async def test_an_rgb_picture_is_understood():
     rig = Rig(net)
     rig.calibrate()
     flipped = np.ascontiguousarray(draw(PLACES, camera, around)[..., ::-1])
-    async with net.running(run, config):
+    async with running_service(net, run, config):
         rig.images.put(array_to_image(flipped, "rgb8", Header(stamp=5, frame_id=FRAME)))
         assert len((await rig.next()).markers) == 3
 

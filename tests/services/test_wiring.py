@@ -8,7 +8,7 @@ import pytest
 
 from common import topics
 from common.config import Surroundings, World, load_cell, service_config
-from common.transport.wiring import Wiring, wiring
+from common.process.wiring import Wiring, wiring
 
 CELLS = {name: load_cell(name, ["services.viewer.port=0"]) for name in ("panda", "ur5")}
 SERVICES = [(cell, name) for cell, loaded in CELLS.items() for name in loaded.services]

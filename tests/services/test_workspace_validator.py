@@ -8,9 +8,10 @@ from common import topics
 from common.config import Grasp, Surroundings, load_cell
 from common.messages import Header, Marker, MarkerArray, Pose, TFMessage, TransformStamped, Vector3
 from common.perception.pinhole import Pinhole
+from common.process.in_process import running_service
+from common.process.wiring import wiring
 from common.robot.transforms import matrix_to_pose
 from common.transport.local import LocalNetwork
-from common.transport.wiring import wiring
 from services.workspace_validator import Config, run
 
 around = Surroundings()
@@ -70,7 +71,7 @@ class Rig:
 async def test_detections_in_targets_out_under_the_same_stamp():
     net = LocalNetwork()
     rig = Rig(net)
-    async with net.running(run, config, name="workspace_validator"):
+    async with running_service(net, run, config, name="workspace_validator"):
         message = await rig.answer(seen((0.5, -0.2, 0.03), (0.4, 0.05, 0.03), stamp=77), 2)
     assert message.header == Header(stamp=77, frame_id="world")
     np.testing.assert_allclose(
@@ -83,7 +84,7 @@ async def test_each_kind_of_rejection_has_its_reason():
     net = LocalNetwork()
     rig = Rig(net)
     places = [(0.05, 0.0, 0.03), (0.12, 0.1, 0.03), (0.70, -0.44, 0.03), (0.2, 0.0, 0.03), (0.45, 0.47, 0.03)]
-    async with net.running(run, config, name="workspace_validator"):
+    async with running_service(net, run, config, name="workspace_validator"):
         await rig.answer(seen(*places, (0.5, -0.2, 0.03), partial={4}), 1)
         reasons = await rig.reasons(5)
     starts = ("singularity column", "too close", "too far", "pre-grasp at", "partly out of view")
@@ -94,7 +95,7 @@ async def test_a_place_is_told_and_logged_once_while_something_lies_there(caplog
     net = LocalNetwork()
     rig = Rig(net)
     with caplog.at_level(logging.INFO):
-        async with net.running(run, config, name="workspace_validator"):
+        async with running_service(net, run, config, name="workspace_validator"):
             for stamp in range(1, 8):
                 jitter = 0.001 * (stamp % 2)
                 await rig.answer(seen((0.05 + jitter, 0.0, 0.03), (0.5, 0, 0.03), stamp=stamp * 10**8), 1)
@@ -107,7 +108,7 @@ async def test_something_put_back_after_a_while_is_told_again():
     net = LocalNetwork()
     rig = Rig(net)
     bad, good = (0.05, 0.0, 0.03), (0.5, 0, 0.03)
-    async with net.running(run, config, name="workspace_validator"):
+    async with running_service(net, run, config, name="workspace_validator"):
         await rig.answer(seen(bad, good, stamp=10**9), 1)
         await rig.answer(seen(good, stamp=2 * 10**9), 1)
         await rig.answer(seen(bad, good, stamp=int(2.5 * 10**9)), 1)
@@ -122,7 +123,7 @@ async def test_balls_in_the_box_are_neither_targets_nor_told():
     rig = Rig(net)
     c = around.container
     boxed = [(c.x + dx, c.y + dy, z) for dx in (-0.033, 0.033) for dy in (-0.033, 0.033) for z in (0.035, 0.095)]
-    async with net.running(run, config, name="workspace_validator"):
+    async with running_service(net, run, config, name="workspace_validator"):
         await rig.answer(seen(*boxed, (0.5, -0.2, 0.03), partial={0}), 1)
         assert rig.rejected.received == 0
 
@@ -130,21 +131,21 @@ async def test_balls_in_the_box_are_neither_targets_nor_told():
 async def test_detections_without_a_pixel_are_judged_by_their_place():
     net = LocalNetwork()
     rig = Rig(net)
-    async with net.running(run, config, name="workspace_validator"):
+    async with running_service(net, run, config, name="workspace_validator"):
         await rig.answer(seen((0.55, 0.25, 0.035), (0.5, -0.2, 0.03), pixel=False), 1)
 
 
 async def test_an_empty_table_is_an_answer_too():
     net = LocalNetwork()
     rig = Rig(net)
-    async with net.running(run, config):
+    async with running_service(net, run, config):
         assert (await rig.answer(seen(stamp=5), 0)).poses == []
 
 
 async def test_frames_before_the_camera_is_known_are_dropped():
     net = LocalNetwork()
     rig = Rig(net, calibrated=False)
-    async with net.running(run, config):
+    async with running_service(net, run, config):
         rig.found.put(seen((0.5, -0.2, 0.03), stamp=1))
         await asyncio.sleep(0.05)
         rig.calibrate()
@@ -154,7 +155,7 @@ async def test_frames_before_the_camera_is_known_are_dropped():
 
 async def test_shell_and_column_are_there_for_whoever_comes_late():
     net = LocalNetwork()
-    async with net.running(run, config, name="workspace_validator"):
+    async with running_service(net, run, config, name="workspace_validator"):
         message = await asyncio.wait_for(Rig(net).markers.next(), 10)
     shell, column = message.markers
     assert message.header.frame_id == "world"

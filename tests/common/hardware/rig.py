@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from common.hardware.checks import Tolerances
-from common.hardware.controller import TrajectoryController
+from common.control.checks import Tolerances
+from common.control.controller import TrajectoryController
 from common.hardware.mock import MockHardware
 
 START = np.zeros(2)

@@ -10,7 +10,7 @@ import pytest
 from common.errors import ConfigError
 from common.security.certificates import Authority, write_secret
 from common.security.checking import require_valid
-from common.security.credentials import credentials_of, identity_of_listener, refuse_to_publish
+from common.transport.credentials import credentials_of, identity_of_listener, refuse_to_publish
 
 RENEW = "zencell secure init DIR --renew"
 

@@ -7,9 +7,10 @@ import pytest
 from common import topics
 from common.errors import NoResponder
 from common.messages import Image, LogLine, PickPlaceStatus, TaskCommand, TaskStatus
+from common.process.in_process import running_service
+from common.process.wiring import wiring
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
-from common.transport.wiring import wiring
 
 PATIENCE = 20.0
 
@@ -45,7 +46,7 @@ async def test_service_runs_in_process_from_its_ready_to_the_end_of_the_block() 
     net = LocalNetwork()
     tester = net.bus("tester")
     status, log = tester.reader(topics.PICK_PLACE_STATUS), tester.reader(topics.LOG)
-    async with net.running(service, Config(), name="toy"):
+    async with running_service(net, service, Config(), name="toy"):
         assert await tester.alive.known() == {"toy"}
         tester.writer(topics.CAMERA_IMAGE).put(image(4))
         assert (await asyncio.wait_for(status.next(), PATIENCE)).placed == 4
@@ -61,7 +62,7 @@ async def test_crash_at_the_start_is_raised() -> None:
     config = Config()
     config.fail = True
     with pytest.raises(RuntimeError, match="the start has a bug"):
-        async with LocalNetwork().running(service, config):
+        async with running_service(LocalNetwork(), service, config):
             raise AssertionError("the block must not be entered")
 
 
@@ -70,7 +71,7 @@ async def test_crash_in_the_middle_ends_the_block_and_is_raised() -> None:
     client = net.bus("tester").client(topics.TASK_COMMAND)
 
     async def block() -> None:
-        async with net.running(service, Config()):
+        async with running_service(net, service, Config()):
             asking = asyncio.create_task(client.call(TaskCommand(command="stop")))
             asking.add_done_callback(lambda task: task.exception())
             await asyncio.Event().wait()
@@ -81,13 +82,13 @@ async def test_crash_in_the_middle_ends_the_block_and_is_raised() -> None:
 
 async def test_failure_of_the_block_is_raised_as_it_is() -> None:
     with pytest.raises(ZeroDivisionError):
-        async with LocalNetwork().running(service, Config()):
+        async with running_service(LocalNetwork(), service, Config()):
             _ = 1 // 0
 
 
 async def test_block_that_is_cancelled_is_cancelled() -> None:
     async def block() -> None:
-        async with LocalNetwork().running(service, Config()):
+        async with running_service(LocalNetwork(), service, Config()):
             await asyncio.Event().wait()
 
     task = asyncio.create_task(block())
@@ -102,7 +103,7 @@ async def test_service_that_ends_before_it_is_ready_is_reported() -> None:
         bus.log.debug("nothing to do")
 
     with pytest.raises(RuntimeError, match="ended before it was ready"):
-        async with LocalNetwork().running(short, Config(), name="short"):
+        async with running_service(LocalNetwork(), short, Config(), name="short"):
             raise AssertionError("the block must not be entered")
     with pytest.raises(RuntimeError, match="before ready"):
         await wiring(short, Config())

@@ -8,9 +8,9 @@ import pytest
 
 from common import topics
 from common.messages import Image, LogLine, PickPlaceStatus, Rejections, TFMessage
+from common.process.log import BusLog
 from common.transport.bus import Bus, Reader, Writer
 from common.transport.codec import Attachment, checksum_of, encode, encode_attachment
-from common.transport.log import BusLog
 
 PATIENCE = 20.0
 

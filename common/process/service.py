@@ -15,14 +15,14 @@ from typing import Any, Generic, NoReturn, TypeVar
 from common.clock import EPOCH_VARIABLE, SPEED_VARIABLE, Clock
 from common.config import Parameters, Watchdogs, load_cell, service_config
 from common.errors import ConfigError, UnknownName, ZencellError
-from common.security.credentials import Credentials, common_name, credentials_of, secure_folder
+from common.process.lifeline import Lifeline, fail, leave
+from common.process.log import BusLog, log_to_stderr
+from common.process.loop_watch import LoopWatch
+from common.process.parameters import serve_parameters
 from common.transport.bus import Bus
+from common.transport.credentials import Credentials, common_name, credentials_of, secure_folder
 from common.transport.endpoint import endpoint_of
 from common.transport.handoff import call_on_loop
-from common.transport.lifeline import Lifeline, fail, leave
-from common.transport.log import BusLog, log_to_stderr
-from common.transport.loop_watch import LoopWatch
-from common.transport.parameters import serve_parameters
 from common.transport.zenoh_session import ZenohSession, close_bounded, open_zenoh
 
 log = logging.getLogger(__name__)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from common.config import Fixture, GripperConfig, World
+from common.control.cycle import ControlCycle
 from common.errors import ConfigError, Refused
-from common.hardware.cycle import ControlCycle
 from common.hardware.fingers import Fingers
 from common.hardware.interface import HardwareFault
 from common.hardware.lag import LagHardware

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from common.errors import ConfigError
-from common.transport.endpoint import SECURE_VARIABLE
 
+SECURE_VARIABLE = "ZENCELL_SECURE"  # folder of certificates, as `zencell secure init` makes it
 AUTHORITY, ROUTER_NAME, ACCESS = "ca", "router", "access.json5"
 SUPERVISOR, RECORDER = "supervisor", "recorder"  # beside the services of each cell
 OPERATOR, OBSERVER = "operator", "observer"  # people's tools, for all cells

@@ -6,9 +6,9 @@ import numpy as np
 from pydantic import Field
 
 from common.config import Parameters, Tunable
+from common.control.trajectory import Trajectory, from_message, with_best_interpolation
 from common.errors import Refused
 from common.hardware.interface import Limits, Vector
-from common.hardware.trajectory import Trajectory, from_message, with_best_interpolation
 from common.messages import JointTrajectory
 
 

@@ -11,9 +11,9 @@ from typing import Any, Protocol, TypeVar
 from common import messages as m
 from common import topics
 from common.errors import RemoteError
+from common.process.persist import persist
 from common.tasks.reliance import LOOK_PERIOD, Reliance
 from common.transport.bus import Bus
-from common.transport.persist import persist
 from common.transport.reader import Reader
 from common.transport.requests import Client
 from common.transport.writer import Writer

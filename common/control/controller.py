@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from common.control.checks import Tolerances, checked_trajectory
+from common.control.goals import REMEMBERED, GoalMemory
+from common.control.pacing import next_rate, way
+from common.control.trajectory import Trajectory
 from common.errors import Refused
-from common.hardware.checks import Tolerances, checked_trajectory
-from common.hardware.goals import REMEMBERED, GoalMemory
 from common.hardware.interface import Limits, Vector
-from common.hardware.pacing import next_rate, way
-from common.hardware.trajectory import Trajectory
 from common.messages import GoalState, Holder, JointTrajectory, MotionStatus
 
 LARGEST_STEP = 0.1  # cell time [s]: after a stall of the loop a trajectory goes on where it was, instead of jumping

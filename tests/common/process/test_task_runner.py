@@ -9,11 +9,12 @@ from typing import Any
 
 from common import messages as m
 from common import topics
+from common.process.in_process import running_service
+from common.process.task_runner import Command, TaskRunner
 from common.tasks.outline_legs import OutlineView
 from common.tasks.reliance import Reliance
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
-from common.transport.task_runner import Command, TaskRunner
 
 POINT = m.JointTrajectoryPoint(time_from_start=0.0, positions=[0.0], velocities=[0.0], accelerations=[0.0])
 GO = m.ExecuteRequest(id="go", trajectory=m.JointTrajectory(joint_names=["j"], points=[POINT]))
@@ -51,7 +52,7 @@ async def running(net: LocalNetwork, *also: Command) -> AsyncIterator[Bus]:
         await bus.ready()
         await runner.run(())
 
-    async with net.running(run, None, name="smart_pick_place") as bus:
+    async with running_service(net, run, None, name="smart_pick_place") as bus:
         yield bus
 
 
@@ -107,7 +108,7 @@ async def test_only_the_newest_hold_and_no_motion_after_a_stop_reach_an_executor
 async def test_a_watchdog_and_a_person_do_not_make_each_others_holds_void() -> None:
     net = LocalNetwork()
     watchdog = m.HoldRequest(hold=True, reason="no joint states", by="watchdog")
-    async with running(net, watchdog):
+    async with running_service(net, watchdog):
         await tell(net, "pause")
         executor = Executor(net)
         await executor.bus.ready()
@@ -139,7 +140,7 @@ async def test_what_is_missing_is_told_in_the_status_and_holds_the_arm_until_it_
 
     person = net.bus("person")
     status, joints = person.reader(topics.PICK_PLACE_STATUS), executor.bus.writer(topics.JOINT_STATES)
-    async with net.running(run, None, name="smart_pick_place"):
+    async with running_service(net, run, None, name="smart_pick_place"):
         joints.put(m.JointState(header=m.Header(stamp=1), name=["j"], position=[0.0]))
         hold = await executor.next()
         assert isinstance(hold, m.HoldRequest) and hold.hold and hold.by == "watchdog"

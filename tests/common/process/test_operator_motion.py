@@ -9,8 +9,8 @@ import pytest
 
 from common import messages as m
 from common import topics
+from common.process.operator_motion import MotionFailed, OperatorMotion
 from common.transport.local import LocalNetwork
-from common.transport.operator_motion import MotionFailed, OperatorMotion
 
 HOME = m.JointGoal(named="home")
 POINT = m.JointTrajectoryPoint(time_from_start=0.0, positions=[0.0], velocities=[0.0], accelerations=[0.0])
@@ -77,7 +77,7 @@ class Cell:
 @pytest.fixture(autouse=True)
 def _short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     """For the task that most of these cells do not have."""
-    monkeypatch.setattr("common.transport.operator_motion.FIRST_WORD", 0.05)
+    monkeypatch.setattr("common.process.operator_motion.FIRST_WORD", 0.05)
 
 
 @pytest.fixture
@@ -154,7 +154,7 @@ async def test_robot_that_is_held_with_nothing_to_do_is_let_go_first(cell: Cell,
 async def test_motion_of_somebody_else_is_not_touched(
     cell: Cell, person: OperatorMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("common.transport.operator_motion.COME_TO_REST", 0.05)
+    monkeypatch.setattr("common.process.operator_motion.COME_TO_REST", 0.05)
     cell.say(id="other", state="active", held=True)
     with pytest.raises(MotionFailed, match="follows goal 'other'") as caught:
         await person.move(HOME)
@@ -230,7 +230,7 @@ async def test_motion_that_ends_otherwise_is_told_in_one_line(
 
 
 async def test_cell_without_an_executor_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("common.transport.operator_motion.REQUEST_TIMEOUT", 0.05)
+    monkeypatch.setattr("common.process.operator_motion.REQUEST_TIMEOUT", 0.05)
     person = OperatorMotion(LocalNetwork().bus(), [])
     with pytest.raises(MotionFailed, match="does not say how the robot is"):
         await person.move(HOME)

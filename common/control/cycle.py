@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.config import GripperConfig
+from common.control.checks import Tolerances
+from common.control.controller import TrajectoryController
+from common.control.gripper_controller import GripperController
 from common.errors import ConfigError, Refused
-from common.hardware.checks import Tolerances
-from common.hardware.controller import TrajectoryController
-from common.hardware.gripper_controller import GripperController
 from common.hardware.interface import Hardware, HardwareFault, Limits, SimulatedGripper, Vector
 from common.messages import (
     ExecuteRequest,

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from common.process.loop_watch import PERIOD, STUCK_EXIT, Turning
 from common.transport.endpoint import endpoint_of
-from common.transport.loop_watch import PERIOD, STUCK_EXIT, Turning
 from common.transport.zenoh_session import wait_router
 
 PATIENCE = 20.0
@@ -40,7 +40,7 @@ async def toy(processes, domain: int):
     await wait_router(endpoint_of(domain), PATIENCE)
 
     def start(mode: str):
-        return processes.start("tests.common.transport.toy", "--cell", CELL, "--domain", str(domain),
+        return processes.start("tests.common.process.toy", "--cell", CELL, "--domain", str(domain),
                                "--set", f"services.toy.mode={mode}", "--set", "watchdogs.loop=1.5")
 
     return start

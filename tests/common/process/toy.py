@@ -8,8 +8,8 @@ from common import topics
 from common.config import Parameters
 from common.errors import ConfigError, Refused
 from common.messages import PickPlaceStatus, TaskCommand, TaskStatus
+from common.process.service import main
 from common.transport.bus import Bus
-from common.transport.service import main
 
 
 class Config(Parameters):

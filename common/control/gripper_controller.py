@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from common.config import GripperConfig
-from common.hardware.goals import REMEMBERED, GoalMemory
+from common.control.goals import REMEMBERED, GoalMemory
 from common.hardware.interface import Gripper, GripperReading
 from common.messages import GripperCommand, GripperState
 from common.robot.finger_joints import driven_position

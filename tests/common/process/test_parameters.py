@@ -13,11 +13,12 @@ from common import topics
 from common.config import Motion, Parameters, Tunable, load_cell, service_config
 from common.errors import NoResponder, RemoteError
 from common.messages import ParameterReply, ParameterRequest
+from common.process.in_process import running_service
+from common.process.pace import Pace
+from common.process.wiring import wiring
 from common.topics import find_topic, parameters_of
 from common.transport.bus import Bus, Client
 from common.transport.local import LocalNetwork
-from common.transport.pace import Pace
-from common.transport.wiring import wiring
 
 PATIENCE = 20.0
 CELLS = {name: load_cell(name) for name in ("panda", "ur5")}
@@ -64,7 +65,7 @@ class Rig:
 @pytest.fixture
 async def rig() -> AsyncIterator[Rig]:
     made = Rig()
-    async with made.net.running(service, made.config, name="toy"):
+    async with running_service(made.net, service, made.config, name="toy"):
         yield made
 
 
@@ -115,7 +116,7 @@ async def test_a_bad_request_leaves_the_service_running(rig: Rig) -> None:
 
 async def test_a_service_that_is_gone_does_not_answer() -> None:
     rig = Rig()
-    async with rig.net.running(service, rig.config, name="toy"):
+    async with running_service(rig.net, service, rig.config, name="toy"):
         await rig.bus.alive.wait("toy", PATIENCE)
         await rig.ask()
     await rig.bus.alive.wait("toy", PATIENCE, there=False)

@@ -42,7 +42,7 @@ class Stage:
 
     def toy(self, *arguments: str, mode: str = "serve") -> subprocess.Popen[bytes]:
         return self.processes.start(
-            "tests.common.transport.toy", "--cell", CELL, "--domain", str(self.domain),
+            "tests.common.process.toy", "--cell", CELL, "--domain", str(self.domain),
             "--set", f"services.toy.mode={mode}", *arguments,
         )
 

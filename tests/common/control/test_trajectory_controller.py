@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.hardware.controller import LARGEST_STEP
-from common.hardware.goals import REMEMBERED
+from common.control.controller import LARGEST_STEP
+from common.control.goals import REMEMBERED
 from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware
 from tests.common.hardware.rig import START, STEP, T0, Rig

@@ -1,4 +1,4 @@
-"""Whether the service of a container is ready: `python -m common.transport.health`, exit code 0 or 1.
+"""Whether the service of a container is ready: `python -m common.process.health`, exit code 0 or 1.
 
 It asks the router for the service's readiness token, which also vanishes when the process is frozen or cut off. One
 that is frozen it ends, for the engine to start it again. It imports nothing but Zenoh, because it is started every
@@ -13,12 +13,11 @@ import re
 import sys
 from pathlib import Path
 
-import zenoh
-
-from common.security.credentials import ROUTER_NAME, common_name, credentials_of, secure_folder
-from common.transport.endpoint import client_config, endpoint_of
-from common.transport.frozen import end_if_frozen
+from common.process.frozen import end_if_frozen
+from common.transport.credentials import ROUTER_NAME, common_name, credentials_of, secure_folder
+from common.transport.endpoint import endpoint_of
 from common.transport.keys import ROUTER, alive_key
+from common.transport.router import is_reached
 
 TIMEOUT = 1.0  # [s]
 FIRST_PROCESS = Path("/proc/1/cmdline")
@@ -36,15 +35,7 @@ def is_ready(endpoint: str, cell: str, service: str) -> bool:
     folder = secure_folder()
     name = ROUTER_NAME if service == ROUTER else common_name(cell, service)
     credentials = credentials_of(name, folder) if folder else None
-    try:
-        session = zenoh.open(client_config(endpoint, connect_ms=int(TIMEOUT * 1000), credentials=credentials))
-    except zenoh.ZError:
-        return False
-    with session:
-        if service == ROUTER:
-            return True
-        replies = session.liveliness().get(alive_key(cell, service), timeout=TIMEOUT)
-        return any(reply.ok is not None for reply in replies)
+    return is_reached(endpoint, "" if service == ROUTER else alive_key(cell, service), TIMEOUT, credentials)
 
 
 def main() -> int:
