@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from common.applications.pick_place.detector import Detector
 from common.config import Surroundings, load_cell
-from common.perception.detector import Detector
-from common.perception.drawing import draw
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import wholly_in_view
 from common.robot.model import RobotModel
 from common.scene.workspace import reach_reason
+from common.sim.drawing import draw
 
 Array = npt.NDArray[np.float64]
 Shape = Callable[[np.random.Generator], Array]

@@ -16,16 +16,16 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from common.applications.outlining.contours import ContourOptions, find_contours, is_hole
+from common.applications.outlining.duplicates import simplified, without_duplicates
+from common.applications.outlining.top_face import TopFaceOptions, top_face
 from common.config import RobotConfig, Surroundings, World, check, config_root, find_file, read_robot, read_yaml
 from common.messages import Header, JointState, WorldObject
-from common.perception.contours import ContourOptions, find_contours, is_hole
-from common.perception.duplicates import simplified, without_duplicates
 from common.perception.pinhole import Pinhole
-from common.perception.ray_caster import Mesh, View, cast, empty_view
-from common.perception.top_face import TopFaceOptions, top_face
 from common.robot.model import RobotModel
 from common.sim.depth_view import GROUND, DepthView
 from common.sim.objects import world_object
+from common.sim.ray_caster import Mesh, View, cast, empty_view
 from common.sim.solids import fixture_mesh, object_mesh
 
 Array = npt.NDArray[np.float64]

@@ -29,7 +29,7 @@ def require_terminal() -> None:
 async def ask(bus: Bus, folder: Path) -> None:
     """Store the picture with its contours in a folder, and ask until one of them is chosen."""
     from common import topics
-    from common.perception.contours_choice import NoSuchContour, described, parse_choice
+    from common.applications.outlining.contours_choice import NoSuchContour, described, parse_choice
 
     contours, images = bus.reader(topics.CONTOURS), bus.reader(topics.CONTOUR_IMAGE)
     select = bus.client(topics.OUTLINE_SELECT)

@@ -106,9 +106,9 @@ def choices(
     if not ask and source is None:
         return given
     from cli.asking import CHOOSE_BY_HAND, require_terminal
+    from common.applications.outlining.stage_files import CLEARED, read_coordinates
     from common.config import load_cell
     from common.errors import ConfigError
-    from common.perception.stage_files import CLEARED, read_coordinates
 
     for option, wanted in (("--ask", ask), ("--from", source is not None)):
         if wanted and load_cell(cell, given, world=world).task != "contour_tracer":

@@ -146,7 +146,7 @@ def select(
 ) -> None:
     """Choose the object to outline."""
     from common import topics
-    from common.perception.contours_choice import parse_choice
+    from common.applications.outlining.contours_choice import parse_choice
 
     wanted = parse_choice(which)
     if wanted is None:

@@ -41,8 +41,8 @@ def snapshot(
     """
     from cli.inspection import inspect
     from cli.operation import Operation
+    from common.applications.outlining.contours_choice import parse_choice
     from common.config import load_cell
-    from common.perception.contours_choice import parse_choice
     from common.supervision.launch import place_of, require_free_port
     from common.transport.endpoint import endpoint_of
     from common.transport.router import PortInUse
@@ -78,7 +78,7 @@ async def store(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
     import asyncio
 
     from common import topics
-    from common.perception import stage_files
+    from common.applications.outlining import stage_files
     from common.perception.depth_intake import depth_of
     from common.perception.intake import colour_picture
 
@@ -130,8 +130,8 @@ def outline(
     overrides: options.Overrides = None, world: options.WorldName = None,
 ) -> None:
     """Find the outline in the files of a folder, write its stages there and plan its tracing; nothing moves."""
+    from common.applications.outlining.contours_choice import parse_choice
     from common.config import load_cell
-    from common.perception.contours_choice import parse_choice
 
     wanted = parse_choice(select)
     if wanted is None:
@@ -140,14 +140,14 @@ def outline(
 
 
 def _stages(cell: Cell, place: Path, wanted: OutlineSelect, *, keep: bool) -> None:
+    from common.applications.outlining import stage_files
+    from common.applications.outlining.legs import Legs
+    from common.applications.outlining.offline import perceive, plan_outline
+    from common.applications.outlining.scene import planning_scene
     from common.config import Surroundings, service_config
-    from common.perception import stage_files
     from common.perception.pinhole import Pinhole
     from common.planning.pipeline import PlanningPipeline
     from common.robot.model import RobotModel
-    from common.scene.outline_scene import planning_scene
-    from common.tasks.outline_legs import Legs
-    from common.tasks.outline_offline import perceive, plan_outline
     from services import contour_detector, contour_tracer, duplicate_remover, pixel_to_world
 
     around = cell.section(Surroundings)

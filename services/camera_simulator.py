@@ -8,11 +8,11 @@ from pydantic import Field
 from common import topics
 from common.config import Parameters, Run, Surroundings, Tunable
 from common.messages import PoseArray
-from common.perception.drawing import draw
 from common.perception.image import array_to_image
 from common.perception.pinhole import Pinhole
 from common.process.pace import Pace
 from common.process.service import main
+from common.sim.drawing import draw
 from common.transport.bus import Bus
 
 UNSEEN = ("held", "elsewhere")  # hidden by the hand; off the table

@@ -9,12 +9,12 @@ import cv2
 from pydantic import Field
 
 from common import topics
+from common.applications.outlining.contours import ContourOptions, Picture, find_contours
+from common.applications.outlining.contours_choice import NoSuchContour, parse_choice
+from common.applications.outlining.contours_drawing import annotate_contours
+from common.applications.outlining.contours_following import Following
 from common.errors import ConfigError, Refused
 from common.messages import Contour, Contours, Image, OutlineSelect, OutlineSelection
-from common.perception.contours import ContourOptions, Picture, find_contours
-from common.perception.contours_choice import NoSuchContour, parse_choice
-from common.perception.contours_drawing import annotate_contours
-from common.perception.contours_following import Following
 from common.perception.image import array_to_image
 from common.perception.intake import Unusable, colour_picture
 from common.process.service import main

@@ -5,14 +5,14 @@ from __future__ import annotations
 import uuid
 
 from common import topics
+from common.applications.outlining.legs import OutlineView
+from common.applications.outlining.task import Outline, OutlineParameters
 from common.config import RobotConfig, Run
 from common.errors import ConfigError
 from common.process.service import main
 from common.process.task_runner import TaskRunner
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
-from common.tasks.outline import Outline, OutlineParameters
-from common.tasks.outline_legs import OutlineView
 from common.tasks.reliance import Reliance
 from common.transport.bus import Bus
 

@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import Field
 
 from common import topics
+from common.applications.outlining.duplicates import simplified, without_duplicates
+from common.applications.outlining.stage_files import StageFileError, read_coordinates
 from common.config import Parameters, Tunable
 from common.errors import ConfigError
 from common.messages import OutlinePoints, Pose, Vector3
-from common.perception.duplicates import simplified, without_duplicates
-from common.perception.stage_files import StageFileError, read_coordinates
 from common.process.service import main
 from common.transport.bus import Bus
 

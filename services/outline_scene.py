@@ -6,13 +6,13 @@ import asyncio
 from collections import deque
 
 from common import topics
+from common.applications.outlining.perceived_solids import perceived_solids
+from common.applications.outlining.scene import HomeWatch, planning_scene
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Contours, Image
 from common.perception.image import ImageError, image_to_array
 from common.perception.intake import Cameras, Unusable
-from common.perception.perceived_solids import perceived_solids
 from common.process.service import main
-from common.scene.outline_scene import HomeWatch, planning_scene
 from common.transport.bus import Bus
 
 KEPT = 5  # depth images that wait for their contours

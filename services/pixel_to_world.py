@@ -6,14 +6,14 @@ import asyncio
 from collections import OrderedDict
 
 from common import topics
+from common.applications.outlining.contours import is_hole
+from common.applications.outlining.top_face import TopFace, TopFaceOptions, top_face
 from common.errors import ZencellError
 from common.messages import Contours, Header, Image, OutlinePoints, Pose, Vector3
-from common.perception.contours import is_hole
 from common.perception.depth import check_depth
 from common.perception.depth_intake import depth_of
 from common.perception.intake import camera_of
 from common.perception.pinhole import Pinhole
-from common.perception.top_face import TopFace, TopFaceOptions, top_face
 from common.process.service import main
 from common.transport.bus import Bus
 

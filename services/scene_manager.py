@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 
 from common import topics
+from common.applications.pick_place.perceived import PerceivedScene
+from common.applications.pick_place.tracks import SceneParameters
 from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError
 from common.perception.intake import Cameras, Unusable
 from common.process.service import main
 from common.robot.model import RobotModel
-from common.scene.perceived import PerceivedScene
-from common.scene.tracks import SceneParameters
 from common.transport.bus import Bus
 
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import uuid
 
 from common import topics
+from common.applications.pick_place.parameters import PickPlaceParameters
+from common.applications.pick_place.stages import View
+from common.applications.pick_place.task import PickPlace
 from common.config import Grasp, RobotConfig, Run, Surroundings
 from common.errors import ConfigError
 from common.process.service import main
 from common.process.task_runner import TaskRunner
 from common.robot.model import RobotModel
-from common.tasks.pick_place import PickPlace
-from common.tasks.pick_place_parameters import PickPlaceParameters
 from common.tasks.reliance import Reliance
-from common.tasks.stages import View
 from common.transport.bus import Bus
 
 

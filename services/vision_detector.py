@@ -7,10 +7,10 @@ from collections import Counter
 import cv2
 
 from common import topics
+from common.applications.pick_place.annotation import annotate
+from common.applications.pick_place.detector import Detection, Detector, DetectorOptions
 from common.config import Surroundings
 from common.messages import Color, Header, Marker, MarkerArray, Pose, Vector3
-from common.perception.annotation import annotate
-from common.perception.detector import Detection, Detector, DetectorOptions
 from common.perception.image import array_to_image
 from common.perception.intake import Cameras, Unusable, picture_of
 from common.process.service import main

@@ -9,13 +9,13 @@ from contextlib import suppress
 from pydantic import Field
 
 from common import topics
+from common.applications.pick_place.validation import Validation
 from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
 from common.perception.intake import Cameras, Unusable
 from common.perception.pinhole import Pinhole
 from common.process.service import main
 from common.robot.model import RobotModel
-from common.scene.validation import Validation
 from common.scene.workspace import ReachCache, WorkspaceBounds
 from common.transport.bus import Bus
 

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from common.config import Surroundings
 from common.messages import JointState, WorldObject
 from common.perception.pinhole import Pinhole
-from common.perception.ray_caster import Mesh, View, cast, empty_view
 from common.robot.model import RobotModel
+from common.sim.ray_caster import Mesh, View, cast, empty_view
 from common.sim.robot_shapes import robot_shapes
 from common.sim.solids import fixture_mesh, object_mesh, placed
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from common.config import Fixture
 from common.messages import WorldObject
-from common.perception.ray_caster import Mesh
 from common.robot.transforms import rpy_to_matrix, transform
 from common.sim.objects import circle
+from common.sim.ray_caster import Mesh
 
 Array = NDArray[np.float64]
 

@@ -19,9 +19,9 @@ import pytest
 
 from benchmarks.runs import RunningCell, command_line, environment, free_domain, until
 from common import topics
+from common.applications.outlining import stage_files
 from common.config import load_cell
 from common.messages import OutlineStatus, SupervisorStatus
-from common.perception import stage_files
 
 pytestmark = pytest.mark.cell
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cli.main import app
-from common.perception import stage_files
+from common.applications.outlining import stage_files
 
 
 @pytest.fixture

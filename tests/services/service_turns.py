@@ -14,16 +14,16 @@ import numpy as np
 
 from common import messages as m
 from common import topics
+from common.applications.outlining.contours import ContourOptions, find_contours
 from common.clock import Clock
 from common.config import Parameters, load_cell, service_config
 from common.config.tunables import tunable_sections
-from common.perception.contours import ContourOptions, find_contours
-from common.perception.drawing import draw
 from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
+from common.sim.drawing import draw
 from common.sim.objects import world_object
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork

@@ -16,8 +16,8 @@ from common.config.tunables import apply, checked, leaves, tunable_sections
 from common.messages import OutlinePoints, PlanRequest
 from common.robot.transforms import tool_down
 from common.sim.world import GraspTolerances, SimulatedWorld
-from tests.common.tasks.cell_double import CellDouble
-from tests.common.tasks.outline_double import OutlineDouble
+from tests.common.applications.outlining.outline_double import OutlineDouble
+from tests.common.applications.pick_place.cell_double import CellDouble
 from tests.services.service_turns import CELLS, SCENARIOS, Running, config_of
 from tests.services.watched_reading import Watch
 

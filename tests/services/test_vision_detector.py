@@ -8,12 +8,12 @@ from common import topics
 from common.config import Surroundings, check
 from common.errors import ConfigError
 from common.messages import Header, Image, TFMessage, TransformStamped
-from common.perception.drawing import draw
 from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.process.wiring import wiring
 from common.robot.transforms import matrix_to_pose
+from common.sim.drawing import draw
 from common.transport.local import LocalNetwork
 from services.vision_detector import Config, run
 

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 
 from common.perception.calibration_board import Board, BoardOptions
-from common.perception.drawing import RIM_WIDTH, draw
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, rpy_to_matrix, transform
+from common.sim.drawing import RIM_WIDTH, draw
 
 FINER = 2  # rays along each side of a pixel
 

@@ -7,7 +7,7 @@ from common.perception.depth_intake import depth_of
 from common.perception.image import array_to_image
 from common.perception.intake import Unusable, colour_picture
 from common.perception.point_cloud import point_cloud
-from tests.common.perception.outline_scenes import seen_world
+from tests.common.applications.outlining.outline_scenes import seen_world
 
 HEADER = Header(frame_id="camera")
 

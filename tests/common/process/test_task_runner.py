@@ -9,9 +9,9 @@ from typing import Any
 
 from common import messages as m
 from common import topics
+from common.applications.outlining.legs import OutlineView
 from common.process.in_process import running_service
 from common.process.task_runner import Command, TaskRunner
-from common.tasks.outline_legs import OutlineView
 from common.tasks.reliance import Reliance
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
@@ -108,7 +108,7 @@ async def test_only_the_newest_hold_and_no_motion_after_a_stop_reach_an_executor
 async def test_a_watchdog_and_a_person_do_not_make_each_others_holds_void() -> None:
     net = LocalNetwork()
     watchdog = m.HoldRequest(hold=True, reason="no joint states", by="watchdog")
-    async with running_service(net, watchdog):
+    async with running(net, watchdog):
         await tell(net, "pause")
         executor = Executor(net)
         await executor.bus.ready()

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from common import messages as m
 from common.tasks.reliance import LOOK_PERIOD, Reliance
-from tests.common.tasks.cell_double import CellDouble
-from tests.common.tasks.outline_double import OutlineDouble
+from tests.common.applications.outlining.outline_double import OutlineDouble
+from tests.common.applications.pick_place.cell_double import CellDouble
 
 ACTIVE, IDLE = m.MotionStatus(id="a", state="active"), m.MotionStatus()
 PLANNER, EXECUTOR = "motion_planner", "trajectory_executor"

@@ -1,0 +1,200 @@
+"""Find balls of known size and colour in a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
+
+from common.applications.pick_place.blobs import Blob, Mask, find_blobs
+from common.applications.pick_place.fit import fit_each, fit_spheres
+from common.applications.pick_place.separation import separate
+from common.config import Parameters, Surroundings, Tunable
+from common.perception.pinhole import Pinhole
+from common.perception.resting import Resting
+from common.perception.sphere import ray_distances, silhouettes
+
+Array = npt.NDArray[np.float64]
+Picture = npt.NDArray[np.uint8]
+
+_ROUND = 0.96  # part of an outline that must fit for a blob to be one ball
+
+Hue = Annotated[int, Field(ge=0, le=180)]
+Byte = Annotated[int, Field(ge=0, le=255)]
+Hsv = tuple[Hue, Byte, Byte]
+
+
+class DetectorOptions(Parameters):
+    """How red is told from the rest. HSV as OpenCV has it: hue 0 to 180, saturation and value 0 to 255."""
+
+    hsv_red_lo1: Tunable[Hsv] = Field((0, 120, 80), description="lower end of the first window: hue, saturation, value")
+    hsv_red_hi1: Tunable[Hsv] = Field((10, 255, 255), description="upper end of the first window")
+    hsv_red_lo2: Tunable[Hsv] = Field(
+        (170, 120, 80), description="lower end of the second window: red goes round the hue axis"
+    )
+    hsv_red_hi2: Tunable[Hsv] = Field((180, 255, 255), description="upper end of the second window")
+    morph_kernel_px: Tunable[int] = Field(7, ge=1, le=51, description="ellipse for opening, then closing [px]")
+    min_contour_area_px: Tunable[float] = Field(400.0, gt=0, le=1e7, description="smaller blobs are ignored [px^2]")
+    outline_offset_px: Tunable[float] = Field(
+        -1.0, ge=-10, le=10, description="where the outline is expected, outside of the silhouette [px]"
+    )
+    max_offset_px: Tunable[float] = Field(
+        2.0, gt=0, le=20, description="an outline that is further from where it is expected is not that of a ball [px]"
+    )
+
+    @model_validator(mode="after")
+    def _windows_are_not_empty(self) -> DetectorOptions:
+        for low, high in (("hsv_red_lo1", "hsv_red_hi1"), ("hsv_red_lo2", "hsv_red_hi2")):
+            for name, a, b in zip("hsv", getattr(self, low), getattr(self, high), strict=True):
+                if a > b:
+                    raise ValueError(f"{low} {name} = {a} is above {high} {name} = {b}")
+        return self
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A ball that was seen.
+
+    Attributes:
+        position: (3,) where the ray of its centre meets the plane of the centres of balls on the table [m], world.
+        pixel: (u, v) where its centre is seen [px].
+        area: of the blob that it is part of, divided by the balls in it [px^2].
+        partial: reaches over the border of the picture.
+        outline: (n, 2) its fitted silhouette [px].
+    """
+
+    position: tuple[float, float, float]
+    pixel: tuple[float, float]
+    area: float
+    partial: bool
+    outline: Array
+
+
+@dataclass(frozen=True)
+class _Seen:
+    center: Array  # (3,) relative to the optical centre [m]
+    area: float  # [px^2]
+    border: Array  # (m, 2) pixels of its blob at the border of the picture
+
+
+class Detector:
+    """Finds balls: the same picture always gives the same detections."""
+
+    def __init__(self, surroundings: Surroundings, options: DetectorOptions | None = None) -> None:
+        """Prepare for balls of the surroundings' size.
+
+        Args:
+            surroundings: radius of the balls, height of the table, container.
+            options: colour windows and sizes; they may change between pictures.
+        """
+        self.options = options or DetectorOptions()
+        self.resting = Resting.of(surroundings)
+        self._last: tuple[Picture, Pinhole, DetectorOptions, list[Detection]] | None = None
+
+    def masks(self, picture: Picture) -> tuple[Mask, Mask]:
+        """What is red in a bgr8 picture: opened, and then closed; 255 where it is."""
+        o, size = self.options, self.options.morph_kernel_px
+        hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
+        low = cv2.inRange(hsv, np.array(o.hsv_red_lo1), np.array(o.hsv_red_hi1))
+        high = cv2.inRange(hsv, np.array(o.hsv_red_lo2), np.array(o.hsv_red_hi2))
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+        opened = cv2.morphologyEx(cv2.bitwise_or(low, high), cv2.MORPH_OPEN, kernel)
+        closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel)
+        return np.asarray(opened, np.uint8), np.asarray(closed, np.uint8)
+
+    def detect(self, picture: Picture, camera: Pinhole) -> list[Detection]:
+        """Balls in a bgr8 picture (height, width, 3), nearest to the upper left corner first.
+
+        A picture that is the last one again, as drawn ones without noise often are, is not looked at again.
+        """
+        last = self._last
+        if last and camera is last[1] and self.options == last[2] and np.array_equal(picture, last[0]):
+            return list(last[3])
+        found = self._look_at(picture, camera)
+        self._last = (picture.copy(), camera, self.options.model_copy(), found)
+        return list(found)
+
+    def _look_at(self, picture: Picture, camera: Pinhole) -> list[Detection]:
+        fine, closed = self.masks(picture)
+        blobs = find_blobs(closed, fine, camera, self.options.min_contour_area_px)
+        pixel_size = abs(float(camera.position[2]) - self.resting.plane) / camera.fx  # at the plane of the balls
+        offset = self.options.outline_offset_px * pixel_size
+        seen: list[_Seen] = []
+        alone, crowded, offsets = self._alone(blobs, camera, offset, pixel_size)
+        seen += alone
+        # All outlines of a picture are off by as much: balls that stand alone say by how much.
+        spread = 1.0 * pixel_size
+        if offsets:
+            offset, spread = float(np.median(offsets)), 0.2 * pixel_size
+        for blob in crowded:  # balls that touch, hide each other or reach over the border
+            centers = separate(blob.outline, closed, camera, self.resting, offset)
+            if len(centers):
+                fit = fit_spheres(blob.outline, centers, self.resting.radius, offset=offset, offset_std=spread)
+                seen += [_Seen(center, blob.area / len(centers), blob.border) for center in fit.centers]
+        return sorted(self._detections(seen, camera), key=lambda d: (d.pixel[1], d.pixel[0]))
+
+    def _alone(
+        self, blobs: list[Blob], camera: Pinhole, offset: float, pixel_size: float
+    ) -> tuple[list[_Seen], list[Blob], list[float]]:
+        """Blobs that are one ball wholly in view, blobs that are not round, and the offsets of the former [m].
+
+        What is round but as large as no ball looks where it can lie is left out: it is something else, or falling.
+        """
+        crowded, tried, starts = [], [], []
+        for index, blob in enumerate(blobs):
+            center = camera.on_plane(blob.centroid, self.resting.plane)
+            if len(blob.border) or len(blob.outline) < 12 or not np.isfinite(center).all():
+                crowded.append(blob)
+                continue
+            ray = np.append(center, self.resting.plane) - camera.position
+            for z in self.resting.heights(camera, blob.centroid):
+                tried.append(index)
+                starts.append(ray * ((z - camera.position[2]) / ray[2]))
+        if not tried:
+            return [], crowded, []
+        centers, offsets, close = fit_each(
+            [blobs[index].outline for index in tried], np.array(starts), self.resting.radius, offset=offset,
+            gates=(self.resting.radius, 4 * pixel_size, 3 * pixel_size), close=1.3 * pixel_size,
+        )
+        alone, found = [], []
+        for index in dict.fromkeys(tried):
+            mine = [k for k, other in enumerate(tried) if other == index]
+            if min(close[mine]) < _ROUND:
+                crowded.append(blobs[index])
+                continue
+            best = min(mine, key=lambda k: abs(offsets[k] - offset))
+            if abs(offsets[best] - offset) <= self.options.max_offset_px * pixel_size:
+                alone.append(_Seen(centers[best], blobs[index].area, blobs[index].border))
+                found.append(float(offsets[best]))
+        return alone, crowded, found
+
+    def _detections(self, seen: list[_Seen], camera: Pinhole) -> list[Detection]:
+        if not seen:
+            return []
+        centers = np.array([one.center for one in seen]) + camera.position
+        pixels = camera.project(centers)
+        places = camera.on_plane(pixels, self.resting.plane)
+        outlines = silhouettes(camera, centers, self.resting.radius, 32)
+        inside = np.asarray(camera.in_picture(outlines).all(axis=1))
+        return [
+            Detection(
+                position=(float(places[k, 0]), float(places[k, 1]), self.resting.plane),
+                pixel=(float(pixels[k, 0]), float(pixels[k, 1])),
+                area=one.area,
+                partial=not inside[k] or self._cut(one, camera),
+                outline=outlines[k],
+            )
+            for k, one in enumerate(seen)
+            if np.isfinite(places[k]).all() and np.isfinite(outlines[k]).all()
+        ]
+
+    def _cut(self, seen: _Seen, camera: Pinhole) -> bool:
+        """Whether the picture's border cuts through the ball: its blob touches it there."""
+        if not len(seen.border):
+            return False
+        distance, _ = ray_distances(camera.directions(seen.border), seen.center[None])
+        return bool((distance < self.resting.radius).any())

@@ -1,0 +1,150 @@
+"""A cell without a network: answers the task's requests at once, with a world of its own."""
+
+from __future__ import annotations
+
+import math
+
+from common import messages as m
+from common.applications.pick_place.parameters import PickPlaceParameters
+from common.applications.pick_place.stages import View
+from common.applications.pick_place.task import PickPlace
+from common.config import load_cell
+
+CELL = load_cell("panda")
+
+
+class CellDouble:
+    """Balls on a table; plans succeed, motions take five steps, fingers hold what lies at the tool."""
+
+    def __init__(self, balls: list[tuple[float, float]], **parameters: object) -> None:
+        assert CELL.robot.gripper is not None
+        self.task = PickPlace(PickPlaceParameters(**parameters), CELL.grasp, CELL.world, CELL.robot.gripper, "t")
+        self.balls = {f"track_{k}": (x, y, 0.03) for k, (x, y) in enumerate(balls)}
+        self.unreachable: list[tuple[float, float]] = []
+        self.held: str = ""
+        self.contained = 0
+        self.now = 100.0
+        self.tcp = (0.3, 0.0, 0.5)
+        self.motion = m.MotionStatus()
+        self.gripper = m.GripperState(width=0.08)
+        self.requests: list[m.Message] = []
+        self.unplannable = lambda request: ""  # noqa: E731 - replaced by tests
+        self.slips = 0  # closes that will hold nothing
+        self.camera_on = True
+        self.camera_ahead = 0.0  # [s] its clock
+        self.late = 0  # motions that will reach the controller too late
+        self._stamp = self.now
+        self._arrival = 0.0
+        self._ends: list[m.ExecuteRequest] = []
+        self._goals: dict[str, m.Pose] = {}
+
+    def view(self) -> View:
+        if self.camera_on:
+            self._stamp = self.now + self.camera_ahead
+        objects = [self._sphere(name, "target", p) for name, p in self.balls.items()]
+        objects += [self._sphere(f"slot_{k}", "contained", (0.55, 0.25, 0.035)) for k in range(self.contained)]
+        attached = []
+        if self.held:
+            attached = [m.AttachedObject(link="panda_hand_tcp", object=self._sphere(self.held, "attached", (0, 0, 0)))]
+        header = m.Header(stamp=int(self._stamp * 1e9), frame_id="world")
+        reachable = [p for p in self.balls.values() if p[:2] not in self.unreachable]
+        scene = m.PlanningScene(header=header, objects=objects, attached=attached)
+        return View(self.now, reachable, self._stamp, scene, self.gripper, self.motion, self.tcp)
+
+    @staticmethod
+    def _sphere(name: str, role: str, p: tuple[float, float, float]) -> m.CollisionObject:
+        return m.CollisionObject.model_validate({
+            "id": name, "role": role, "shape": "sphere", "dimensions": [0.03],
+            "pose": m.Pose(position=m.Vector3(x=p[0], y=p[1], z=p[2])),
+        })
+
+    def tell(self, command: str) -> list[m.Message]:
+        """Say something to the task; what it asks for is answered."""
+        asked: list[m.Message] = list(self.task.command(command, self.view()))
+        for request in asked:
+            self.answer(request)
+        return asked
+
+    def step(self) -> list[m.Message]:
+        """One step of the task; every request is answered before the next."""
+        self.now += 0.1
+        if self.motion.held:
+            self._arrival += 0.1
+        elif self._ends and self.now >= self._arrival:
+            self._arrive(self._ends.pop())
+        asked: list[m.Message] = list(self.task.step(self.view()))
+        for request in asked:
+            self.answer(request)
+        return asked
+
+    def answer(self, request: m.Message) -> None:
+        self.requests.append(request)
+        header = m.Header(stamp=int(self.now * 1e9))
+        if isinstance(request, m.PlanRequest):
+            error = self.unplannable(request)
+            if isinstance(request.goal, m.PoseGoal):
+                self._goals[request.id] = request.goal.pose
+            point = m.JointTrajectoryPoint(time_from_start=0, positions=[0.0], velocities=[0.0], accelerations=[0.0])
+            trajectory = m.JointTrajectory(header=m.Header(frame_id=request.id), joint_names=["j"], points=[point])
+            self.task.on_plan(m.PlanResponse(id=request.id, ok=not error, trajectory=None if error else trajectory,
+                                             error=error, message=error and f"{request.stage}: {error}",
+                                             planner="double", seconds=0.01, fraction=1.0), self.view())
+        elif isinstance(request, m.ExecuteRequest) and self.late:
+            self.late -= 1
+            refused = m.MotionStatus(id=request.id, state="rejected", error="stale_request", message="it is 10 s old")
+            self.task.on_goal(refused, self.view())
+        elif isinstance(request, m.ExecuteRequest):
+            self.motion = m.MotionStatus(header=header, id=request.id, state="active", held=self.motion.held)
+            self.task.on_goal(self.motion, self.view())
+            self._ends.append(request)
+            self._arrival = self.now + 0.45
+        elif isinstance(request, m.GripperCommand):
+            self._grip(request, header)
+        elif isinstance(request, m.StopRequest):
+            if self.motion.state == "active":
+                self._ends.clear()
+                self.motion = self.motion.model_copy(update={"header": header, "state": "cancelled"})
+        elif isinstance(request, m.HoldRequest):
+            self.motion = self.motion.model_copy(update={"header": header, "held": request.hold})
+
+    def _arrive(self, request: m.ExecuteRequest) -> None:
+        pose = self._goals.get(request.trajectory.header.frame_id)
+        if pose is not None:
+            self.tcp = (pose.position.x, pose.position.y, pose.position.z)
+        self.motion = m.MotionStatus(header=m.Header(stamp=int(self.now * 1e9)), id=request.id, state="succeeded")
+
+    def _grip(self, request: m.GripperCommand, header: m.Header) -> None:
+        if request.width > 0.06 and self.held:
+            if math.dist(self.tcp[:2], (0.55, 0.25)) < 0.03:
+                self.contained += 1
+            else:
+                self.balls[self.held] = (*self.tcp[:2], 0.03)
+            self.held = ""
+        elif request.width < 0.06 and not self.slips:
+            for name, p in self.balls.items():
+                if math.dist(p, self.tcp) < 0.01:
+                    self.held = name
+            self.balls.pop(self.held, None)
+        elif request.width < 0.06:
+            self.slips -= 1
+        self.gripper = m.GripperState(header=header, id=request.id, state="succeeded", holding=bool(self.held),
+                                      width=0.06 if self.held else request.width)
+        self.task.on_goal(self.gripper, self.view())
+
+    def drop(self) -> None:
+        """The held ball falls on the table below."""
+        self.balls[self.held] = (*self.tcp[:2], 0.03)
+        self.held = ""
+        self.gripper = self.gripper.model_copy(update={"holding": False, "width": 0.0})
+
+    def until(self, condition: str, most: int = 2000) -> None:
+        """Step until an expression about the status (a state, a stage) is true."""
+        for _ in range(most):
+            self.step()
+            if condition in (self.task.status.state, self.task.status.stage):
+                return
+        raise AssertionError(f"never {condition}: {self.task.status}")
+
+    def stages(self) -> list[str]:
+        """Stages for which a plan was asked, in order."""
+        return [r.stage for r in self.requests if isinstance(r, m.PlanRequest)]

@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from common.applications.pick_place.grasp import HandShape, finger_clearance, grasp_yaws, yaw_candidates
+from common.config import Container
+from common.robot.transforms import tool_down
+
+HAND = HandShape()
+
+
+def test_yaws_cover_half_a_turn_evenly_and_begin_with_the_least() -> None:
+    yaws = yaw_candidates(8)
+    assert yaws[0] == 0
+    assert sorted(round(math.degrees(y), 1) for y in yaws) == [-67.5, -45, -22.5, 0, 22.5, 45, 67.5, 90]
+
+
+def test_lone_ball_is_taken_without_turning() -> None:
+    assert grasp_yaws(HAND, (0.4, 0.0), [], 0.03)[0] == 0
+
+
+def test_neighbour_along_the_fingers_forces_a_turn() -> None:
+    axis = tool_down(0, 0, 0, 0.0)[:2, 1]
+    neighbour = tuple(np.array([0.4, 0.0]) + 0.07 * axis)
+    yaws = grasp_yaws(HAND, (0.4, 0.0), [neighbour], 0.03)
+    assert yaws and 0 not in yaws
+
+
+@pytest.mark.parametrize("yaw", yaw_candidates(8))
+def test_clearance_is_least_along_the_finger_axis_of_that_yaw(yaw: float) -> None:
+    axis = tool_down(0, 0, 0, yaw)[:2, 1]
+    side = tool_down(0, 0, 0, yaw)[:2, 0]
+    along = finger_clearance(HAND, (0, 0), yaw, [tuple(0.08 * axis)], 0.03)
+    across = finger_clearance(HAND, (0, 0), yaw, [tuple(0.08 * side)], 0.03)
+    assert along == pytest.approx(0.08 - 0.056 - 0.03)
+    assert across > along
+
+
+def test_ring_of_touching_neighbours_leaves_no_yaw() -> None:
+    ring = [(0.4 + 0.062 * math.cos(a), 0.062 * math.sin(a)) for a in np.arange(6) * math.pi / 3]
+    assert grasp_yaws(HAND, (0.4, 0.0), ring, 0.03) == []
+
+
+def test_walls_of_the_container_are_cleared() -> None:
+    box = Container()
+    beside = (box.x, box.y - box.half_side - 0.045)
+    assert finger_clearance(HAND, beside, 0.0, [], 0.03, box) < 0
+    assert finger_clearance(HAND, beside, math.pi / 2, [], 0.03, box) > 0.02

@@ -1,0 +1,312 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common import messages as m
+from tests.common.applications.pick_place.cell_double import CELL, CellDouble
+
+SEVEN = [tuple(spot) for spot in CELL.world.spots[:7]]
+
+
+def test_seven_balls_end_in_the_container_and_the_task_is_done() -> None:
+    cell = CellDouble(SEVEN)
+    cell.until("DONE")
+    assert (cell.contained, cell.balls, cell.task.status.placed) == (7, {}, 7)
+    assert cell.task.status.failures == 0
+
+
+def test_nearest_ball_is_taken_first() -> None:
+    cell = CellDouble([(0.6, -0.2), (0.35, 0.0)])
+    cell.until("pre-grasp")
+    assert cell.task.status.target == "track_1"
+
+
+def test_next_pick_is_planned_while_the_ball_is_carried_across() -> None:
+    cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
+    cell.until("across")
+    before = len(cell.stages())
+    cell.step()
+    assert cell.stages()[before:before + 1] == ["pre-grasp"]
+    assert cell.motion.state == "active"
+
+
+def test_planned_ahead_motions_start_where_the_one_before_ends() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.until("DONE")
+    plans = [r for r in cell.requests if isinstance(r, m.PlanRequest)]
+    assert [bool(p.start) for p in plans[:4]] == [False, True, True, True]
+
+
+def test_ball_is_an_obstacle_until_the_descent_then_may_be_touched_then_is_attached() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.until("DONE")
+    plans = {r.stage: r for r in cell.requests if isinstance(r, m.PlanRequest)}
+    assert not plans["pre-grasp"].allowed_collisions and not plans["pre-grasp"].attach
+    assert ("panda_hand", "track_0") in plans["descend"].allowed_collisions and plans["descend"].straight
+    assert plans["lift"].attach == "track_0" and plans["lift"].attach_pose is not None
+    assert plans["across"].attach == "track_0"
+
+
+def test_grasp_that_closes_on_nothing_is_retried_from_a_fresh_picture() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.slips = 2
+    cell.until("DONE")
+    assert (cell.contained, cell.task.status.retries, cell.task.status.failures) == (1, 2, 0)
+    assert cell.stages().count("retreat") == 2
+
+
+def test_place_that_is_always_missed_is_given_up_and_reported() -> None:
+    cell = CellDouble([(0.40, -0.30)], max_retries=2)
+    cell.slips = 1000
+    cell.until("DONE")
+    assert cell.task.status.retries == 3
+    assert "closed on nothing 3 times" in cell.task.status.skipped[0].reason
+
+
+@pytest.mark.parametrize("stage", ["lift", "across"])
+def test_ball_that_falls_on_the_way_is_picked_again(stage: str) -> None:
+    cell = CellDouble([(0.40, -0.30), (0.40, 0.09)])
+    cell.until(stage)
+    cell.drop()
+    asked = cell.step()
+    assert any(isinstance(request, m.StopRequest) for request in asked)
+    cell.until("DONE")
+    assert (cell.contained, cell.task.status.failures) == (2, 1)
+
+
+def test_only_unreachable_balls_left_end_the_task_after_the_grace_period() -> None:
+    cell = CellDouble([(0.40, -0.30), (0.7, 0.4)])
+    cell.unreachable = [(0.7, 0.4)]
+    cell.until("release")
+    released = cell.now
+    cell.until("DONE")
+    assert cell.contained == 1
+    assert cell.now - released >= 8.0
+    assert "1 object" in cell.task.status.message
+
+
+def test_empty_table_ends_the_task_after_a_second() -> None:
+    cell = CellDouble([])
+    start = cell.now
+    cell.until("DONE")
+    assert 1.0 <= cell.now - start < 2.0
+
+
+def test_no_picture_never_ends_the_task_nor_starts_a_motion() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.camera_on = False
+    cell.now += 10
+    for _ in range(300):
+        cell.step()
+    assert cell.task.status.state == "IDLE"
+    assert not any(isinstance(r, m.ExecuteRequest) for r in cell.requests)
+    cell.camera_on = True
+    cell.until("DONE")
+    assert cell.contained == 1
+
+
+def test_pictures_that_stop_coming_do_not_end_the_task_however_fresh_the_last_one_counts() -> None:
+    cell = CellDouble([], frame_timeout=30.0)
+    cell.step()
+    cell.camera_on = False
+    for _ in range(100):
+        cell.step()
+    assert cell.task.status.state == "IDLE"
+    cell.camera_on = True
+    cell.until("DONE")
+
+
+def test_first_picture_after_a_long_time_without_any_does_not_end_the_task() -> None:
+    cell = CellDouble([])
+    cell.camera_on, cell._stamp = False, 0.0  # as a scene manager that has seen nothing yet says
+    cell.step()
+    cell.camera_on = True
+    start = cell.now
+    cell.until("DONE")
+    assert cell.now - start >= 1.0
+
+
+def test_scene_that_shows_nothing_yet_does_not_end_the_task_while_targets_are_seen() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    known, cell.balls = cell.balls, {}
+    for _ in range(50):
+        cell.now += 0.1
+        view = cell.view()
+        view.targets = [(0.40, -0.30, 0.03)]  # a scene manager that was started again has to see it twice
+        assert cell.task.step(view) == []
+        assert cell.task.status.state == "IDLE"
+    cell.balls = known
+    cell.until("DONE")
+    assert cell.contained == 1
+
+
+def test_target_that_can_not_be_planned_is_tried_at_every_yaw_then_skipped_until_the_scene_changes() -> None:
+    cell = CellDouble([(0.40, -0.09), (0.40, 0.30)])
+    cell.unplannable = lambda r: "collision" if (
+        r.stage == "descend" and len(cell.balls) > 1 and r.goal.pose.position.y < 0
+    ) else ""
+    cell.until("DONE")
+    assert cell.contained == 2
+    yaws = cell.task.p.hand.yaw_count
+    assert cell.stages().count("descend") == yaws + 2
+
+
+def test_ball_that_moves_before_the_grasp_is_chosen_anew() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.until("pre-grasp")
+    cell.balls["track_0"] = (0.52, -0.10, 0.03)
+    cell.until("DONE")
+    assert cell.contained == 1
+
+
+def test_ball_added_beside_the_way_makes_what_was_planned_ahead_be_planned_again() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.until("pre-grasp")
+    cell.balls["track_9"] = (0.50, -0.10, 0.03)
+    before = len(cell.stages())
+    cell.until("close")
+    assert cell.stages()[before:][0] == "descend"
+    cell.until("DONE")
+    assert cell.contained == 2
+
+
+def test_ninth_ball_is_reported_because_the_container_is_full() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.contained = 8
+    cell.until("DONE")
+    assert cell.contained == 8
+    assert cell.task.status.skipped[0].reason == "the container is full"
+
+
+def test_balls_are_taken_again_once_the_container_is_emptied_and_nothing_on_the_table_has_changed() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.contained = 8
+    cell.until("DONE")
+    cell.contained = 0
+    cell.until("pre-grasp")
+    assert not cell.task.status.skipped
+    cell.until("DONE")
+    assert cell.contained == 1
+
+
+def test_restart_while_holding_carries_the_ball_to_the_container() -> None:
+    cell = CellDouble([(0.52, -0.04)])
+    cell.balls["track_5"] = (0.40, -0.30, 0.03)
+    cell.until("lift")
+    held = cell.held
+    again = CellDouble([])
+    again.balls, again.held, again.gripper, again.tcp = cell.balls, held, cell.gripper, (0.5, 0.0, 0.03)
+    again.until("across")
+    assert again.stages()[:2] == ["lift", "across"]
+    again.until("DONE")
+    assert (again.contained, again.held) == (2, "")
+
+
+def test_restart_waits_for_what_the_task_before_it_had_begun() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.motion = m.MotionStatus(id="other-1", state="active")
+    for _ in range(20):
+        assert cell.step() == []
+    cell.motion = m.MotionStatus(id="other-1", state="succeeded")
+    cell.until("DONE")
+    assert cell.contained == 1
+
+
+def test_home_only_after_a_failure() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.until("pre-grasp")
+    cell.motion = cell.motion.model_copy(update={"state": "aborted", "message": "path tolerance"})
+    cell._ends.clear()
+    cell.until("HOMING")
+    cell.until("DONE")
+    assert (cell.contained, cell.task.status.failures, cell.stages().count("home")) == (1, 1, 1)
+
+
+def test_failures_in_a_row_end_in_error_and_start_tries_again() -> None:
+    cell = CellDouble([(0.40, -0.30)], max_failures=3)
+    cell.until("pre-grasp")
+    cell.unplannable = lambda r: "no_ik"
+    cell.motion = cell.motion.model_copy(update={"state": "aborted", "message": "path tolerance"})
+    cell._ends.clear()
+    cell.until("DONE")  # the ball is given up, which is no failure of the arm
+    assert cell.task.status.failures >= 2
+    assert cell.task.status.skipped
+
+
+def test_motion_stopped_by_somebody_else_pauses_the_task() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.until("pre-grasp")
+    cell.motion = cell.motion.model_copy(update={"state": "cancelled", "message": "asked to"})
+    cell._ends.clear()
+    cell.step()
+    assert cell.task.status.paused
+    assert cell.step() == []
+    cell.task.command("resume", cell.view())
+    cell.until("DONE")
+
+
+def test_task_that_is_not_started_waits_for_start() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.task.status.started = False
+    for _ in range(50):
+        assert cell.step() == []
+    cell.task.command("start", cell.view())
+    cell.until("DONE")
+
+
+def test_ball_added_after_the_end_is_still_taken() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.until("DONE")
+    cell.balls["track_8"] = (0.52, -0.04, 0.03)
+    cell.until("GRASPING")
+    cell.until("DONE")
+    assert cell.contained == 2
+
+
+def test_start_in_collision_is_left_by_a_retreat_that_may_touch_the_pair() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    failing = ["start_in_collision"]
+
+    def plan(request: m.PlanRequest) -> str:
+        return failing.pop() if failing and request.stage == "pre-grasp" else ""
+
+    cell.unplannable = plan
+    original = cell.task.on_plan
+    cell.task.on_plan = lambda response, view: original(  # type: ignore[method-assign]
+        response.model_copy(update={"colliding": ("panda_hand", "track_0")}) if not response.ok else response, view)
+    cell.until("DONE")
+    retreat = next(r for r in cell.requests if isinstance(r, m.PlanRequest) and r.stage == "retreat")
+    assert ("panda_hand", "track_0") in retreat.allowed_collisions
+    assert cell.contained == 1
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data())
+def test_whatever_slips_falls_moves_or_restarts_every_ball_ends_in_the_container(data: st.DataObject) -> None:
+    cell = CellDouble(SEVEN)
+    for _ in range(data.draw(st.integers(1, 6))):
+        for _ in range(data.draw(st.integers(1, 60))):
+            cell.step()
+        event = data.draw(st.sampled_from(["slip", "drop", "move", "restart", "abort", "forget"]))
+        if event == "slip":
+            cell.slips = 1
+        elif event == "drop" and cell.held and cell.task.status.stage in ("lift", "across"):
+            if all(abs(cell.tcp[0] - p[0]) + abs(cell.tcp[1] - p[1]) > 0.1 for p in cell.balls.values()):
+                cell.drop()
+        elif event == "move" and cell.balls:
+            name = sorted(cell.balls)[0]
+            if all(abs(0.45 - p[0]) + abs(0.05 - p[1]) > 0.15 for p in cell.balls.values()):
+                cell.balls[name] = (0.45, 0.05, 0.03)
+        elif event == "restart":
+            cell.task = CellDouble([]).task
+            cell.task.prefix = f"again{cell.now:.1f}"
+        elif event == "abort" and cell.motion.state == "active":
+            cell._ends.clear()
+            cell.motion = cell.motion.model_copy(update={"state": "aborted"})
+        elif event == "forget" and cell.motion.state == "active":
+            cell._ends.clear()
+            cell.motion = m.MotionStatus(header=m.Header(stamp=int((cell.now + 0.01) * 1e9)))
+    cell.until("DONE", most=5000)
+    assert (cell.contained, cell.balls, cell.held) == (7, {}, "")

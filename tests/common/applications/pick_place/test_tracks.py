@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.applications.pick_place.tracks import SceneParameters, Tracks
+
+
+def tracks(**options: float) -> Tracks:
+    defaults = {"match_radius": 0.08, "confirm_frames": 2, "forget_after": 0.5, "smoothing": 0.5, "still": 0.003}
+    return Tracks(SceneParameters(**{**defaults, **options}))
+
+
+def test_ball_exists_after_two_frames_and_is_forgotten_after_a_while() -> None:
+    t = tracks()
+    t.update([(0.4, 0.0, 0.03)], 1.0)
+    assert t.confirmed() == []
+    t.update([(0.4, 0.0, 0.03)], 1.1)
+    assert [b.id for b in t.confirmed()] == ["track_1"]
+    t.update([], 1.5)
+    assert len(t.confirmed()) == 1
+    t.update([], 1.7)
+    assert t.confirmed() == []
+
+
+def test_touching_balls_keep_their_ids_when_one_is_taken_away() -> None:
+    t = tracks()
+    a, b = (0.40, 0.0, 0.03), (0.46, 0.0, 0.03)
+    for now in (1.0, 1.1):
+        t.update([a, b], now)
+    ids = {b.id: b.position for b in t.confirmed()}
+    t.update([b], 1.2)
+    t.update([b], 1.7)
+    left = t.confirmed()
+    assert len(left) == 1
+    assert ids[left[0].id] == b
+
+
+def test_ball_that_lies_still_is_smoothed_and_one_that_jumps_is_not() -> None:
+    t = tracks()
+    t.update([(0.40, 0.0, 0.03)], 1.0)
+    t.update([(0.402, 0.0, 0.03)], 1.1)
+    assert abs(t.confirmed()[0].position[0] - 0.401) < 1e-9
+    t.update([(0.43, 0.0, 0.03)], 1.2)
+    assert t.confirmed()[0].position[0] == 0.43
+
+
+coordinate = st.floats(0.2, 0.8, allow_nan=False)
+
+
+@given(st.lists(st.lists(st.tuples(coordinate, coordinate, st.just(0.03)), max_size=8), min_size=1, max_size=6))
+def test_matching_is_one_to_one_whatever_is_seen(frames: list[list[tuple[float, float, float]]]) -> None:
+    t = tracks(confirm_frames=1, forget_after=0.0)
+    for number, frame in enumerate(frames):
+        t.update(frame, float(number))
+        found = t.confirmed()
+        assert len(found) == len(frame)
+        assert len({b.id for b in found}) == len(found)

@@ -1,0 +1,134 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.perception.pinhole import Pinhole
+from common.robot.transforms import rpy_to_matrix, transform
+from common.sim.objects import world_object
+from common.sim.ray_caster import Mesh, cast, empty_view
+from common.sim.solids import fixture_mesh, object_mesh
+from tests.common.applications.outlining.outline_scenes import WORLDS, seen_world, world
+
+GREY = (178 / 255,) * 3
+CAMERA = Pinhole(80.0, 80.0, 32.0, 24.0, 64, 48, transform(rpy_to_matrix(-math.pi, 0, math.pi / 2), (0.5, 0, 2.0)))
+
+
+def ray_by_ray(meshes, camera, pixels):
+    """Depth along the optical axis and colour of what each ray meets first, triangle by triangle.
+
+    Möller and Trumbore, "Fast, minimum storage ray/triangle intersection" (1997).
+    """
+    origin, directions = camera.position, camera.directions(pixels)
+    depth, color = np.full(len(pixels), np.inf), np.full((len(pixels), 3), np.nan)
+    forward = camera.T_world_optical[:3, 2]
+    for mesh in meshes:
+        for a, b, c in mesh.corners:
+            e, f = b - a, c - a
+            p = np.cross(directions, f)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                inverse = 1.0 / (p @ e)
+                u = (p @ (origin - a)) * inverse
+                q = np.cross(origin - a, e)
+                v = (directions @ q) * inverse
+                t = (f @ q) * inverse
+            met = np.isfinite(t) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0.01)
+            d = np.where(met, t * (directions @ forward), np.inf)
+            nearer = d < depth - 1e-9
+            depth[nearer], color[nearer] = d[nearer], mesh.color
+    return depth, color
+
+
+def triangles(seed, count):
+    rng = np.random.default_rng(seed)
+    middle = rng.uniform((0.2, -0.4, 0.0), (0.8, 0.4, 2.3), (count, 1, 3))
+    return middle + rng.normal(0, 0.15, (count, 3, 3))
+
+
+@given(seed=st.integers(0, 10**6), count=st.integers(1, 12))
+@settings(max_examples=40, deadline=None)
+def test_every_pixel_of_random_triangles_is_what_its_ray_meets(seed, count):
+    corners = triangles(seed, count)
+    colors = np.random.default_rng(seed).integers(0, 256, (count, 3)) / 255
+    meshes = [Mesh(c[None], tuple(map(float, color))) for c, color in zip(corners, colors, strict=True)]
+    view = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
+    u, v = np.meshgrid(np.arange(64), np.arange(48))
+    depth, _ = ray_by_ray(meshes, CAMERA, np.stack([u, v], axis=-1).reshape(-1, 2).astype(float))
+    expected, got = depth.reshape(48, 64), view.depth.astype(float)
+    same = np.isclose(1 / got, 1 / expected, rtol=1e-4, atol=1e-6)
+    assert (~same).mean() < 0.002  # rays through an edge
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_pictures_of_the_worlds_are_what_single_rays_meet(name):
+    camera, picture, depth = seen_world(name)
+    objects = [object_mesh(world_object(o)) for o in world(name).objects]
+    meshes = [fixture_mesh(f) for f in world(name).fixtures] + objects
+    rng = np.random.default_rng(3)
+    around = np.rint(camera.project(np.concatenate([m.corners for m in objects]).reshape(-1, 3))).astype(int)
+    pixels = np.vstack([rng.choice(around, 60) + rng.integers(-3, 4, (60, 2)), rng.integers(0, (1024, 768), (60, 2))])
+    expected, color = ray_by_ray(meshes, camera, pixels.astype(float))
+    got = depth[pixels[:, 1], pixels[:, 0]]
+    expected[expected > 2.25] = np.nan
+    np.testing.assert_allclose(got, expected, atol=2e-6)
+    flat = np.array([np.ptp(picture[v - 1 : v + 2, u - 1 : u + 2].reshape(-1, 3), axis=0).max() == 0
+                     for u, v in pixels])
+    shown = np.where(np.isnan(color), GREY, color)[:, ::-1] * 255
+    np.testing.assert_allclose(picture[pixels[:, 1], pixels[:, 0]][flat], shown[flat], atol=0.5)
+
+
+def test_colour_at_an_edge_is_the_part_of_the_pixel_that_is_covered():
+    z, f = 1.0, 80.0  # a square that ends 0.3 px right of the centre of column 40 and 0.2 px below that of row 30
+    x, y = (40.3 - 32) * z / f, (30.2 - 24) * z / f
+    corners = np.array([[-0.1, -0.1, z], [x, -0.1, z], [x, y, z], [-0.1, y, z]])
+    camera = Pinhole(f, f, 32, 24, 64, 48, np.eye(4))
+    view = cast([Mesh(corners[[[0, 1, 2], [0, 2, 3]]], (1.0, 1.0, 1.0))], camera, empty_view(camera, (0, 0, 0)))
+    covered = view.colour[..., 0] / 255
+    assert covered[28, 40] == pytest.approx(0.8, abs=0.04) and covered[30, 38] == pytest.approx(0.7, abs=0.04)
+    assert covered[30, 40] == pytest.approx(0.56, abs=0.1)
+    assert covered[28, 39] == 1 and covered[28, 41] == 0
+    assert view.depth[28, 40] == pytest.approx(1.0) and np.isinf(view.depth[28, 41])
+
+
+def test_two_halves_of_a_square_have_no_seam():
+    camera = Pinhole(80.0, 80.0, 32, 24, 64, 48, np.eye(4))
+    for angle in np.linspace(0, 1.5, 23):
+        c, s = math.cos(angle), math.sin(angle)
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ np.array([[c, s], [-s, c]]) * 3
+        square = np.column_stack([corners, np.full(4, 2.0)])
+        meshes = [Mesh(square[[[0, 1, 2], [0, 2, 3]]], (1.0, 1.0, 1.0))]
+        view = cast(meshes, camera, empty_view(camera, (0, 0, 0)))
+        assert (view.colour == 255).all() and (view.depth == 2).all()
+
+
+def test_what_lies_behind_something_seen_before_stays_hidden():
+    camera = Pinhole(80.0, 80.0, 32, 24, 64, 48, np.eye(4))
+
+    def wall(z, color, width):
+        corners = np.array([[-width, -9, z], [width, -9, z], [width, 9, z], [-width, 9, z]], float)
+        return Mesh(corners[[[0, 1, 2], [0, 2, 3]]], color)
+
+    near = cast([wall(1.0, (1, 0, 0), 0.1)], camera, empty_view(camera, (0, 0, 0)))
+    both = cast([wall(2.0, (0, 1, 0), 9)], camera, near)
+    together = cast([wall(1.0, (1, 0, 0), 0.1), wall(2.0, (0, 1, 0), 9)], camera, empty_view(camera, (0, 0, 0)))
+    np.testing.assert_array_equal(both.depth, together.depth)
+    assert np.abs(both.colour.astype(int) - together.colour)[:, 20].max() == 0
+    assert both.colour[24, 32].tolist() == [0, 0, 255] and both.colour[24, 5].tolist() == [0, 255, 0]
+    assert near.colour[24, 5].tolist() == [0, 0, 0]  # what was seen before is not changed
+
+
+def test_triangles_that_reach_behind_the_camera_are_cut_and_not_turned_inside_out():
+    camera = Pinhole(80.0, 80.0, 32, 24, 64, 48, np.eye(4))
+    floor = np.array([[-50, 0.5, -10], [50, 0.5, -10], [50, 0.5, 40], [-50, 0.5, 40]], float)
+    view = cast([Mesh(floor[[[0, 1, 2], [0, 2, 3]]], (1, 1, 1))], camera, empty_view(camera, (0, 0, 0)))
+    assert np.isinf(view.depth[:25]).all()
+    np.testing.assert_allclose(view.depth[30:, 3], 0.5 * 80 / (np.arange(30, 48) - 24), rtol=1e-5)
+
+
+def test_depth_outside_the_range_is_nan():
+    camera = Pinhole(80.0, 80.0, 32, 24, 64, 48, np.eye(4))
+    assert np.isnan(empty_view(camera, GREY).depth_within(0.1, 2.25)).all()
+    view = cast([], camera, empty_view(camera, GREY))
+    assert (view.colour == 178).all()
