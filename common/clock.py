@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import os
-import time
 from collections.abc import Mapping
+
+from common import sources
 
 SPEED_VARIABLE = "ZENCELL_SPEED"
 EPOCH_VARIABLE = "ZENCELL_EPOCH"
@@ -34,7 +35,7 @@ class Clock:
             raise ValueError(f"speed: {speed:g} is not within {MIN_SPEED:g} to {MAX_SPEED:g}")
         self.speed = speed
         # Monotonic from here on: a step of the system clock must not move the robot.
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        self._offset_ns = sources.wall_ns() - sources.monotonic_ns()
         self.epoch_ns = self._wall_ns() if epoch_ns is None else epoch_ns
 
     @classmethod
@@ -48,7 +49,7 @@ class Clock:
         return {SPEED_VARIABLE: repr(self.speed), EPOCH_VARIABLE: str(self.epoch_ns)}
 
     def _wall_ns(self) -> int:
-        return time.monotonic_ns() + self._offset_ns
+        return sources.monotonic_ns() + self._offset_ns
 
     def now_ns(self) -> int:
         """Cell time now, in ns since the Unix epoch: the stamp of a header."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
-
 from common import topics
 from common.applications.outlining.legs import OutlineView
 from common.applications.outlining.task import Outline, OutlineParameters
@@ -13,6 +11,7 @@ from common.process.service import main
 from common.process.task_runner import TaskRunner
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
+from common.sources import new_id
 from common.tasks.reliance import Reliance
 from common.transport.bus import Bus
 
@@ -33,7 +32,7 @@ async def run(bus: Bus, config: Config) -> None:
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: contour_tracer needs a robot with one")
-    home, prefix = config.robot.named_poses["home"], uuid.uuid4().hex[:8]
+    home, prefix = config.robot.named_poses["home"], new_id()
     task = Outline(config, config.robot.gripper, home, prefix, config.run.autostart, bus.clock.speed)
     view = OutlineView(now=bus.clock.now())
 

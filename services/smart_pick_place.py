@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
-
 from common import topics
 from common.applications.pick_place.parameters import PickPlaceParameters
 from common.applications.pick_place.stages import View
@@ -13,6 +11,7 @@ from common.errors import ConfigError
 from common.process.service import main
 from common.process.task_runner import TaskRunner
 from common.robot.model import RobotModel
+from common.sources import new_id
 from common.tasks.reliance import Reliance
 from common.transport.bus import Bus
 
@@ -35,7 +34,7 @@ async def run(bus: Bus, config: Config) -> None:
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: smart_pick_place needs a robot with one")
-    prefix = uuid.uuid4().hex[:8]
+    prefix = new_id()
     task = PickPlace(
         config, config.grasp, config.world, config.robot.gripper, prefix, config.run.autostart, bus.clock.speed
     )

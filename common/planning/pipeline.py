@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -22,6 +21,7 @@ from common.planning.robot_geometry import RobotGeometry
 from common.planning.timing import BLENDS, retime
 from common.planning.validation import Fault, validate
 from common.robot.model import RobotModel
+from common.sources import monotonic
 
 Array = NDArray[np.float64]
 
@@ -67,7 +67,7 @@ class PlanningPipeline:
             current: (dof,) [rad] where the robot is, used when the request has no start.
             cancel: set from another thread to end planning early.
         """
-        began = time.monotonic()
+        began = monotonic()
         flag = cancel or Cancel()
         attempts: list[PlanAttempt] = []
         try:
@@ -82,13 +82,13 @@ class PlanningPipeline:
         problem = self._problem(request, checked, world, began)
         best: tuple[str, Result] | None = None
         for name, (plan, options) in planners.items():
-            since = time.monotonic()
+            since = monotonic()
             result = plan(problem, options, flag)
             trajectory = None
             if not result.error:
                 trajectory, result = self._finish(problem, result)
             if result.error != NOT_APPLICABLE:
-                attempts += _recorded(name, result, time.monotonic() - since)
+                attempts += _recorded(name, result, monotonic() - since)
             if trajectory is not None:
                 message = _message(self.robot, trajectory)
                 return PlanResponse(
@@ -96,7 +96,7 @@ class PlanningPipeline:
                     ok=True,
                     trajectory=message,
                     planner=name,
-                    seconds=time.monotonic() - began,
+                    seconds=monotonic() - began,
                     fraction=result.fraction,
                     attempts=attempts,
                 )
@@ -239,7 +239,7 @@ def _failed(
         id=request.id,
         ok=False,
         planner=planner,
-        seconds=time.monotonic() - began,
+        seconds=monotonic() - began,
         fraction=result.fraction,
         error=error,
         message=f"{where}: {result.message}",

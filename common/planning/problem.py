@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +12,7 @@ from common.messages import PlanAttempt
 from common.planning.collision import CollisionWorld, Pair
 from common.planning.retiming import TimedPath
 from common.robot.model import RobotModel
+from common.sources import monotonic
 
 Array = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ class Problem:
         straight: only a straight line of the TCP will do.
         velocity, acceleration, jerk: scaled limits (dof,).
         attempts: how many tries a sampling planner has.
-        deadline: on time.monotonic() [s].
+        deadline: on the monotonic clock of common.sources [s].
     """
 
     robot: RobotModel
@@ -99,7 +99,7 @@ class Problem:
     @property
     def seconds_left(self) -> float:
         """Wall time left for planning [s]."""
-        return self.deadline - time.monotonic()
+        return self.deadline - monotonic()
 
 
 class Cancel:

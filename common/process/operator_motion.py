@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import uuid
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from common import messages as m
 from common import topics
 from common.errors import RequestFailed, ZencellError
+from common.sources import new_id
 from common.transport.bus import Bus
 from common.transport.reader import Reader
 
@@ -183,4 +183,4 @@ async def _first(reader: Reader[A]) -> A:
 
 
 def _mint() -> str:
-    return f"operator-{uuid.uuid4().hex[:8]}"
+    return f"operator-{new_id()}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol, TypeVar
 
@@ -12,6 +11,7 @@ from common import messages as m
 from common import topics
 from common.errors import RemoteError
 from common.process.persist import persist
+from common.sources import monotonic
 from common.tasks.reliance import LOOK_PERIOD, Reliance
 from common.transport.bus import Bus
 from common.transport.reader import Reader
@@ -100,7 +100,7 @@ class TaskRunner:
         if self._reliance is None:
             return []
         serving = {client.topic.writer: client.available for client in (self._plan, self._execute)}
-        holds = self._reliance.look(time.monotonic(), serving, view.motion)
+        holds = self._reliance.look(monotonic(), serving, view.motion)
         view.trouble = self._reliance.trouble
         return holds
 

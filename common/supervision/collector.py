@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from common import topics
 from common.config import RobotConfig
 from common.messages import Message, TaskReport
+from common.sources import monotonic
 from common.supervision.rates import Rates
 from common.supervision.summary import Summary, is_settled, progress_line
 
@@ -84,7 +84,7 @@ class Collector:
 
     async def settle(self) -> None:
         """Wait until nothing is on its way any more, for a short time at most, and read the truth."""
-        deadline = time.monotonic() + SETTLE_TIMEOUT
+        deadline = monotonic() + SETTLE_TIMEOUT
         try:
             async with asyncio.timeout(SETTLE_TIMEOUT):
                 while not is_settled(self._balls.latest):
@@ -92,7 +92,7 @@ class Collector:
         except TimeoutError:
             pass
         # The task may say DONE a moment before the world says that the last ball has come to rest.
-        await asyncio.sleep(min(0.2, max(0.0, deadline - time.monotonic())))
+        await asyncio.sleep(min(0.2, max(0.0, deadline - monotonic())))
         self.read_truth()
 
     def read_truth(self) -> None:
@@ -111,7 +111,7 @@ class Collector:
 
     async def _follow_motion(self) -> None:
         async for status in self._motion:
-            self.summary.on_motion(status, time.monotonic() - self._started_at)
+            self.summary.on_motion(status, monotonic() - self._started_at)
 
     async def _follow_targets(self) -> None:
         async for targets in self._targets:
@@ -123,7 +123,7 @@ class Collector:
 
     async def _follow_counters(self) -> None:
         async for counters in self._counters:
-            self.rates.update(counters, time.monotonic())
+            self.rates.update(counters, monotonic())
 
 
 async def _follow(reader: Reader[M], note: Callable[[M], None]) -> None:

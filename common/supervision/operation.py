@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import logging
 import socket
-import time
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -14,6 +13,7 @@ from common import topics
 from common.config import Cell
 from common.errors import ConfigError, DecodeError, ZencellError
 from common.messages import ServiceStatus, SupervisorStatus
+from common.sources import monotonic
 from common.supervision.elsewhere import Elsewhere
 from common.supervision.interrupts import Interrupts
 from common.supervision.launch import Launch
@@ -174,7 +174,7 @@ async def _kill_frozen(bus: Bus, cell: Cell, supervisor: Supervisor) -> None:
     async def look() -> None:
         while True:
             await asyncio.sleep(PERIOD)
-            for verdict in silence.look(time.monotonic(), bus.connected, supervisor.kept, supervisor.stopped):
+            for verdict in silence.look(monotonic(), bus.connected, supervisor.kept, supervisor.stopped):
                 supervisor.kill(verdict.name, verdict.reason)
 
     await beside(listen(), look())

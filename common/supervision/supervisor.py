@@ -7,13 +7,13 @@ import contextlib
 import json
 import logging
 import re
-import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from common.config import Cell
 from common.errors import ZencellError
 from common.messages import ServiceStatus
+from common.sources import monotonic
 from common.supervision.backoff import Backoff
 from common.supervision.child import Child, describe_exit
 from common.supervision.launch import Launch
@@ -173,13 +173,13 @@ class Supervisor:
         """End all processes in reverse order: SIGTERM, then SIGKILL; at once when `hurry` is set."""
         self._stopping.set()
         hurry = hurry or asyncio.Event()
-        deadline = time.monotonic() + STOP_TIMEOUT
+        deadline = monotonic() + STOP_TIMEOUT
         ending: set[asyncio.Task[None]] = set()
         for watched in reversed(self._all):
             # The others say goodbye through the router, and those that look on want to hear it.
             if (watched is self._router or not watched.again) and ending:
-                await asyncio.wait(ending, timeout=max(0.0, deadline - 0.5 - time.monotonic()))
-            latest = time.monotonic() + TERM_TIMEOUT
+                await asyncio.wait(ending, timeout=max(0.0, deadline - 0.5 - monotonic()))
+            latest = monotonic() + TERM_TIMEOUT
             # Who looks on has its whole time, however long the others took: it may have much to write.
             task = asyncio.create_task(self._end(watched, min(deadline, latest) if watched.again else latest, hurry))
             ending.add(task)
@@ -240,7 +240,7 @@ class Supervisor:
         watched.child.terminate()
         gone = asyncio.create_task(watched.gone.wait())
         hurried = asyncio.create_task(hurry.wait())
-        left = max(0.0, deadline - time.monotonic())
+        left = max(0.0, deadline - monotonic())
         await asyncio.wait({gone, hurried}, timeout=left, return_when=asyncio.FIRST_COMPLETED)
         if not gone.done():
             if watched.child.pid is not None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import secrets
 import threading
 
+from common.sources import new_id
 from common.topics import PublishedKind
 from common.transport.codec import Attachment, checksum_of, encode_attachment
 from common.transport.session import Query, Session
@@ -27,7 +27,7 @@ class RawWriter:
         self._key = key
         self._encoding = encoding
         # Of this writer alone: a service that was restarted counts from the start again.
-        self._id = f"{service}.{secrets.token_hex(4)}"
+        self._id = f"{service}.{new_id()}"
         self._sequence = 0
         self._lock = threading.Lock()
         self._last: tuple[bytes, bytes] | None = None

@@ -149,7 +149,7 @@ class Client(Generic[Q, A]):
         self._limit = limit
         self._key = f"{cell}/{topic.key}"
         self._servers = servers
-        self._waiting: set[asyncio.Future[RawReply | None]] = set()
+        self._waiting: dict[asyncio.Future[RawReply | None], None] = {}  # in their order
         servers.on_change(self._on_servers)
 
     @property
@@ -222,14 +222,14 @@ class Client(Generic[Q, A]):
             self._key, settle, lambda: settle(None), payload=payload, encoding=encoding_of(self.topic.message),
             attachment=attachment, timeout=seconds + 1.0,
         )
-        self._waiting.add(future)
+        self._waiting[future] = None
         try:
             async with asyncio.timeout(seconds):  # wait_for of Python 3.11 can lose a cancellation
                 return await future
         except TimeoutError:
             raise RequestTimeout(self.topic.key, timeout) from None
         finally:
-            self._waiting.discard(future)
+            del self._waiting[future]
             cancel()
 
 

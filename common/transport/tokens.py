@@ -20,7 +20,7 @@ class TokenWatch:
         self._first: set[str] = set()  # what the first question found and the watch has not reported yet
         self._known = asyncio.Event()
         self._callbacks: list[Callable[[str, bool], None]] = []
-        self._waiters: set[asyncio.Event] = set()
+        self._waiters: dict[asyncio.Event, None] = {}  # in their order
         session.watch_tokens(
             key,
             lambda token, there: call_on_loop(loop, lambda: self._on_token(_name(token), there)),
@@ -52,14 +52,14 @@ class TokenWatch:
             TimeoutError: they did not within `timeout` seconds.
         """
         changed = asyncio.Event()
-        self._waiters.add(changed)
+        self._waiters[changed] = None
         try:
             async with asyncio.timeout(timeout):
                 while not condition(self.names):
                     changed.clear()
                     await changed.wait()
         finally:
-            self._waiters.discard(changed)
+            del self._waiters[changed]
 
     def _on_token(self, name: str, there: bool) -> None:
         before = self.names
@@ -84,7 +84,7 @@ class TokenWatch:
 
     def _tell(self, before: frozenset[str]) -> None:
         now = self.names
-        for name in before ^ now:
+        for name in sorted(before ^ now):
             for callback in self._callbacks:
                 callback(name, name in now)
         if before != now:

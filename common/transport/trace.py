@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import secrets
 from contextvars import ContextVar
+
+from common.sources import new_id
 
 _current: ContextVar[str] = ContextVar("trace", default="")
 
 
 def current_trace() -> str:
     """Trace of the message that this task read last, or a new one."""
-    return _current.get() or secrets.token_hex(8)
+    return _current.get() or new_id(8)
 
 
 def follow(trace: str) -> None:

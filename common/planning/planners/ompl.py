@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, Literal
@@ -20,6 +19,7 @@ from common.planning.collision import CollisionWorld
 from common.planning.goal_sampling import least_time, sample_goals
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result
 from common.robot.model import RobotModel
+from common.sources import monotonic
 
 Array = NDArray[np.float64]
 
@@ -58,11 +58,11 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
             return _no_goal(cancel.reason(problem), samples.reached, samples.colliding)
     else:
         goals = [problem.goal]
-    began = time.monotonic()
+    began = monotonic()
     for goal in goals:
         if problem.world.edge_free(problem.start, goal):
             attempt = PlanAttempt(
-                planner="ompl", seconds=time.monotonic() - began, fraction=1.0, message="straight edge in joint space"
+                planner="ompl", seconds=monotonic() - began, fraction=1.0, message="straight edge in joint space"
             )
             return Result(waypoints=np.array([problem.start, goal]), fraction=1.0, attempts=[attempt])
     return _best(problem, options, cancel, goals)
@@ -81,7 +81,7 @@ def _best(problem: Problem, options: Options, cancel: Cancel, goals: Sequence[Ar
     best: Array | None = None
     attempts: list[PlanAttempt] = []
     for _ in range(problem.attempts):
-        began = time.monotonic()
+        began = monotonic()
         stop = cancel.reason(problem)
         path = None if stop else _attempt(problem, options, cancel, goals)
         stop = stop or cancel.reason(problem)
@@ -89,12 +89,12 @@ def _best(problem: Problem, options: Options, cancel: Cancel, goals: Sequence[Ar
             error = stop or "no_path"
             message = f"{options.algorithm} found no path"
             attempts.append(
-                PlanAttempt(planner="ompl", seconds=time.monotonic() - began, error=error, message=message)
+                PlanAttempt(planner="ompl", seconds=monotonic() - began, error=error, message=message)
             )
         else:
             message = f"{options.algorithm}: {len(path)} waypoints, {_cost(path, problem.velocity):.2f} s at least"
             attempts.append(
-                PlanAttempt(planner="ompl", seconds=time.monotonic() - began, message=message, fraction=1.0)
+                PlanAttempt(planner="ompl", seconds=monotonic() - began, message=message, fraction=1.0)
             )
             if best is None or _cost(path, problem.velocity) < _cost(best, problem.velocity):
                 best = path
@@ -155,8 +155,8 @@ def _attempt(problem: Problem, options: Options, cancel: Cancel, goals: Sequence
     setup.setGoal(region)
     end = problem.deadline
     if options.algorithm in _IMPROVING:
-        end = min(end, time.monotonic() + options.improving_time)
-    ended = ob.PlannerTerminationCondition(lambda: cancel.is_set or time.monotonic() >= end)
+        end = min(end, monotonic() + options.improving_time)
+    ended = ob.PlannerTerminationCondition(lambda: cancel.is_set or monotonic() >= end)
     if setup.solve(ended).getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
         return None
     path = setup.getSolutionPath()
