@@ -9,6 +9,7 @@ import time
 from typing import Any
 
 from common import topics
+from common.applications.pick_place.topics import VALIDATED_TARGETS
 from common.transport.bus import Bus
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
@@ -28,7 +29,7 @@ async def motions(bus: Bus) -> None:
 
 async def targets(bus: Bus) -> None:
     """Say each time that targets came."""
-    async for seen in bus.reader(topics.VALIDATED_TARGETS):
+    async for seen in bus.reader(VALIDATED_TARGETS):
         say("targets", count=len(seen.poses))
 
 

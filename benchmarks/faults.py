@@ -17,6 +17,7 @@ from typing import Any
 
 from benchmarks.runs import RunningCell, beside, folder_for, until
 from common import topics
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.config import load_cell
 from common.messages import SupervisorStatus
 from common.transport.bus import Bus
@@ -63,7 +64,7 @@ class Assassin:
 
     async def run(self, bus: Bus) -> None:
         """Kill it at any moment, and once more with a ball in the hand."""
-        gripper, task = bus.reader(topics.GRIPPER_STATE), bus.reader(topics.PICK_PLACE_STATUS)
+        gripper, task = bus.reader(topics.GRIPPER_STATE), bus.reader(PICK_PLACE_STATUS)
         processes = bus.reader(topics.SUPERVISOR_STATUS)
         await until(bus.reader(topics.MOTION_STATUS), lambda status: status.state == "active")
         for number in range(2):

@@ -34,6 +34,7 @@ import zenoh
 from benchmarks.runs import RunningCell, free_domain
 from benchmarks.transport import router
 from common import topics
+from common.application import all_topics
 from common.messages import Header, Image
 from common.topics import Topic
 from common.transport.codec import encode
@@ -90,7 +91,7 @@ async def gather(folder: Path) -> list[Spoken]:
                     break
         cell.interrupt()
         await cell.ended(30.0)
-    kinds = {key: topic.kind for key, topic in topics.all_topics().items()}
+    kinds = {key: topic.kind for key, topic in all_topics().items()}
     return [Spoken(key, found[key], rate, kinds[key] != "stream") for key, rate in RATES.items()]
 
 

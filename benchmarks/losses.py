@@ -6,12 +6,13 @@ import time
 from dataclasses import dataclass, field
 
 from common import topics
+from common.application import all_topics
 from common.errors import DecodeError
 from common.transport.bus import Bus
 from common.transport.codec import decode_attachment
 from common.transport.session import RawSample
 
-WATCHED = [topic for topic in topics.all_topics().values()
+WATCHED = [topic for topic in all_topics().values()
            if topic.kind in ("state", "event") or topic in (topics.JOINT_STATES, topics.TF)]
 
 
@@ -74,7 +75,7 @@ class Losses:
     @staticmethod
     def kind(key: str) -> str:
         """Of a topic."""
-        return topics.all_topics()[key].kind
+        return all_topics()[key].kind
 
     def table(self) -> list[str]:
         """Lines for what came at all."""

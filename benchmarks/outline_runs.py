@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from benchmarks.runs import RunningCell, beside, folder_for
 from common import topics
+from common.applications.outlining.messages import OutlinePoints, OutlineStatus
+from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_STATUS
 from common.config import Cell, Surroundings, load_cell
 from common.messages import (
     CollisionObject,
     Header,
     JointState,
-    OutlinePoints,
-    OutlineStatus,
     PlanningScene,
     Pose,
     Vector3,
@@ -71,14 +71,14 @@ async def watch(bus: Bus, seen: Watched) -> None:
             seen.joints.append(state)
 
     async def paths() -> None:
-        async for path in bus.reader(topics.CONTOUR_PATH):
+        async for path in bus.reader(CONTOUR_PATH):
             ages.setdefault("path", {}).setdefault(path.header.stamp, bus.clock.age_ms(path.header.stamp))
             if path.poses and not seen.ages:
                 seen.path = path
 
     async def statuses() -> None:
         before: OutlineStatus | None = None
-        async for status in bus.reader(topics.OUTLINE_STATUS):
+        async for status in bus.reader(OUTLINE_STATUS):
             if len(status.plans) == MOTIONS and seen.path is not None and not seen.ages:
                 stamp = seen.path.header.stamp
                 seen.ages = {name: known[stamp] for name, known in ages.items() if stamp in known}
@@ -91,7 +91,7 @@ async def watch(bus: Bus, seen: Watched) -> None:
 
     async with beside(
         joints(), paths(), stamped("picture", bus.reader(topics.DEPTH_CAMERA_IMAGE)),
-        stamped("contours", bus.reader(topics.CONTOURS)), stamped("points", bus.reader(topics.CONTOUR_POINTS)),
+        stamped("contours", bus.reader(CONTOURS)), stamped("points", bus.reader(CONTOUR_POINTS)),
         stamped("scene", bus.reader(topics.PLANNING_SCENE)),
     ):
         await statuses()

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks.runs import beside
 from common import topics
+from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import Cell, Surroundings
 from common.messages import CollisionObject, GripperState, JointState, PlanningScene, Pose, PoseArray
 from common.planning.collision import CollisionWorld, Pair, interpolate
@@ -44,7 +45,7 @@ class Recording:
 
 async def record(bus: Bus, stop: asyncio.Event) -> Recording:
     """Everything that is said until `stop` is set."""
-    raw: dict[str, list[bytes]] = {t.key: [] for t in (topics.JOINT_STATES, topics.GRIPPER_STATE, topics.SCENE_BALLS)}
+    raw: dict[str, list[bytes]] = {t.key: [] for t in (topics.JOINT_STATES, topics.GRIPPER_STATE, SCENE_BALLS)}
 
     async def keep(key: str) -> None:
         async for sample in bus.raw_reader(f"{bus.cell}/{key}"):
@@ -54,7 +55,7 @@ async def record(bus: Bus, stop: asyncio.Event) -> Recording:
         await stop.wait()
 
     return Recording(
-        _decoded(topics.JOINT_STATES, raw), _decoded(topics.GRIPPER_STATE, raw), _decoded(topics.SCENE_BALLS, raw)
+        _decoded(topics.JOINT_STATES, raw), _decoded(topics.GRIPPER_STATE, raw), _decoded(SCENE_BALLS, raw)
     )
 
 

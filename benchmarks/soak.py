@@ -33,6 +33,8 @@ from benchmarks.losses import Losses
 from benchmarks.runs import LOG, RunningCell, beside, until
 from benchmarks.subscribers import Subscriber
 from common import topics
+from common.application import all_topics
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.errors import RequestFailed
 from common.messages import WorldEdit
 from common.transport.bus import Bus
@@ -101,7 +103,7 @@ async def watch_processes(cell: RunningCell, seen: Seen, period: float) -> None:
 
 async def keep_busy(bus: Bus, seen: Seen) -> None:
     """Put all balls back on the table whenever the task has cleared it."""
-    status, edit, again = bus.reader(topics.PICK_PLACE_STATUS), bus.client(topics.WORLD_EDIT), 0.0
+    status, edit, again = bus.reader(PICK_PLACE_STATUS), bus.client(topics.WORLD_EDIT), 0.0
     async for message in status:
         seen.failures = message.failures
         if not seen.placed or seen.placed[-1][1] != message.placed:
@@ -178,7 +180,7 @@ def report(seen: Seen, losses: Losses, settle: float, period: float) -> tuple[li
 
 def _counted(seen: Seen, wrong: list[str]) -> list[str]:
     """Lines on what the readers of the services counted."""
-    kinds = {key: topic.kind for key, topic in topics.all_topics().items()}
+    kinds = {key: topic.kind for key, topic in all_topics().items()}
     lines = ["| readers of | replaced unread | overflow | refused |", "|---|---|---|---|"]
     for kind in ("stream", "state", "event"):
         dropped, overflow, invalid = (

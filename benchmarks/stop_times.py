@@ -18,6 +18,8 @@ import numpy as np
 
 from benchmarks.runs import RunningCell, beside, folder_for, until
 from common import topics
+from common.applications.outlining.topics import OUTLINE_STATUS
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.config import load_cell
 from common.messages import JointState, TaskCommand, TaskStatus, WorldEdit
 from common.robot.model import RobotModel
@@ -45,7 +47,7 @@ class Watch:
         self._bus, self._joints = bus, bus.reader(topics.JOINT_STATES)
         self._task: Client[TaskCommand, TaskStatus] = bus.client(topics.TASK_COMMAND)
         self._edit, self._cell = bus.client(topics.WORLD_EDIT), cell
-        self._status: Reader[Any] = bus.reader(topics.PICK_PLACE_STATUS if cell == "panda" else topics.OUTLINE_STATUS)
+        self._status: Reader[Any] = bus.reader(PICK_PLACE_STATUS if cell == "panda" else OUTLINE_STATUS)
         loaded = load_cell(cell)
         self._names = set(loaded.robot.joints)
         robot = RobotModel.load(loaded.robot)

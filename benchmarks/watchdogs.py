@@ -16,7 +16,9 @@ import psutil
 
 from benchmarks.runs import RunningCell, until
 from common import topics
-from common.messages import MotionStatus, PickPlaceStatus, ServiceStatus, SupervisorStatus
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from common.messages import MotionStatus, ServiceStatus, SupervisorStatus
 from common.transport.bus import Bus
 
 FROZEN = ("vision_detector", "camera_simulator", "trajectory_executor", "router")
@@ -40,7 +42,7 @@ def of(status: SupervisorStatus | None, name: str) -> ServiceStatus:
 
 async def freeze(cell: RunningCell, bus: Bus, name: str) -> str:
     """Stop a process; a row of what followed."""
-    supervisor, status = bus.reader(topics.SUPERVISOR_STATUS), bus.reader(topics.PICK_PLACE_STATUS)
+    supervisor, status = bus.reader(topics.SUPERVISOR_STATUS), bus.reader(PICK_PLACE_STATUS)
     before = of(await supervisor.next(), name).restarts
     await until(bus.reader(topics.MOTION_STATUS), begun)
     process, began = cell.processes()[name], time.monotonic()
@@ -57,7 +59,7 @@ async def freeze(cell: RunningCell, bus: Bus, name: str) -> str:
 
 async def kill_planner(cell: RunningCell, bus: Bus) -> str:
     """Kill the planner in the middle of a motion; a row of what followed."""
-    status, motion = bus.reader(topics.PICK_PLACE_STATUS), bus.reader(topics.MOTION_STATUS)
+    status, motion = bus.reader(PICK_PLACE_STATUS), bus.reader(topics.MOTION_STATUS)
     await until(motion, begun)
     began = time.monotonic()
     cell.processes()["motion_planner"].kill()

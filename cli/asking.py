@@ -7,10 +7,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from common.applications.outlining.messages import Contours
+from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOURS, OUTLINE_SELECT
 from common.errors import ConfigError, RemoteError
 
 if TYPE_CHECKING:
-    from common.messages import Contours, Image
+    from common.messages import Image
     from common.transport.bus import Bus
 
 CHOOSE_BY_HAND = ("services.contour_detector.select=none", "services.contour_tracer.selection_timeout=0")
@@ -28,11 +30,10 @@ def require_terminal() -> None:
 
 async def ask(bus: Bus, folder: Path) -> None:
     """Store the picture with its contours in a folder, and ask until one of them is chosen."""
-    from common import topics
     from common.applications.outlining.contours_choice import NoSuchContour, described, parse_choice
 
-    contours, images = bus.reader(topics.CONTOURS), bus.reader(topics.CONTOUR_IMAGE)
-    select = bus.client(topics.OUTLINE_SELECT)
+    contours, images = bus.reader(CONTOURS), bus.reader(CONTOUR_IMAGE)
+    select = bus.client(OUTLINE_SELECT)
     while not (found := await contours.next()).contours:
         say("no contour in the picture yet")
     path = folder / f"{bus.cell}_contours.png"

@@ -8,6 +8,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from common import topics
+from common.application import all_topics
 from common.errors import DecodeError
 from common.messages import SupervisorStatus
 from common.recording.sample import Sample, message_of
@@ -36,7 +37,7 @@ class Capture:
         self._sink = sink
         self._lock = threading.Lock()
         self._ahead = time.time_ns() - time.monotonic_ns()  # a step of the system clock must not turn messages round
-        self._kinds = {topic.key: str(topic.kind) for topic in topics.all_topics().values()}
+        self._kinds = {topic.key: str(topic.kind) for topic in all_topics().values()}
         self._run_known = False
         self._declared: list[Declared] = []
 

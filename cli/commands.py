@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import completing, options
+from common.applications.outlining.topics import OUTLINE_SELECT
 from common.errors import ConfigError, UnknownName
 
 if TYPE_CHECKING:
@@ -37,8 +38,9 @@ def call(
     connect: options.Connect = None,
 ) -> None:
     """Send a request and print the answer as JSON; exit 1 with one line if there is none."""
+    from common.application import all_topics, find_topic
     from common.config import check
-    from common.topics import Request, all_topics, find_topic
+    from common.topics import Request
 
     request = find_topic(key)
     if not isinstance(request, Request):
@@ -145,13 +147,12 @@ def select(
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Choose the object to outline."""
-    from common import topics
     from common.applications.outlining.contours_choice import parse_choice
 
     wanted = parse_choice(which)
     if wanted is None:
         raise ConfigError("task select", which, "chooses nothing; choices: an index, a label, a colour, or auto")
-    _send(topics.OUTLINE_SELECT, wanted, TIMEOUT, cell, domain, connect)
+    _send(OUTLINE_SELECT, wanted, TIMEOUT, cell, domain, connect)
 
 
 # --- world ------------------------------------------------------------------------------------------------------

@@ -19,7 +19,8 @@ class SilentKey(UnknownName):
     """A key that is not known, and nothing says that somebody writes it."""
 
     def __init__(self, key: str, why: str) -> None:
-        from common.topics import Topic, all_topics
+        from common.application import all_topics
+        from common.topics import Topic
 
         super().__init__("key", key, [known for known, topic in all_topics().items() if isinstance(topic, Topic)])
         self.args = (f"{self}; {why}",)

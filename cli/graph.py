@@ -108,7 +108,8 @@ def graph_of(cell: str, services: list[Wired], alive: frozenset[str] | None = No
         alive: the services that are ready, when the cell is up.
     """
     from cli.wired import Wired
-    from common.topics import SUPERVISOR_STATUS, find_topic
+    from common.application import find_topic
+    from common.topics import SUPERVISOR_STATUS
 
     services = [replace(each, calls=[key for key in each.calls if not key.startswith(PARAMETERS)]) for each in services]
     if any(SUPERVISOR_STATUS.key in each.reads for each in services):

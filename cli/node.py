@@ -145,7 +145,7 @@ def _described(
 
 
 def _lines(described: dict[str, Any]) -> Iterator[str]:
-    from common.topics import find_topic
+    from common.application import find_topic
 
     yield f"{described['cell']}/{described['service']}: {described['doc']}"
     yield f"state: {described['state']}" + (

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
+from common.applications.outlining.messages import OutlinePoints, OutlineSelect
+from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
 from common.errors import ConfigError, ZencellError
 
 if TYPE_CHECKING:
     from common.config import Cell
-    from common.messages import Image, OutlinePoints, OutlineSelect
+    from common.messages import Image
     from common.transport.bus import Bus, Reader
 
 TIMEOUT = 30.0  # [s] for a picture and its outline
@@ -83,14 +85,14 @@ async def store(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
     from common.perception.intake import colour_picture
 
     pictures, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
-    contours, points = bus.reader(topics.CONTOURS), bus.reader(topics.CONTOUR_POINTS)
-    paths = bus.reader(topics.CONTOUR_PATH)
+    contours, points = bus.reader(CONTOURS), bus.reader(CONTOUR_POINTS)
+    paths = bus.reader(CONTOUR_PATH)
     try:
         async with asyncio.timeout(TIMEOUT):
             first = await pictures.next()
             if wanted is not None and wanted.rule != "auto":
                 await contours.next()
-                await bus.client(topics.OUTLINE_SELECT).call(wanted)
+                await bus.client(OUTLINE_SELECT).call(wanted)
             picture, depth = await _pair(pictures, depths)
             stage_files.write_pictures(folder, colour_picture(picture), depth_of(depth))
             path = await paths.next()

@@ -208,7 +208,7 @@ def _greet(player: Player, recording: Recording, cell: str, endpoint: str, *, ow
 
 async def _warn_of_others(bus: Bus, played: list[str]) -> None:
     """Say which services that are up write what is played too."""
-    from common.topics import all_topics
+    from common.application import all_topics
 
     up = await bus.alive.known()
     known = all_topics()

@@ -68,7 +68,8 @@ def _publishable(key: str) -> Topic[Any] | None:
     Raises:
         ConfigError: it is a request.
     """
-    from common.topics import Topic, find_topic
+    from common.application import find_topic
+    from common.topics import Topic
 
     topic = find_topic(key)
     if topic is None or isinstance(topic, Topic):

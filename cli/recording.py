@@ -106,7 +106,7 @@ def _positive(option: str, text: str | None) -> float | None:
 def _require_published(selection: Selection) -> None:
     """Return when no key is one that answers requests: these do not travel as messages that can be heard."""
     from cli.topic import published
-    from common.topics import all_topics
+    from common.application import all_topics
 
     for key in selection.keys:
         if key in all_topics():
@@ -179,7 +179,7 @@ async def _require_heard(bus: Bus, selection: Selection) -> None:
     from contextlib import aclosing
 
     from cli.foreign import samples
-    from common.topics import all_topics
+    from common.application import all_topics
 
     for key in selection.keys:
         if key not in all_topics() and "*" not in key:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli.recording import File
+from common.applications.outlining.messages import OutlineStatus
 from common.errors import ConfigError, ZencellError
 
 if TYPE_CHECKING:
@@ -100,6 +101,8 @@ class _Listener:
 
     def __init__(self, recording: Recording, run: dict[str, Any], cell: Cell | None) -> None:
         from common import topics as t
+        from common.applications.outlining import topics as outlining
+        from common.applications.pick_place import topics as pick_place
         from common.reporting.gathering import Gathering
         from common.supervision.collector import STATUS_OF_TASK
         from common.supervision.summary import Summary
@@ -111,22 +114,22 @@ class _Listener:
         self.heard_task = False
         g = self.gathered = Gathering()
         s = self.summary = Summary(recording.cell, int(run.get("seed") or 0), self._speed)
-        if cell is not None and STATUS_OF_TASK.get(cell.task) is t.OUTLINE_STATUS:
+        if cell is not None and STATUS_OF_TASK.get(cell.task) is outlining.OUTLINE_STATUS:
             s.traced = Traced(cell.robot)
         self.routes: dict[str, list[Callable[[float, Any], None]]] = {
-            t.PICK_PLACE_STATUS.key: [g.on_task, self._on_task],
-            t.OUTLINE_STATUS.key: [g.on_task, self._on_task],
+            pick_place.PICK_PLACE_STATUS.key: [g.on_task, self._on_task],
+            outlining.OUTLINE_STATUS.key: [g.on_task, self._on_task],
             t.MOTION_STATUS.key: [g.on_motion, lambda time, status: s.on_motion(status, time)],
             t.GRIPPER_STATE.key: [g.on_gripper],
             t.DISPLAY_TRAJECTORY.key: [g.on_trajectory],
             t.JOINT_STATES.key: [g.on_joints, lambda _, state: s.traced.on_joints(state) if s.traced else None],
-            t.DETECTED_OBJECTS.key: [g.on_detections],
-            t.VALIDATED_TARGETS.key: [self._on_targets],
-            t.REJECTED_TARGETS.key: [g.on_rejections, lambda _, message: s.rejected.add(message.rejected)],
+            pick_place.DETECTED_OBJECTS.key: [g.on_detections],
+            pick_place.VALIDATED_TARGETS.key: [self._on_targets],
+            pick_place.REJECTED_TARGETS.key: [g.on_rejections, lambda _, message: s.rejected.add(message.rejected)],
             t.PLANNING_SCENE.key: [g.on_scene],
-            t.SCENE_BALLS.key: [g.on_truth, self._on_balls],
+            pick_place.SCENE_BALLS.key: [g.on_truth, self._on_balls],
             t.SCENE_OBJECTS.key: [g.on_objects, lambda _, truth: s.traced.on_truth(truth) if s.traced else None],
-            t.CONTOUR_PATH.key: [g.on_contour, self._on_path],
+            outlining.CONTOUR_PATH.key: [g.on_contour, self._on_path],
             t.SUPERVISOR_STATUS.key: [g.on_services],
             t.LOG.key: [g.on_log],
             t.COUNTERS.key: [g.on_counters],
@@ -170,7 +173,7 @@ def _cut(recording: Recording) -> str:
 
 def _figures(summary: Summary) -> dict[str, Any]:
     """The summary; of an outline whose robot is not known, what the task told of it."""
-    from common.messages import OutlineStatus
+
 
     figures, status = summary.as_dict(), summary.status
     if isinstance(status, OutlineStatus) and "outline" not in figures:

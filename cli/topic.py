@@ -26,7 +26,7 @@ AnyKey = Annotated[
 @app.command("list")
 def list_(as_json: options.Json = False) -> None:
     """List all topics: key, kind, message, who writes or serves it, and what it is."""
-    from common.topics import all_topics
+    from common.application import all_topics
 
     for topic in all_topics().values():
         if as_json:
@@ -195,7 +195,7 @@ def topic_of(key: str) -> AnyTopic:
     Raises:
         UnknownName: with the keys that there are.
     """
-    from common.topics import all_topics, find_topic
+    from common.application import all_topics, find_topic
 
     topic = find_topic(key)
     if topic is None:
@@ -209,7 +209,8 @@ def published(key: str) -> Topic[Any]:
     Raises:
         UnknownName: with the keys that are.
     """
-    from common.topics import Topic, all_topics
+    from common.application import all_topics
+    from common.topics import Topic
 
     topic = topic_of(key)
     if not isinstance(topic, Topic):
@@ -223,6 +224,6 @@ def published_or_foreign(key: str) -> Topic[Any] | None:
     Raises:
         UnknownName: with the keys that are published, for one that is requested.
     """
-    from common.topics import find_topic
+    from common.application import find_topic
 
     return published(key) if find_topic(key) else None

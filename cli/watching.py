@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from cli.hearing import Hearing
+from common.application import all_topics
 
 if TYPE_CHECKING:
     import psutil
@@ -83,7 +84,7 @@ class Watch:
 
         self._bus = bus
         self._clock = clock
-        self._known = topics.all_topics()
+        self._known = all_topics()
         self._hearing: dict[str, Hearing] = {}
         self._rates = Rates(self._known)
         self._counted: dict[str, tuple[float, ServiceCounters]] = {}  # by service: when [s], what

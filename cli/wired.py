@@ -74,7 +74,7 @@ def wired(cell: Cell, entry: ServiceEntry) -> Wired:
 
 def _in_order(side: list[Any]) -> list[str]:
     """Keys in the order of common/topics.py, then others."""
-    from common.topics import all_topics
+    from common.application import all_topics
 
     known = list(all_topics())
     keys = {topic.key for topic in side}

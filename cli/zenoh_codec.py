@@ -50,7 +50,7 @@ def encode(key: str, value: str) -> bytes:
 
 def _model_of(key: str) -> type[BaseModel] | None:
     """What the key carries, or None for a key that is not ours."""
-    from common.topics import find_topic
+    from common.application import find_topic
 
     topic = find_topic(str(key).partition("?")[0].partition("/")[2])
     return topic.message if topic else None

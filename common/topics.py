@@ -1,4 +1,4 @@
-"""Every key of a cell, said once: its message, its kind and who writes it.
+"""Every key that the platform knows, said once: its message, its kind and who writes it. Applications add their own.
 
 A key on the wire is `<cell>/<topic>`, for example `panda/camera/image_raw`.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Literal, TypeVar
+from typing import Generic, Literal, TypeVar
 
 from common import messages as m
 
@@ -56,21 +56,10 @@ class Request(Generic[Q, A]):
         return self.writer.split(", ")
 
 
-SCENE_BALLS = Topic("scene_balls", m.PoseArray, "state", "trajectory_executor",
-                    "the truth: where every ball is; simulated hardware only")
 SCENE_OBJECT_UPDATES = Topic("scene_object_updates", m.SceneUpdate, "event", "trajectory_executor",
                              "remove:ball_3 when grasped, add:ball_3 when it lies still again")
 CAMERA_IMAGE = Topic("camera/image_raw", m.Image, "stream", "camera_simulator", "what the camera sees, 10 Hz")
 CAMERA_INFO = Topic("camera/camera_info", m.CameraInfo, "state", "camera_simulator", "intrinsics of the camera")
-DETECTED_OBJECTS = Topic("detected_objects", m.MarkerArray, "stream", "vision_detector",
-                         "balls found in the picture, in world")
-DETECTION_IMAGE = Topic("detection_image", m.Image, "stream", "vision_detector", "the picture with what was found")
-VALIDATED_TARGETS = Topic("validated_targets", m.PoseArray, "stream", "workspace_validator",
-                          "detections that the arm can take, in world")
-REJECTED_TARGETS = Topic("rejected_targets", m.Rejections, "event", "workspace_validator",
-                         "detections that it can not take, with the reason, once for each place")
-WORKSPACE_MARKERS = Topic("workspace_markers", m.MarkerArray, "state", "workspace_validator",
-                          "reachable shell and excluded column as cylinders")
 PLANNING_SCENE = Topic("planning_scene", m.PlanningScene, "state", "scene_manager, outline_scene",
                        "fixtures and perceived objects with ids, attached object, allowed collisions")
 JOINT_STATES = Topic("joint_states", m.JointState, "stream", "trajectory_executor", "joint positions, 100 Hz")
@@ -81,8 +70,6 @@ GRIPPER_STATE = Topic("gripper/state", m.GripperState, "state", "trajectory_exec
 MOTION_STATUS = Topic("motion/status", m.MotionStatus, "state", "trajectory_executor",
                       "newest goal: state, progress, error, source")
 DISPLAY_TRAJECTORY = Topic("display_trajectory", m.JointTrajectory, "state", "motion_planner", "newest plan")
-PICK_PLACE_STATUS = Topic("pick_place_status", m.PickPlaceStatus, "state", "smart_pick_place",
-                          "IDLE, GRASPING, PLACING, HOMING, DONE or ERROR, and counters")
 SCENE_OBJECTS = Topic("scene_objects", m.WorldObjects, "state", "trajectory_executor",
                       "the truth: where every object is; simulated hardware only")
 DEPTH_CAMERA_IMAGE = Topic("depth_camera/image_raw", m.Image, "stream", "depth_camera", "colour picture")
@@ -91,13 +78,6 @@ DEPTH_CAMERA_DEPTH = Topic("depth_camera/depth/image_raw", m.Image, "stream", "d
 DEPTH_CAMERA_POINTS = Topic("depth_camera/points", m.PointCloud2, "stream", "depth_camera",
                             "coloured points, only while somebody listens")
 DEPTH_CAMERA_INFO = Topic("depth_camera/camera_info", m.CameraInfo, "state", "depth_camera", "intrinsics")
-CONTOURS = Topic("contours", m.Contours, "state", "contour_detector", "contours of the picture and the chosen one")
-CONTOUR_IMAGE = Topic("contour_image", m.Image, "state", "contour_detector", "the picture with labelled contours")
-CONTOUR_POINTS = Topic("contour_points", m.OutlinePoints, "state", "pixel_to_world",
-                       "outline of the chosen object's top face in world")
-CONTOUR_PATH = Topic("contour_path", m.OutlinePoints, "state", "duplicate_remover",
-                     "the same, cleared of duplicates")
-OUTLINE_STATUS = Topic("outline_status", m.OutlineStatus, "state", "contour_tracer", "state and figures")
 SUPERVISOR_STATUS = Topic("supervisor/status", m.SupervisorStatus, "state", "supervisor", "all processes")
 LOG = Topic("log", m.LogLine, "event", "everyone", "log lines")
 COUNTERS = Topic("counters", m.ServiceCounters, "event", "everyone",
@@ -113,8 +93,6 @@ GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState, "
                           "move the fingers; the result appears on gripper/state")
 WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "trajectory_executor",
                      "add, move, remove, reset; simulated hardware only")
-OUTLINE_SELECT = Request("outline/select", m.OutlineSelect, m.OutlineSelection, "contour_detector",
-                         "choose the object to outline")
 TASK_COMMAND = Request("task/command", m.TaskCommand, m.TaskStatus, "smart_pick_place, contour_tracer",
                        "start, pause, resume or stop the task")
 PARAMETERS = Request("param/<service>", m.ParameterRequest, m.ParameterReply, "everyone",
@@ -128,14 +106,6 @@ def parameters_of(service: str) -> Request[m.ParameterRequest, m.ParameterReply]
     return replace(PARAMETERS, key=f"param/{service}", writer=service)
 
 
-def find_topic(key: str) -> Topic[Any] | Request[Any, Any] | None:
-    """The topic or request of a key, also of the parameters of a service; None for one that is not known."""
-    prefix, _, service = key.partition("/")
-    if prefix == "param" and SERVICE_NAME.fullmatch(service):
-        return parameters_of(service)
-    return all_topics().get(key)
-
-
-def all_topics() -> dict[str, AnyTopic]:
-    """Every topic by key, in the order of this file."""
+def platform_topics() -> dict[str, AnyTopic]:
+    """Every topic of this file by key, in its order."""
     return {value.key: value for value in globals().values() if isinstance(value, Topic | Request)}

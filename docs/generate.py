@@ -16,6 +16,7 @@ from pydantic import BaseModel
 
 from common import config as c
 from common import topics
+from common.application import all_topics
 from common.config.tunables import bounds_of, is_tunable
 from common.planning.planners import load_planner
 from common.process.wiring import wiring
@@ -114,7 +115,7 @@ def parameters() -> str:
 def topic_table() -> str:
     """All topics, of both cells."""
     lines = ["| key, after the cell | message | kind | written or served by | |", "|---|---|---|---|---|"]
-    for topic in topics.all_topics().values():
+    for topic in all_topics().values():
         message = topic.message.__name__
         if isinstance(topic, topics.Request):
             message = f"{message} → {topic.answer.__name__}"

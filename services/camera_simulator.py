@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import Field
 
 from common import topics
+from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import Parameters, Run, Surroundings, Tunable
 from common.messages import PoseArray
 from common.perception.image import array_to_image
@@ -41,7 +42,7 @@ def seen(balls: PoseArray) -> list[tuple[float, float, float]]:
 
 async def run(bus: Bus, config: Config) -> None:
     """Send a picture at the rate, from the first time on that the world says where its balls are."""
-    truth = bus.reader(topics.SCENE_BALLS)
+    truth = bus.reader(SCENE_BALLS)
     images, infos = bus.writer(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_INFO)
     frame = config.world.camera.frame
     camera = Pinhole.from_config(config.world.camera)

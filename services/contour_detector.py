@@ -13,8 +13,10 @@ from common.applications.outlining.contours import ContourOptions, Picture, find
 from common.applications.outlining.contours_choice import NoSuchContour, parse_choice
 from common.applications.outlining.contours_drawing import annotate_contours
 from common.applications.outlining.contours_following import Following
+from common.applications.outlining.messages import Contour, Contours, OutlineSelect, OutlineSelection
+from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOURS, OUTLINE_SELECT
 from common.errors import ConfigError, Refused
-from common.messages import Contour, Contours, Image, OutlineSelect, OutlineSelection
+from common.messages import Image
 from common.perception.image import array_to_image
 from common.perception.intake import Unusable, colour_picture
 from common.process.service import main
@@ -44,7 +46,7 @@ def initial_choice(select: str | int) -> OutlineSelect | None:
 async def run(bus: Bus, config: Config) -> None:
     """Look at every picture as it comes; what can not be looked at is dropped, counted and told once."""
     images = bus.reader(topics.DEPTH_CAMERA_IMAGE)
-    found, shown = bus.writer(topics.CONTOURS), bus.writer(topics.CONTOUR_IMAGE)
+    found, shown = bus.writer(CONTOURS), bus.writer(CONTOUR_IMAGE)
     cv2.setNumThreads(1)  # the other cores have other services
     following = Following(initial_choice(config.select))
     last: tuple[Image, Picture, list[Contour]] | None = None
@@ -76,7 +78,7 @@ async def run(bus: Bus, config: Config) -> None:
         publish(contour.index, "")
         return OutlineSelection(index=contour.index, label=contour.label)
 
-    bus.serve(topics.OUTLINE_SELECT, select)
+    bus.serve(OUTLINE_SELECT, select)
     await bus.ready()
     async for image in images:
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from common import topics
 from common.applications.outlining.legs import OutlineView
 from common.applications.outlining.task import Outline, OutlineParameters
+from common.applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
 from common.config import RobotConfig, Run
 from common.errors import ConfigError
 from common.process.service import main
@@ -25,10 +26,10 @@ class Config(OutlineParameters):
 
 async def run(bus: Bus, config: Config) -> None:
     """Step the task whenever something is heard, and at least 20 times a second."""
-    path, scene = bus.reader(topics.CONTOUR_PATH), bus.reader(topics.PLANNING_SCENE)
+    path, scene = bus.reader(CONTOUR_PATH), bus.reader(topics.PLANNING_SCENE)
     gripper, motion = bus.reader(topics.GRIPPER_STATE), bus.reader(topics.MOTION_STATUS)
     joints = bus.reader(topics.JOINT_STATES)
-    status = bus.writer(topics.OUTLINE_STATUS)
+    status = bus.writer(OUTLINE_STATUS)
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: contour_tracer needs a robot with one")

@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from common import topics
 from common.applications.outlining.duplicates import simplified, without_duplicates
+from common.applications.outlining.messages import OutlinePoints
 from common.applications.outlining.stage_files import StageFileError, read_coordinates
+from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS
 from common.config import Parameters, Tunable
 from common.errors import ConfigError
-from common.messages import OutlinePoints, Pose, Vector3
+from common.messages import Pose, Vector3
 from common.process.service import main
 from common.transport.bus import Bus
 
@@ -51,8 +52,8 @@ def points_of(file: Path) -> list[Pose]:
 
 async def run(bus: Bus, config: Config) -> None:
     """Clear every outline as it comes, or answer it with the points of a file."""
-    outlines = bus.reader(topics.CONTOUR_POINTS)
-    paths = bus.writer(topics.CONTOUR_PATH)
+    outlines = bus.reader(CONTOUR_POINTS)
+    paths = bus.writer(CONTOUR_PATH)
     file = Path(config.coordinates)
     given = cleared(points_of(file), 0.0) if config.coordinates else []
     name = f"{file.parent.name}/{file.name}"

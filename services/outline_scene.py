@@ -6,10 +6,12 @@ import asyncio
 from collections import deque
 
 from common import topics
+from common.applications.outlining.messages import Contours
 from common.applications.outlining.perceived_solids import perceived_solids
 from common.applications.outlining.scene import HomeWatch, planning_scene
+from common.applications.outlining.topics import CONTOURS
 from common.config import Parameters, RobotConfig, Surroundings
-from common.messages import Contours, Image
+from common.messages import Image
 from common.perception.image import ImageError, image_to_array
 from common.perception.intake import Cameras, Unusable
 from common.process.service import main
@@ -27,7 +29,7 @@ class Config(Parameters):
 
 async def run(bus: Bus, config: Config) -> None:
     """Publish the planning scene for every picture that was taken with the arm at home."""
-    contours = bus.reader(topics.CONTOURS)
+    contours = bus.reader(CONTOURS)
     depths = bus.reader(topics.DEPTH_CAMERA_DEPTH)
     infos = bus.reader(topics.DEPTH_CAMERA_INFO)
     statics = bus.reader(topics.TF_STATIC)

@@ -7,9 +7,11 @@ from collections import OrderedDict
 
 from common import topics
 from common.applications.outlining.contours import is_hole
+from common.applications.outlining.messages import Contours, OutlinePoints
 from common.applications.outlining.top_face import TopFace, TopFaceOptions, top_face
+from common.applications.outlining.topics import CONTOUR_POINTS, CONTOURS
 from common.errors import ZencellError
-from common.messages import Contours, Header, Image, OutlinePoints, Pose, Vector3
+from common.messages import Header, Image, Pose, Vector3
 from common.perception.depth import check_depth
 from common.perception.depth_intake import depth_of
 from common.perception.intake import camera_of
@@ -39,9 +41,9 @@ def outline(contours: Contours, image: Image, camera: Pinhole, config: Config) -
 
 async def run(bus: Bus, config: Config) -> None:
     """Answer the contours of each picture with an outline, or with why there is none."""
-    contours, depths = bus.reader(topics.CONTOURS), bus.reader(topics.DEPTH_CAMERA_DEPTH)
+    contours, depths = bus.reader(CONTOURS), bus.reader(topics.DEPTH_CAMERA_DEPTH)
     infos, statics = bus.reader(topics.DEPTH_CAMERA_INFO), bus.reader(topics.TF_STATIC)
-    out = bus.writer(topics.CONTOUR_POINTS)
+    out = bus.writer(CONTOUR_POINTS)
     images: OrderedDict[int, Image] = OrderedDict()
     waiting: Contours | None = None  # contours whose depth image has not come yet
     told = ""

@@ -6,6 +6,7 @@ import asyncio
 
 from common import topics
 from common.applications.pick_place.perceived import PerceivedScene
+from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.applications.pick_place.tracks import SceneParameters
 from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError
@@ -24,7 +25,7 @@ class Config(SceneParameters):
 
 async def run(bus: Bus, config: Config) -> None:
     """Publish the planning scene whenever a frame was looked at or the hand closed or opened."""
-    detected = bus.reader(topics.DETECTED_OBJECTS)
+    detected = bus.reader(DETECTED_OBJECTS)
     infos = bus.reader(topics.CAMERA_INFO)
     statics = bus.reader(topics.TF_STATIC)
     joints = bus.reader(topics.JOINT_STATES)

@@ -6,6 +6,7 @@ from common import topics
 from common.applications.pick_place.parameters import PickPlaceParameters
 from common.applications.pick_place.stages import View
 from common.applications.pick_place.task import PickPlace
+from common.applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common.config import Grasp, RobotConfig, Run, Surroundings
 from common.errors import ConfigError
 from common.process.service import main
@@ -27,10 +28,10 @@ class Config(PickPlaceParameters):
 
 async def run(bus: Bus, config: Config) -> None:
     """Step the task whenever something is heard, and at least 20 times a second."""
-    targets, scene = bus.reader(topics.VALIDATED_TARGETS), bus.reader(topics.PLANNING_SCENE)
+    targets, scene = bus.reader(VALIDATED_TARGETS), bus.reader(topics.PLANNING_SCENE)
     gripper, motion = bus.reader(topics.GRIPPER_STATE), bus.reader(topics.MOTION_STATUS)
     joints = bus.reader(topics.JOINT_STATES)
-    status = bus.writer(topics.PICK_PLACE_STATUS)
+    status = bus.writer(PICK_PLACE_STATUS)
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: smart_pick_place needs a robot with one")

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from common import topics
+from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import Grasp, Members, Parameters, RobotConfig, Run, Tunable, World
 from common.control.alone import Alone, WhenAlone
 from common.control.checks import Tolerances
@@ -108,7 +109,7 @@ async def run(bus: Bus, config: Config) -> None:
     simulated = find_backend(config.robot).simulated
     joints, motion = bus.writer(topics.JOINT_STATES), bus.writer(topics.MOTION_STATUS)
     gripper = bus.writer(topics.GRIPPER_STATE) if config.robot.gripper else None
-    balls = bus.writer(topics.SCENE_BALLS) if simulated else None
+    balls = bus.writer(SCENE_BALLS) if simulated else None
     updates = bus.writer(topics.SCENE_OBJECT_UPDATES) if simulated else None
     objects = bus.writer(topics.SCENE_OBJECTS) if simulated else None
 

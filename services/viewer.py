@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import viser
 from pydantic import Field
 
-from common import topics
+from common.applications.outlining.topics import OUTLINE_STATUS
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.config import Members, Parameters, RobotConfig, Run, Surroundings
 from common.process.operator_motion import OperatorMotion
 from common.process.service import main
@@ -84,7 +85,7 @@ async def run(bus: Bus, config: Config) -> None:
     layout = load_layout(config.layout)
     feeds = Feeds(bus, config.members)
     requests = Requests(bus, config.members, feeds)
-    tasks = [feeds.reader(topic) for topic in (topics.PICK_PLACE_STATUS, topics.OUTLINE_STATUS)]
+    tasks = [feeds.reader(topic) for topic in (PICK_PLACE_STATUS, OUTLINE_STATUS)]
     motions = OperatorMotion(bus, [reader for reader in tasks if reader is not None])
     server = make_server(config.host, config.port, config.token, published=config.published)
     try:

@@ -9,6 +9,7 @@ import cv2
 from common import topics
 from common.applications.pick_place.annotation import annotate
 from common.applications.pick_place.detector import Detection, Detector, DetectorOptions
+from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE
 from common.config import Surroundings
 from common.messages import Color, Header, Marker, MarkerArray, Pose, Vector3
 from common.perception.image import array_to_image
@@ -51,7 +52,7 @@ async def run(bus: Bus, config: Config) -> None:
     """Look at every picture as it comes; what can not be looked at is dropped, counted and told once."""
     images = bus.reader(topics.CAMERA_IMAGE)
     infos, statics = bus.reader(topics.CAMERA_INFO), bus.reader(topics.TF_STATIC)
-    found, shown = bus.writer(topics.DETECTED_OBJECTS), bus.writer(topics.DETECTION_IMAGE)
+    found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
     cv2.setNumThreads(1)  # the other cores have other services
     detector = Detector(config.world, config)
     unusable: Counter[str] = Counter()

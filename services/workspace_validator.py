@@ -9,6 +9,12 @@ from contextlib import suppress
 from pydantic import Field
 
 from common import topics
+from common.applications.pick_place.topics import (
+    DETECTED_OBJECTS,
+    REJECTED_TARGETS,
+    VALIDATED_TARGETS,
+    WORKSPACE_MARKERS,
+)
 from common.applications.pick_place.validation import Validation
 from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
@@ -54,10 +60,10 @@ def shells(config: Config, header: Header) -> MarkerArray:
 
 async def run(bus: Bus, config: Config) -> None:
     """Judge every frame with what is known; the inverse kinematics of new places is worked out beside that."""
-    detected = bus.reader(topics.DETECTED_OBJECTS)
+    detected = bus.reader(DETECTED_OBJECTS)
     infos, statics = bus.reader(topics.CAMERA_INFO), bus.reader(topics.TF_STATIC)
-    validated, rejected = bus.writer(topics.VALIDATED_TARGETS), bus.writer(topics.REJECTED_TARGETS)
-    markers = bus.writer(topics.WORKSPACE_MARKERS)
+    validated, rejected = bus.writer(VALIDATED_TARGETS), bus.writer(REJECTED_TARGETS)
+    markers = bus.writer(WORKSPACE_MARKERS)
     reach = ReachCache(RobotModel.load(config.robot), config.grasp, config)
     validation = Validation(config.world, reach, forget_after=config.forget_after)
 

@@ -18,6 +18,7 @@ import pytest
 import yaml
 
 from benchmarks.runs import free_domain
+from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import check, load_cell, service_config
 from common.errors import ConfigError, UnknownName
 from common.hardware.interface import Limits
@@ -27,7 +28,7 @@ from common.planning.planners import load_planner
 from common.process.in_process import running_service
 from common.process.wiring import wiring
 from common.robot.model import RobotModel
-from common.topics import CAMERA_IMAGE, CAMERA_INFO, SCENE_BALLS
+from common.topics import CAMERA_IMAGE, CAMERA_INFO
 from common.transport.local import LocalNetwork
 
 ROOT = Path(__file__).resolve().parent.parent

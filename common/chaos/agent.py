@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from common import topics
+from common.application import find_topic
+from common.applications.pick_place.topics import SCENE_BALLS
 from common.chaos.damage import damaged, nonsense
 from common.chaos.plan import STATELESS_FORMS, Fault
 from common.config import Container
@@ -66,7 +68,7 @@ class Chaos:
         self._bus, self._plan, self._pids, self._container = bus, plan, pids, container
         self._patience = patience
         self._gripper = bus.reader(topics.GRIPPER_STATE) if container else None
-        self._balls = bus.reader(topics.SCENE_BALLS) if container else None
+        self._balls = bus.reader(SCENE_BALLS) if container else None
         self._edit = bus.client(topics.WORLD_EDIT) if container else None
         self._began = 0.0
         self._stopped: set[int] = set()
@@ -159,7 +161,7 @@ class Chaos:
 
     async def _disturb(self, fault: Fault) -> None:
         """Put bad messages under a key, as if they came from who writes it, or from nobody."""
-        topic: Any = topics.find_topic(fault.target)
+        topic: Any = find_topic(fault.target)
         key, encoding = f"{self._bus.cell}/{topic.key}", encoding_of(topic.message)
         rng = np.random.default_rng(fault.seed)
         if topic.kind == "request":

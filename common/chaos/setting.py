@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from common import topics
+from common.application import all_topics
 from common.chaos.agent import Chaos
 from common.chaos.plan import CELL_SECONDS, faults, plan
 from common.config import Cell
@@ -44,4 +44,4 @@ def chaos_in(
 
 def keys_of(services: list[str]) -> list[str]:
     """Keys that these services write or answer, but for those of all services."""
-    return [key for key, topic in topics.all_topics().items() if set(topic.writer.split(", ")) & set(services)]
+    return [key for key, topic in all_topics().items() if set(topic.writer.split(", ")) & set(services)]

@@ -26,6 +26,7 @@ class Members(Section):
 
     services: list[str] = Field(description="in start order")
     task: str = Field(description="the service that runs the task")
+    application: str = Field("", description="what the cell is for: a name, or a dotted module")
 
 
 class Cell(Section):
@@ -39,6 +40,7 @@ class Cell(Section):
     pipeline: Pipeline
     watchdogs: Watchdogs = Watchdogs()
     services: dict[str, ServiceEntry]
+    application: str = Field(description="what the cell is for: a name of common/applications, or a dotted module")
     task: str = Field(description="the service that runs the task and ends in DONE")
 
     @property
@@ -51,7 +53,8 @@ class Cell(Section):
         if kind is Surroundings:
             return Surroundings.model_validate({f: getattr(self.world, f) for f in Surroundings.model_fields})
         if kind is Members:
-            return Members(services=[entry.name for entry in self.services.values()], task=self.task)
+            names = [entry.name for entry in self.services.values()]
+            return Members(services=names, task=self.task, application=self.application)
         for value in (self.run, self.robot, self.world, self.motion, self.grasp, self.pipeline, self.watchdogs):
             if type(value) is kind:
                 return value

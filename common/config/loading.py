@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from common.application import application_of_task, find_application
 from common.config.basics import Parameters
 from common.config.cell import Cell
 from common.config.checking import check, is_section
@@ -90,8 +91,23 @@ def load_cell(
     if seed is not None:
         run["seed"] = seed
     tree["run"] = run
+    _name_application(tree)
     tree["services"] = {name: _service_entry(name, value) for name, value in services.items()}
     return check(Cell, tree)
+
+
+def _name_application(tree: dict[str, Any]) -> None:
+    """Let an application name the cell's task, or the task, in older files, the application.
+
+    Raises:
+        UnknownName, ConfigError: there is no such application.
+    """
+    task, given = tree.get("task"), tree.get("application")
+    if given is None and isinstance(task, str):
+        tree["application"] = application_of_task(task)
+    elif isinstance(given, str):
+        found = find_application(given)
+        tree.setdefault("task", found.task or given.rpartition(".")[2])
 
 
 def _service_entry(name: str, parameters: Any) -> dict[str, Any]:

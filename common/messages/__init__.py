@@ -19,15 +19,6 @@ from common.messages.execution import (
     StopRequest,
 )
 from common.messages.geometry import Color, Pose, PoseArray, Quaternion, TFMessage, TransformStamped, Vector3
-from common.messages.outline import (
-    Contour,
-    Contours,
-    OutlinePoints,
-    OutlineSelect,
-    OutlineSelection,
-    OutlineState,
-    OutlineStatus,
-)
 from common.messages.parameters import Parameter, ParameterReply, ParameterRequest
 from common.messages.planning import (
     ArcGoal,
@@ -43,7 +34,5 @@ from common.messages.planning import (
 from common.messages.processes import LogLine, ServiceCounters, ServiceStatus, SupervisorStatus
 from common.messages.robot import JointState, JointTrajectory, JointTrajectoryPoint
 from common.messages.scene import AttachedObject, CollisionObject, PlanningScene
-from common.messages.task import PickPlaceStatus, PlanFigure, TaskCommand, TaskState, TaskStatus
+from common.messages.task import PlanFigure, TaskCommand, TaskStatus
 from common.messages.world import SceneUpdate, WorldEdit, WorldEditReply, WorldObject, WorldObjects
-
-TaskReport = PickPlaceStatus | OutlineStatus  # what the task of a cell says about itself

@@ -1,4 +1,4 @@
-"""Telling the task what to do, and what it says of itself."""
+"""Telling the task what to do, and what every task says of itself."""
 
 from __future__ import annotations
 
@@ -9,24 +9,11 @@ from pydantic import Field
 from common.messages.basics import Finite, Header, Message
 from common.messages.camera import Rejection
 
-TaskState = Literal["IDLE", "GRASPING", "PLACING", "HOMING", "DONE", "ERROR"]
-
 
 class TaskCommand(Message):
     """What a person may tell the task."""
 
     command: Literal["start", "pause", "resume", "stop"]
-
-
-class TaskStatus(Message):
-    """How far a task is, as the answer to a command: every task has more to say in a status of its own."""
-
-    header: Header = Header()
-    state: str = "IDLE"
-    paused: bool = False
-    started: bool = False
-    stage: str = ""
-    message: str = ""
 
 
 class PlanFigure(Message):
@@ -38,22 +25,26 @@ class PlanFigure(Message):
     attempts: int
 
 
-class PickPlaceStatus(Message):
-    """State and counters of the pick-and-place task."""
+class TaskStatus(Message):
+    """How far a task is: what every task says, and the answer to a command. Each task derives a status of its own.
+
+    `figures` are the task's own, by name; they stand in the summary of a run as they are.
+    """
 
     header: Header = Header()
-    state: TaskState = "IDLE"
+    state: str = Field("IDLE", description="DONE and ERROR end a run; IDLE is at rest; all else is the task's own")
     paused: bool = False
     started: bool = False
     stage: str = ""
-    target: str = Field("", description="track id of the object in work")
-    placed: int = 0
-    targets: int = Field(0, description="objects that the task has seen and may take or has taken")
+    subject: str = Field("", description="what is in work: the id of an object, for example")
+    done: int = Field(0, description="of `total`")
+    total: int = Field(0, description="what the task has seen and may do or has done")
     failures: int = 0
     retries: int = 0
-    skipped: list[Rejection] = Field([], description="validated targets that could not be taken, and why")
+    skipped: list[Rejection] = Field([], description="what could not be done, where, and why")
     plans: list[PlanFigure] = []
     moving_seconds: Finite = Field(0.0, description="cell time in motion [s]")
     planning_seconds: Finite = Field(0.0, description="wall time spent in plan requests [s]")
     task_seconds: Finite = Field(0.0, description="cell time since the start of the task [s]")
+    figures: dict[str, bool | int | Finite | str | None] = {}
     message: str = ""

@@ -14,6 +14,8 @@ from typing import Any, TypeVar
 
 from common import messages as m
 from common import topics
+from common.applications.outlining.topics import OUTLINE_STATUS
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.errors import RequestFailed, ZencellError
 from common.sources import new_id
 from common.transport.bus import Bus
@@ -52,14 +54,14 @@ class OperatorMotion:
 
         Args:
             bus: in the cell.
-            tasks: readers of what the cell's tasks say of themselves (a `TaskReport`); all that there may be if None.
+            tasks: readers of what the cell's tasks say of themselves (a `TaskStatus`); all that there may be if None.
         """
         self._bus = bus
         self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
         self._stop, self._hold = bus.client(topics.MOTION_STOP), bus.client(topics.MOTION_HOLD)
         self._motion = bus.reader(topics.MOTION_STATUS)
         if tasks is None:
-            tasks = [bus.reader(topics.PICK_PLACE_STATUS), bus.reader(topics.OUTLINE_STATUS)]
+            tasks = [bus.reader(PICK_PLACE_STATUS), bus.reader(OUTLINE_STATUS)]
         self._tasks = tasks
 
     async def plan(self, goal: Goal, *, planner: str = "", straight: bool = False) -> m.PlanResponse:

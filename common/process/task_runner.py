@@ -34,7 +34,7 @@ class Task(Protocol):
     """A state machine that is fed with what is known and answers with what it wants done."""
 
     @property
-    def status(self) -> m.TaskReport:
+    def status(self) -> m.TaskStatus:
         """How far it is."""
 
     def step(self, view: Any) -> list[Command]:
@@ -75,7 +75,7 @@ class TaskRunner:
         self._woken = asyncio.Event()
         self._told: list[Command] = []
         self._asking: dict[str, asyncio.Task[None]] = {}  # the newest of each kind
-        self._before: m.TaskReport | None = None
+        self._before: m.TaskStatus | None = None
         bus.serve(topics.TASK_COMMAND, self._obey)
 
     async def run(self, heard: Iterable[Reader[Any]]) -> None:

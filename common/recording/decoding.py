@@ -7,9 +7,9 @@ from collections import Counter
 import msgpack
 from pydantic import ValidationError
 
+from common.application import message_class
 from common.messages import Message
 from common.recording.sample import Sample
-from common.recording.schemas import message_class
 
 
 class Decoder:
@@ -20,7 +20,7 @@ class Decoder:
         self.skipped: Counter[str] = Counter()
 
     def message(self, sample: Sample) -> Message | None:
-        """The message that a sample holds, or None for one that can not be told."""
+        """The message that a sample holds, or None for one that cannot be told."""
         model = message_class(sample.message)
         if model is not None:
             try:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from common.applications.outlining.messages import OutlinePoints
 from common.messages import (
     CameraInfo,
     Image,
@@ -19,7 +20,6 @@ from common.messages import (
     LogLine,
     MarkerArray,
     Message,
-    OutlinePoints,
     PlanningScene,
     PointCloud2,
     Pose,

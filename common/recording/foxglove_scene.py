@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from common.applications.outlining.messages import OutlinePoints
 from common.messages import (
     CollisionObject,
     Color,
     MarkerArray,
-    OutlinePoints,
     PlanningScene,
     Pose,
     Vector3,

@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from common import messages as m
+from common.applications.outlining.messages import OutlinePoints, OutlineStatus
+from common.applications.pick_place.messages import PickPlaceStatus
 
 Array = npt.NDArray[np.float64]
 
@@ -105,9 +107,9 @@ class Gathering:
     _target: str = ""
     _scene: dict[str, tuple[float, float, float]] = field(default_factory=dict)
 
-    def on_task(self, time: float, status: m.PickPlaceStatus | m.OutlineStatus) -> None:
+    def on_task(self, time: float, status: PickPlaceStatus | OutlineStatus) -> None:
         """Take note of how far the task is."""
-        thing = status.object if isinstance(status, m.OutlineStatus) else status.target
+        thing = status.object if isinstance(status, OutlineStatus) else status.target
         self._target = thing or self._target
         _change(self.tasks, time, status.state, thing)
         _while(self.paused, time, status.paused, "paused")
@@ -176,7 +178,7 @@ class Gathering:
         self.outlines = [np.array(edge) for thing in objects.objects for edge in (thing.outline, thing.hole)
                          if len(edge) > 2]
 
-    def on_contour(self, _time: float, path: m.OutlinePoints) -> None:
+    def on_contour(self, _time: float, path: OutlinePoints) -> None:
         """Take note of the contour that is to be traced; once the arm moves it may hide a part of it."""
         before = not self.tasks or self.tasks[-1].label in ("IDLE", "SELECTING", "PLANNING")
         if path.poses and (before or not len(self.contour)):

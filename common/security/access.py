@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, all_topics, parameters_of
+from common.application import all_topics
+from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, parameters_of
 from common.transport.credentials import OBSERVER, OPERATOR, ROUTER_NAME, common_name
 from common.transport.keys import alive_key, serves_key
 

@@ -7,8 +7,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from common import topics
+from common.application import all_topics
+from common.applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
+from common.applications.pick_place.topics import PICK_PLACE_STATUS, REJECTED_TARGETS, SCENE_BALLS, VALIDATED_TARGETS
 from common.config import RobotConfig
-from common.messages import Message, TaskReport
+from common.messages import Message, TaskStatus
 from common.sources import monotonic
 from common.supervision.rates import Rates
 from common.supervision.summary import Summary, is_settled, progress_line
@@ -22,7 +25,7 @@ ENDED = ("DONE", "ERROR")
 M = TypeVar("M", bound=Message)
 
 # On which topic a task says how far it is, where it is not pick_place_status.
-STATUS_OF_TASK = {"contour_tracer": topics.OUTLINE_STATUS}
+STATUS_OF_TASK = {"contour_tracer": OUTLINE_STATUS}
 
 
 class Collector:
@@ -43,27 +46,27 @@ class Collector:
             robot: whose tool tip is followed in a cell that outlines objects.
         """
         self.summary = summary
-        self.rates = Rates(topics.all_topics())
-        self.task_status: TaskReport | None = None
+        self.rates = Rates(all_topics())
+        self.task_status: TaskStatus | None = None
         self.ended = asyncio.Event()
         self._clock = bus.clock
         self._started_at = started_at
         self._on_progress = on_progress
         self._progress = ""
-        self._status: Reader[Any] = bus.reader(STATUS_OF_TASK.get(task, topics.PICK_PLACE_STATUS))
+        self._status: Reader[Any] = bus.reader(STATUS_OF_TASK.get(task, PICK_PLACE_STATUS))
         self._motion = bus.reader(topics.MOTION_STATUS)
-        self._targets = bus.reader(topics.VALIDATED_TARGETS)
-        self._rejected = bus.reader(topics.REJECTED_TARGETS)
-        self._balls = bus.reader(topics.SCENE_BALLS)
+        self._targets = bus.reader(VALIDATED_TARGETS)
+        self._rejected = bus.reader(REJECTED_TARGETS)
+        self._balls = bus.reader(SCENE_BALLS)
         self._counters = bus.reader(topics.COUNTERS)
         self._noted: list[tuple[Reader[Any], Callable[[Any], None]]] = []
-        if robot is not None and STATUS_OF_TASK.get(task) is topics.OUTLINE_STATUS:
+        if robot is not None and STATUS_OF_TASK.get(task) is OUTLINE_STATUS:
             from common.supervision.traced import Traced
 
             traced = summary.traced = Traced(robot)
             self._noted = [
                 (bus.reader(topics.JOINT_STATES), traced.on_joints),
-                (bus.reader(topics.CONTOUR_PATH), traced.on_path),
+                (bus.reader(CONTOUR_PATH), traced.on_path),
                 (bus.reader(topics.SCENE_OBJECTS), traced.on_truth),
             ]
 

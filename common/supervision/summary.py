@@ -8,14 +8,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from common.applications.outlining.messages import OutlineStatus
+from common.applications.pick_place.messages import PickPlaceStatus
 from common.messages import (
     MotionStatus,
-    OutlineStatus,
-    PickPlaceStatus,
     PlanFigure,
     PoseArray,
     Rejection,
-    TaskReport,
+    TaskStatus,
     Vector3,
 )
 
@@ -57,7 +57,7 @@ class Counted:
     plans: list[PlanFigure] = field(default_factory=list)
 
     @classmethod
-    def of(cls, status: TaskReport) -> Counted:
+    def of(cls, status: TaskStatus) -> Counted:
         """The figures in a status."""
         retries = status.retries if isinstance(status, PickPlaceStatus) else 0
         return cls(status.failures, retries, status.moving_seconds, status.planning_seconds, list(status.plans))
@@ -97,7 +97,7 @@ class Summary:
         self.cell = cell
         self.seed = seed
         self.speed = speed
-        self.status: TaskReport = PickPlaceStatus()
+        self.status: TaskStatus = PickPlaceStatus()
         self.traced: Traced | None = None  # of a cell that outlines objects
         self.ready: float | None = None  # wall time [s] from the start of the process to the cell being ready
         self.first_motion: float | None = None  # wall time [s] from the start of the process
@@ -112,7 +112,7 @@ class Summary:
         self._task_since: float | None = None  # cell time [s]
         self._task_until = 0.0  # cell time [s]
 
-    def on_status(self, status: TaskReport) -> None:
+    def on_status(self, status: TaskStatus) -> None:
         """Take note of the task's status."""
         if isinstance(status, OutlineStatus) and self.traced is not None:
             self.traced.on_status(status)
@@ -153,8 +153,8 @@ class Summary:
         return {
             "cell": self.cell,
             "state": self.state,
-            "placed": task.placed,
-            "targets": task.targets,
+            "placed": task.done,
+            "targets": task.total,
             "rejected": [{"position": _xyz(place.position), "reason": place.reason} for place in rejected.places],
             "failures": figures.failures,
             "retries": figures.retries,
@@ -200,16 +200,16 @@ def percentile(values: Sequence[float], fraction: float) -> float | None:
     return sorted(values)[max(0, math.ceil(fraction * len(values)) - 1)]
 
 
-def progress_line(task: TaskReport | None) -> str:
+def progress_line(task: TaskStatus | None) -> str:
     """Where the task is, as "3 of 7 placed - GRASPING ball_4" or "TRACING Object_1, 0.400 m"."""
     if task is None:
         return "the task has not spoken yet"
     if isinstance(task, OutlineStatus):
         line = f"{task.state} {task.object}, {task.length_m:.3f} m" if task.object else task.state
     else:
-        line = f"{task.placed} of {task.targets} placed - {task.state}"
-        if task.target:
-            line += f" {task.target}"
+        line = f"{task.done} of {task.total} placed - {task.state}"
+        if task.subject:
+            line += f" {task.subject}"
     if task.paused:
         line += " (paused)"
     elif not task.started and task.state == "IDLE":

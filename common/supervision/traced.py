@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from common.applications.outlining.messages import OutlinePoints, OutlineStatus
 from common.config import RobotConfig
-from common.messages import JointState, OutlinePoints, OutlineStatus, WorldObjects
+from common.messages import JointState, WorldObjects
 
 Array = NDArray[np.float64]
 

@@ -61,7 +61,7 @@ class Execution(Generic[S]):
         return motion if self.moves_arm else gripper
 
 
-def note_plan(status: m.TaskReport, response: m.PlanResponse) -> None:
+def note_plan(status: m.TaskStatus, response: m.PlanResponse) -> None:
     """Count a plan response in the figures of a task: its time always, its planner when it brought a trajectory."""
     status.planning_seconds += response.seconds
     if not response.ok or response.trajectory is None:

@@ -184,8 +184,8 @@ def router_settings(
 
 def size_limit() -> dict[str, Any]:
     """What the router drops, because it is larger than any message of its topic ever is."""
+    from common.application import all_topics
     from common.messages import Image, PointCloud2
-    from common.topics import all_topics
 
     small = [topic.key for topic in all_topics().values() if topic.message not in (Image, PointCloud2)]
     return {

@@ -6,6 +6,17 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from common import topics
+from common.application import all_topics
+from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
+from common.applications.pick_place.topics import (
+    DETECTED_OBJECTS,
+    DETECTION_IMAGE,
+    PICK_PLACE_STATUS,
+    REJECTED_TARGETS,
+    SCENE_BALLS,
+    VALIDATED_TARGETS,
+    WORKSPACE_MARKERS,
+)
 from common.config import Members
 from common.messages import Message
 from common.topics import Request, Topic
@@ -17,14 +28,14 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=Message)
 
 ALWAYS: tuple[Topic[Any], ...] = (  # small or seldom
-    topics.JOINT_STATES, topics.TF_STATIC, topics.PLANNING_SCENE, topics.VALIDATED_TARGETS, topics.REJECTED_TARGETS,
-    topics.WORKSPACE_MARKERS, topics.CAMERA_INFO, topics.DEPTH_CAMERA_INFO, topics.DISPLAY_TRAJECTORY,
-    topics.MOTION_STATUS, topics.GRIPPER_STATE, topics.PICK_PLACE_STATUS, topics.OUTLINE_STATUS,
-    topics.CONTOUR_PATH, topics.SUPERVISOR_STATUS, topics.COUNTERS, topics.LOG,
+    topics.JOINT_STATES, topics.TF_STATIC, topics.PLANNING_SCENE, VALIDATED_TARGETS, REJECTED_TARGETS,
+    WORKSPACE_MARKERS, topics.CAMERA_INFO, topics.DEPTH_CAMERA_INFO, topics.DISPLAY_TRAJECTORY,
+    topics.MOTION_STATUS, topics.GRIPPER_STATE, PICK_PLACE_STATUS, OUTLINE_STATUS,
+    CONTOUR_PATH, topics.SUPERVISOR_STATUS, topics.COUNTERS, topics.LOG,
 )
 ON_DEMAND: tuple[Topic[Any], ...] = (  # large, or made only for who listens
-    topics.CAMERA_IMAGE, topics.DETECTION_IMAGE, topics.DEPTH_CAMERA_IMAGE, topics.CONTOUR_IMAGE, topics.CONTOURS,
-    topics.SCENE_BALLS, topics.SCENE_OBJECTS, topics.TF, topics.DETECTED_OBJECTS,
+    topics.CAMERA_IMAGE, DETECTION_IMAGE, topics.DEPTH_CAMERA_IMAGE, CONTOUR_IMAGE, CONTOURS,
+    SCENE_BALLS, topics.SCENE_OBJECTS, topics.TF, DETECTED_OBJECTS,
 )
 _OF_NO_SERVICE = ("supervisor", "everyone")
 _LOG_SIZE = 2000  # lines that may wait
@@ -32,7 +43,7 @@ _LOG_SIZE = 2000  # lines that may wait
 
 def in_cell(topic: Topic[Any] | Request[Any, Any], members: Members) -> bool:
     """Whether a cell may have a topic: a service of it writes it, or one that is not known here might."""
-    known = {writer for other in topics.all_topics().values() for writer in other.writers} | {"viewer"}
+    known = {writer for other in all_topics().values() for writer in other.writers} | {"viewer"}
     return bool({*topic.writers} & {*members.services, *_OF_NO_SERVICE}) or not {*members.services} <= known
 
 

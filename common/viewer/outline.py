@@ -8,8 +8,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from common.applications.outlining.messages import Contour, Contours, OutlinePoints
 from common.config import Fixture, Surroundings
-from common.messages import CollisionObject, Contour, Contours, OutlinePoints, PlanningScene
+from common.messages import CollisionObject, PlanningScene
 from common.perception.pinhole import Pinhole
 from common.viewer.poses import position_of, rgb_of
 

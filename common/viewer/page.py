@@ -9,9 +9,17 @@ from typing import TYPE_CHECKING, Any
 import viser
 
 from common import topics
+from common.applications.outlining.messages import OutlineSelect
+from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
+from common.applications.pick_place.topics import (
+    DETECTION_IMAGE,
+    PICK_PLACE_STATUS,
+    REJECTED_TARGETS,
+    VALIDATED_TARGETS,
+)
 from common.config import Members, check
 from common.errors import ZencellError
-from common.messages import Image, OutlineSelect
+from common.messages import Image
 from common.supervision.summary import Rejected
 from common.topics import Topic
 from common.viewer.desk import Desk
@@ -38,9 +46,9 @@ if TYPE_CHECKING:
 OUTLINER = "contour_tracer"
 IMAGES: dict[str, tuple[Topic[Image], ...]] = {
     LIVE: (topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
-    ANNOTATED: (topics.DETECTION_IMAGE, topics.CONTOUR_IMAGE),
+    ANNOTATED: (DETECTION_IMAGE, CONTOUR_IMAGE),
 }
-STAMPED: tuple[Topic[Any], ...] = (topics.VALIDATED_TARGETS, topics.CONTOUR_PATH)  # with when the picture was taken
+STAMPED: tuple[Topic[Any], ...] = (VALIDATED_TARGETS, CONTOUR_PATH)  # with when the picture was taken
 
 
 class Page:
@@ -133,7 +141,7 @@ class Page:
         """
         gui = self._server.gui
         with self._place["Plots"]:
-            seen = "Picture to targets" if topics.VALIDATED_TARGETS in self._feeds else "Picture to path"
+            seen = "Picture to targets" if VALIDATED_TARGETS in self._feeds else "Picture to path"
             self._plots = PlotPanel(gui, limits, seen)
         with self._place["Move"]:
             self._move = MovePanel(gui, self.desk, self._motions, scene, planners, planner=self._layout.planner,
@@ -155,7 +163,7 @@ class Page:
         if not self.pages:
             return
         if self._periods.due("task", now):
-            task = self._feeds.latest(topics.OUTLINE_STATUS) or self._feeds.latest(topics.PICK_PLACE_STATUS)
+            task = self._feeds.latest(OUTLINE_STATUS) or self._feeds.latest(PICK_PLACE_STATUS)
             holding = self._feeds.latest(topics.GRIPPER_STATE)
             self._task.show(task, self._feeds.latest(topics.MOTION_STATUS), gripper(holding),
                             len(self._rejected.places))
@@ -166,7 +174,7 @@ class Page:
             self._plots.show(now)
         if self._periods.due("picture", now):
             self._show_pictures(now)
-        contours = self._feeds.fresh(topics.CONTOURS) if self._periods.due("contours", now) else None
+        contours = self._feeds.fresh(CONTOURS) if self._periods.due("contours", now) else None
         if contours is not None:
             self._task.show_contours(contours)
         self._scene.show(state, contours, now)
@@ -201,7 +209,7 @@ class Page:
                 self._health.count(counters, asyncio.get_running_loop().time())
 
     async def _follow_rejected(self) -> None:
-        if (reader := self._feeds.reader(topics.REJECTED_TARGETS)) is not None:
+        if (reader := self._feeds.reader(REJECTED_TARGETS)) is not None:
             async for rejections in reader:
                 self._scene.reject(rejections)
                 self._rejected.add(rejections.rejected)

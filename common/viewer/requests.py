@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 from pydantic import JsonValue
 
 from common import topics
+from common.applications.outlining.messages import OutlineSelect, OutlineSelection
+from common.applications.outlining.topics import CONTOUR_PATH, OUTLINE_SELECT, OUTLINE_STATUS
 from common.config import Members
 from common.errors import RequestFailed
 from common.messages import (
-    OutlineSelect,
-    OutlineSelection,
     Parameter,
     ParameterReply,
     ParameterRequest,
@@ -52,7 +52,7 @@ class Requests:
         self._task = bus.client(topics.TASK_COMMAND)
         self._motion_stop = bus.client(topics.MOTION_STOP)
         self._edit = bus.client(topics.WORLD_EDIT)
-        self._select = bus.client(topics.OUTLINE_SELECT) if in_cell(topics.OUTLINE_SELECT, members) else None
+        self._select = bus.client(OUTLINE_SELECT) if in_cell(OUTLINE_SELECT, members) else None
         self._parameters: dict[str, Client[ParameterRequest, ParameterReply]] = {
             name: bus.client(topics.parameters_of(name)) for name in members.services
         }
@@ -80,12 +80,12 @@ class Requests:
         """Have an object outlined: it is chosen, and the task starts once its path is known."""
         assert self._select is not None
         chosen = await self._select.call(choice)
-        status = self._feeds.latest(topics.OUTLINE_STATUS)
+        status = self._feeds.latest(OUTLINE_STATUS)
         if status is None or (status.started and status.state not in _ENDED):
             return chosen  # it traces what is chosen by itself
         try:
             async with asyncio.timeout(_PATH_TIMEOUT):
-                while (path := self._feeds.latest(topics.CONTOUR_PATH)) is None or path.object != chosen.label:  # noqa: ASYNC110
+                while (path := self._feeds.latest(CONTOUR_PATH)) is None or path.object != chosen.label:  # noqa: ASYNC110
                     await asyncio.sleep(0.02)  # others read the messages themselves
         except TimeoutError:
             pass  # the task tells what is wrong with the object

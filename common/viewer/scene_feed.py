@@ -6,7 +6,10 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from common import topics
-from common.messages import Contours, JointState, JointTrajectory, Rejections
+from common.applications.outlining.messages import Contours
+from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS
+from common.applications.pick_place.topics import DETECTED_OBJECTS, SCENE_BALLS, VALIDATED_TARGETS, WORKSPACE_MARKERS
+from common.messages import JointState, JointTrajectory, Rejections
 from common.topics import Topic
 from common.viewer.feeds import Feeds
 from common.viewer.layers import layers_shown
@@ -16,7 +19,7 @@ from common.viewer.pictures import Picture
 if TYPE_CHECKING:
     from common.viewer.scene_view import SceneView
 
-TRUTH: tuple[Topic[Any], ...] = (topics.SCENE_BALLS, topics.SCENE_OBJECTS)
+TRUTH: tuple[Topic[Any], ...] = (SCENE_BALLS, topics.SCENE_OBJECTS)
 
 
 class SceneFeed:
@@ -60,13 +63,13 @@ class SceneFeed:
 
     def wanted(self) -> list[Topic[Any]]:
         """Topics, of those that are read on demand, that the scene needs to be seen."""
-        wanted: list[Topic[Any]] = [topics.CONTOURS]
+        wanted: list[Topic[Any]] = [CONTOURS]
         if self.layers["truth"] or self.editing:
             wanted += TRUTH
         if self.layers["frames"]:
             wanted.append(topics.TF)
         if self.layers["rejected"]:
-            wanted.append(topics.DETECTED_OBJECTS)
+            wanted.append(DETECTED_OBJECTS)
         return wanted
 
     def set_layer(self, name: str, on: bool) -> None:
@@ -120,14 +123,14 @@ class SceneFeed:
         if contours is not None:
             scene.show_contours(contours)
         shows: list[tuple[Topic[Any], Callable[[Any], None]]] = [
-            (topics.PLANNING_SCENE, scene.show_scene), (topics.VALIDATED_TARGETS, scene.show_targets),
-            (topics.WORKSPACE_MARKERS, scene.show_workspace), (topics.TF_STATIC, scene.show_transforms),
+            (topics.PLANNING_SCENE, scene.show_scene), (VALIDATED_TARGETS, scene.show_targets),
+            (WORKSPACE_MARKERS, scene.show_workspace), (topics.TF_STATIC, scene.show_transforms),
             (topics.TF, scene.show_transforms), (topics.CAMERA_INFO, scene.show_camera),
             (topics.DEPTH_CAMERA_INFO, scene.show_camera), (topics.DISPLAY_TRAJECTORY, self._plan),
-            (topics.CONTOUR_PATH, scene.show_outline),
+            (CONTOUR_PATH, scene.show_outline),
         ]
         if self._periods.due("detected", now):
-            shows.append((topics.DETECTED_OBJECTS, scene.show_detected))
+            shows.append((DETECTED_OBJECTS, scene.show_detected))
         for topic, show in shows:
             if (message := self._feeds.fresh(topic)) is not None:
                 show(message)

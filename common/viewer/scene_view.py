@@ -12,14 +12,13 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from common.applications.outlining.messages import Contours, OutlinePoints
 from common.config import Surroundings
 from common.messages import (
     CameraInfo,
-    Contours,
     JointState,
     JointTrajectory,
     MarkerArray,
-    OutlinePoints,
     PlanningScene,
     Pose,
     PoseArray,

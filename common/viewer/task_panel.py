@@ -8,8 +8,9 @@ from typing import Any
 
 import viser
 
+from common.applications.outlining.messages import Contours, OutlineSelect, OutlineStatus
 from common.errors import ZencellError
-from common.messages import Contours, MotionStatus, OutlineSelect, OutlineStatus, TaskReport
+from common.messages import MotionStatus, TaskStatus
 from common.viewer import words
 from common.viewer.desk import Desk, assign
 from common.viewer.knobs import SLIDING
@@ -70,7 +71,7 @@ class TaskPanel:
         """Show a line about what a person asked for; an empty one takes it away."""
         self._notice.content = block(span(line, kind), "notice", kind=kind) if line else ""
 
-    def show(self, task: TaskReport | None, motion: MotionStatus | None, gripper: str, rejected: int) -> None:
+    def show(self, task: TaskStatus | None, motion: MotionStatus | None, gripper: str, rejected: int) -> None:
         """Show how the task is doing.
 
         Args:
@@ -109,12 +110,12 @@ class TaskPanel:
             self._choices.options = options
 
     @staticmethod
-    def _done(task: TaskReport | None, motion: MotionStatus | None) -> float:
+    def _done(task: TaskStatus | None, motion: MotionStatus | None) -> float:
         if task is not None and task.state == "DONE":
             return 1.0
         if task is None or isinstance(task, OutlineStatus):
             return motion.progress if motion and motion.state == "active" else 0.0
-        return min(1.0, task.placed / task.targets) if task.targets else 0.0
+        return min(1.0, task.done / task.total) if task.total else 0.0
 
     async def _stop(self) -> None:
         await self._requests.stop()

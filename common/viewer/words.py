@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from common.applications.outlining.messages import OutlineStatus
+from common.applications.pick_place.messages import PickPlaceStatus
 from common.errors import NoResponder, RemoteError, ZencellError
-from common.messages import GripperState, MotionStatus, OutlineStatus, PickPlaceStatus, PlanResponse, TaskReport
+from common.messages import GripperState, MotionStatus, PlanResponse, TaskStatus
 from common.viewer.markup import BAD, BUSY, GOOD, OFF
 
 TASK_STATES = {
@@ -40,7 +42,7 @@ GOAL_STATES = {
 }
 
 
-def task_state(status: TaskReport | None) -> tuple[str, str]:
+def task_state(status: TaskStatus | None) -> tuple[str, str]:
     """What the task does, in words, and how that is."""
     if status is None:
         return "Not known yet", OFF
@@ -53,7 +55,7 @@ def task_state(status: TaskReport | None) -> tuple[str, str]:
         return word, GOOD
     if not status.started:
         return "Stopped" if status.state != "IDLE" else "Waiting for start", OFF
-    thing = status.object if isinstance(status, OutlineStatus) else status.target
+    thing = status.object if isinstance(status, OutlineStatus) else status.subject
     return f"{word} {thing}".rstrip(), GOOD
 
 
@@ -64,7 +66,7 @@ def service_state(state: str, restarts: int) -> tuple[str, str]:
     return SERVICE_STATES[state]
 
 
-def counters(status: TaskReport | None, rejected: int) -> dict[str, object]:
+def counters(status: TaskStatus | None, rejected: int) -> dict[str, object]:
     """The figures of the task by their names."""
     if isinstance(status, OutlineStatus):
         return {
@@ -72,7 +74,7 @@ def counters(status: TaskReport | None, rejected: int) -> dict[str, object]:
             "planned": f"{100 * status.fraction:.0f} %", "failures": status.failures,
         }
     if isinstance(status, PickPlaceStatus):
-        return {"placed": status.placed, "targets": status.targets, "rejected": rejected, "retries": status.retries,
+        return {"placed": status.done, "targets": status.total, "rejected": rejected, "retries": status.retries,
                 "failures": status.failures}
     return {}
 

@@ -9,7 +9,9 @@ import pytest
 
 from benchmarks.runs import RunningCell, until
 from common import topics
-from common.messages import GripperState, MotionStatus, PickPlaceStatus, PoseArray
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.topics import PICK_PLACE_STATUS, SCENE_BALLS
+from common.messages import GripperState, MotionStatus, PoseArray
 
 pytestmark = pytest.mark.cell
 
@@ -67,13 +69,13 @@ async def test_balls_that_are_moved_added_and_taken_away_end_up_where_they_shoul
     # Not `run`: it may have ended before the last of these commands has found the cell.
     with RunningCell(tmp_path, "up", "panda", "--speed", "5", "--set", "world.count=4") as cell:
         async with cell.listen() as bus:
-            task = bus.reader(topics.PICK_PLACE_STATUS)
+            task = bus.reader(PICK_PLACE_STATUS)
             await until(task, placing)
             for command in (("move", "ball_1", "0.50", "-0.38"), ("add", "0.40", "0.10", "--id", "new"),
                             ("remove", "ball_3")):
                 answer = await asyncio.to_thread(cell.tell, "world", *command)
                 assert answer.returncode == 0, answer.stderr
-            await until(bus.reader(topics.SCENE_BALLS), in_place)
+            await until(bus.reader(SCENE_BALLS), in_place)
             await until(task, lambda status: status.state == "DONE")
         cell.interrupt()
         assert await cell.ended(10) == 0

@@ -10,6 +10,8 @@ import pytest
 
 from benchmarks.runs import RunningCell, until
 from common import topics
+from common.applications.outlining.topics import OUTLINE_STATUS
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.config import load_cell
 from common.messages import JointGoal, JointState, MotionStatus, TaskCommand
 from common.process.operator_motion import MotionFailed, OperatorMotion
@@ -18,7 +20,7 @@ from common.transport.bus import Bus, Reader
 pytestmark = pytest.mark.cell
 
 PATIENT = ("--set", "services.contour_tracer.selection_timeout=40")  # wall time: machines may be busy
-STATUS = {"panda": topics.PICK_PLACE_STATUS, "ur5": topics.OUTLINE_STATUS}
+STATUS = {"panda": PICK_PLACE_STATUS, "ur5": OUTLINE_STATUS}
 STILL = 30  # joint states in a row
 
 
@@ -95,7 +97,7 @@ def test_task_service_that_dies_while_paused_leaves_the_robot_held_until_somebod
     async def kill_and_resume(cell: RunningCell) -> None:
         async with cell.listen() as bus:
             joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
-            status = bus.reader(topics.PICK_PLACE_STATUS)
+            status = bus.reader(PICK_PLACE_STATUS)
             await until(status, lambda s: s.stage == "across", 90)
             await tell(bus, "pause")
             at_rest = await held(motion)
@@ -118,7 +120,7 @@ def test_stopped_robot_is_brought_home_by_a_person_and_the_task_starts_again(tmp
     async def stop_and_go_home(cell: RunningCell) -> None:
         async with cell.listen() as bus:
             joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
-            status = bus.reader(topics.PICK_PLACE_STATUS)
+            status = bus.reader(PICK_PLACE_STATUS)
             person = OperatorMotion(bus, [status])
             await until(status, lambda s: s.stage == "pre-grasp", 90)
             with pytest.raises(MotionFailed, match=r"smart_pick_place is GRASPING .*stop the task first"):

@@ -13,7 +13,8 @@ import msgpack
 import pytest
 
 from benchmarks.runs import RunningCell, command_line, environment, free_domain, until
-from common import topics
+from common.applications.outlining.topics import CONTOURS
+from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.recording.reading import Recording
 from common.topics import Topic
 from common.transport.connect import connect
@@ -25,8 +26,8 @@ LEAST = 5  # pictures whose results are compared
 PATIENCE = 60.0  # [s]
 
 CASES = [
-    ("panda", "vision_detector", topics.DETECTED_OBJECTS, ["camera/image_raw", "camera/camera_info", "tf_static"], ()),
-    ("ur5", "contour_detector", topics.CONTOURS, ["depth_camera/image_raw"], ("--speed", "5")),
+    ("panda", "vision_detector", DETECTED_OBJECTS, ["camera/image_raw", "camera/camera_info", "tf_static"], ()),
+    ("ur5", "contour_detector", CONTOURS, ["depth_camera/image_raw"], ("--speed", "5")),
 ]
 
 
@@ -107,7 +108,7 @@ def test_replayed_pictures_give_what_they_gave_live(
     assert len(both) >= LEAST, (len(live), len(replayed), logs)
     for stamp in both:
         first, again = live[stamp], replayed[stamp]
-        if topic is topics.CONTOURS:  # which one is chosen depends on all pictures before
+        if topic is CONTOURS:  # which one is chosen depends on all pictures before
             first, again = ({**message, "selected": None, "message": ""} for message in (first, again))
         assert again == first
     some = next(iter(both))

@@ -12,6 +12,7 @@ from benchmarks.losses import Losses
 from benchmarks.runs import RunningCell, beside, until
 from benchmarks.subscribers import Subscriber
 from common import topics
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import ServiceCounters, TaskCommand
 from common.transport.bus import Bus
 
@@ -28,7 +29,7 @@ async def test_a_slow_and_a_frozen_subscriber_keep_nobody_from_anything(tmp_path
     settings = ("autostart=false", "world.count=2", "services.camera_simulator.rate=30")
     with RunningCell(tmp_path, "up", "panda", "--speed", "5", *(f"--set={one}" for one in settings)) as cell:
         async with cell.listen() as bus:
-            losses, task, status = Losses(bus), bus.client(topics.TASK_COMMAND), bus.reader(topics.PICK_PLACE_STATUS)
+            losses, task, status = Losses(bus), bus.client(topics.TASK_COMMAND), bus.reader(PICK_PLACE_STATUS)
             await task.wait_available(60.0)
             slow, stuck = await asyncio.gather(
                 *(asyncio.to_thread(Subscriber, cell.endpoint, "panda/**", rest) for rest in (0.5, 0.0))

@@ -20,8 +20,10 @@ import pytest
 from benchmarks.runs import RunningCell, command_line, environment, free_domain, until
 from common import topics
 from common.applications.outlining import stage_files
+from common.applications.outlining.messages import OutlineStatus
+from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
 from common.config import load_cell
-from common.messages import OutlineStatus, SupervisorStatus
+from common.messages import SupervisorStatus
 
 pytestmark = pytest.mark.cell
 
@@ -66,7 +68,7 @@ def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCell]:
         async def ready() -> None:
             async with cell.listen() as bus:
                 await until(bus.reader(topics.SUPERVISOR_STATUS), all_ready)
-                await until(bus.reader(topics.CONTOURS), lambda found: len(found.contours) == 3)
+                await until(bus.reader(CONTOURS), lambda found: len(found.contours) == 3)
 
         asyncio.run(ready())
         yield cell
@@ -106,10 +108,10 @@ def test_object_that_is_not_there_is_refused_with_the_choices_and_another_is_out
 
     async def trace() -> OutlineStatus:
         async with up.listen() as bus:
-            await until(bus.reader(topics.CONTOUR_PATH), lambda path: path.object == label)
+            await until(bus.reader(CONTOUR_PATH), lambda path: path.object == label)
             started = up.tell("task", "start")
             assert started.returncode == 0, started.stderr
-            return await until(bus.reader(topics.OUTLINE_STATUS), done, 100)
+            return await until(bus.reader(OUTLINE_STATUS), done, 100)
 
     status = asyncio.run(trace())
     assert (status.object, status.closed) == (label, True)

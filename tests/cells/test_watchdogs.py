@@ -13,6 +13,7 @@ import yaml
 
 from benchmarks.runs import ROOT, RunningCell, until
 from common import topics
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import MotionStatus, ParameterRequest, SupervisorStatus
 from common.transport.bus import Bus
 
@@ -95,7 +96,7 @@ async def test_the_arm_is_held_while_the_planner_is_dead_and_the_same_motion_goe
 ) -> None:
     with RunningCell(tmp_path, "run", "panda", "--speed", "1.5", "--set", "world.count=1") as cell:
         async with cell.listen() as bus:
-            motion, status = bus.reader(topics.MOTION_STATUS), bus.reader(topics.PICK_PLACE_STATUS)
+            motion, status = bus.reader(topics.MOTION_STATUS), bus.reader(PICK_PLACE_STATUS)
             before = await until(motion, halfway, 60)
             cell.processes()["motion_planner"].kill()
             told = await until(status, lambda s: s.message == "the arm waits: motion_planner is gone", 20)

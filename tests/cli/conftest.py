@@ -20,10 +20,12 @@ PATIENCE = 40.0  # [s] until a test gives up waiting for an event
 
 SERVICE = '''"""A tiny service."""
 import asyncio, os, sys
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from common.applications.pick_place.messages import PickPlaceStatus
 from common import topics
 from common.config import Parameters
 from common.errors import ConfigError
-from common.messages import PickPlaceStatus
+
 from common.process.service import main
 
 class Config(Parameters):
@@ -41,7 +43,7 @@ async def run(bus, config):
     if config.behave == "crash once" and not os.path.exists(sys.argv[0] + ".crashed"):
         open(sys.argv[0] + ".crashed", "w").close()
         raise RuntimeError("a bug")
-    status = bus.writer(topics.PICK_PLACE_STATUS) if bus.service == "last" else None
+    status = bus.writer(PICK_PLACE_STATUS) if bus.service == "last" else None
     await bus.ready()
     if status is not None:
         state = {"done": "DONE", "error": "ERROR"}.get(config.behave, "IDLE")

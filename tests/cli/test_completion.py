@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from cli import completing
+from common.application import all_topics
 from common.config import load_cell, service_config, service_names
 from common.planning.planners import planner_names
-from common.topics import Topic, all_topics
+from common.topics import Topic
 from tests.cli.conftest import PATIENCE, ask, command_line, environment
 
 

@@ -27,7 +27,7 @@ from typing import Literal
 from pydantic import Field
 from common import topics
 from common.config import Motion, Parameters, Tunable
-from common.messages import PickPlaceStatus
+
 from common.process.service import main
 
 class Config(Parameters):

@@ -12,6 +12,7 @@ import pytest
 
 from cli.player import Player
 from common import topics
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import Header, Image
 from common.recording.reading import Recording
 from common.recording.sample import Sample
@@ -102,7 +103,7 @@ async def test_start_in_the_middle_begins_with_the_states_of_before(tmp_path: Pa
     async with playing(path, offset=0.15) as (_player, listener, task):
         await task
         assert await listener.until(3) == ["pick_place_status", "joint_states", "joint_states"]
-        reader = listener.bus.reader(topics.PICK_PLACE_STATUS)  # came too late, and asks
+        reader = listener.bus.reader(PICK_PLACE_STATUS)  # came too late, and asks
         assert (await asyncio.wait_for(reader.next(), 10)).state == "PLACING"
 
 

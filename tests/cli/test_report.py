@@ -6,6 +6,8 @@ import pytest
 
 from cli.main import app
 from common import messages as m
+from common.applications.outlining.messages import OutlinePoints, OutlineStatus
+from common.applications.pick_place.messages import PickPlaceStatus
 from common.recording.sample import Sample
 from common.recording.writing import RUN, RecordingWriter
 from common.transport.codec import encode
@@ -85,7 +87,7 @@ def pick_and_place(tape):
     services = [m.ServiceStatus(name="vision_detector", state="ready", ready_seconds=1.25)]
     tape.put(0, "supervisor/status", m.SupervisorStatus(cell="panda", services=services))
     tape.put(0.1, "planning_scene", m.PlanningScene(header=tape.header(0.1), objects=[ball, table]))
-    tape.put(0.2, "pick_place_status", m.PickPlaceStatus(header=tape.header(0.2), state="IDLE", targets=2))
+    tape.put(0.2, "pick_place_status", PickPlaceStatus(header=tape.header(0.2), state="IDLE", targets=2))
     for k in range(100):
         t = 0.25 + 0.02 * k
         q = [0.3 * np.sin(t), 0.1, 0, -1.5, 0, 1.5, 0.2]
@@ -103,7 +105,7 @@ def pick_and_place(tape):
         rest = {"positions": [0] * 7, "velocities": [0] * 7, "accelerations": [0] * 7}
         last = m.JointTrajectoryPoint(time_from_start=2.5 + k, **rest)
         tape.put(0.6 + k, "display_trajectory", m.JointTrajectory(joint_names=ARM, points=[last]))
-        tape.put(0.65 + k, "pick_place_status", m.PickPlaceStatus(
+        tape.put(0.65 + k, "pick_place_status", PickPlaceStatus(
             header=tape.header(0.65 + k), state="GRASPING", target="ball_1", started=True, targets=2,
             plans=plans[: k + 1], planning_seconds=sum(p.seconds for p in plans[: k + 1])))
         tape.put(0.7 + k, "motion/status", m.MotionStatus(id=f"goal_{k}", state="active"))
@@ -120,7 +122,7 @@ def pick_and_place(tape):
                                                 invalid={"camera/image_raw": 3}, overflow={"x": 1}))
     tape.put(2.2, "scene_balls", m.PoseArray(header=tape.header(2.2), labels=["box", "table"], poses=[
         m.Pose(position=point(0.55, 0.25)), m.Pose(position=point(0.2, 0))]))
-    tape.put(2.5, "pick_place_status", m.PickPlaceStatus(
+    tape.put(2.5, "pick_place_status", PickPlaceStatus(
         header=tape.header(2.5), state="DONE", started=True, placed=1, targets=2, failures=4, retries=5, plans=plans,
         moving_seconds=1.75, planning_seconds=0.357, task_seconds=2.25,
         skipped=[m.Rejection(position=point(0.3, 0.3), reason="given up after 3 tries")]))
@@ -186,7 +188,7 @@ def test_what_failed_is_listed_in_time_with_its_reason(page):
 def test_a_recording_that_ran_faster_tells_latency_in_wall_time(tmp_path):
     path = tmp_path / "fast.mcap"
     tape = Tape(path, speed=5.0)
-    tape.put(0, "pick_place_status", m.PickPlaceStatus())
+    tape.put(0, "pick_place_status", PickPlaceStatus())
     for k in range(3):  # exposed 20 ms of wall time before: cell time runs five times as fast
         stamp = m.Header(stamp=BEGIN + round((1 + k - 0.02) * 5e9))
         tape.put(1 + k, "validated_targets", m.PoseArray(header=stamp, poses=[]))
@@ -200,17 +202,17 @@ def test_an_outline_is_compared_with_what_was_traced(tmp_path):
     tape = Tape(path, "ur5", world="w2")
     corners = [(0.45, -0.05), (0.55, -0.05), (0.55, 0.05), (0.45, 0.05)]
     poses = [m.Pose(position=point(x, y, 1.05)) for x, y in corners]
-    tape.put(0, "outline_status", m.OutlineStatus(header=tape.header(0), state="PLANNING", started=True))
-    tape.put(0.4, "contour_path", m.OutlinePoints(header=tape.header(0.1), poses=poses, object="Object_0"))
+    tape.put(0, "outline_status", OutlineStatus(header=tape.header(0), state="PLANNING", started=True))
+    tape.put(0.4, "contour_path", OutlinePoints(header=tape.header(0.1), poses=poses, object="Object_0"))
     tape.put(0.5, "scene_objects", m.WorldObjects(objects=[m.WorldObject(
         id="cube", shape="box", outline=corners, base=1.0, height=0.05)]))
-    tape.put(1, "outline_status", m.OutlineStatus(header=tape.header(1), state="APPROACHING", started=True))
-    tape.put(1.5, "outline_status", m.OutlineStatus(header=tape.header(1.5), state="TRACING", started=True))
+    tape.put(1, "outline_status", OutlineStatus(header=tape.header(1), state="APPROACHING", started=True))
+    tape.put(1.5, "outline_status", OutlineStatus(header=tape.header(1.5), state="TRACING", started=True))
     for k in range(20):
         t = 1.6 + 0.05 * k
         q = [0.01 * k, -1.5, 1.5, -1.5, -1.5, 0.0]
         tape.put(t, "joint_states", m.JointState(header=tape.header(t), name=UR5, position=q, velocity=[0.2] * 6))
-    tape.put(3, "outline_status", m.OutlineStatus(
+    tape.put(3, "outline_status", OutlineStatus(
         header=tape.header(3), state="DONE", started=True, object="Object_0", points=4, fraction=0.75, length_m=0.4))
     tape.writer.close()
     assert app.execute(["report", str(path)]) == 0
@@ -225,7 +227,7 @@ def test_an_outline_is_compared_with_what_was_traced(tmp_path):
 def test_the_recording_of_a_cell_that_is_not_here_has_no_limits_and_says_so(tmp_path):
     path = tmp_path / "away.mcap"
     tape = Tape(path, "elsewhere")
-    tape.put(0, "pick_place_status", m.PickPlaceStatus(state="ERROR", started=True, message="x"))
+    tape.put(0, "pick_place_status", PickPlaceStatus(state="ERROR", started=True, message="x"))
     tape.put(1, "joint_states", m.JointState(header=tape.header(1), name=[*ARM, "panda_finger_joint1"],
                                              position=[0.5] * 8, velocity=[0.0] * 8))
     tape.writer.close()
@@ -242,7 +244,7 @@ def test_the_recording_of_a_cell_that_is_not_here_has_no_limits_and_says_so(tmp_
 def test_a_recording_that_was_cut_is_reported_as_far_as_it_goes(tmp_path, capsys):
     path = tmp_path / "cut.mcap"
     tape = Tape(path)
-    tape.put(0, "pick_place_status", m.PickPlaceStatus(state="GRASPING", started=True, targets=3))
+    tape.put(0, "pick_place_status", PickPlaceStatus(state="GRASPING", started=True, targets=3))
     tape.put(2, "motion/status", m.MotionStatus(id="g", state="active"))
     tape.writer.flush()
     tape.writer.abandon()
@@ -273,7 +275,7 @@ def test_what_is_no_recording_of_a_run_is_one_line(content, code, wanted, tmp_pa
     elif content:
         tape = Tape(path)
         if content == "foreign":
-            tape.put(0, "somebody/else", m.PickPlaceStatus())
+            tape.put(0, "somebody/else", PickPlaceStatus())
         tape.writer.close()
     assert app.execute(["report", str(path)]) == code
     (line,) = capsys.readouterr().err.splitlines()

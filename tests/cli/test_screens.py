@@ -7,7 +7,8 @@ from rich.console import Console
 
 from cli.live import render
 from cli.screens import Content, JsonScreen, PlainScreen, ScreenHandler, open_screen
-from common.messages import PickPlaceStatus, ServiceStatus
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.messages import ServiceStatus
 
 CONTENT = Content(
     [ServiceStatus(name="router", state="ready", pid=12), ServiceStatus(name="vision", state="restarting", restarts=2)],

@@ -7,6 +7,7 @@ from rich.console import Console
 from cli.top import render
 from cli.watching import ON_DEMAND, Processes, ServiceRow, TopicRow, View, Watch, statuses
 from common import topics
+from common.application import all_topics
 from common.clock import Clock
 from common.messages import (
     GripperState,
@@ -60,7 +61,7 @@ async def test_repetition_of_an_old_state_says_nothing_of_its_age() -> None:
 async def test_what_is_made_only_for_listeners_is_not_listened_to() -> None:
     network = LocalNetwork()
     bus = network.bus("camera")
-    made = {key: bus.writer(topic) for key, topic in topics.all_topics().items() if isinstance(topic, Topic)}
+    made = {key: bus.writer(topic) for key, topic in all_topics().items() if isinstance(topic, Topic)}
     async with Watch(network.bus("top"), CLOCK) as watch:
         assert {key for key, writer in made.items() if not writer.matched} == set(ON_DEMAND)
         watch.count(counted("viewer", {"detection_image": 0}), 1.0)

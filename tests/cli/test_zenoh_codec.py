@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from cli.zenoh_codec import decode, encode
 from common import topics
+from common.application import all_topics
 from common.errors import ConfigError
 from common.messages import Header, Image, JointState, StopRequest
 from common.transport.codec import decode as decode_message
@@ -69,7 +70,7 @@ def test_a_key_that_is_not_ours_takes_any_json() -> None:
     assert msgpack.unpackb(encode("other/key", '{"a": {"base64": "AAE="}}')) == {"a": b"\x00\x01"}
 
 
-@pytest.mark.parametrize("topic", topics.all_topics().values(), ids=str)
+@pytest.mark.parametrize("topic", all_topics().values(), ids=str)
 def test_every_topic_has_a_message_that_can_be_shown(topic: topics.AnyTopic) -> None:
     from cli.schema import example_of, fields_of
 

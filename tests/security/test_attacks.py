@@ -23,6 +23,7 @@ import zenoh
 from benchmarks.runs import RunningCell, command_line, environment, until
 from common import messages as m
 from common import topics
+from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.errors import NoRouter
 from common.recording.reading import Recording
 from common.security.certificates import Authority
@@ -318,7 +319,7 @@ async def test_messages_that_are_none_are_counted_and_harm_nobody(secured: Secur
                 await asyncio.sleep(0.3)  # a stream keeps only the newest of a sender
             while not refused(await until(counters, lambda one: one.service == "vision_detector")):
                 camera.put(f"panda/{name}", MARK)
-            found = bus.reader(topics.DETECTED_OBJECTS)
+            found = bus.reader(DETECTED_OBJECTS)
             assert await found.next()  # from the true pictures
 
 

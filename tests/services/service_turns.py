@@ -15,6 +15,9 @@ import numpy as np
 from common import messages as m
 from common import topics
 from common.applications.outlining.contours import ContourOptions, find_contours
+from common.applications.outlining.messages import Contours, OutlinePoints
+from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_STATUS
+from common.applications.pick_place.topics import DETECTED_OBJECTS, SCENE_BALLS, VALIDATED_TARGETS
 from common.clock import Clock
 from common.config import Parameters, load_cell, service_config
 from common.config.tunables import tunable_sections
@@ -77,14 +80,14 @@ def calibrate(bus: Bus, camera: Pinhole, frame: str) -> None:
 
 async def simulate_camera(bus: Bus) -> AsyncIterator[m.Image]:
     images = bus.reader(topics.CAMERA_IMAGE)
-    bus.writer(topics.SCENE_BALLS).put(m.PoseArray())
+    bus.writer(SCENE_BALLS).put(m.PoseArray())
     while True:
         yield await later(bus, images)
 
 
 async def detect(bus: Bus) -> AsyncIterator[list[m.Marker]]:
     frame = PANDA.world.camera.frame
-    images, found = bus.writer(topics.CAMERA_IMAGE), bus.reader(topics.DETECTED_OBJECTS)
+    images, found = bus.writer(topics.CAMERA_IMAGE), bus.reader(DETECTED_OBJECTS)
     calibrate(bus, CAMERA, frame)
     pictures = [draw(balls, CAMERA, PANDA.world) for balls in (BALLS, BALLS[:2])]
     for turn in itertools.count():
@@ -94,7 +97,7 @@ async def detect(bus: Bus) -> AsyncIterator[list[m.Marker]]:
 
 
 async def validate(bus: Bus) -> AsyncIterator[m.PoseArray]:
-    detected, targets = bus.writer(topics.DETECTED_OBJECTS), bus.reader(topics.VALIDATED_TARGETS)
+    detected, targets = bus.writer(DETECTED_OBJECTS), bus.reader(VALIDATED_TARGETS)
     calibrate(bus, CAMERA, PANDA.world.camera.frame)
     turn = 0
     while True:
@@ -115,7 +118,7 @@ def markers(bus: Bus, *places: tuple[float, float, float]) -> m.MarkerArray:
 
 
 async def keep_scene(bus: Bus) -> AsyncIterator[list[m.CollisionObject]]:
-    detected, scenes = bus.writer(topics.DETECTED_OBJECTS), bus.reader(topics.PLANNING_SCENE)
+    detected, scenes = bus.writer(DETECTED_OBJECTS), bus.reader(topics.PLANNING_SCENE)
     calibrate(bus, CAMERA, PANDA.world.camera.frame)
     while True:
         frame = markers(bus, (0.40, 0.0, 0.03))
@@ -143,7 +146,7 @@ async def pick_and_place(bus: Bus) -> AsyncIterator[m.PlanRequest]:
     bus.serve(topics.MOTION_PLAN, plan)
     gripper, motion = bus.writer(topics.GRIPPER_STATE), bus.writer(topics.MOTION_STATUS)
     joints, scene = bus.writer(topics.JOINT_STATES), bus.writer(topics.PLANNING_SCENE)
-    targets = bus.writer(topics.VALIDATED_TARGETS)
+    targets = bus.writer(VALIDATED_TARGETS)
     turn = 0
     while True:
         x, y = 0.40 + 0.08 * (turn % 3), -0.17  # another place, for this one is given up in the end
@@ -216,37 +219,37 @@ def square() -> np.ndarray:
     return picture
 
 
-async def contour(bus: Bus) -> AsyncIterator[m.Contours]:
-    images, contours = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.CONTOURS)
+async def contour(bus: Bus) -> AsyncIterator[Contours]:
+    images, contours = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.reader(CONTOURS)
     while True:
         header = bus.header(UR5.world.camera.frame)
         images.put(array_to_image(square(), "bgr8", header))
         yield await heard(contours, lambda c, stamp=header.stamp: c.header.stamp == stamp)
 
 
-async def to_world(bus: Bus) -> AsyncIterator[m.OutlinePoints]:
+async def to_world(bus: Bus) -> AsyncIterator[OutlinePoints]:
     frame = UR5.world.camera.frame
     calibrate(bus, DEPTH_CAMERA, frame)
-    depths, contours = bus.writer(topics.DEPTH_CAMERA_DEPTH), bus.writer(topics.CONTOURS)
-    points = bus.reader(topics.CONTOUR_POINTS)
+    depths, contours = bus.writer(topics.DEPTH_CAMERA_DEPTH), bus.writer(CONTOURS)
+    points = bus.reader(CONTOUR_POINTS)
     depth = np.full((DEPTH_CAMERA.height, DEPTH_CAMERA.width), 1.75, np.float32)
     depth[300:400, 400:500] = 1.65
     found = find_contours(square(), ContourOptions())
     while True:
         header = bus.header(frame)
         depths.put(array_to_image(depth, "32FC1", header))
-        contours.put(m.Contours(header=header, width=DEPTH_CAMERA.width, height=DEPTH_CAMERA.height, contours=found,
+        contours.put(Contours(header=header, width=DEPTH_CAMERA.width, height=DEPTH_CAMERA.height, contours=found,
                                 selected=0))
         yield await heard(points, lambda p, stamp=header.stamp: p.header.stamp == stamp)
 
 
-async def clear(bus: Bus) -> AsyncIterator[m.OutlinePoints]:
-    outlines, paths = bus.writer(topics.CONTOUR_POINTS), bus.reader(topics.CONTOUR_PATH)
+async def clear(bus: Bus) -> AsyncIterator[OutlinePoints]:
+    outlines, paths = bus.writer(CONTOUR_POINTS), bus.reader(CONTOUR_PATH)
     round_ = [m.Pose(position=m.Vector3(x=0.5 + 0.05 * np.cos(a), y=0.05 * np.sin(a), z=1.1))
               for a in np.linspace(0, 2 * np.pi, 90, endpoint=False)]
     while True:
         header = bus.header("world")
-        outlines.put(m.OutlinePoints(header=header, poses=round_, object="Object_0"))
+        outlines.put(OutlinePoints(header=header, poses=round_, object="Object_0"))
         yield await heard(paths, lambda p, stamp=header.stamp: p.header.stamp == stamp)
 
 
@@ -263,9 +266,9 @@ async def trace(bus: Bus) -> AsyncIterator[m.PlanRequest]:
                               error="" if done else "no_ik", message="" if done else "not today")
 
     bus.serve(topics.MOTION_PLAN, plan)
-    command, status = bus.client(topics.TASK_COMMAND), bus.reader(topics.OUTLINE_STATUS)
+    command, status = bus.client(topics.TASK_COMMAND), bus.reader(OUTLINE_STATUS)
     writers = {topic.key: bus.writer(topic) for topic in (
-        topics.GRIPPER_STATE, topics.MOTION_STATUS, topics.JOINT_STATES, topics.PLANNING_SCENE, topics.CONTOUR_PATH)}
+        topics.GRIPPER_STATE, topics.MOTION_STATUS, topics.JOINT_STATES, topics.PLANNING_SCENE, CONTOUR_PATH)}
     corners = [(0.45, -0.05), (0.55, -0.05), (0.55, 0.05), (0.45, 0.05)]
     cube = m.CollisionObject(
         id="Object_3", role="target", shape="prism", dimensions=[0.1], outline=[(x - 0.5, y) for x, y in corners],
@@ -278,7 +281,7 @@ async def trace(bus: Bus) -> AsyncIterator[m.PlanRequest]:
         writers["motion/status"].put(m.MotionStatus(header=header))
         writers["joint_states"].put(m.JointState(header=header, name=UR5.robot.joints, position=home))
         writers["planning_scene"].put(m.PlanningScene(header=header, objects=[cube]))
-        writers["contour_path"].put(m.OutlinePoints(header=header, poses=poses, object="Object_3"))
+        writers["contour_path"].put(OutlinePoints(header=header, poses=poses, object="Object_3"))
         async with asyncio.timeout(PATIENCE):
             while (request := await asked.get()).stage != "trace":
                 pass

@@ -9,6 +9,7 @@ import pytest
 
 from cli.main import app
 from common import topics
+from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.config import load_cell, service_config
 from common.perception.image import image_to_array
 from common.process.in_process import running_service
@@ -61,7 +62,7 @@ def cell(tmp_path_factory):
 async def test_balls_are_found_where_they_are_within_two_millimetres(cell):
     loaded, net = load_cell(cell), LocalNetwork()
     bus = net.bus()
-    found, infos, images = (bus.reader(t) for t in (topics.DETECTED_OBJECTS, topics.CAMERA_INFO, topics.CAMERA_IMAGE))
+    found, infos, images = (bus.reader(t) for t in (DETECTED_OBJECTS, topics.CAMERA_INFO, topics.CAMERA_IMAGE))
     async with AsyncExitStack() as stack, asyncio.timeout(60):
         for module in (robot_state_publisher, vision_detector, camera_opencv):
             name = module.__name__.rpartition(".")[2]

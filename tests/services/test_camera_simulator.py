@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from common import topics
+from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.config import Run, Surroundings
 from common.messages import Pose, PoseArray, Vector3
@@ -37,7 +38,7 @@ async def test_one_layout_in_pictures_and_camera_info_out():
     net = LocalNetwork()
     tester = net.bus()
     images, infos = tester.reader(topics.CAMERA_IMAGE), tester.reader(topics.CAMERA_INFO)
-    truth = tester.writer(topics.SCENE_BALLS)
+    truth = tester.writer(SCENE_BALLS)
     async with running_service(net, run, config, name="camera_simulator"):
         truth.put(balls((0.5, -0.2, 0.03)))
         image, info = await next_of(images), await next_of(infos)
@@ -51,7 +52,7 @@ async def test_nothing_is_sent_before_the_world_says_where_its_balls_are():
     net = LocalNetwork()
     tester = net.bus()
     images, infos = tester.reader(topics.CAMERA_IMAGE), tester.reader(topics.CAMERA_INFO)
-    truth = tester.writer(topics.SCENE_BALLS)
+    truth = tester.writer(SCENE_BALLS)
     async with running_service(net, run, config.model_copy(update={"rate": 200.0, "max_rate": 200.0})):
         await asyncio.sleep(0.1)
         assert images.latest is None and infos.latest is None
@@ -62,7 +63,7 @@ async def test_nothing_is_sent_before_the_world_says_where_its_balls_are():
 async def test_what_is_drawn_follows_the_world_and_leaves_out_what_can_not_be_seen():
     net = LocalNetwork()
     tester = net.bus()
-    images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_BALLS)
+    images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(SCENE_BALLS)
     async with running_service(net, run, config):
         truth.put(balls((0.5, -0.2, 0.03), (0.6, 0.0, 0.03)))
         while not red_at(await next_of(images), 0.6, 0.0):
@@ -84,7 +85,7 @@ async def test_stamps_are_cell_time_at_the_rate_in_cell_time():
     net = LocalNetwork()
     clock = Clock(speed=5.0)
     tester = net.bus(clock=clock)
-    images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_BALLS)
+    images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(SCENE_BALLS)
     async with running_service(net, run, config, clock=clock):
         truth.put(balls())
         stamps = [(await next_of(images)).header.stamp for _ in range(8)]
@@ -97,7 +98,7 @@ async def test_noise_comes_from_the_seed_of_the_run():
     async def first(seed):
         net = LocalNetwork()
         tester = net.bus()
-        images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_BALLS)
+        images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(SCENE_BALLS)
         truth.put(balls())
         noisy = Config(world=Surroundings(), run=Run(cell="test", seed=seed), noise_std=8, brightness=-20)
         async with running_service(net, run, noisy):
@@ -111,6 +112,6 @@ async def test_noise_comes_from_the_seed_of_the_run():
 
 async def test_it_is_the_only_one_here_that_reads_the_truth():
     found = await wiring(run, config)
-    assert found.reads == {topics.SCENE_BALLS}
+    assert found.reads == {SCENE_BALLS}
     assert found.writes == {topics.CAMERA_IMAGE, topics.CAMERA_INFO}
     assert not found.serves and not found.calls

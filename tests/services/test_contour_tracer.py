@@ -4,6 +4,8 @@ import asyncio
 
 from common import messages as m
 from common import topics
+from common.applications.outlining.messages import OutlinePoints
+from common.applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import Refused
@@ -29,7 +31,7 @@ def show(bus: Bus) -> None:
         pose=m.Pose(position=m.Vector3(x=0.5, z=1.05)))
     bus.writer(topics.PLANNING_SCENE).put(m.PlanningScene(header=header, objects=[cube]))
     poses = [m.Pose(position=m.Vector3(x=x, y=y, z=1.1)) for x, y in SQUARE]
-    bus.writer(topics.CONTOUR_PATH).put(m.OutlinePoints(header=header, poses=poses, object="Object_3"))
+    bus.writer(CONTOUR_PATH).put(OutlinePoints(header=header, poses=poses, object="Object_3"))
 
 
 async def test_chosen_contour_makes_it_ask_for_plans_from_above_to_home() -> None:
@@ -52,7 +54,7 @@ async def test_chosen_contour_makes_it_ask_for_plans_from_above_to_home() -> Non
 
     bus.serve(topics.MOTION_PLAN, plan)
     bus.serve(topics.MOTION_EXECUTE, execute)
-    status = bus.reader(topics.OUTLINE_STATUS)
+    status = bus.reader(OUTLINE_STATUS)
     await bus.ready()
     async with running_service(net, contour_tracer.run, CONFIG, name="contour_tracer"):
         show(bus)
@@ -97,7 +99,7 @@ async def test_status_is_a_state_that_a_late_reader_gets() -> None:
     bus = net.bus("tester", cell="test", clock=Clock())
     async with running_service(net, contour_tracer.run, CONFIG, name="contour_tracer"):
         async with asyncio.timeout(10):
-            first = await bus.reader(topics.OUTLINE_STATUS).next()
-            late = await bus.reader(topics.OUTLINE_STATUS).next()
+            first = await bus.reader(OUTLINE_STATUS).next()
+            late = await bus.reader(OUTLINE_STATUS).next()
         assert first.state == late.state == "IDLE"
         assert late.message == "waiting for gripper/state, planning_scene, joint_states, motion/status"

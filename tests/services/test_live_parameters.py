@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from common import topics
+from common.applications.outlining.messages import OutlinePoints
+from common.applications.pick_place.topics import REJECTED_TARGETS, WORKSPACE_MARKERS
 from common.config import Parameters, World
 from common.config.tunables import apply, checked, leaves, tunable_sections
-from common.messages import OutlinePoints, PlanRequest
+from common.messages import PlanRequest
 from common.robot.transforms import tool_down
 from common.sim.world import GraspTolerances, SimulatedWorld
 from tests.common.applications.outlining.outline_double import OutlineDouble
@@ -289,7 +291,7 @@ async def test_a_goal_is_refused_by_the_tolerances_of_now(tmp_path: Path) -> Non
 
 async def test_the_shell_is_drawn_anew_and_the_next_target_judged_by_it(tmp_path: Path) -> None:
     async with Running("workspace_validator", tmp_path) as service:
-        shells, rejected = service.bus.reader(topics.WORKSPACE_MARKERS), service.bus.reader(topics.REJECTED_TARGETS)
+        shells, rejected = service.bus.reader(WORKSPACE_MARKERS), service.bus.reader(REJECTED_TARGETS)
         await service.turn()
         await service.tune(max_radius=0.5)
         async with asyncio.timeout(10):

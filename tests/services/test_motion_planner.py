@@ -3,6 +3,7 @@ import asyncio
 import pytest
 
 from common import topics
+from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import RemoteError
@@ -161,7 +162,7 @@ async def test_service_that_is_stopped_ends_a_running_plan():
 
 async def test_wiring_reads_no_truth():
     found = await wiring(motion_planner.run, CONFIG)
-    assert topics.SCENE_BALLS not in found.reads
+    assert SCENE_BALLS not in found.reads
     assert found.reads == {topics.PLANNING_SCENE, topics.JOINT_STATES}
     assert found.serves == {topics.MOTION_PLAN}
     assert found.writes == {topics.DISPLAY_TRAJECTORY}

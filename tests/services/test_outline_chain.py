@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from common import topics
+from common.application import all_topics
+from common.applications.outlining.messages import OutlineSelect
+from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
 from common.config import (
     CameraConfig,
     ObjectConfig,
@@ -21,7 +24,7 @@ from common.config import (
     read_yaml,
 )
 from common.errors import ConfigError, RemoteError
-from common.messages import Header, JointState, OutlineSelect, TFMessage, Vector3, WorldEdit, WorldObjects
+from common.messages import Header, JointState, TFMessage, Vector3, WorldEdit, WorldObjects
 from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
@@ -48,8 +51,8 @@ class Cell:
         self.bus = self.net.bus()
         self.truth, self.joints = self.bus.writer(topics.SCENE_OBJECTS), self.bus.writer(topics.JOINT_STATES)
         self.static = self.bus.writer(topics.TF_STATIC)
-        self.contours, self.points = self.bus.reader(topics.CONTOURS), self.bus.reader(topics.CONTOUR_POINTS)
-        self.paths, self.select = self.bus.reader(topics.CONTOUR_PATH), self.bus.client(topics.OUTLINE_SELECT)
+        self.contours, self.points = self.bus.reader(CONTOURS), self.bus.reader(CONTOUR_POINTS)
+        self.paths, self.select = self.bus.reader(CONTOUR_PATH), self.bus.client(OUTLINE_SELECT)
 
     def say(self, objects):
         camera: CameraConfig = AROUND.camera
@@ -192,7 +195,7 @@ async def test_the_camera_alone_reads_the_truth():
     (depth_camera, CAMERA), (contour_detector, DETECTOR), (pixel_to_world, WORLD), (duplicate_remover, REMOVER)])
 async def test_wiring_is_what_the_topic_table_says(module, config):
     found, name = await wiring(module.run, config), module.__name__.rpartition(".")[2]
-    table = topics.all_topics().values()
+    table = all_topics().values()
     assert {t.key for t in found.writes} - {"log", "counters"} == {
         t.key for t in table if t.kind != "request" and t.writer == name}
     assert {t.key for t in found.serves} == {t.key for t in table if t.kind == "request" and t.writer == name}

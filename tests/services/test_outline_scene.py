@@ -6,6 +6,8 @@ import numpy as np
 
 from common import messages as m
 from common import topics
+from common.applications.outlining.messages import Contour, Contours
+from common.applications.outlining.topics import CONTOURS
 from common.clock import Clock
 from common.config import Surroundings, load_cell, service_config
 from common.perception.image import array_to_image
@@ -31,7 +33,7 @@ class Neighbours:
     def __init__(self, net: LocalNetwork) -> None:
         self.bus: Bus = net.bus("tester", cell="test", clock=Clock())
         frame = AROUND.camera.frame
-        self.depths, self.contours = self.bus.writer(topics.DEPTH_CAMERA_DEPTH), self.bus.writer(topics.CONTOURS)
+        self.depths, self.contours = self.bus.writer(topics.DEPTH_CAMERA_DEPTH), self.bus.writer(CONTOURS)
         self.joints = self.bus.writer(topics.JOINT_STATES)
         self.scenes = self.bus.reader(topics.PLANNING_SCENE)
         self.bus.writer(topics.DEPTH_CAMERA_INFO).put(CAMERA.info(m.Header(frame_id=frame)))
@@ -50,9 +52,9 @@ class Neighbours:
         side = np.arange(201)
         pixels = [*((412 + k, 284) for k in side), *((612, 284 + k) for k in side[1:]),
                   *((612 - k, 484) for k in side[1:]), *((412, 484 - k) for k in side[1:-1])]
-        cube = m.Contour.model_validate({"index": 0, "label": "Object_0", "area": 4e4, "pixels": [
+        cube = Contour.model_validate({"index": 0, "label": "Object_0", "area": 4e4, "pixels": [
             (float(u), float(v)) for u, v in pixels]})
-        self.contours.put(m.Contours(header=m.Header(stamp=stamp), width=CAMERA.width, height=CAMERA.height,
+        self.contours.put(Contours(header=m.Header(stamp=stamp), width=CAMERA.width, height=CAMERA.height,
                                      contours=[cube], selected=0))
 
     async def scene(self) -> m.PlanningScene:

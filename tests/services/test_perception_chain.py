@@ -6,6 +6,7 @@ from contextlib import AsyncExitStack
 import numpy as np
 
 from common import topics
+from common.applications.pick_place.topics import REJECTED_TARGETS, SCENE_BALLS, VALIDATED_TARGETS
 from common.clock import Clock
 from common.config import Run, Surroundings, load_cell, service_config
 from common.messages import Header, Pose, PoseArray, TFMessage, TransformStamped, Vector3
@@ -56,8 +57,8 @@ async def targets_like(reader, places):
 async def test_what_lies_on_the_table_is_offered_and_follows_what_happens_there():
     net, clock = LocalNetwork(), Clock()
     bus = net.bus(clock=clock)
-    world, statics = bus.writer(topics.SCENE_BALLS), bus.writer(topics.TF_STATIC)
-    offered, rejected = bus.reader(topics.VALIDATED_TARGETS), bus.reader(topics.REJECTED_TARGETS)
+    world, statics = bus.writer(SCENE_BALLS), bus.writer(topics.TF_STATIC)
+    offered, rejected = bus.reader(VALIDATED_TARGETS), bus.reader(REJECTED_TARGETS)
     statics.put(tf())
     places = list(cell.world.spots[:7])
     async with AsyncExitStack() as stack:
@@ -80,8 +81,8 @@ async def test_what_lies_on_the_table_is_offered_and_follows_what_happens_there(
 async def test_noise_and_a_darker_picture_change_nothing():
     net, clock = LocalNetwork(), Clock()
     bus = net.bus(clock=clock)
-    world, statics = bus.writer(topics.SCENE_BALLS), bus.writer(topics.TF_STATIC)
-    offered = bus.reader(topics.VALIDATED_TARGETS)
+    world, statics = bus.writer(SCENE_BALLS), bus.writer(topics.TF_STATIC)
+    offered = bus.reader(VALIDATED_TARGETS)
     statics.put(tf())
     places = [(0.40, -0.30), (0.46, -0.30), (0.64, -0.25), (0.40, -0.17)]
     async with AsyncExitStack() as stack:

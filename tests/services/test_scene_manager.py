@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 from common import messages as m
 from common import topics
+from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.perception.pinhole import Pinhole
@@ -36,7 +37,7 @@ async def film(expose: Callable[[], None]) -> None:
 async def test_seen_ball_becomes_an_object_with_an_id_and_moves_into_the_hand_that_takes_it() -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test", clock=Clock())
-    detected, scene = bus.writer(topics.DETECTED_OBJECTS), bus.reader(topics.PLANNING_SCENE)
+    detected, scene = bus.writer(DETECTED_OBJECTS), bus.reader(topics.PLANNING_SCENE)
     bus.writer(topics.CAMERA_INFO).put(CAMERA.info(bus.header("camera_optical_frame")))
     bus.writer(topics.TF_STATIC).put(m.TFMessage(transforms=[m.TransformStamped(
         header=bus.header("world"), child_frame_id="camera_optical_frame",

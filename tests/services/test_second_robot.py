@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from common import topics
+from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import RemoteError
@@ -55,7 +56,7 @@ async def test_it_starts_at_home_with_open_fingers_and_tells_every_joint(robot: 
     async with executor() as bus:
         joints = await see(bus.reader(topics.JOINT_STATES), lambda m: True)
         gripper = await see(bus.reader(topics.GRIPPER_STATE), lambda m: True)
-        balls = await see(bus.reader(topics.SCENE_BALLS), lambda m: True)
+        balls = await see(bus.reader(SCENE_BALLS), lambda m: True)
         objects = await see(bus.reader(topics.SCENE_OBJECTS), lambda m: True)
     assert joints.name == [*robot.joint_names, *GRIPPER.joints]
     assert joints.position == pytest.approx([*robot.named("home"), *[0.0] * 6], abs=1e-5)

@@ -4,6 +4,7 @@ import asyncio
 
 from common import messages as m
 from common import topics
+from common.applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.process.in_process import running_service
@@ -29,7 +30,7 @@ def show(bus: Bus, targets: list[tuple[float, float]], age: float = 0.0) -> None
         m.JointState(header=header, name=CELL.robot.joints, position=CELL.robot.named_poses["home"]))
     bus.writer(topics.PLANNING_SCENE).put(
         m.PlanningScene(header=header, objects=[ball(f"track_{k}", *t) for k, t in enumerate(targets)]))
-    bus.writer(topics.VALIDATED_TARGETS).put(m.PoseArray(
+    bus.writer(VALIDATED_TARGETS).put(m.PoseArray(
         header=header, poses=[m.Pose(position=m.Vector3(x=x, y=y, z=0.03)) for x, y in targets]))
 
 
@@ -75,8 +76,8 @@ async def test_status_is_a_state_that_a_late_reader_gets() -> None:
     net = LocalNetwork()
     bus = net.bus("tester", cell="test", clock=Clock())
     async with running_service(net, smart_pick_place.run, CONFIG, name="smart_pick_place"):
-        first = await asyncio.wait_for(bus.reader(topics.PICK_PLACE_STATUS).next(), 5)
-        late = await asyncio.wait_for(bus.reader(topics.PICK_PLACE_STATUS).next(), 5)
+        first = await asyncio.wait_for(bus.reader(PICK_PLACE_STATUS).next(), 5)
+        late = await asyncio.wait_for(bus.reader(PICK_PLACE_STATUS).next(), 5)
         assert first.state == late.state == "IDLE"
         assert "waiting for" in late.message
 

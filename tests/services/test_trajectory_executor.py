@@ -8,6 +8,7 @@ import pytest
 import ruckig
 
 from common import topics
+from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import ConfigError, RemoteError, UnknownName
@@ -57,7 +58,7 @@ class Person:
         self.joints = self.bus.reader(topics.JOINT_STATES)
         self.motion = self.bus.reader(topics.MOTION_STATUS)
         self.gripper = self.bus.reader(topics.GRIPPER_STATE)
-        self.balls = self.bus.reader(topics.SCENE_BALLS)
+        self.balls = self.bus.reader(SCENE_BALLS)
         self.updates = self.bus.reader(topics.SCENE_OBJECT_UPDATES)
         self.execute = self.bus.client(topics.MOTION_EXECUTE)
         self.stop = self.bus.client(topics.MOTION_STOP)
@@ -113,7 +114,7 @@ def move(robot: RobotModel, start, end, scaling=0.5) -> JointTrajectory:
 async def test_it_reads_nothing_and_serves_motion_gripper_and_world() -> None:
     found = await wiring(trajectory_executor.run, config())
     assert found.reads == set() and found.calls == set()
-    assert found.writes == {topics.JOINT_STATES, topics.MOTION_STATUS, topics.GRIPPER_STATE, topics.SCENE_BALLS,
+    assert found.writes == {topics.JOINT_STATES, topics.MOTION_STATUS, topics.GRIPPER_STATE, SCENE_BALLS,
                             topics.SCENE_OBJECTS, topics.SCENE_OBJECT_UPDATES}
     assert found.serves == {topics.MOTION_EXECUTE, topics.MOTION_STOP, topics.MOTION_HOLD, topics.GRIPPER_COMMAND,
                             topics.WORLD_EDIT}

@@ -16,6 +16,17 @@ import yaml
 
 from common import messages as m
 from common import topics
+from common.applications.outlining.messages import (
+    Contour,
+    Contours,
+    OutlinePoints,
+    OutlineSelect,
+    OutlineSelection,
+    OutlineStatus,
+)
+from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT, OUTLINE_STATUS
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.topics import DETECTION_IMAGE, PICK_PLACE_STATUS, REJECTED_TARGETS, SCENE_BALLS
 from common.clock import Clock
 from common.config import Cell, load_cell, service_config
 from common.errors import Refused
@@ -78,7 +89,7 @@ class Played:
     commands: list[str] = field(default_factory=list)
     stops: list[str] = field(default_factory=list)
     sets: list[tuple[dict[str, object], str]] = field(default_factory=list)
-    selects: list[m.OutlineSelect] = field(default_factory=list)
+    selects: list[OutlineSelect] = field(default_factory=list)
     area: float = 60.0
 
     async def command(self, request: m.TaskCommand) -> m.TaskStatus:
@@ -89,9 +100,9 @@ class Played:
         self.stops.append(request.reason)
         return m.MotionStatus()
 
-    async def select(self, request: m.OutlineSelect) -> m.OutlineSelection:
+    async def select(self, request: OutlineSelect) -> OutlineSelection:
         self.selects.append(request)
-        return m.OutlineSelection(index=request.index or 0, label=f"Object_{request.index or 0}")
+        return OutlineSelection(index=request.index or 0, label=f"Object_{request.index or 0}")
 
     async def parameters(self, request: m.ParameterRequest) -> m.ParameterReply:
         for path, value in request.set.items():
@@ -108,7 +119,7 @@ class Played:
     def serve(self) -> None:
         self.bus.serve(topics.TASK_COMMAND, self.command)
         self.bus.serve(topics.MOTION_STOP, self.stop)
-        self.bus.serve(topics.OUTLINE_SELECT, self.select)
+        self.bus.serve(OUTLINE_SELECT, self.select)
         self.bus.serve(topics.parameters_of("vision_detector"), self.parameters)
 
 
@@ -169,8 +180,8 @@ async def test_task_is_told_what_is_clicked(panda: Played, page: BrowserDouble, 
 
 
 async def test_state_and_counters_are_shown_in_words(panda: Played, page: BrowserDouble) -> None:
-    status = m.PickPlaceStatus(state="GRASPING", started=True, target="track_4", placed=2, targets=7, stage="pre_grasp")
-    panda.bus.writer(topics.PICK_PLACE_STATUS).put(status)
+    status = PickPlaceStatus(state="GRASPING", started=True, target="track_4", placed=2, targets=7, stage="pre_grasp")
+    panda.bus.writer(PICK_PLACE_STATUS).put(status)
     panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(state="active", progress=0.5, held=True))
     await page.until(lambda: "Taking track_4" in page.text and "pre grasp" in page.text)
     await page.until(lambda: 'data-held="True"' in page.text and "held on its path" in page.text)
@@ -178,8 +189,8 @@ async def test_state_and_counters_are_shown_in_words(panda: Played, page: Browse
 
 
 async def test_pictures_and_truth_are_read_only_while_a_page_that_shows_them_is_open(panda: Played) -> None:
-    writers = {topic: panda.bus.writer(topic) for topic in (topics.CAMERA_IMAGE, topics.DETECTION_IMAGE)}
-    balls = panda.bus.writer(topics.SCENE_BALLS)
+    writers = {topic: panda.bus.writer(topic) for topic in (topics.CAMERA_IMAGE, DETECTION_IMAGE)}
+    balls = panda.bus.writer(SCENE_BALLS)
     assert not any(writer.matched for writer in writers.values()) and not balls.matched
     async with opened(panda.port) as page:
         await until(lambda: all(writer.matched for writer in writers.values()))
@@ -187,7 +198,7 @@ async def test_pictures_and_truth_are_read_only_while_a_page_that_shows_them_is_
         await page.set("Truth (simulated hardware)", True)
         await until(lambda: balls.matched)
         await page.set("With what was found", False)
-        await until(lambda: not writers[topics.DETECTION_IMAGE].matched)
+        await until(lambda: not writers[DETECTION_IMAGE].matched)
         assert writers[topics.CAMERA_IMAGE].matched
     await until(lambda: not writers[topics.CAMERA_IMAGE].matched and not balls.matched)
 
@@ -252,7 +263,7 @@ async def test_odd_messages_leave_the_page_and_the_service_as_they_are(
         await page.say({"type": "GuiUpdateMessage", "uuid": speed, "updates": {"value": value}})
     await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Start"), "updates": {"value": "Explode"}})
     await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Show"), "updates": {"value": "nothing"}})
-    panda.bus.writer(topics.DETECTION_IMAGE).put(m.Image(
+    panda.bus.writer(DETECTION_IMAGE).put(m.Image(
         header=m.Header(), height=4, width=4, encoding="bgr8", data=b"short"))
     await page.click("Pause")
     await until(lambda: panda.commands)
@@ -288,16 +299,16 @@ async def test_saved_layout_opens_with_what_was_on(tmp_path: Path) -> None:
 
 async def test_chosen_object_is_traced_once_its_path_is_known() -> None:
     async with page_of("ur5") as played, opened(played.port) as page:
-        played.bus.writer(topics.OUTLINE_STATUS).put(m.OutlineStatus(state="DONE", started=True))
-        contours = [m.Contour(index=i, label=f"Object_{i}", pixels=[(1.0, 1.0), (2.0, 1.0), (2.0, 2.0)])
+        played.bus.writer(OUTLINE_STATUS).put(OutlineStatus(state="DONE", started=True))
+        contours = [Contour(index=i, label=f"Object_{i}", pixels=[(1.0, 1.0), (2.0, 1.0), (2.0, 2.0)])
                     for i in range(2)]
-        played.bus.writer(topics.CONTOURS).put(
-            m.Contours(header=m.Header(), width=4, height=4, contours=contours, selected=0))
+        played.bus.writer(CONTOURS).put(
+            Contours(header=m.Header(), width=4, height=4, contours=contours, selected=0))
         await page.until(lambda: page.label("● Object_0"))
         await page.click("Object_1")
         await until(lambda: played.selects)
-        assert played.selects == [m.OutlineSelect(rule="index", index=1)] and played.commands == []
-        played.bus.writer(topics.CONTOUR_PATH).put(m.OutlinePoints(object="Object_1"))
+        assert played.selects == [OutlineSelect(rule="index", index=1)] and played.commands == []
+        played.bus.writer(CONTOUR_PATH).put(OutlinePoints(object="Object_1"))
         await until(lambda: played.commands)
         assert played.commands == ["start"]
         await page.until(lambda: "Object_1 is chosen" in page.text)
@@ -308,7 +319,7 @@ async def test_contour_that_is_clicked_in_the_scene_is_chosen(scenes: list[Scene
         await until(lambda: scenes and scenes[0].begun)
         await asyncio.to_thread(lambda: scenes[0].on_select(1))  # as viser does
         await until(lambda: played.selects)
-        assert played.selects == [m.OutlineSelect(rule="index", index=1)]
+        assert played.selects == [OutlineSelect(rule="index", index=1)]
 
 
 async def test_object_that_is_dragged_is_moved_in_the_world_and_a_refusal_is_told(
@@ -379,7 +390,7 @@ async def test_rejection_that_came_before_the_scene_is_shown_in_it(
     monkeypatch.setattr("common.viewer.scene_view.SceneView", slow)
     async with page_of("panda") as played, opened(played.port) as page:
         rejected = m.Rejections(header=m.Header(), rejected=[m.Rejection(position=m.Vector3(x=1.0), reason="too far")])
-        played.bus.writer(topics.REJECTED_TARGETS).put(rejected)
+        played.bus.writer(REJECTED_TARGETS).put(rejected)
         await page.click("Pause")  # the page is there before the scene is
         await until(lambda: played.commands)
         go.set()
@@ -426,8 +437,8 @@ async def test_plan_that_was_found_is_played_and_not_begun_anew(
 
 
 async def test_rejected_places_are_counted_once(panda: Played, page: BrowserDouble) -> None:
-    writer = panda.bus.writer(topics.REJECTED_TARGETS)
-    panda.bus.writer(topics.PICK_PLACE_STATUS).put(m.PickPlaceStatus())
+    writer = panda.bus.writer(REJECTED_TARGETS)
+    panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
     for x, reason in ((0.9, "too far"), (0.91, "too far"), (0.2, "too near"), (0.5, "inside the container")):
         rejection = m.Rejection(position=m.Vector3(x=x), reason=reason)
         writer.put(m.Rejections(header=m.Header(), rejected=[rejection]))

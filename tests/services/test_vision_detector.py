@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from common import topics
+from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE
 from common.config import Surroundings, check
 from common.errors import ConfigError
 from common.messages import Header, Image, TFMessage, TransformStamped
@@ -41,7 +42,7 @@ class Rig:
         self.images = bus.writer(topics.CAMERA_IMAGE)
         self.infos = bus.writer(topics.CAMERA_INFO)
         self.statics = bus.writer(topics.TF_STATIC)
-        self.found = bus.reader(topics.DETECTED_OBJECTS)
+        self.found = bus.reader(DETECTED_OBJECTS)
         self.bus = bus
 
     def calibrate(self):
@@ -161,7 +162,7 @@ async def test_annotated_picture_is_drawn_for_whoever_listens():
     net = LocalNetwork()
     rig = Rig(net)
     rig.calibrate()
-    shown = rig.bus.reader(topics.DETECTION_IMAGE)
+    shown = rig.bus.reader(DETECTION_IMAGE)
     async with running_service(net, run, config):
         rig.images.put(picture(stamp=7))
         image = await asyncio.wait_for(shown.next(), 10)
@@ -182,7 +183,7 @@ async def test_an_rgb_picture_is_understood():
 async def test_it_reads_no_truth():
     found = await wiring(run, config)
     assert found.reads == {topics.CAMERA_IMAGE, topics.CAMERA_INFO, topics.TF_STATIC}
-    assert found.writes == {topics.DETECTED_OBJECTS, topics.DETECTION_IMAGE}
+    assert found.writes == {DETECTED_OBJECTS, DETECTION_IMAGE}
 
 
 @pytest.mark.parametrize(

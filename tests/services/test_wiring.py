@@ -7,6 +7,8 @@ import importlib
 import pytest
 
 from common import topics
+from common.application import all_topics
+from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import Surroundings, World, load_cell, service_config
 from common.process.wiring import Wiring, wiring
 
@@ -15,7 +17,7 @@ SERVICES = [(cell, name) for cell, loaded in CELLS.items() for name in loaded.se
 CAMERAS = ("camera_simulator", "depth_camera")
 SHOWING = "viewer"  # shows the truth on a tick, and decides nothing
 DECIDING = [(cell, name) for cell, name in SERVICES if name not in (*CAMERAS, SHOWING, "trajectory_executor")]
-TRUTH = {topics.SCENE_BALLS, topics.SCENE_OBJECTS}
+TRUTH = {SCENE_BALLS, topics.SCENE_OBJECTS}
 
 
 async def wired(cell: str, name: str) -> Wiring:
@@ -47,9 +49,9 @@ async def test_service_writes_and_serves_what_the_topic_table_says(cell: str, na
     found = await wired(cell, name)
     shared = {"log", "counters"}
     assert {t.key for t in found.writes} - shared == {
-        t.key for t in topics.all_topics().values() if t.kind != "request" and name in t.writers}
+        t.key for t in all_topics().values() if t.kind != "request" and name in t.writers}
     assert {t.key for t in found.serves} == {
-        t.key for t in topics.all_topics().values() if t.kind == "request" and name in t.writers}
+        t.key for t in all_topics().values() if t.kind == "request" and name in t.writers}
 
 
 @pytest.mark.parametrize("cell", CELLS)

@@ -5,6 +5,12 @@ import numpy as np
 import pytest
 
 from common import topics
+from common.applications.pick_place.topics import (
+    DETECTED_OBJECTS,
+    REJECTED_TARGETS,
+    VALIDATED_TARGETS,
+    WORKSPACE_MARKERS,
+)
 from common.config import Grasp, Surroundings, load_cell
 from common.messages import Header, Marker, MarkerArray, Pose, TFMessage, TransformStamped, Vector3
 from common.perception.pinhole import Pinhole
@@ -39,11 +45,11 @@ def seen(*places, stamp=1_000, partial=(), pixel=True):
 class Rig:
     def __init__(self, net, *, calibrated=True):
         bus = net.bus()
-        self.found = bus.writer(topics.DETECTED_OBJECTS)
+        self.found = bus.writer(DETECTED_OBJECTS)
         self.infos, self.statics = bus.writer(topics.CAMERA_INFO), bus.writer(topics.TF_STATIC)
-        self.targets = bus.reader(topics.VALIDATED_TARGETS)
-        self.rejected = bus.reader(topics.REJECTED_TARGETS)
-        self.markers = bus.reader(topics.WORKSPACE_MARKERS)
+        self.targets = bus.reader(VALIDATED_TARGETS)
+        self.rejected = bus.reader(REJECTED_TARGETS)
+        self.markers = bus.reader(WORKSPACE_MARKERS)
         if calibrated:
             self.calibrate()
 
@@ -168,5 +174,5 @@ async def test_shell_and_column_are_there_for_whoever_comes_late():
 
 async def test_it_reads_no_truth():
     found = await wiring(run, config)
-    assert found.reads == {topics.DETECTED_OBJECTS, topics.CAMERA_INFO, topics.TF_STATIC}
-    assert found.writes == {topics.VALIDATED_TARGETS, topics.REJECTED_TARGETS, topics.WORKSPACE_MARKERS}
+    assert found.reads == {DETECTED_OBJECTS, topics.CAMERA_INFO, topics.TF_STATIC}
+    assert found.writes == {VALIDATED_TARGETS, REJECTED_TARGETS, WORKSPACE_MARKERS}

@@ -12,13 +12,15 @@ import pytest
 
 from benchmarks.runs import until
 from common import topics
+from common.applications.outlining.messages import OutlineStatus
+from common.applications.outlining.topics import CONTOURS, OUTLINE_STATUS
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import (
     JointState,
     MotionStatus,
-    OutlineStatus,
     ParameterReply,
     ParameterRequest,
-    PickPlaceStatus,
     SupervisorStatus,
 )
 from common.transport.bus import Client, Reader
@@ -59,7 +61,7 @@ async def test_pause_stops_the_arm_and_resume_starts_it(bring: Bring, watched: W
     page = await watched.open(cell.address)
     async with cell.listen() as bus:
         joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
-        status = bus.reader(topics.PICK_PLACE_STATUS)
+        status = bus.reader(PICK_PLACE_STATUS)
         await in_motion(page, joints)
         await page.get_by_role("button", name="Pause").click()
         await until(motion, lambda told: told.held, PATIENCE)
@@ -80,7 +82,7 @@ async def test_stop_stops_arm_and_task(bring: Bring, watched: Watched) -> None:
         joints = bus.reader(topics.JOINT_STATES)
         await in_motion(page, joints)
         stopping = asyncio.create_task(
-            until(bus.reader(topics.PICK_PLACE_STATUS), lambda told: not told.started, PATIENCE))
+            until(bus.reader(PICK_PLACE_STATUS), lambda told: not told.started, PATIENCE))
         await page.get_by_role("button", name="STOP").click()
         stopped: PickPlaceStatus = await stopping
         ended: MotionStatus = await until(
@@ -99,7 +101,7 @@ async def test_escape_stops_as_the_button_does(bring: Bring, watched: Watched) -
         await in_motion(page, bus.reader(topics.JOINT_STATES))
         await page.keyboard.press("Escape")
         await until(bus.reader(topics.MOTION_STATUS), lambda told: told.state == "cancelled", PATIENCE)
-        await until(bus.reader(topics.PICK_PLACE_STATUS), lambda told: not told.started, PATIENCE)
+        await until(bus.reader(PICK_PLACE_STATUS), lambda told: not told.started, PATIENCE)
 
 
 async def test_parameter_changed_on_the_page_changes_the_service_and_the_other_way_round(
@@ -153,8 +155,8 @@ async def test_choosing_an_object_on_the_page_traces_it(bring: Bring, watched: W
     cell = await bring(*UR5)
     page = await watched.open(cell.address)
     async with cell.listen() as bus:
-        status = bus.reader(topics.OUTLINE_STATUS)
-        found = await until(bus.reader(topics.CONTOURS), lambda told: len(told.contours) == 3, PATIENCE)
+        status = bus.reader(OUTLINE_STATUS)
+        found = await until(bus.reader(CONTOURS), lambda told: len(told.contours) == 3, PATIENCE)
         other = next(contour.label for contour in found.contours if contour.index != found.selected)
         await page.get_by_role("button", name=other).click()
         done: OutlineStatus = await until(status, lambda told: told.state in ("DONE", "ERROR"), 2 * PATIENCE)

@@ -14,6 +14,7 @@ from websockets.asyncio.client import connect as connect_socket
 
 from benchmarks.runs import until
 from common import topics
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import TaskCommand
 from common.viewer.guard import close_server, make_server
 from tests.viewer.conftest import IN_BROWSER, PATIENCE, Bring, Opened, Viewed, Watched
@@ -43,7 +44,7 @@ async def test_pages_that_come_and_go_change_nothing_for_the_task(opened: Opened
     with Viewed(tmp_path, "up", "panda", "--speed", "2", "--set", "world.count=3", *WAITING) as cell:
         await cell.served()
         async with cell.listen() as bus, AsyncExitStack() as stack:
-            status = bus.reader(topics.PICK_PLACE_STATUS)
+            status = bus.reader(PICK_PLACE_STATUS)
             sockets = await asyncio.gather(*(stack.enter_async_context(socket_of(cell)) for _ in range(10)))
             for socket in sockets:
                 await socket.send(CAMERA)

@@ -1,0 +1,3 @@
+"""Outlining: the tool traces the outline of an object that a depth camera saw."""
+
+TASK = "contour_tracer"

@@ -11,8 +11,9 @@ import numpy.typing as npt
 from pydantic import Field
 
 from common.applications.outlining.contours_refinement import refine
+from common.applications.outlining.messages import Contour
 from common.config import Parameters, Tunable
-from common.messages import Color, Contour
+from common.messages import Color
 
 Picture = npt.NDArray[np.uint8]
 Channel = Literal["saturation", "maximum", "grey"]

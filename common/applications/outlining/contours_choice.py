@@ -6,8 +6,9 @@ import colorsys
 from collections.abc import Sequence
 
 from common.applications.outlining.contours import is_hole
+from common.applications.outlining.messages import Contour, OutlineSelect
 from common.errors import ZencellError
-from common.messages import Color, Contour, OutlineSelect
+from common.messages import Color
 
 HUES = {"red": 0, "orange": 30, "yellow": 60, "green": 120, "cyan": 180, "blue": 240, "magenta": 300}  # [degrees]
 NAMES = [*HUES, "white", "grey", "black"]

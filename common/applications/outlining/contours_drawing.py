@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.applications.outlining.contours import is_hole
-from common.messages import Contour
+from common.applications.outlining.messages import Contour
 
 Picture = npt.NDArray[np.uint8]
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from common.applications.outlining.contours_choice import NoSuchContour, choose, described
-from common.messages import Contour, OutlineSelect
+from common.applications.outlining.messages import Contour, OutlineSelect
 
 LARGEST_CHANGE = 2.0  # of the area of an object between two pictures
 

@@ -9,6 +9,7 @@ from itertools import pairwise
 from pydantic import Field
 
 from common import messages as m
+from common.applications.outlining.messages import OutlinePoints, OutlineState
 from common.config import GripperConfig, Number, Parameters, Tunable
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
 
@@ -21,7 +22,7 @@ class Leg:
     """A motion of the arm; `trajectory` is there once it was planned. `touches` are pairs that may touch in it."""
 
     name: str
-    state: m.OutlineState
+    state: OutlineState
     goal: m.PoseGoal | m.PathGoal | m.JointGoal
     straight: bool = False
     touches: list[tuple[str, str]] = field(default_factory=list)
@@ -42,7 +43,7 @@ class Close:
     """The fingers come together: they trace closed."""
 
     name = "close"
-    state: m.OutlineState = "PLANNING"
+    state: OutlineState = "PLANNING"
 
 
 @dataclass
@@ -50,7 +51,7 @@ class OutlineView:
     """What the task knows at an instant: only what was perceived or reported. Times are cell time [s]."""
 
     now: float
-    path: m.OutlinePoints | None = None
+    path: OutlinePoints | None = None
     scene: m.PlanningScene | None = None
     gripper: m.GripperState | None = None
     motion: m.MotionStatus | None = None
@@ -94,7 +95,7 @@ def _area(thing: m.CollisionObject) -> float:
     return float((max(xs) - min(xs)) * (max(ys) - min(ys)))
 
 
-def closed(path: m.OutlinePoints) -> list[Place]:
+def closed(path: OutlinePoints) -> list[Place]:
     """The points of a path [m] and the first once more."""
     points = [(p.position.x, p.position.y, p.position.z) for p in path.poses]
     return [*points, points[0]]

@@ -13,6 +13,7 @@ from common.applications.outlining.contours import ContourOptions, find_contours
 from common.applications.outlining.contours_choice import NoSuchContour, choose
 from common.applications.outlining.duplicates import simplified, without_duplicates
 from common.applications.outlining.legs import Leg, Legs, OutlineView, closed
+from common.applications.outlining.messages import Contour, OutlinePoints, OutlineSelect
 from common.applications.outlining.perceived_solids import PerceivedSolid, perceived_solids
 from common.applications.outlining.top_face import TopFaceOptions, top_face
 from common.errors import ZencellError
@@ -35,7 +36,7 @@ class Perceived:
     """What the stages of perception found: the chosen contour (n, 2) [px], and points (n, 3) [m] in world."""
 
     label: str
-    contours: list[m.Contour]
+    contours: list[Contour]
     pixels: Array
     coordinates: Array
     cleared: Array
@@ -43,7 +44,7 @@ class Perceived:
 
 
 def perceive(
-    picture: Picture, depth: Depth, camera: Pinhole, wanted: m.OutlineSelect,
+    picture: Picture, depth: Depth, camera: Pinhole, wanted: OutlineSelect,
     contour_options: ContourOptions, face_options: TopFaceOptions, tolerance: float,
 ) -> Perceived:
     """Contours, the chosen one, its points in world, and those without duplicates.
@@ -93,7 +94,7 @@ def plan_outline(
         Impossible: the first motion that can not be planned says why.
     """
     poses = [m.Pose(position=m.Vector3(x=x, y=y, z=z)) for x, y, z in points.tolist()]
-    path = m.OutlinePoints(header=scene.header, poses=poses, object=label, given=given)
+    path = OutlinePoints(header=scene.header, poses=poses, object=label, given=given)
     solid = OutlineView(now=0.0, path=path, scene=scene).solid()
     if solid is None:
         raise Impossible(f"{label}: nothing in the planning scene lies within the outline")

@@ -10,8 +10,9 @@ import numpy.typing as npt
 
 from common.applications.outlining.contours import is_hole
 from common.applications.outlining.duplicates import simplified, without_duplicates
+from common.applications.outlining.messages import Contour
 from common.applications.outlining.top_face import TopFaceOptions, top_face
-from common.messages import Color, Contour
+from common.messages import Color
 from common.perception.depth import Depth, DepthError
 from common.perception.pinhole import Pinhole
 

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from common import messages as m
 from common.applications.outlining.legs import Close, Leg, Legs, OutlineView, TracingParameters, closed, length
+from common.applications.outlining.messages import OutlinePoints, OutlineStatus
 from common.config import GripperConfig, Tunable
 from common.tasks.execution import ANEW, FOUND_HELD, Execution, note_plan
 from common.tasks.pictures import Pictures
@@ -71,7 +72,7 @@ class Outline:
             speed: cell time that passes per wall time.
         """
         self.p, self.legs = parameters, Legs(parameters, gripper)
-        self.status = m.OutlineStatus(started=started, standoff=parameters.standoff)
+        self.status = OutlineStatus(started=started, standoff=parameters.standoff)
         self._home, self._speed = home, speed
         self._pictures = Pictures(speed)
         self._ids = (f"{prefix}-{n}" for n in itertools.count(1))
@@ -134,7 +135,7 @@ class Outline:
         else:
             if leg.name == "trace":
                 self.status.fraction = response.fraction
-            self._fail(f"{self.status.object}: {response.message}" if self.status.object else response.message, view)
+            self._fail(f"{self.status.subject}: {response.message}" if self.status.subject else response.message, view)
 
     def on_goal(self, answer: m.MotionStatus | m.GripperState, view: OutlineView) -> None:
         """Take in the answer to execute or to a gripper command: accepted, or refused with a reason."""
@@ -262,19 +263,19 @@ class Outline:
         if 0 < limit * self._speed < view.now - self._selecting[1]:
             self._fail(problem, view)
 
-    def _take(self, path: m.OutlinePoints, solid: str, view: OutlineView) -> None:
+    def _take(self, path: OutlinePoints, solid: str, view: OutlineView) -> None:
         """Make the motions for a contour that goes round a solid of the planning scene."""
         assert view.gripper is not None
         points = closed(path)
         status = self.status
-        status.state, status.message, status.object = "PLANNING", "", path.object
+        status.state, status.message, status.subject = "PLANNING", "", path.object
         status.points, status.length_m, status.fraction, status.closed = len(path.poses), length(points), 0.0, False
         status.invalid_depth, status.standoff = path.invalid_depth, self.p.standoff
         if view.gripper.width > SHUT:
             self._stages.append(Close())
         self._stages += self.legs.outline(points, solid)
 
-    def _unseen(self, path: m.OutlinePoints, view: OutlineView) -> str:
+    def _unseen(self, path: OutlinePoints, view: OutlineView) -> str:
         """Why the picture in which a contour was found can not be decided by; empty when it can."""
         stamps = (path.header.stamp * 1e-9,)
         return self._pictures.problem(view.now, stamps, self.p.frame_timeout, self.p.clock_tolerance)

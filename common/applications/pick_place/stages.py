@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from common import messages as m
+from common.applications.pick_place.messages import TaskState
 
 Place = tuple[float, float, float]
 Spots = list[tuple[float, float]]
@@ -34,7 +35,7 @@ class Move:
     """A motion of the arm; `trajectory` is there once it was planned, around what stood at `planned_around`."""
 
     name: str
-    state: m.TaskState
+    state: TaskState
     goal: m.PoseGoal | m.JointGoal
     cycle: Cycle | None = None
     straight: bool = False
@@ -54,7 +55,7 @@ class Grip:
     """A motion of the fingers to a width [m]."""
 
     name: str
-    state: m.TaskState
+    state: TaskState
     width: float
     cycle: Cycle | None = None
 

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 
 from common import messages as m
 from common.applications.pick_place.choice import Choice
+from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.parameters import PickPlaceParameters
 from common.applications.pick_place.rows import Rows
 from common.applications.pick_place.stages import Command, Cycle, Grip, Move, Stage, Target, View, appeared
@@ -44,7 +45,7 @@ class PickPlace:
         self._pictures = Pictures(speed)
         self.rows = Rows(grasp, around, gripper, parameters)
         self.choice = Choice(parameters, around.container, around.ball_radius)
-        self.status = m.PickPlaceStatus(started=started)
+        self.status = PickPlaceStatus(started=started)
         self._stages: deque[Stage] = deque()
         self._running: Execution[Stage] | None = None
         self._stopping = False
@@ -114,7 +115,7 @@ class PickPlace:
         assert view.motion is not None and view.gripper is not None
         if not self._looked:
             # Balls in the container were placed before a restart, or by somebody else.
-            self._looked, self.status.placed = True, len(view.objects("contained"))
+            self._looked, self.status.done = True, len(view.objects("contained"))
         if not self._found:
             self._found, self.status.paused = True, view.motion.paused
             if view.motion.paused:
@@ -136,7 +137,7 @@ class PickPlace:
             self.status.task_seconds = view.now - (self._began or view.now)
         self.status.skipped = self.choice.rejections()
         if self.status.stage not in ("close", "lift", "across", "release"):  # then one is in the hand or in the air
-            self.status.targets = self.status.placed + len(view.targets)
+            self.status.total = self.status.done + len(view.targets)
         return [*self._plan_ahead(view), *(() if view.trouble else self._advance(view))]
 
     # --- what runs -------------------------------------------------------------------------------------------
@@ -181,7 +182,7 @@ class PickPlace:
             if view.holding:
                 self._fail("the fingers opened and still hold something", view)
                 return
-            self.status.placed += 1
+            self.status.done += 1
             self._failures_in_a_row = 0
             self.choice.released(stage.cycle.target, view)
 
@@ -289,7 +290,7 @@ class PickPlace:
             self._quiet = (seen, bool(left))
             self.status.message = f"{left} objects are left that can not be taken" if left else "the table looks empty"
         done = self._quiet is not None and seen - self._quiet[0] >= (self.p.grace if left else self.p.empty)
-        self.status.state, self.status.stage, self.status.target = "DONE" if done else "IDLE", "", ""
+        self.status.state, self.status.stage, self.status.subject = "DONE" if done else "IDLE", "", ""
 
     # --- planning and doing ----------------------------------------------------------------------------------
 
@@ -377,7 +378,7 @@ class PickPlace:
             command = m.ExecuteRequest(id=self._mint(), trajectory=stage.trajectory)
         self._running = Execution(stage, command, view.now)
         self.status.state, self.status.stage = stage.state, stage.name
-        self.status.target = stage.cycle.target.id if stage.cycle else ""
+        self.status.subject = stage.cycle.target.id if stage.cycle else ""
         yield command
 
     def _is_planned(self, move: Move) -> bool:

@@ -10,11 +10,12 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from common.applications.pick_place.messages import PickPlaceStatus
 from common.chaos.damage import damaged, nonsense
 from common.chaos.plan import CELL_SECONDS, LABELS, Fault, Form, Kind, faults, plan
 from common.chaos.setting import keys_of
 from common.errors import DecodeError
-from common.messages import PickPlaceStatus, StopRequest
+from common.messages import StopRequest
 from common.transport.codec import Attachment, checksum_of, decode, encode, require_whole
 
 PROCESSES = ["router", "motion_planner", "trajectory_executor", "smart_pick_place"]

@@ -9,6 +9,8 @@ import pytest
 
 from common import messages as m
 from common import topics
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.process.operator_motion import MotionFailed, OperatorMotion
 from common.transport.local import LocalNetwork
 
@@ -23,7 +25,7 @@ class Cell:
     def __init__(self, net: LocalNetwork) -> None:
         self.bus = net.bus("trajectory_executor")
         self.motion = self.bus.writer(topics.MOTION_STATUS)
-        self.task = self.bus.writer(topics.PICK_PLACE_STATUS)
+        self.task = self.bus.writer(PICK_PLACE_STATUS)
         self.status = m.MotionStatus()
         self.asked: list[m.Message] = []
         self.came: asyncio.Queue[m.Message] = asyncio.Queue()
@@ -131,7 +133,7 @@ async def test_way_that_can_not_be_planned_is_told_and_nothing_moves(cell: Cell,
 async def test_robot_that_a_task_has_is_left_to_it(
     cell: Cell, person: OperatorMotion, said: dict[str, object], told: str
 ) -> None:
-    cell.task.put(m.PickPlaceStatus.model_validate(said))
+    cell.task.put(PickPlaceStatus.model_validate(said))
     with pytest.raises(MotionFailed, match=told):
         await person.move(HOME)
     assert cell.asked == []
@@ -140,7 +142,7 @@ async def test_robot_that_a_task_has_is_left_to_it(
 @pytest.mark.parametrize("said", [{"started": True, "state": "DONE"}, {"started": True, "state": "IDLE"},
                                   {"started": False, "state": "GRASPING"}, {"started": True, "state": "ERROR"}])
 async def test_robot_that_no_task_has_is_moved(cell: Cell, person: OperatorMotion, said: dict[str, object]) -> None:
-    cell.task.put(m.PickPlaceStatus.model_validate(said))
+    cell.task.put(PickPlaceStatus.model_validate(said))
     assert (await person.move(HOME)).state == "succeeded"
 
 
@@ -176,7 +178,7 @@ async def test_task_that_begins_meanwhile_is_named(cell: Cell, person: OperatorM
     answer = cell.plan
 
     async def begin(request: m.PlanRequest) -> m.PlanResponse:
-        cell.task.put(m.PickPlaceStatus(started=True, state="GRASPING"))
+        cell.task.put(PickPlaceStatus(started=True, state="GRASPING"))
         return await answer(request)
 
     server = next(s for s in cell.bus._servers if s.topic is topics.MOTION_PLAN)

@@ -10,13 +10,14 @@ import pytest
 from pydantic import Field
 
 from common import topics
+from common.application import find_topic
 from common.config import Motion, Parameters, Tunable, load_cell, service_config
 from common.errors import NoResponder, RemoteError
 from common.messages import ParameterReply, ParameterRequest
 from common.process.in_process import running_service
 from common.process.pace import Pace
 from common.process.wiring import wiring
-from common.topics import find_topic, parameters_of
+from common.topics import parameters_of
 from common.transport.bus import Bus, Client
 from common.transport.local import LocalNetwork
 

@@ -14,6 +14,7 @@ import psutil
 import pytest
 
 from common import topics
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.errors import NoResponder, NoRouter, RemoteError, RequestLost, RequestTimeout
 from common.messages import TaskCommand
 from common.transport.bus import Bus, Client
@@ -172,7 +173,7 @@ async def test_handler_with_a_bug_ends_the_process_with_its_traceback(stage: Sta
 async def test_all_heals_when_the_router_is_restarted(stage: Stage, bus: Bus) -> None:
     toy = stage.toy()
     client = await available(bus)
-    reader = bus.reader(topics.PICK_PLACE_STATUS)
+    reader = bus.reader(PICK_PLACE_STATUS)
     await asyncio.wait_for(reader.next(), PATIENCE)
     await bus.alive.wait("toy", PATIENCE)
     stage.the_router.kill()

@@ -10,6 +10,8 @@ from typing import Any
 from common import messages as m
 from common import topics
 from common.applications.outlining.legs import OutlineView
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.process.in_process import running_service
 from common.process.task_runner import Command, TaskRunner
 from common.tasks.reliance import Reliance
@@ -25,7 +27,7 @@ class Script:
     """A task that asks for a motion at once, and for what a command stands for."""
 
     def __init__(self) -> None:
-        self.status = m.PickPlaceStatus()
+        self.status = PickPlaceStatus()
         self.first: list[Command] = [GO]
         self.also: list[Command] = []  # together with every command
 
@@ -48,7 +50,7 @@ async def running(net: LocalNetwork, *also: Command) -> AsyncIterator[Bus]:
     async def run(bus: Bus, config: None) -> None:
         script = Script()
         script.also = list(also)
-        runner = TaskRunner(bus, script, lambda: None, bus.writer(topics.PICK_PLACE_STATUS), lambda: 1.0)
+        runner = TaskRunner(bus, script, lambda: None, bus.writer(PICK_PLACE_STATUS), lambda: 1.0)
         await bus.ready()
         await runner.run(())
 
@@ -133,13 +135,13 @@ async def test_what_is_missing_is_told_in_the_status_and_holds_the_arm_until_it_
     async def run(bus: Bus, config: None) -> None:
         joints = bus.reader(topics.JOINT_STATES)
         reliance = Reliance(lambda: joints.received, lambda: 0.2)
-        writer = bus.writer(topics.PICK_PLACE_STATUS)
+        writer = bus.writer(PICK_PLACE_STATUS)
         runner = TaskRunner(bus, Silent(), lambda: view, writer, lambda: 1.0, reliance)
         await bus.ready()
         await runner.run(())
 
     person = net.bus("person")
-    status, joints = person.reader(topics.PICK_PLACE_STATUS), executor.bus.writer(topics.JOINT_STATES)
+    status, joints = person.reader(PICK_PLACE_STATUS), executor.bus.writer(topics.JOINT_STATES)
     async with running_service(net, run, None, name="smart_pick_place"):
         joints.put(m.JointState(header=m.Header(stamp=1), name=["j"], position=[0.0]))
         hold = await executor.next()

@@ -5,9 +5,11 @@ import time
 from typing import Literal
 
 from common import topics
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.config import Parameters
 from common.errors import ConfigError, Refused
-from common.messages import PickPlaceStatus, TaskCommand, TaskStatus
+from common.messages import TaskCommand, TaskStatus
 from common.process.service import main
 from common.transport.bus import Bus
 
@@ -22,7 +24,7 @@ def hang() -> None:
 
 
 async def run(bus: Bus, config: Config) -> None:
-    status = bus.writer(topics.PICK_PLACE_STATUS)
+    status = bus.writer(PICK_PLACE_STATUS)
 
     async def handle(request: TaskCommand) -> TaskStatus:
         if request.command == "pause":

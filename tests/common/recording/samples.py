@@ -6,7 +6,8 @@ from pathlib import Path
 
 import msgpack
 
-from common.messages import Header, JointState, Message, PickPlaceStatus
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.messages import Header, JointState, Message
 from common.recording.sample import Sample
 from common.recording.writing import RecordingWriter
 

@@ -13,6 +13,8 @@ import pytest
 from mcap.reader import make_reader
 
 from common import messages as m
+from common.applications.outlining.messages import OutlinePoints
+from common.applications.pick_place.messages import PickPlaceStatus
 from common.messages import Header, Image, Message, Pose, Quaternion, Vector3
 from common.perception.image import array_to_image
 from common.recording import foxglove, pictures, tables
@@ -44,8 +46,8 @@ CONVERTED: list[tuple[Message, str]] = [
     (m.TFMessage(transforms=[m.TransformStamped(header=HEADER, child_frame_id="a", transform=POSE)]),
      "foxglove.FrameTransforms"),
     (m.PoseArray(header=HEADER, poses=[POSE]), "foxglove.PosesInFrame"),
-    (m.OutlinePoints(header=HEADER, poses=[POSE, POSE], object="Object_0"), "foxglove.SceneUpdate"),
-    (m.OutlinePoints(header=HEADER), "foxglove.SceneUpdate"),
+    (OutlinePoints(header=HEADER, poses=[POSE, POSE], object="Object_0"), "foxglove.SceneUpdate"),
+    (OutlinePoints(header=HEADER), "foxglove.SceneUpdate"),
     (m.MarkerArray(header=HEADER, markers=[
         m.Marker(ns="n", id=i, type=kind, pose=POSE, scale=Vector3(x=1, y=1, z=1), text="t")
         for i, kind in enumerate(["sphere", "cylinder", "box", "text"])]), "foxglove.SceneUpdate"),
@@ -56,7 +58,7 @@ CONVERTED: list[tuple[Message, str]] = [
     (m.JointState(header=HEADER, name=["a"], position=[1.0], velocity=[2.0]), "foxglove.JointStates"),
     (m.LogLine(header=HEADER, service="s", level="warning", message="hot"), "foxglove.Log"),
     (m.PointCloud2(header=HEADER, height=1, width=1, row_step=16, data=bytes(16)), "foxglove.PointCloud"),
-    (m.PickPlaceStatus(header=HEADER, state="DONE"), "PickPlaceStatus"),
+    (PickPlaceStatus(header=HEADER, state="DONE"), "PickPlaceStatus"),
 ]
 TYPES = {"number": (int, float), "integer": int, "string": str, "boolean": bool, "array": list, "object": dict}
 

@@ -2,12 +2,14 @@ import numpy as np
 import pytest
 
 from common import messages as m
+from common.applications.outlining.messages import OutlinePoints, OutlineStatus
+from common.applications.pick_place.messages import PickPlaceStatus
 from common.reporting import figures
 from common.reporting.gathering import MOST_LINES, Gathering
 
 
 def status(state, target="", **values):
-    return m.PickPlaceStatus(state=state, target=target, **values)
+    return PickPlaceStatus(state=state, target=target, **values)
 
 
 def test_states_of_the_task_follow_each_other_without_gaps():
@@ -80,12 +82,12 @@ def test_the_contour_of_before_the_arm_moved_stays():
 
     def path(n):
         poses = [m.Pose(position=m.Vector3(x=k)) for k in range(n)]
-        return m.OutlinePoints(header=m.Header(), poses=poses)
+        return OutlinePoints(header=m.Header(), poses=poses)
 
-    run.on_task(0, m.OutlineStatus(state="SELECTING"))
+    run.on_task(0, OutlineStatus(state="SELECTING"))
     run.on_contour(1, path(3))
     run.on_contour(2, path(4))
-    run.on_task(3, m.OutlineStatus(state="TRACING"))
+    run.on_task(3, OutlineStatus(state="TRACING"))
     run.on_contour(4, path(9))
     assert len(run.contour) == 4
 

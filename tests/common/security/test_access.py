@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 
 from common import topics
+from common.application import all_topics
+from common.applications.pick_place.topics import SCENE_BALLS
 from common.errors import ConfigError
 from common.security.access import Rights, access_control, rights_of, rights_of_recorder, rights_of_supervisor
 from common.security.checking import allowances, require_current
@@ -24,7 +26,7 @@ class Declared:
     calls: set[Request[Any, Any]] = field(default_factory=set)
 
 
-CAMERA = Declared(reads={topics.SCENE_BALLS}, writes={topics.CAMERA_IMAGE, topics.CAMERA_INFO})
+CAMERA = Declared(reads={SCENE_BALLS}, writes={topics.CAMERA_IMAGE, topics.CAMERA_INFO})
 TASK = Declared(reads={topics.GRIPPER_STATE}, calls={topics.GRIPPER_COMMAND, topics.PARAMETERS})
 EXECUTOR = Declared(writes={topics.GRIPPER_STATE}, serves={topics.GRIPPER_COMMAND})
 
@@ -66,7 +68,7 @@ def test_everything_else_is_denied_and_every_rule_names_its_cell() -> None:
 def test_who_only_listens_can_ask_for_states_and_for_no_request(name: str) -> None:
     asks = allowances(access_control({"panda": {"recorder": rights_of_recorder()}}))[name]["asks"]
     keys = {key.partition("/")[2] for key in asks}
-    assert keys == {topic.key for topic in topics.all_topics().values() if topic.kind == "state"}
+    assert keys == {topic.key for topic in all_topics().values() if topic.kind == "state"}
 
 
 def test_rules_that_are_those_of_the_services_are_current() -> None:

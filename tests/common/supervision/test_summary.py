@@ -7,11 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common import topics
+from common.application import all_topics
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.topics import PICK_PLACE_STATUS, REJECTED_TARGETS, SCENE_BALLS, VALIDATED_TARGETS
 from common.clock import Clock
 from common.messages import (
     Header,
     MotionStatus,
-    PickPlaceStatus,
     PlanFigure,
     Pose,
     PoseArray,
@@ -141,7 +143,7 @@ def test_progress_in_one_line(values: dict[str, object], line: str) -> None:
 
 
 def test_rates_come_from_what_readers_count() -> None:
-    rates = Rates(topics.all_topics())
+    rates = Rates(all_topics())
     for second in range(3):
         received = {"camera/image_raw": 10 * second, "joint_states": 100 * second}
         rates.update(ServiceCounters(service="vision_detector", received=received), float(second))
@@ -161,13 +163,13 @@ async def test_collector_hears_the_cell_and_waits_for_what_still_falls() -> None
     bus = net.bus("supervisor", cell="test", clock=clock)
     collector = Collector(bus, "smart_pick_place", summary, 0.0, progress.append)
     listening = asyncio.create_task(collector.run())
-    truth = cell.writer(topics.SCENE_BALLS)
+    truth = cell.writer(SCENE_BALLS)
     truth.put(balls("box", "falling"))
-    cell.writer(topics.REJECTED_TARGETS).put(Rejections(header=cell.header(), rejected=[at(0.9, 0.0)]))
+    cell.writer(REJECTED_TARGETS).put(Rejections(header=cell.header(), rejected=[at(0.9, 0.0)]))
     cell.writer(topics.MOTION_STATUS).put(MotionStatus(state="active"))
     stamp = clock.now_ns() - int(0.020 * 2.0 * 1e9)
-    cell.writer(topics.VALIDATED_TARGETS).put(PoseArray(header=Header(stamp=stamp)))
-    cell.writer(topics.PICK_PLACE_STATUS).put(status("DONE", 1, placed=2, targets=2))
+    cell.writer(VALIDATED_TARGETS).put(PoseArray(header=Header(stamp=stamp)))
+    cell.writer(PICK_PLACE_STATUS).put(status("DONE", 1, placed=2, targets=2))
     async with asyncio.timeout(10):
         await collector.ended.wait()
         settling = asyncio.create_task(collector.settle())

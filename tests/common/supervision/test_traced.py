@@ -11,6 +11,8 @@ import pytest
 
 from common import messages as m
 from common import topics
+from common.applications.outlining.messages import OutlinePoints, OutlineStatus
+from common.applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
 from common.config import load_cell
 from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
@@ -32,15 +34,15 @@ def joints_at(x: float, y: float, z: float, stamp: int) -> m.JointState:
     return m.JointState(header=m.Header(stamp=stamp), name=ROBOT.joint_names, position=q.tolist())
 
 
-def status(state: str, stamp: int, **values: object) -> m.OutlineStatus:
-    return m.OutlineStatus.model_validate({
+def status(state: str, stamp: int, **values: object) -> OutlineStatus:
+    return OutlineStatus.model_validate({
         "header": m.Header(stamp=stamp), "state": state, "started": True, "object": "Object_1", "points": 4,
         "fraction": 1.0, "length_m": 0.4, **values})
 
 
-def path(shift: float = 0.0, stamp: int = 0) -> m.OutlinePoints:
+def path(shift: float = 0.0, stamp: int = 0) -> OutlinePoints:
     poses = [m.Pose(position=m.Vector3(x=x + shift, y=y, z=TOP)) for x, y in SQUARE]
-    return m.OutlinePoints(header=m.Header(stamp=stamp), poses=poses, object="Object_1")
+    return OutlinePoints(header=m.Header(stamp=stamp), poses=poses, object="Object_1")
 
 
 def truth(shift: float = 0.0) -> m.WorldObjects:
@@ -61,9 +63,9 @@ def traced(standoff: float = 0.0, off: float = 0.0, there: m.WorldObjects | None
         follower.on_joints(joints_at(x + math.copysign(off, x - 0.5), y, TOP + standoff, 21 + k))
     follower.on_status(status("RETREATING", 30, standoff=standoff, closed=True))
     follower.on_joints(joints_at(0.5, 0.0, 1.2, 31))
-    follower.on_path(m.OutlinePoints(poses=[m.Pose()] * 3, object="arm"))
+    follower.on_path(OutlinePoints(poses=[m.Pose()] * 3, object="arm"))
     follower.on_status(status("DONE", 40, standoff=standoff, closed=True))
-    follower.on_path(m.OutlinePoints(poses=[m.Pose()] * 3, object="arm"))
+    follower.on_path(OutlinePoints(poses=[m.Pose()] * 3, object="arm"))
     return follower
 
 
@@ -126,7 +128,7 @@ def test_distance_from_a_closed_polyline_counts_its_last_side_too() -> None:
 
 def test_progress_of_an_outline_in_one_line() -> None:
     assert progress_line(status("TRACING", 1)) == "TRACING Object_1, 0.400 m"
-    assert progress_line(m.OutlineStatus(started=True, state="SELECTING")) == "SELECTING"
+    assert progress_line(OutlineStatus(started=True, state="SELECTING")) == "SELECTING"
 
 
 async def test_collector_follows_an_outline_to_its_end() -> None:
@@ -137,8 +139,8 @@ async def test_collector_follows_an_outline_to_its_end() -> None:
     collector = Collector(bus, "contour_tracer", summary, 0.0, lines.put_nowait, CELL.robot)
     listening = asyncio.create_task(collector.run())
     cell.writer(topics.SCENE_OBJECTS).put(truth())
-    statuses, states = cell.writer(topics.OUTLINE_STATUS), cell.writer(topics.JOINT_STATES)
-    cell.writer(topics.CONTOUR_PATH).put(path())
+    statuses, states = cell.writer(OUTLINE_STATUS), cell.writer(topics.JOINT_STATES)
+    cell.writer(CONTOUR_PATH).put(path())
     async with asyncio.timeout(20):
         for state, stamp in (("PLANNING", 5), ("APPROACHING", 10), ("TRACING", 20)):
             statuses.put(status(state, stamp))

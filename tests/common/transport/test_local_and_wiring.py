@@ -5,8 +5,10 @@ import asyncio
 import pytest
 
 from common import topics
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.errors import NoResponder
-from common.messages import Image, LogLine, PickPlaceStatus, TaskCommand, TaskStatus
+from common.messages import Image, LogLine, TaskCommand, TaskStatus
 from common.process.in_process import running_service
 from common.process.wiring import wiring
 from common.transport.bus import Bus
@@ -21,7 +23,7 @@ class Config:
 
 async def service(bus: Bus, config: Config) -> None:
     images = bus.reader(topics.CAMERA_IMAGE)
-    status = bus.writer(topics.PICK_PLACE_STATUS)
+    status = bus.writer(PICK_PLACE_STATUS)
     bus.client(topics.MOTION_PLAN)
 
     async def handle(request: TaskCommand) -> TaskStatus:
@@ -45,7 +47,7 @@ def image(stamp: int) -> Image:
 async def test_service_runs_in_process_from_its_ready_to_the_end_of_the_block() -> None:
     net = LocalNetwork()
     tester = net.bus("tester")
-    status, log = tester.reader(topics.PICK_PLACE_STATUS), tester.reader(topics.LOG)
+    status, log = tester.reader(PICK_PLACE_STATUS), tester.reader(topics.LOG)
     async with running_service(net, service, Config(), name="toy"):
         assert await tester.alive.known() == {"toy"}
         tester.writer(topics.CAMERA_IMAGE).put(image(4))
@@ -112,7 +114,7 @@ async def test_service_that_ends_before_it_is_ready_is_reported() -> None:
 async def test_wiring_lists_what_a_service_has_to_do_with() -> None:
     found = await wiring(service, Config())
     assert found.reads == {topics.CAMERA_IMAGE}
-    assert found.writes == {topics.PICK_PLACE_STATUS}
+    assert found.writes == {PICK_PLACE_STATUS}
     assert found.serves == {topics.TASK_COMMAND}
     assert found.calls == {topics.MOTION_PLAN}
 
@@ -126,7 +128,7 @@ async def test_wiring_raises_what_the_service_raises() -> None:
 
 async def test_buses_of_two_networks_or_cells_do_not_meet() -> None:
     net = LocalNetwork()
-    net.bus("sender", cell="a").writer(topics.PICK_PLACE_STATUS).put(PickPlaceStatus())
-    assert net.bus("other", cell="b").reader(topics.PICK_PLACE_STATUS).latest is None
-    assert LocalNetwork().bus("other", cell="a").reader(topics.PICK_PLACE_STATUS).latest is None
-    assert net.bus("same", cell="a").reader(topics.PICK_PLACE_STATUS).latest == PickPlaceStatus()
+    net.bus("sender", cell="a").writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
+    assert net.bus("other", cell="b").reader(PICK_PLACE_STATUS).latest is None
+    assert LocalNetwork().bus("other", cell="a").reader(PICK_PLACE_STATUS).latest is None
+    assert net.bus("same", cell="a").reader(PICK_PLACE_STATUS).latest == PickPlaceStatus()

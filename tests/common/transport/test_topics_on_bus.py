@@ -7,7 +7,9 @@ import msgpack
 import pytest
 
 from common import topics
-from common.messages import Image, LogLine, PickPlaceStatus, Rejections, TFMessage
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.topics import PICK_PLACE_STATUS, REJECTED_TARGETS
+from common.messages import Image, LogLine, Rejections, TFMessage
 from common.process.log import BusLog
 from common.transport.bus import Bus, Reader, Writer
 from common.transport.codec import Attachment, checksum_of, encode, encode_attachment
@@ -101,14 +103,14 @@ async def test_events_that_overflow_are_counted_and_reported(new_bus, until, cap
 
 async def test_late_reader_gets_the_state_at_once(new_bus) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
-    sender.writer(topics.PICK_PLACE_STATUS).put(status(3))
-    assert (await next_of(receiver.reader(topics.PICK_PLACE_STATUS))).placed == 3
+    sender.writer(PICK_PLACE_STATUS).put(status(3))
+    assert (await next_of(receiver.reader(PICK_PLACE_STATUS))).placed == 3
 
 
 @pytest.mark.parametrize("pattern", ["pick_place_status", "**", "*"])
 async def test_state_can_be_asked_for_also_with_wildcards(new_bus, pattern: str) -> None:
     sender, plain = await new_bus("sender"), await new_bus("plain")
-    sender.writer(topics.PICK_PLACE_STATUS).put(status(3))
+    sender.writer(PICK_PLACE_STATUS).put(status(3))
     samples = []
     async with asyncio.timeout(PATIENCE):
         while not samples:
@@ -120,14 +122,14 @@ async def test_state_can_be_asked_for_also_with_wildcards(new_bus, pattern: str)
 
 async def test_state_that_was_never_put_has_no_value_to_ask_for(new_bus) -> None:
     bus = await new_bus()
-    bus.writer(topics.PICK_PLACE_STATUS)
+    bus.writer(PICK_PLACE_STATUS)
     assert await bus.raw_get(f"{bus.cell}/**", 2.0) == []
 
 
 async def test_plain_late_subscriber_sees_the_state_repeated_and_readers_do_not(new_bus) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
-    reader = receiver.reader(topics.PICK_PLACE_STATUS)
-    sender.writer(topics.PICK_PLACE_STATUS).put(status(3))
+    reader = receiver.reader(PICK_PLACE_STATUS)
+    sender.writer(PICK_PLACE_STATUS).put(status(3))
     await next_of(reader)
     async with asyncio.timeout(PATIENCE):
         seen = []
@@ -142,12 +144,12 @@ async def test_plain_late_subscriber_sees_the_state_repeated_and_readers_do_not(
 
 async def test_restarted_writer_is_heard_though_it_counts_from_the_start(new_bus, until) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
-    reader = receiver.reader(topics.PICK_PLACE_STATUS)
-    first = sender.writer(topics.PICK_PLACE_STATUS)
+    reader = receiver.reader(PICK_PLACE_STATUS)
+    first = sender.writer(PICK_PLACE_STATUS)
     for number in range(5):
         first.put(status(number))
     await until(lambda: reader.latest is not None and reader.latest.placed == 4)
-    sender.writer(topics.PICK_PLACE_STATUS).put(status(9))
+    sender.writer(PICK_PLACE_STATUS).put(status(9))
     await until(lambda: reader.latest.placed == 9)
 
 
@@ -193,14 +195,14 @@ async def test_bad_payloads_are_dropped_counted_and_reported_once(new_bus, until
 
 async def test_a_message_that_was_damaged_on_its_way_is_refused_and_the_next_real_one_is_not(new_bus, until) -> None:
     bus = await new_bus()
-    reader, writer = bus.reader(topics.PICK_PLACE_STATUS), bus.writer(topics.PICK_PLACE_STATUS)
+    reader, writer = bus.reader(PICK_PLACE_STATUS), bus.writer(PICK_PLACE_STATUS)
     await matched(writer, until)
-    sent, key = encode(status(3)), f"{bus.cell}/{topics.PICK_PLACE_STATUS.key}"
+    sent, key = encode(status(3)), f"{bus.cell}/{PICK_PLACE_STATUS.key}"
     for damaged in (sent[:-1], encode(status(4)), b"x" + sent[1:]):
-        put_raw(bus, topics.PICK_PLACE_STATUS, damaged,
+        put_raw(bus, PICK_PLACE_STATUS, damaged,
                 encode_attachment(Attachment("somebody", 9, checksum=checksum_of(key, sent))))
     await until(lambda: reader.invalid == 3)
-    put_raw(bus, topics.PICK_PLACE_STATUS, sent,
+    put_raw(bus, PICK_PLACE_STATUS, sent,
             encode_attachment(Attachment("somebody", 5, checksum=checksum_of(key, sent))))
     assert (await next_of(reader)).placed == 3
     assert reader.invalid == 3
@@ -219,11 +221,11 @@ async def test_a_message_that_was_sent_under_another_key_is_refused(new_bus, unt
 
 async def test_rubbish_does_not_displace_a_state_that_was_not_read_yet(new_bus, until) -> None:
     bus = await new_bus()
-    reader, writer = bus.reader(topics.PICK_PLACE_STATUS), bus.writer(topics.PICK_PLACE_STATUS)
+    reader, writer = bus.reader(PICK_PLACE_STATUS), bus.writer(PICK_PLACE_STATUS)
     await matched(writer, until)
     writer.put(status(3))
-    put_raw(bus, topics.PICK_PLACE_STATUS, b"garbage")
-    put_raw(bus, topics.PICK_PLACE_STATUS, b"garbage", encode_attachment(Attachment("somebody", 1)))
+    put_raw(bus, PICK_PLACE_STATUS, b"garbage")
+    put_raw(bus, PICK_PLACE_STATUS, b"garbage", encode_attachment(Attachment("somebody", 1)))
     await until(lambda: reader.received == 3)
     assert (await next_of(reader)).placed == 3
 
@@ -260,7 +262,7 @@ async def test_trace_rides_from_what_was_read_to_what_is_put(new_bus, until) -> 
 
 async def test_counters_are_published_while_somebody_reads_them(new_bus, until) -> None:
     service, tool = await new_bus("service"), await new_bus("tool")
-    reader, writer = service.reader(topics.REJECTED_TARGETS), service.writer(topics.REJECTED_TARGETS)
+    reader, writer = service.reader(REJECTED_TARGETS), service.writer(REJECTED_TARGETS)
     await matched(writer, until)
     writer.put(Rejections(header={}, rejected=[]))
     await next_of(reader)
@@ -313,7 +315,7 @@ async def test_reader_listens_only_while_it_is_told_to(new_bus, until) -> None:
 
 async def test_state_reader_that_begins_to_listen_gets_the_last_value(new_bus, until) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
-    reader = receiver.reader(topics.PICK_PLACE_STATUS, listening=False)
-    sender.writer(topics.PICK_PLACE_STATUS).put(status(4))
+    reader = receiver.reader(PICK_PLACE_STATUS, listening=False)
+    sender.writer(PICK_PLACE_STATUS).put(status(4))
     receiver.listen(reader, True)
     assert (await next_of(reader)).placed == 4

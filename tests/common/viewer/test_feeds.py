@@ -2,6 +2,8 @@ from __future__ import annotations
 
 from common import messages as m
 from common import topics
+from common.applications.outlining.topics import CONTOURS
+from common.applications.pick_place.topics import SCENE_BALLS, VALIDATED_TARGETS
 from common.config import Members, load_cell
 from common.transport.local import LocalNetwork
 from common.viewer.feeds import Feeds, in_cell
@@ -15,8 +17,8 @@ def members(*extra: str) -> Members:
 
 def test_cell_has_the_topics_of_its_services_and_what_everybody_writes() -> None:
     assert isinstance(PANDA, Members) and isinstance(UR5, Members)
-    assert in_cell(topics.VALIDATED_TARGETS, PANDA) and not in_cell(topics.VALIDATED_TARGETS, UR5)
-    assert in_cell(topics.CONTOURS, UR5) and not in_cell(topics.CONTOURS, PANDA)
+    assert in_cell(VALIDATED_TARGETS, PANDA) and not in_cell(VALIDATED_TARGETS, UR5)
+    assert in_cell(CONTOURS, UR5) and not in_cell(CONTOURS, PANDA)
     for topic in (topics.LOG, topics.SUPERVISOR_STATUS, topics.COUNTERS):
         assert in_cell(topic, members())
 
@@ -24,7 +26,7 @@ def test_cell_has_the_topics_of_its_services_and_what_everybody_writes() -> None
 def test_service_that_is_not_known_here_may_write_anything() -> None:
     assert not in_cell(topics.CAMERA_IMAGE, members())
     assert in_cell(topics.CAMERA_IMAGE, members("camera_opencv"))
-    assert in_cell(topics.CONTOURS, members("somebody's_own"))
+    assert in_cell(CONTOURS, members("somebody's_own"))
 
 
 async def test_message_is_fresh_once_and_the_latest_for_long() -> None:
@@ -42,17 +44,17 @@ async def test_message_is_fresh_once_and_the_latest_for_long() -> None:
 
 async def test_topic_that_the_cell_does_not_have_is_not_asked_for() -> None:
     feeds = Feeds(LocalNetwork().bus("viewer"), members())
-    assert topics.CONTOURS not in feeds and feeds.reader(topics.CONTOURS) is None
-    feeds.listen([topics.CONTOURS])
-    assert feeds.latest(topics.CONTOURS) is None
+    assert CONTOURS not in feeds and feeds.reader(CONTOURS) is None
+    feeds.listen([CONTOURS])
+    assert feeds.latest(CONTOURS) is None
 
 
 async def test_what_is_large_is_listened_to_while_it_is_wanted() -> None:
     net = LocalNetwork()
     feeds = Feeds(net.bus("viewer"), members())
-    balls = net.bus("trajectory_executor").writer(topics.SCENE_BALLS)
+    balls = net.bus("trajectory_executor").writer(SCENE_BALLS)
     assert not balls.matched
-    feeds.listen([topics.SCENE_BALLS])
+    feeds.listen([SCENE_BALLS])
     assert balls.matched
     feeds.listen([])
     assert not balls.matched

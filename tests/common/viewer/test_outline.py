@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from common import messages as m
+from common.applications.outlining.messages import Contour, Contours, OutlinePoints
 from common.perception.pinhole import Pinhole
 from tests.common.viewer.scene_cell import WORLD, Stage, around_of, at, scene_of
 
@@ -26,10 +27,10 @@ def stage(ur5: Stage) -> Stage:
     return ur5
 
 
-def contours(*squares: tuple[str, np.ndarray[Any, np.dtype[np.float64]]], selected: int = -1) -> m.Contours:
+def contours(*squares: tuple[str, np.ndarray[Any, np.dtype[np.float64]]], selected: int = -1) -> Contours:
     camera = Pinhole.from_config(around_of("ur5").camera)
-    return m.Contours(header=WORLD, width=1024, height=768, selected=selected, contours=[
-        m.Contour(index=i, label=label, pixels=[(float(u), float(v)) for u, v in camera.project(points)])
+    return Contours(header=WORLD, width=1024, height=768, selected=selected, contours=[
+        Contour(index=i, label=label, pixels=[(float(u), float(v)) for u, v in camera.project(points)])
         for i, (label, points) in enumerate(squares)
     ])
 
@@ -107,9 +108,9 @@ def test_contours_of_a_camera_that_is_not_known_or_distorted_are_left_out(ur5: S
 
 def test_outline_is_closed_and_goes_when_there_is_none(stage: Stage) -> None:
     poses = [at(*point) for point in square(0.5, 0, TOP).tolist()]
-    stage.view.show_outline(m.OutlinePoints(header=WORLD, poses=poses, object="yellow_1"))
+    stage.view.show_outline(OutlinePoints(header=WORLD, poses=poses, object="yellow_1"))
     node = stage.view.outline._node
     assert node is not None and len(node.points) == 4
     np.testing.assert_allclose(node.points[-1, 1], node.points[0, 0])
-    stage.view.show_outline(m.OutlinePoints(header=WORLD, message="nothing is chosen"))
+    stage.view.show_outline(OutlinePoints(header=WORLD, message="nothing is chosen"))
     assert stage.view.outline._node is None

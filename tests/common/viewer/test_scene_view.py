@@ -9,6 +9,7 @@ import pytest
 import viser
 
 from common import messages as m
+from common.applications.outlining.messages import Contours, OutlinePoints
 from common.errors import UnknownName
 from common.robot.finger_joints import finger_positions
 from common.robot.transforms import pose_to_matrix
@@ -192,8 +193,8 @@ def test_messages_without_content_do_no_harm(ur5: Stage) -> None:
     view.show_picture(np.zeros((48, 64, 3), np.uint8))
     view.show_plan(m.JointTrajectory(joint_names=["a"], points=[]))
     view.play_plan()
-    view.show_outline(m.OutlinePoints())
-    view.show_contours(m.Contours(header=WORLD, width=64, height=48))
+    view.show_outline(OutlinePoints())
+    view.show_contours(Contours(header=WORLD, width=64, height=48))
     view.show_truth(balls=m.PoseArray(), objects=m.WorldObjects())
     view.show_joints(m.JointState(header=WORLD, name=ur5.robot.joint_names, position=[0.0] * 6))
 

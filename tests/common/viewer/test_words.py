@@ -4,6 +4,8 @@ from typing import get_args
 
 import pytest
 
+from common.applications.outlining.messages import OutlineState, OutlineStatus
+from common.applications.pick_place.messages import PickPlaceStatus, TaskState
 from common.errors import ConfigError, NoResponder, RemoteError, ZencellError
 from common.messages import (
     GoalState,
@@ -11,12 +13,8 @@ from common.messages import (
     JointTrajectory,
     JointTrajectoryPoint,
     MotionStatus,
-    OutlineState,
-    OutlineStatus,
-    PickPlaceStatus,
     PlanResponse,
     ServiceStatus,
-    TaskState,
 )
 from common.viewer import words
 from common.viewer.markup import block, row, span

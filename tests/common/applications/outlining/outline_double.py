@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from common import messages as m
 from common.applications.outlining.legs import OutlineView
+from common.applications.outlining.messages import OutlinePoints, OutlineStatus
 from common.applications.outlining.task import Outline, OutlineParameters
 from common.config import RobotConfig, check, find_file, read_robot
 
@@ -16,9 +17,9 @@ SQUARE = [(0.45, -0.05), (0.55, -0.05), (0.55, 0.05), (0.45, 0.05)]
 TOP = 1.1
 
 
-def outline_of(points: list[tuple[float, float]], stamp: int, name: str = "Object_1") -> m.OutlinePoints:
+def outline_of(points: list[tuple[float, float]], stamp: int, name: str = "Object_1") -> OutlinePoints:
     poses = [m.Pose(position=m.Vector3(x=x, y=y, z=TOP)) for x, y in points]
-    return m.OutlinePoints(header=m.Header(stamp=stamp, frame_id="world"), poses=poses, object=name, invalid_depth=2)
+    return OutlinePoints(header=m.Header(stamp=stamp, frame_id="world"), poses=poses, object=name, invalid_depth=2)
 
 
 def prism(name: str, x: float, y: float, half: float) -> m.CollisionObject:
@@ -36,7 +37,7 @@ class OutlineDouble:
         assert ROBOT.gripper is not None
         self.task = Outline(OutlineParameters(**parameters), ROBOT.gripper, HOME, "t", started)
         self.now = 100.0
-        self.path: m.OutlinePoints | None = outline_of(SQUARE, self.stamp)
+        self.path: OutlinePoints | None = outline_of(SQUARE, self.stamp)
         self.objects = [prism("Object_1", 0.5, 0.0, 0.05), prism("Object_2", 0.5, 0.3, 0.02)]
         self.motion = m.MotionStatus()
         self.gripper = m.GripperState(width=0.085)
@@ -58,7 +59,7 @@ class OutlineDouble:
         return int(self.now * 1e9)
 
     @property
-    def status(self) -> m.OutlineStatus:
+    def status(self) -> OutlineStatus:
         return self.task.status
 
     def view(self) -> OutlineView:

@@ -16,7 +16,8 @@ from common.applications.outlining.contours_choice import (
 from common.applications.outlining.contours_drawing import CHOSEN, annotate_contours
 from common.applications.outlining.contours_following import Following
 from common.applications.outlining.contours_refinement import normals
-from common.messages import Color, OutlineSelect
+from common.applications.outlining.messages import OutlineSelect
+from common.messages import Color
 from tests.common.applications.outlining.outline_scenes import WORLDS, seen_world, world
 
 SEED = ContourOptions(subpixel=False)

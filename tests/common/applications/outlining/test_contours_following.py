@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from common.applications.outlining.contours_following import Following
-from common.messages import Contour, OutlineSelect
+from common.applications.outlining.messages import Contour, OutlineSelect
 
 
 def square(index: int, u: float, v: float, side: float) -> Contour:

@@ -5,6 +5,7 @@ import math
 import pytest
 
 from common import messages as m
+from common.applications.outlining.messages import OutlinePoints
 from common.applications.outlining.task import MOST_FORGOTTEN
 from common.robot.transforms import pose_to_matrix, rpy_to_matrix
 from tests.common.applications.outlining.outline_double import (
@@ -171,13 +172,13 @@ def test_arm_that_can_not_go_home_stays_and_says_so() -> None:
     ("path", "message"),
     [
         (None, "no contour came from the camera"),
-        (m.OutlinePoints(message="every contour touches the border of the picture"), "touches the border"),
-        (m.OutlinePoints(), "no object is chosen"),
+        (OutlinePoints(message="every contour touches the border of the picture"), "touches the border"),
+        (OutlinePoints(), "no object is chosen"),
         (outline_of([(0.5, 0.0)], 0), "the contour of Object_1 is a single point"),
         (outline_of([(0.5, -0.3), (0.52, -0.3), (0.5, -0.28)], 0), "the planning scene does not hold Object_1"),
     ],
 )
-def test_without_a_usable_contour_it_ends_in_error_with_the_reason(path: m.OutlinePoints | None, message: str) -> None:
+def test_without_a_usable_contour_it_ends_in_error_with_the_reason(path: OutlinePoints | None, message: str) -> None:
     cell = OutlineDouble(selection_timeout=3.0, picture_timeout=3.0)
     cell.path = path
     cell.until("SELECTING")
@@ -191,7 +192,7 @@ def test_without_a_usable_contour_it_ends_in_error_with_the_reason(path: m.Outli
 
 def test_camera_that_is_started_again_costs_no_time_of_the_selection() -> None:
     cell = OutlineDouble(selection_timeout=3.0, picture_timeout=30.0)
-    chosen, cell.path = cell.path, m.OutlinePoints(message="no object is chosen")
+    chosen, cell.path = cell.path, OutlinePoints(message="no object is chosen")
     cell.until("SELECTING")
     came_back = cell.now + 20
     while cell.now < came_back:
@@ -207,7 +208,7 @@ def test_camera_that_is_started_again_costs_no_time_of_the_selection() -> None:
 
 def test_selection_is_waited_for_as_long_as_it_takes_when_asked_to() -> None:
     cell = OutlineDouble(selection_timeout=0.0)
-    chosen, cell.path = cell.path, m.OutlinePoints(message="no object is chosen")
+    chosen, cell.path = cell.path, OutlinePoints(message="no object is chosen")
     for _ in range(500):
         cell.step()
     assert cell.status.state == "SELECTING"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from common import messages as m
 from common.applications.outlining.contours import ContourOptions
 from common.applications.outlining.legs import Legs, TracingParameters
+from common.applications.outlining.messages import OutlineSelect
 from common.applications.outlining.offline import Impossible, Perceived, perceive, plan_outline
 from common.applications.outlining.scene import planning_scene
 from common.applications.outlining.top_face import TopFaceOptions
@@ -46,9 +47,9 @@ def photographed(objects: list[ObjectConfig]) -> tuple[NDArray[np.uint8], NDArra
     return seen.colour, seen.depth_within(0.10, 2.25)
 
 
-def perceived(objects: list[ObjectConfig], select: m.OutlineSelect | None = None) -> Perceived:
+def perceived(objects: list[ObjectConfig], select: OutlineSelect | None = None) -> Perceived:
     colour, depth = photographed(objects)
-    return perceive(colour, depth, CAMERA, select or m.OutlineSelect(), ContourOptions(), TopFaceOptions(), 5e-5)
+    return perceive(colour, depth, CAMERA, select or OutlineSelect(), ContourOptions(), TopFaceOptions(), 5e-5)
 
 
 def planned(found: Perceived, *, given: bool = False, **parameters: float) -> list[tuple[str, m.PlanResponse]]:
@@ -88,14 +89,14 @@ def test_picture_without_an_object_has_no_outline() -> None:
 
 def test_contour_that_is_not_there_is_refused_with_the_choices() -> None:
     with pytest.raises(Impossible, match=r"no contour 7; choices: 0 \(Object_0, yellow\)"):
-        perceived(list(CELL.world.objects), m.OutlineSelect(rule="index", index=7))
+        perceived(list(CELL.world.objects), OutlineSelect(rule="index", index=7))
 
 
 def test_depth_image_without_depth_is_refused() -> None:
     colour, depth = photographed(list(CELL.world.objects))
     nothing = np.full_like(depth, np.nan)
     with pytest.raises(DepthError, match="no valid depth at all"):
-        perceive(colour, nothing, CAMERA, m.OutlineSelect(), ContourOptions(), TopFaceOptions(), 5e-5)
+        perceive(colour, nothing, CAMERA, OutlineSelect(), ContourOptions(), TopFaceOptions(), 5e-5)
 
 
 def test_points_that_were_given_are_traced_wherever_they_are() -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, computed_field, model_validator
 
 from common.messages.basics import Finite, Header, Message, Name
 from common.messages.geometry import Color, PoseArray
-from common.messages.task import PlanFigure
+from common.messages.task import TaskStatus
 
 
 class Contour(Message):
@@ -52,7 +52,7 @@ class OutlineSelection(Message):
 class OutlinePoints(PoseArray):
     """The outline of the top face of the chosen object, closed: the last point is followed by the first.
 
-    The stamp is that of the picture. Without a chosen object, or when its outline can not be told, there are no poses
+    The stamp is that of the picture. Without a chosen object, or when its outline cannot be told, there are no poses
     and `message` says why.
     """
 
@@ -67,24 +67,26 @@ OutlineState = Literal[
 ]
 
 
-class OutlineStatus(Message):
-    """State and figures of the outline task."""
+class OutlineStatus(TaskStatus):
+    """State and figures of the outline task. `subject` is the label of the object that is outlined."""
 
-    header: Header = Header()
     state: OutlineState = "IDLE"
-    paused: bool = False
-    started: bool = False
-    stage: str = ""
-    object: str = ""
     points: int = 0
     fraction: Finite = 0.0
     length_m: Finite = 0.0
     closed: bool = False
     invalid_depth: int = Field(0, description="pixels of the contour whose depth was filled from neighbours")
     standoff: Finite = Field(0.0, description="of the tool above the contour [m]")
-    failures: int = 0
-    plans: list[PlanFigure] = []
-    moving_seconds: Finite = 0.0
-    planning_seconds: Finite = 0.0
-    task_seconds: Finite = 0.0
-    message: str = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_seed_name(cls, values: Any) -> Any:
+        if not isinstance(values, dict) or "object" not in values:
+            return values
+        return {"subject": values["object"]} | {name: value for name, value in values.items() if name != "object"}
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def object(self) -> str:
+        """Label of the object that is outlined."""
+        return self.subject

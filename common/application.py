@@ -1,0 +1,151 @@
+"""Applications: what a cell is for. The platform names none; it finds them.
+
+An application is a package of common/applications, or a dotted module of a person's own, which may be a single file.
+What it brings lies in modules of these names within the package, or else in the file itself:
+
+    topics    its keys as `Topic` and `Request`, with their messages; and, by these names, the ones that all look for:
+                STATUS     on which its task says how far it is: a `Topic` of a `TaskStatus`
+                DECIDED_BY (optional) a stream whose stamp is that of the picture by which the task decides
+                REJECTED   (optional) a `Topic` of `Rejections`: what the task is not offered, and why
+                ANNOTATED  (optional) a `Topic` of `Image`: the picture with what was found in it
+                VIEWS      (optional) {Topic: function(WorldObjects) -> message}: truth as the application calls it,
+                           published by whoever simulates the world
+    figures   (optional) what the summary, the report and the recheck say of a run
+    page      (optional) labels and layers of the operator's page
+    verbs     (optional) verbs of the command line
+
+`TASK` in the package itself names the service that decides; without it the cell's `task` does.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import pkgutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from types import ModuleType
+from typing import Any, cast
+
+from common import messages, topics
+from common.errors import ConfigError, UnknownName
+from common.messages import Message, TaskStatus
+from common.topics import AnyTopic, Request, Topic
+
+PACKAGE = "common.applications"
+
+
+@dataclass(frozen=True)
+class Application:
+    """An application by its name in common/applications, or by that of its own dotted module."""
+
+    name: str
+
+    @property
+    def module(self) -> ModuleType:
+        """The package, or the single file."""
+        return importlib.import_module(self.name if "." in self.name else f"{PACKAGE}.{self.name}")
+
+    def part(self, name: str) -> ModuleType | None:
+        """The module of that name within the package, or None; a single file is all parts of itself."""
+        module = self.module
+        if not hasattr(module, "__path__"):
+            return module
+        full = f"{module.__name__}.{name}"
+        return importlib.import_module(full) if importlib.util.find_spec(full) else None
+
+    def find(self, part: str, name: str) -> Any:
+        """What a part calls by that name, or None."""
+        return getattr(self.part(part), name, None)
+
+    @property
+    def task(self) -> str:
+        """The service that decides; empty when the cell says it."""
+        return str(getattr(self.module, "TASK", ""))
+
+    @property
+    def status(self) -> Topic[TaskStatus]:
+        """Where the task says how far it is.
+
+        Raises:
+            ConfigError: the module is no application.
+        """
+        found = self.find("topics", "STATUS")
+        if not isinstance(found, Topic) or not issubclass(found.message, TaskStatus):
+            raise ConfigError("application", self.name, "is no application: its topics have no STATUS")
+        return cast("Topic[TaskStatus]", found)
+
+    @property
+    def topics(self) -> dict[str, AnyTopic]:
+        """Its own topics by key, in the order of its file."""
+        return _topics_in(self.part("topics"))
+
+
+def application_names() -> list[str]:
+    """Applications that come with the project."""
+    return sorted(found.name for found in pkgutil.iter_modules(importlib.import_module(PACKAGE).__path__))
+
+
+def applications() -> Iterator[Application]:
+    """Those that come with the project."""
+    return (Application(name) for name in application_names())
+
+
+def find_application(name: str) -> Application:
+    """The application of that name.
+
+    Raises:
+        UnknownName: there is none; lists the choices.
+        ConfigError: a dotted module that cannot be imported.
+    """
+    if "." not in name and name not in application_names():
+        raise UnknownName("application", name, application_names())
+    found = Application(name)
+    try:
+        _ = found.module
+    except ImportError as error:
+        raise ConfigError("application", name, f"cannot be imported: {error}") from None
+    return found
+
+
+def application_of_task(task: str) -> str:
+    """The application of a cell file that names only its task; one with a task of its own gets the usual one."""
+    for found in applications():
+        if found.task == task:
+            return found.name
+    return next((found.name for found in applications() if getattr(found.module, "FOR_ANY_TASK", False)), "")
+
+
+@cache
+def all_topics() -> dict[str, AnyTopic]:
+    """Every topic of the platform and of the applications that come with it, by key."""
+    known = dict(topics.platform_topics())
+    for found in applications():
+        known |= found.topics
+    return known
+
+
+def find_topic(key: str) -> Topic[Any] | Request[Any, Any] | None:
+    """The topic or request of a key, also of the parameters of a service; None for one that is not known."""
+    prefix, _, service = key.partition("/")
+    if prefix == "param" and topics.SERVICE_NAME.fullmatch(service):
+        return topics.parameters_of(service)
+    return all_topics().get(key)
+
+
+@cache
+def message_class(name: str) -> type[Message] | None:
+    """The message class of that name, of the platform or of an application that comes with it; None for no such."""
+    modules = [messages, *(part for found in applications() if (part := found.part("messages")) is not None)]
+    for module in modules:
+        found = vars(module).get(name)
+        if isinstance(found, type) and issubclass(found, Message):
+            return found
+    return None
+
+
+def _topics_in(module: ModuleType | None) -> dict[str, AnyTopic]:
+    found = vars(module).values() if module is not None else ()
+    shared = topics.platform_topics()
+    return {t.key: t for t in found if isinstance(t, Topic | Request) and t.key not in shared}

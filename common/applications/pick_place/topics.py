@@ -1,0 +1,26 @@
+"""Keys of pick and place."""
+
+from __future__ import annotations
+
+from common import messages as m
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.topics import Topic
+
+SCENE_BALLS = Topic("scene_balls", m.PoseArray, "state", "trajectory_executor",
+                    "the truth: where every ball is; simulated hardware only")
+DETECTED_OBJECTS = Topic("detected_objects", m.MarkerArray, "stream", "vision_detector",
+                         "balls found in the picture, in world")
+DETECTION_IMAGE = Topic("detection_image", m.Image, "stream", "vision_detector", "the picture with what was found")
+VALIDATED_TARGETS = Topic("validated_targets", m.PoseArray, "stream", "workspace_validator",
+                          "detections that the arm can take, in world")
+REJECTED_TARGETS = Topic("rejected_targets", m.Rejections, "event", "workspace_validator",
+                         "detections that it can not take, with the reason, once for each place")
+WORKSPACE_MARKERS = Topic("workspace_markers", m.MarkerArray, "state", "workspace_validator",
+                          "reachable shell and excluded column as cylinders")
+PICK_PLACE_STATUS = Topic("pick_place_status", PickPlaceStatus, "state", "smart_pick_place",
+                          "IDLE, GRASPING, PLACING, HOMING, DONE or ERROR, and counters")
+
+STATUS = PICK_PLACE_STATUS
+DECIDED_BY = VALIDATED_TARGETS
+REJECTED = REJECTED_TARGETS
+ANNOTATED = DETECTION_IMAGE
