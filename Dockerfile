@@ -5,7 +5,7 @@ COPY pyproject.toml constraints.txt ./
 # The packages first: they change less often than the code. An index of your own: --secret id=pip,src=pip.conf
 RUN --mount=type=cache,target=/root/.cache/pip --mount=type=secret,id=pip,target=/etc/pip.conf \
     python -m venv /opt/zencell \
- && mkdir common && touch common/__init__.py README.md \
+ && mkdir zencell && touch zencell/__init__.py README.md \
  && /opt/zencell/bin/python -m pip install --disable-pip-version-check -c constraints.txt . \
  && /opt/zencell/bin/python -m pip uninstall --yes --quiet zencell
 COPY deploy/slim.py deploy/slim.py
@@ -23,6 +23,7 @@ COPY --chmod=755 deploy/zencell /opt/zencell/bin/zencell
 COPY common common
 COPY services services
 COPY cli cli
+COPY zencell zencell
 COPY config config
 USER zencell
 HEALTHCHECK --interval=3s --timeout=10s --start-period=90s --retries=5 CMD ["python", "-m", "common.process.health"]

@@ -14,7 +14,7 @@ from tests.deploy.engine import Containers, require_engine
 pytestmark = [pytest.mark.container, pytest.mark.timeout(900)]
 
 SERVICE, OTHER = "panda-vision_detector", "panda-workspace_validator"
-SOURCE = ("common", "services", "cli", "config", "deploy")
+SOURCE = ("common", "services", "cli", "zencell", "config", "deploy")
 FILES = ("compose.yaml", "compose.dev.yaml", "Dockerfile", ".dockerignore", ".env", "pyproject.toml", "constraints.txt")
 PATIENCE = 120.0  # [s] only ever waited for by a test that fails
 

@@ -1,0 +1,190 @@
+"""The wheel, built and installed as a person would, and where the modules of every process come from."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDERS = ("common", "services", "cli", "zencell")
+DOMAIN = 110
+
+# Python imports this first in every process that finds it on PYTHONPATH: it tells which modules there were at the end.
+PROBE = """
+import atexit, json, os, sys
+at_once = os._exit
+def tell():
+    main = sys.modules.get("__main__")
+    loaded = [[name, module.__file__, id(module)] for name, module in list(sys.modules.items())
+              if isinstance(getattr(module, "__file__", None), str)]
+    with open(os.path.join(os.environ["PROBE"], f"{os.getpid()}.json"), "w") as file:
+        json.dump({"main": str(getattr(getattr(main, "__spec__", None), "name", None)), "loaded": loaded}, file)
+def leave(code):
+    tell()
+    at_once(code)
+os._exit = leave
+atexit.register(tell)
+"""
+SERVICE = '''"""A service of one's own, which ends its cell."""
+import asyncio
+from common import topics
+from common.config import Parameters
+from common.messages import PickPlaceStatus
+from common.process.service import main
+
+class Config(Parameters):
+    """Nothing."""
+
+async def run(bus, config):
+    status = bus.writer(topics.PICK_PLACE_STATUS)
+    await bus.ready()
+    status.put(PickPlaceStatus(header=bus.header(), state="DONE", started=True))
+    await asyncio.Event().wait()
+
+if __name__ == "__main__":
+    main(run, Config)
+'''
+CELL = """
+robot: panda
+world: balls
+pipeline: lerp
+task: task
+motion: {}
+services: {mine.task: }
+"""
+
+
+@dataclass(frozen=True)
+class Installation:
+    """A `zencell` to run, and the folder in which its modules lie."""
+
+    command: list[str]
+    modules: Path
+    site: Path | None = None  # the site-packages, of a wheel
+
+    def run(self, folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+        """A verb, run in a folder."""
+        kept = {k: v for k, v in os.environ.items() if not k.startswith(("ZENCELL_", "PYTHON", "VIRTUAL_ENV"))}
+        done = subprocess.run([*self.command, *arguments], cwd=folder, env=kept | environment, text=True, timeout=100,
+                              capture_output=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done
+
+
+CLONE = Installation([sys.executable, "-m", "zencell"], ROOT)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Installation:
+    """The wheel that pip makes of what the clone tracks, installed without the clone in reach."""
+    folder = tmp_path_factory.mktemp("wheel")
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=False)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    for name in filter(None, listed.stdout.decode().split("\0")):
+        (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, folder / "source" / name)
+    bare = folder / "bare"
+    subprocess.run([sys.executable, "-m", "venv", bare], check=True)
+    site, = bare.glob("lib/python*/site-packages")
+    empty = {path.name for path in site.iterdir()}
+    pip = [bare / "bin" / "python", "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    subprocess.run([*pip, "wheel", "./source", "--no-deps", "-w", "dist"], cwd=folder, env=environment, check=True)
+    made, = (folder / "dist").iterdir()
+    subprocess.run([*pip, "install", "--no-deps", made], cwd=folder, env=environment, check=True)
+    added = {path.name for path in site.iterdir()} - empty
+    assert {name.partition("-")[0] for name in added} == {"zencell"} and len(added) == 2, added
+    # The dependencies as they are installed here: the folders themselves, so that no .pth in them (an editable
+    # installation of the clone) counts.
+    here = [path for path in sys.path if Path(path).name == "site-packages"]
+    (site / "dependencies.pth").write_text("\n".join(here) + "\n", encoding="utf-8")
+    return Installation([str(bare / "bin" / "zencell")], site / "zencell" / "top-level", site)
+
+
+def watched(folder: Path) -> dict[str, str]:
+    """The environment in which every process tells its modules to a folder."""
+    (folder / "probe").mkdir()
+    (folder / "probe" / "sitecustomize.py").write_text(PROBE, encoding="utf-8")
+    return {"PYTHONPATH": str(folder / "probe"), "PROBE": str(folder / "probe")}
+
+
+def mains(folder: Path, installation: Installation) -> set[str]:
+    """The modules that were run as programs; none of the project's may have been loaded twice, nor from elsewhere."""
+    packages = {name: installation.modules / name for name in FOLDERS}
+    if installation.site:
+        packages["zencell"] = installation.site / "zencell"
+    found = set()
+    for path in (folder / "probe").glob("*.json"):
+        told = json.loads(path.read_text(encoding="utf-8"))
+        ours: dict[str, dict[int, str]] = {}
+        for name, file, number in told["loaded"]:
+            package = packages.get(name.partition(".")[0])
+            assert package is None or Path(file).is_relative_to(package), f"{name} is {file}"
+            if any(Path(file).is_relative_to(package) for package in packages.values()):
+                ours.setdefault(os.path.realpath(file), {})[number] = name
+        assert len(ours) > 5, f"{path.name} tells of nothing"
+        assert [list(names.values()) for names in ours.values() if len(names) > 1] == [], told["main"]
+        found.add(told["main"])
+    return found
+
+
+@pytest.mark.parametrize("arguments", [
+    ("-m", "zencell", "cells"), ("-m", "cli.main", "cells"), ("-m", "services.workspace_validator", "--help"),
+], ids=lambda arguments: arguments[1])
+def test_no_module_of_a_process_of_the_clone_has_two_names(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    Installation([sys.executable], ROOT).run(ROOT, *arguments, **watched(tmp_path))
+    assert len(mains(tmp_path, CLONE)) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["clone", "wheel"])
+def test_cell_runs_from_an_empty_folder_and_no_module_has_two_names(
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    installation = CLONE if kind == "clone" else request.getfixturevalue("wheel")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    environment = watched(tmp_path)
+    if kind == "clone":
+        environment["PYTHONPATH"] += f":{ROOT}"
+    else:
+        assert "panda" in installation.run(empty, "cells").stdout
+    done = installation.run(empty, "run", "panda", "--no-viewer", "--speed", "10", "--domain", str(DOMAIN), "--record",
+                            str(tmp_path / "run.mcap"), **environment)
+    assert "DONE, 7 of 7 placed" in done.stdout, done.stdout + done.stderr
+    assert list(empty.iterdir()) == []
+    told = mains(tmp_path, installation)
+    assert {"services.router", "services.motion_planner", "services.trajectory_executor", "cli.main"} <= told
+    assert len(told) >= 11, told  # the command, which is the supervisor, the recorder, the router and eight services
+
+
+@pytest.mark.slow
+def test_modules_of_ones_own_import_the_project_of_a_wheel(wheel: Installation, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "task.py").write_text(SERVICE, encoding="utf-8")
+    (tmp_path / "mine.yaml").write_text(CELL, encoding="utf-8")
+    done = wheel.run(tmp_path, "run", "mine.yaml", "--no-viewer", "--domain", str(DOMAIN + 1), **watched(tmp_path))
+    assert "DONE" in done.stdout and "mine.task" in mains(tmp_path, wheel)
+    (tmp_path / "script.py").write_text("import zencell\nfrom common.config import load_cell\nprint(load_cell('ur5').name)\n")
+    python = Installation([str(Path(wheel.command[0]).with_name("python"))], wheel.modules)
+    assert python.run(tmp_path, "script.py").stdout == "ur5\n"
+
+
+@pytest.mark.slow
+def test_zenoh_cli_finds_the_codec_of_a_wheel(wheel: Installation, tmp_path: Path) -> None:
+    script = """
+from importlib.metadata import entry_points
+for kind in ("decoders", "encoders"):
+    found, = entry_points(group=f"zenoh_cli.codecs.{kind}", name="msgpack")
+    print(found.load().__name__)
+"""
+    python = Installation([str(Path(wheel.command[0]).with_name("python"))], wheel.modules)
+    assert python.run(tmp_path, "-c", script).stdout.split() == ["decode", "encode"]
