@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup run up test containers check audit bench chaos soak docs deploy clean
+.PHONY: setup run up test test-all containers check audit bench chaos soak docs deploy clean
 
 setup: $(STAMP)
 
@@ -22,6 +22,9 @@ up: setup  ## the same, and stay until Ctrl-C
 
 test: setup
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+
+test-all: setup  ## `make test`, and what takes long
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not container"
 
 containers: setup  ## build the image and run a cell in containers; needs a container engine
 	$(BIN)/python -m pytest -q -m container tests/deploy
