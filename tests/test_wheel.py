@@ -16,6 +16,8 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("common", "services", "cli", "zencell")
 DOMAIN = 110
 
+pytestmark = pytest.mark.timeout(300)
+
 # Python imports this first in every process that finds it on PYTHONPATH: it tells which modules there were at the end.
 PROBE = """
 import atexit, json, os, sys
@@ -173,7 +175,8 @@ def test_modules_of_ones_own_import_the_project_of_a_wheel(wheel: Installation, 
     (tmp_path / "mine.yaml").write_text(CELL, encoding="utf-8")
     done = wheel.run(tmp_path, "run", "mine.yaml", "--no-viewer", "--domain", str(DOMAIN + 1), **watched(tmp_path))
     assert "DONE" in done.stdout and "mine.task" in mains(tmp_path, wheel)
-    (tmp_path / "script.py").write_text("import zencell\nfrom common.config import load_cell\nprint(load_cell('ur5').name)\n")
+    script = "import zencell\nfrom common.config import load_cell\nprint(load_cell('ur5').name)\n"
+    (tmp_path / "script.py").write_text(script, encoding="utf-8")
     python = Installation([str(Path(wheel.command[0]).with_name("python"))], wheel.modules)
     assert python.run(tmp_path, "script.py").stdout == "ur5\n"
 
