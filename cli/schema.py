@@ -39,6 +39,8 @@ def fields_of(model: type[BaseModel], indent: int = 0, seen: tuple[type[BaseMode
         for inner in _models_in(field.annotation):
             if inner not in seen:
                 yield from fields_of(inner, indent + 1, (*seen, inner))
+    for name, computed in model.model_computed_fields.items():
+        yield f"{'  ' * indent}{name}: {type_name(computed.return_type)}  # {computed.description}"
 
 
 def type_name(annotation: Any) -> str:

@@ -24,7 +24,9 @@ class Decoder:
         model = message_class(sample.message)
         if model is not None:
             try:
-                return model.model_validate(msgpack.unpackb(sample.payload, raw=False, strict_map_key=True))
+                values = msgpack.unpackb(sample.payload, raw=False, strict_map_key=True)
+                # A field that the class has no more does not make the rest of an old recording worthless.
+                return model.model_validate(values, extra="ignore")
             except (ValidationError, ValueError, TypeError, msgpack.UnpackException, RecursionError):
                 pass
         self.skipped[sample.topic] += 1

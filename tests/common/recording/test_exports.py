@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgpack
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -175,6 +176,14 @@ def test_video_of_depth_alone_is_refused_in_one_line(tmp_path: Path) -> None:
     source = write(tmp_path / "a.mcap", [image(0, DEPTH, "32FC1")])
     with Recording(source) as recording, pytest.raises(RecordingError, match="has no colour picture"):
         pictures.export_video(recording, tmp_path / "v.mp4", "camera/image_raw", Decoder())
+
+
+def test_field_that_a_class_has_no_more_is_left_out_of_an_old_recording() -> None:
+    decoder = Decoder()
+    values = {**msgpack.unpackb(joints(0).payload), "torque_of_old": 1}
+    values["header"]["sequence_of_old"] = 7
+    message = decoder.message(joints(0, payload=msgpack.packb(values)))
+    assert message == decoder.message(joints(0)) and not decoder.skipped
 
 
 def test_payload_that_does_not_hold_is_counted_and_left_out() -> None:

@@ -1,0 +1,127 @@
+"""Recordings of the first release, one of each cell, open in everything that reads recordings."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import json
+import re
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from cli.main import app
+from common.application import message_class
+from common.applications.outlining.topics import OUTLINE_STATUS
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from common.messages import TaskStatus
+from common.recording.reading import Recording
+from common.topics import Topic
+from common.transport.codec import decode
+from common.transport.connect import connect
+from common.transport.endpoint import endpoint_of
+from tests.cli.conftest import command_line, environment
+
+DATA = Path(__file__).resolve().parent.parent / "data"
+PATIENCE = 60.0  # [s]
+
+
+@dataclass(frozen=True)
+class Old:
+    """A recording, and what is known of it."""
+
+    cell: str
+    messages: int
+    types: dict[str, tuple[str, int]]  # class and number by topic, of some
+    status: Topic[TaskStatus]
+    told: tuple[str, ...]  # in the head of its report
+    last: dict[str, str]  # in the last row of its task's table
+
+    @property
+    def path(self) -> Path:
+        return DATA / f"{self.cell}_first_release.mcap"
+
+
+PANDA = Old(
+    "panda", 1890, {"joint_states": ("JointState", 637), "pick_place_status": ("PickPlaceStatus", 25),
+                    "detected_objects": ("MarkerArray", 51), "scene_balls": ("PoseArray", 95)},
+    PICK_PLACE_STATUS, ("panda: DONE", "placed 2 of 2", "rejected places 1", "truth 2 in the box, 1 on the table",
+                        "in 8 plans", "frame to target"),
+    {"state": "DONE", "placed": "2", "targets": "2"},
+)
+UR5 = Old(
+    "ur5", 1393, {"joint_states": ("JointState", 541), "outline_status": ("OutlineStatus", 15),
+                  "contours": ("Contours", 3), "contour_path": ("OutlinePoints", 3)},
+    OUTLINE_STATUS, ("ur5: DONE", "outlined Object_0", "traced 100.0% of 0.399 m", "from the true edge 0.03 mm",
+                     "in 5 plans"),
+    {"state": "DONE", "object": "Object_0", "fraction": "1.0"},
+)
+
+
+@pytest.fixture(params=[PANDA, UR5], ids=lambda old: old.cell)
+def old(request: pytest.FixtureRequest) -> Old:
+    return request.param  # type: ignore[no-any-return]
+
+
+def test_info_tells_what_is_in_it(old: Old, capsys: pytest.CaptureFixture[str]) -> None:
+    assert app.execute(["info", str(old.path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["messages"] == old.messages and told["finished"]
+    found = {topic: (told["topics"][topic]["type"], told["topics"][topic]["messages"]) for topic in old.types}
+    assert found == old.types
+
+
+def test_every_message_is_still_one_of_its_class_and_its_schema_is_in_the_file(old: Old) -> None:
+    with Recording(old.path) as recording:
+        for sample in recording.samples():
+            model = message_class(sample.message)
+            assert model is not None, f"no class {sample.message}: {sample.topic} of an old recording cannot be read"
+            decode(model, sample.payload)
+        schemas = {schema.name: json.loads(schema.data) for schema in recording.layout.schemas.values()}
+    assert {name for name, _ in old.types.values()} <= schemas.keys()
+    assert all(schema["properties"] for schema in schemas.values())
+
+
+def test_report_tells_how_it_went(old: Old, tmp_path: Path) -> None:
+    assert app.execute(["report", str(old.path), "-o", str(tmp_path / "report.html")]) == 0
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    head = " ".join(re.sub(r"<[^>]*>", " ", page[page.index("<h1") : page.index("</section>")]).split())
+    for part in old.told:
+        assert part in head.replace(" : ", ": "), head
+    assert "Not understood" not in page
+
+
+def test_export_leaves_nothing_out(old: Old, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert app.execute(["export", str(old.path), "--csv", str(tmp_path / "csv"), "--images", str(tmp_path / "png"),
+                        "--foxglove", str(tmp_path / "foxglove.mcap")]) == 0
+    shown = capsys.readouterr()
+    assert shown.err == "" and f"foxglove.mcap: {old.messages:,} messages" in shown.out
+    with (tmp_path / "csv" / f"{old.status.key}.csv").open(encoding="utf-8", newline="") as file:
+        *_, last = csv.DictReader(file)
+    assert last | old.last == last
+    assert list((tmp_path / "png").glob("*/*.png"))
+
+
+async def test_play_brings_its_words_to_those_who_listen(old: Old, domain: int) -> None:
+    command = command_line("play", str(old.path), "--rate", "10", "--wait", "listener", "--exclude", "image|points",
+                           "--domain", str(domain))
+    player = await asyncio.create_subprocess_exec(*command, env=environment(), stdout=subprocess.PIPE)
+    endpoint = endpoint_of(domain)
+    try:
+        # The player brings the router, and waits until we listen.
+        async with connect(cell=old.cell, service="listener", endpoint=endpoint, timeout=PATIENCE) as bus:
+            status = bus.reader(old.status)
+            await bus.ready()
+            async with asyncio.timeout(PATIENCE):
+                async for message in status:
+                    if message.state == "DONE":
+                        break
+        async with asyncio.timeout(PATIENCE):
+            told, _ = await player.communicate()
+    finally:
+        if player.returncode is None:
+            player.kill()
+            await player.wait()
+    assert player.returncode == 0 and re.search(rb"played [\d,]+ messages", told)
