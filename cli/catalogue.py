@@ -70,8 +70,10 @@ def service(
         command = [*python_module(ROUTER_MODULE), "--domain", str(number)]
     else:
         entries = {known: ServiceEntry(name=known, module=f"services.{known}") for known in service_names()}
-        for key, entry in load_cell(cell, launch.overrides, world=world, seed=launch.seed).services.items():
-            entries[key] = entries[entry.name] = entry
+        for entry in load_cell(cell, launch.overrides, world=world, seed=launch.seed).services.values():
+            if entry.name == entry.kind:
+                entries[entry.module] = entry
+            entries[entry.name] = entry
         if name not in entries and "." not in name:
             raise UnknownName("service", name, entries)
         entry = entries.get(name) or ServiceEntry(name=name.rpartition(".")[2], module=name)

@@ -78,7 +78,7 @@ class Operation:
         ))
         loaded = load_cell(cell, self.launch.overrides, world=world, seed=self.launch.seed)
         if no_viewer:
-            kept = {name: entry for name, entry in loaded.services.items() if entry.name != viewing.VIEWER}
+            kept = {name: entry for name, entry in loaded.services.items() if entry.kind != viewing.VIEWER}
             loaded = loaded.model_copy(update={"services": kept})
         self.cell: Cell = loaded
         self.summary = Summary(loaded.name, loaded.run.seed, self.launch.clock.speed)

@@ -167,7 +167,7 @@ def rights_in(cell: Cell, names: Collection[str] | None = None) -> dict[str, Rig
     apart = cell.model_copy(update={"services": {
         # The page listens while it is looked at: where nobody else does, for the cell may be up.
         key: entry.model_copy(update={"parameters": {**entry.parameters, "host": "127.0.0.1", "port": 0}})
-        if entry.name == VIEWER else entry for key, entry in cell.services.items()
+        if entry.kind == VIEWER else entry for key, entry in cell.services.items()
     }})
 
     async def find() -> dict[str, Rights]:

@@ -48,7 +48,7 @@ def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
     from common.viewer.access import TOKEN_VARIABLE, address_of, is_loopback, make_token
     from common.viewer.listening import first_free_port, open_socket, refusal
 
-    entry = next((entry for entry in cell.services.values() if entry.name == VIEWER), None)
+    entry = next((entry for entry in cell.services.values() if entry.kind == VIEWER), None)
     for option, value in (("--viewer-port", port), ("--viewer-host", host)):
         if value is not None and entry is None:
             raise ConfigError(option, value, "needs a cell with a viewer, and not --no-viewer")
@@ -67,13 +67,13 @@ def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
         except OSError as error:
             raise refusal(error, at, number, "" if port is None else "--viewer-port") from None
     else:
-        raise ConfigError("services.viewer.port", wanted, f"must be a whole number from 1 to {HIGHEST_PORT}")
-    overrides = [] if host is None else [f"services.viewer.host={at}"]
+        raise ConfigError(f"services.{entry.name}.port", wanted, f"must be a whole number from 1 to {HIGHEST_PORT}")
+    overrides = [] if host is None else [f"services.{entry.name}.host={at}"]
     address, environment = address_of(at, number), {}
     if not (is_loopback(at) or entry.parameters.get("token") or os.environ.get(TOKEN_VARIABLE)):
         environment[TOKEN_VARIABLE] = make_token()
         address += f"/?token={environment[TOKEN_VARIABLE]}"
-    return Page(address, (*overrides, f"services.viewer.port={number}"), environment, free)
+    return Page(address, (*overrides, f"services.{entry.name}.port={number}"), environment, free)
 
 
 def _port(text: str) -> int:

@@ -31,6 +31,7 @@ from typing import Any, cast
 from common import messages, topics
 from common.errors import ConfigError, UnknownName
 from common.messages import Message, TaskStatus
+from common.remapping import SERVICE_NAME
 from common.topics import AnyTopic, Request, Topic
 
 PACKAGE = "common.applications"
@@ -129,7 +130,7 @@ def all_topics() -> dict[str, AnyTopic]:
 def find_topic(key: str) -> Topic[Any] | Request[Any, Any] | None:
     """The topic or request of a key, also of the parameters of a service; None for one that is not known."""
     prefix, _, service = key.partition("/")
-    if prefix == "param" and topics.SERVICE_NAME.fullmatch(service):
+    if prefix == "param" and SERVICE_NAME.fullmatch(service):
         return topics.parameters_of(service)
     return all_topics().get(key)
 

@@ -5,7 +5,6 @@ A key on the wire is `<cell>/<topic>`, for example `panda/camera/image_raw`.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from typing import Generic, Literal, TypeVar
 
@@ -13,7 +12,6 @@ from common import messages as m
 
 Kind = Literal["stream", "event", "state", "request"]
 PublishedKind = Literal["stream", "event", "state"]
-SERVICE_NAME = re.compile(r"[A-Za-z_]\w*")
 M = TypeVar("M", bound=m.Message)
 Q = TypeVar("Q", bound=m.Message)
 A = TypeVar("A", bound=m.Message)

@@ -14,7 +14,7 @@ EXECUTOR = "trajectory_executor"
 CONFIG = "/app/config"
 DATA = "/data"
 # A container's port is published to the loopback of its host only, and forwarded from a pod only by kubectl.
-PAGE = ["--set", "services.viewer.host=0.0.0.0", "--set", "services.viewer.published=true"]
+PAGE = ["--set", "services.{name}.host=0.0.0.0", "--set", "services.{name}.published=true"]
 USER = 10001  # as in the Dockerfile
 # About twice what a service takes in a whole run [MB]: benchmarks/resources.py prints that.
 MEMORY = {"motion_planner": 768, VIEWER: 768}
@@ -51,10 +51,10 @@ def containers_of(file: str, cell: Cell) -> list[Container]:
     kept = {EXECUTOR: {STATE_VARIABLE: DATA}}  # started again, it finds what it simulates as it was
     return [
         Container(
-            entry.name, ["python", "-m", entry.module], environment | kept.get(entry.name, {}),
-            MEMORY.get(entry.name, USUAL_MEMORY),
-            is_task=entry.name == cell.task, page=entry.name == VIEWER,
-            arguments=PAGE if entry.name == VIEWER else [],
+            entry.name, ["python", "-m", entry.module, *entry.name_option], environment | kept.get(entry.kind, {}),
+            MEMORY.get(entry.kind, USUAL_MEMORY),
+            is_task=entry.name == cell.task, page=entry.kind == VIEWER,
+            arguments=[part.format(name=entry.name) for part in PAGE] if entry.kind == VIEWER else [],
         )
         for entry in cell.services.values()
     ]

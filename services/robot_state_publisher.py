@@ -71,10 +71,13 @@ async def run(bus: Bus, config: Config) -> None:
     joints = bus.reader(topics.JOINT_STATES)
     tf, tf_static = bus.writer(topics.TF), bus.writer(topics.TF_STATIC)
     frames = LinkFrames(RobotModel.load(config.robot))
-    camera, stamp = config.surroundings.camera, bus.header().stamp
-    T_world_camera = transform(rpy_to_matrix(*camera.rpy), camera.position)
+    stamp = bus.header().stamp
     base = stamped(WORLD, frames.root, frames.T_world_root, stamp)
-    fixed = [base, stamped(WORLD, camera.frame, T_world_camera, stamp), *frames.fixed(stamp)]
+    cameras = [
+        stamped(WORLD, camera.frame, transform(rpy_to_matrix(*camera.rpy), camera.position), stamp)
+        for camera in config.surroundings.cameras.values()
+    ]
+    fixed = [base, *cameras, *frames.fixed(stamp)]
     tf_static.put(TFMessage(transforms=fixed))
     await bus.ready()
     newest, told = 0, False

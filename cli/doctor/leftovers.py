@@ -111,7 +111,8 @@ def _listed(seen: list[Seen]) -> str:
 def _what(each: Seen) -> str:
     """What a process is, in the words of the command line."""
     if each.is_service:
-        return each.command[list(each.command).index("-m") + 1].rpartition(".")[2]
+        module, option, name, *_ = (*each.command[list(each.command).index("-m") + 1:], "", "")
+        return name if option == "--name" else module.rpartition(".")[2]
     verb = next(index for index, part in enumerate(each.command) if part in VERBS)
     return " ".join(("zencell", *each.command[verb : verb + 2]))
 

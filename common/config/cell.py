@@ -16,9 +16,20 @@ from common.config.world import Surroundings, World
 class ServiceEntry(Section):
     """A process of the cell: its module and its parameters, which are checked by the service itself."""
 
-    name: str
+    name: str = Field(description="of its own in the cell: one module may run several times")
     module: str
+    topics: dict[str, str] = Field({}, description="keys of the cell by its own words for them")
     parameters: dict[str, Any] = {}
+
+    @property
+    def kind(self) -> str:
+        """What it is, whatever it is called: the last part of its module."""
+        return self.module.rpartition(".")[2]
+
+    @property
+    def name_option(self) -> list[str]:
+        """What its command line needs beside the module to say who it is."""
+        return [] if self.name == self.kind else ["--name", self.name]
 
 
 class Members(Section):
@@ -48,10 +59,19 @@ class Cell(Section):
         """The first part of every key."""
         return self.run.cell
 
-    def section(self, kind: type[Section]) -> Section:
-        """The section of that type; surroundings are cut out of the world, without what lies in it."""
+    def section(self, kind: type[Section], camera: str | None = None) -> Section:
+        """The section of that type; surroundings are cut out of the world, without what lies in it.
+
+        Args:
+            kind: the type.
+            camera: which of the world's cameras the surroundings have as *the* camera; the first if not given.
+
+        Raises:
+            UnknownName: the world has no such camera.
+        """
         if kind is Surroundings:
-            return Surroundings.model_validate({f: getattr(self.world, f) for f in Surroundings.model_fields})
+            around = {f: getattr(self.world, f) for f in Surroundings.model_fields}
+            return Surroundings.model_validate(around | {"camera": self.world.camera_of(camera)})
         if kind is Members:
             names = [entry.name for entry in self.services.values()]
             return Members(services=names, task=self.task, application=self.application)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
@@ -41,9 +41,14 @@ def _first_error(error: ValidationError, model: type[BaseModel], prefix: str) ->
 
 def _fields_at(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
     """Names of the fields of the model that lies at a location within `model`."""
-    current = model
+    current, table = model, None
     for part in location:
-        annotation = current.model_fields[str(part)].annotation if str(part) in current.model_fields else None
+        # In a mapping of models the name comes between the field and its fields.
+        field = current.model_fields.get(str(part))
+        annotation = table or (field.annotation if field else None)
+        table = get_args(annotation)[-1] if get_origin(annotation) is dict else None
+        if table is not None:
+            continue
         if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
             break
         current = annotation

@@ -78,9 +78,12 @@ def read_world(path: Path) -> dict[str, Any]:
 
 
 def with_camera(world: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The world; when its camera is the path of a file, relative to the folder, with the values of that file."""
-    if isinstance(world.get("camera"), str):
-        world["camera"] = read_camera(folder / Path(world["camera"]).expanduser())
+    """The world; where a camera is the path of a file, relative to the folder, with the values of that file."""
+    cameras = world.get("cameras")
+    for table, names in ((world, ["camera"]), (cameras, list(cameras) if isinstance(cameras, dict) else [])):
+        for name in names:
+            if isinstance(table, dict) and isinstance(table.get(name), str):
+                table[name] = read_camera(folder / Path(table[name]).expanduser())
     return world
 
 

@@ -22,8 +22,11 @@ from common.config.files import (
     with_camera,
 )
 from common.config.overrides import expanded, parse_override
+from common.config.world import CAMERA, Surroundings
 from common.errors import ConfigError, UnknownName
+from common.remapping import SERVICE_NAME, checked_table
 
+NOT_A_SERVICE = ("router", "supervisor", "recorder")  # processes beside the services, which have names too
 P = TypeVar("P", bound=Parameters)
 
 
@@ -37,6 +40,14 @@ def _override(tree: dict[str, Any], path: Sequence[str], value: Any) -> None:
             raise ConfigError("--set", ".".join(path), f"can not go below {'.'.join(path[: depth + 1])}, a value")
         node = child
     node[path[-1]] = value
+
+
+def _at(tree: dict[str, Any], path: Sequence[str]) -> Any:
+    """What lies at a path of the tree; None if nothing does."""
+    node: Any = tree
+    for part in path:
+        node = node.get(part) if isinstance(node, dict) else None
+    return node
 
 
 def load_cell(
@@ -75,14 +86,16 @@ def load_cell(
     services = tree.get("services")
     if not isinstance(services, dict):
         raise ConfigError("services", services, "must be a mapping of services in start order")
-    by_name = {str(key).rpartition(".")[2]: key for key in services}  # a dotted module goes by its last part
+    by_name = {_name_of(str(key)): key for key in services}
     for parts, value in parsed:
         if parts[0] == "services" and len(parts) > 1 and parts[1] not in services:
             if parts[1] not in by_name:
                 raise UnknownName("service", parts[1], by_name)
             parts[1] = by_name[parts[1]]
-        if parts == ["world", "camera"] and isinstance(value, str):
-            before = tree["world"].get("camera")
+        if parts[0] == "world":
+            _name_camera(tree["world"], parts)
+        if parts[:2] in (["world", "camera"], ["world", "cameras"]) and isinstance(value, str):
+            before = _at(tree, parts)
             camera = {**(before if isinstance(before, dict) else {}), **read_camera(Path(value).expanduser())}
             _override(tree, parts, camera)
         elif len(parts) > 1 or parts[0] not in ("robot", "world", "pipeline"):
@@ -92,7 +105,7 @@ def load_cell(
         run["seed"] = seed
     tree["run"] = run
     _name_application(tree)
-    tree["services"] = {name: _service_entry(name, value) for name, value in services.items()}
+    tree["services"] = _service_entries(services)
     return check(Cell, tree)
 
 
@@ -110,13 +123,50 @@ def _name_application(tree: dict[str, Any]) -> None:
         tree.setdefault("task", found.task or given.rpartition(".")[2])
 
 
-def _service_entry(name: str, parameters: Any) -> dict[str, Any]:
-    if parameters is not None and not isinstance(parameters, dict):
-        raise ConfigError(f"services.{name}", parameters, "must be a mapping of parameters")
-    module = name if "." in name else f"services.{name}"
-    if "." not in name and importlib.util.find_spec(module) is None:
-        raise UnknownName("service", name, service_names())
-    return {"name": name.rpartition(".")[2], "module": module, "parameters": parameters or {}}
+def _name_camera(world: dict[str, Any], path: list[str]) -> None:
+    """Have world and override speak of cameras alike: of a single one, or of several by name."""
+    cameras = world.get("cameras")
+    if path[1:2] == ["cameras"] and cameras is None:
+        world["cameras"] = {CAMERA: world.pop("camera", None) or {}}
+    elif path[1:2] == ["camera"] and isinstance(cameras, dict) and len(cameras) == 1:
+        path[1:2] = ["cameras", *cameras]
+
+
+def _name_of(key: str) -> str:
+    """The name of a service that stands under a key of the cell file: a dotted module goes by its last part."""
+    return key.rpartition(".")[2]
+
+
+def _service_entries(services: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The services by their names, in start order."""
+    entries: dict[str, dict[str, Any]] = {}
+    for key, given in services.items():
+        entry = _service_entry(str(key), given)
+        name = entry["name"]
+        if name in entries:
+            before = entries[name]["module"]
+            raise ConfigError(f"services.{key}", ..., f"{before} goes by the name {name} already: give this one a name "
+                              f"of its own, as in another_{name}: {{service: {key}}}")
+        entries[name] = entry
+    return entries
+
+
+def _service_entry(key: str, given: Any) -> dict[str, Any]:
+    if given is not None and not isinstance(given, dict):
+        raise ConfigError(f"services.{key}", given, "must be a mapping of parameters")
+    parameters = dict(given or {})
+    kind = parameters.pop("service", key)
+    if not isinstance(kind, str) or not kind:
+        raise ConfigError(f"services.{key}.service", kind, f"must be a service; choices: {', '.join(service_names())}")
+    name = _name_of(key)
+    if not SERVICE_NAME.fullmatch(name) or name in NOT_A_SERVICE:
+        raise ConfigError("services", key, "is not a name that a service can have: letters, digits and _, but not "
+                          + ", ".join(NOT_A_SERVICE))
+    module = kind if "." in kind else f"services.{kind}"
+    if "." not in kind and importlib.util.find_spec(module) is None:
+        raise UnknownName("service", kind, service_names())
+    topics = checked_table(f"services.{name}.topics", parameters.pop("topics", None) or {})
+    return {"name": name, "module": module, "topics": topics, "parameters": parameters}
 
 
 def service_names() -> list[str]:
@@ -131,10 +181,16 @@ def service_config(cell: Cell, name: str, config: type[P]) -> P:
     Raises:
         ConfigError: names `services.<name>.<parameter>`, the value and the bounds or choices.
     """
-    entry = next((entry for entry in cell.services.values() if entry.name == name), None)
+    entry = cell.services.get(name)
     given = dict(entry.parameters) if entry else {}
+    # A parameter for whoever looks through one of several cameras, unless the service has one of that name itself.
+    sections = [info.annotation for info in config.model_fields.values() if is_section(info.annotation)]
+    chooses = Surroundings in sections and "camera" not in config.model_fields
+    camera = given.pop("camera", None) if chooses else None
+    if camera is not None and camera not in cell.world.cameras:
+        raise ConfigError(f"services.{name}.camera", camera, f"must be one of {', '.join(cell.world.cameras)}")
     for field, info in config.model_fields.items():
         if is_section(info.annotation):
             # A copy: what a service changes in it at run time stays with it.
-            given[field] = cell.section(info.annotation).model_copy()  # type: ignore[arg-type]
+            given[field] = cell.section(info.annotation, camera).model_copy()  # type: ignore[arg-type]
     return check(config, given, f"services.{name}")

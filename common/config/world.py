@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from common.config.basics import Coordinate, Length, Number, Point, Rgb, Section
+from common.errors import UnknownName
+
+CAMERA = "camera"  # the name of a single one
 
 
 class Fixture(Section):
@@ -42,7 +46,7 @@ class CameraConfig(Section):
     A world may name a file of `zencell calibrate` in its place.
     """
 
-    frame: str = "camera_optical_frame"
+    frame: str = f"{CAMERA}_optical_frame"
     width: int = Field(640, ge=16, le=4096, description="[px]")
     height: int = Field(480, ge=16, le=4096, description="[px]")
     fx: float = Field(520.0, gt=1, le=1e5, description="focal length [px]")
@@ -93,9 +97,52 @@ class Surroundings(Section):
     fixtures: list[Fixture] = []
     container: Container = Container()
     camera: CameraConfig = CameraConfig()
+    cameras: dict[str, CameraConfig] = Field({}, min_length=1, description="by name, in the place of a single one")
     ball_radius: float = Field(0.03, ge=0.01, le=0.035, description="[m]")
     ball_color: Rgb = (1.0, 0.15, 0.10)
     table_height: Coordinate = Field(0.0, description="z of the surface on which balls rest [m]")
+
+
+    @model_validator(mode="before")
+    @classmethod
+    def _cameras_by_name(cls, given: Any) -> Any:
+        """A single camera is a mapping of one; one that does not say what its frame is called has it from its name."""
+        if not isinstance(given, Mapping):
+            return given
+        cameras = given.get("cameras")
+        if cameras is None:
+            camera = given.get("camera")
+            return {**given, "cameras": {CAMERA: {} if camera is None else camera}}
+        if not isinstance(cameras, Mapping):
+            return given
+        return {**given, "cameras": {
+            name: {"frame": f"{name}_optical_frame", **camera} if isinstance(camera, Mapping) else camera
+            for name, camera in cameras.items()
+        }}
+
+    @model_validator(mode="after")
+    def _several_cameras(self) -> Self:
+        """The first of several is *the* camera where none is chosen; their frames tell them apart."""
+        if "camera" not in self.model_fields_set:
+            self.__dict__["camera"] = self.camera_of()
+        elif self.camera not in self.cameras.values():
+            raise ValueError(f"camera is for a world with one: this one has {', '.join(self.cameras)} as cameras.NAME")
+        names: dict[str, str] = {}
+        for name, camera in self.cameras.items():
+            if camera.frame in names:
+                raise ValueError(f"cameras.{name} has the frame of {names[camera.frame]}: {camera.frame}")
+            names[camera.frame] = name
+        return self
+
+    def camera_of(self, name: str | None = None) -> CameraConfig:
+        """A camera by its name; the first if none is given.
+
+        Raises:
+            UnknownName: there is no such camera.
+        """
+        if name is not None and name not in self.cameras:
+            raise UnknownName("camera", name, self.cameras)
+        return self.cameras[name] if name is not None else next(iter(self.cameras.values()))
 
 
 class World(Surroundings):

@@ -26,8 +26,9 @@ FIRST_PROCESS = Path("/proc/1/cmdline")
 def first_service() -> str:
     """Name of the service that is the container's first process; empty when it is something else."""
     command = FIRST_PROCESS.read_bytes().decode(errors="replace").replace("\0", " ")
-    found = re.search(r" -m ([\w.]+)", command)  # also where something else restarts it, which is told the command
-    return found[1].rpartition(".")[2] if found else ""
+    # Also where something else restarts it, which is told the command.
+    found = re.search(r" -m ([\w.]+)(?: --name (\w+))?", command)
+    return (found[2] or found[1].rpartition(".")[2]) if found else ""
 
 
 def is_ready(endpoint: str, cell: str, service: str) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from typing import TypeVar
 
@@ -21,11 +21,11 @@ C = TypeVar("C")
 @asynccontextmanager
 async def running_service(
     network: LocalNetwork, run: Callable[[Bus, C], Awaitable[None]], config: C, *, name: str = "service",
-    cell: str = "test", clock: Clock | None = None,
+    cell: str = "test", clock: Clock | None = None, topics: Mapping[str, str] | None = None,
 ) -> AsyncIterator[Bus]:
     """A service that runs inside the block, from its `ready` on; its crash ends the block and is raised there."""
     session = network.session()
-    bus = Bus(session, service=name, cell=cell, clock=clock or Clock())
+    bus = Bus(session, service=name, cell=cell, clock=clock or Clock(), topics=topics)
     to_topic = BusLog(bus)
     bus.log.addHandler(to_topic)
     bus.log.setLevel(logging.INFO)

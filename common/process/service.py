@@ -8,12 +8,12 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Coroutine, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, NoReturn, TypeVar
 
 from common.clock import EPOCH_VARIABLE, SPEED_VARIABLE, Clock
-from common.config import Parameters, Watchdogs, load_cell, service_config
+from common.config import Cell, Parameters, Watchdogs, load_cell, service_config
 from common.errors import ConfigError, UnknownName, ZencellError
 from common.process.lifeline import Lifeline, fail, leave
 from common.process.log import BusLog, log_to_stderr
@@ -53,10 +53,12 @@ class Start(Generic[P]):
     endpoint: str
     watchdogs: Watchdogs
     credentials: Credentials | None = None
+    topics: Mapping[str, str] = field(default_factory=dict)  # keys of the cell by its own words for them
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that every service process has."""
+    parser.add_argument("--name", help="of this service in the cell, where that is not the name of its module")
     parser.add_argument("--cell", help=f"name or YAML file of the cell ({CELL_VARIABLE})")
     parser.add_argument(
         "--set", action="append", default=[], metavar="PATH=VALUE",
@@ -92,8 +94,13 @@ def clock_from(speed: float | None, environ: Mapping[str, str] = os.environ) -> 
         raise ConfigError("speed", given, f"can not be used: {error}") from None
 
 
-def prepare(name: str, config: type[P], options: argparse.Namespace) -> Start[P]:
+def prepare(kind: str, config: type[P], options: argparse.Namespace) -> Start[P]:
     """Resolve everything that a service is started with.
+
+    Args:
+        kind: the last part of its module, which is also its name if it is given no other.
+        config: of that module.
+        options: of the command line.
 
     Raises:
         ConfigError, UnknownName: one line that names the field, the value and the choices.
@@ -103,10 +110,31 @@ def prepare(name: str, config: type[P], options: argparse.Namespace) -> Start[P]
         raise ConfigError("--cell", "", f"must name a cell, also as {CELL_VARIABLE}")
     endpoint = endpoint_of(options.domain, options.connect)
     cell = load_cell(chosen, options.set, world=options.world, seed=options.seed)
+    name = name_in(cell, kind, options.name)
     folder = secure_folder()
     credentials = credentials_of(common_name(cell.name, name), folder) if folder else None
     clock = clock_from(options.speed)
-    return Start(name, cell.name, service_config(cell, name, config), clock, endpoint, cell.watchdogs, credentials)
+    topics = cell.services[name].topics if name in cell.services else {}
+    return Start(
+        name, cell.name, service_config(cell, name, config), clock, endpoint, cell.watchdogs, credentials, topics)
+
+
+def name_in(cell: Cell, kind: str, given: str | None) -> str:
+    """The name of a service in a cell; one that the cell does not have goes by its kind.
+
+    Raises:
+        ConfigError, UnknownName: the cell has none of that name and kind, or has it under other names only.
+    """
+    of_kind = [entry.name for entry in cell.services.values() if entry.kind == kind]
+    if given is None:
+        if kind not in cell.services and of_kind:
+            raise ConfigError("--name", ..., f"is missing: in {cell.name} a {kind} is called {' or '.join(of_kind)}")
+        given = kind
+    elif given not in cell.services:
+        raise UnknownName("--name", given, of_kind)
+    if given in cell.services and given not in of_kind:
+        raise ConfigError("--name", given, f"is a {cell.services[given].kind} in {cell.name}, not a {kind}")
+    return given
 
 
 def own_name() -> str:
@@ -125,15 +153,15 @@ def main(run: Run[P], config: type[P]) -> NoReturn:
     stderr; 1 for a crash, with its traceback.
     """
     sys.setswitchinterval(_SWITCH_SECONDS)
-    name = own_name()
-    parser = _Parser(prog=name)
+    kind = own_name()
+    parser = _Parser(prog=kind)
     add_options(parser)
     options = parser.parse_args()
     lifeline = Lifeline(gate=options.gate)
     lifeline.start()
-    log_to_stderr(name, as_json=options.log_json)
+    log_to_stderr(options.name or kind, as_json=options.log_json)
     try:
-        start = prepare(name, config, options)
+        start = prepare(kind, config, options)
     except ZencellError as error:
         fail(error)
     leave(run_until_stopped(lambda: _live(run, start, lifeline), lifeline))
@@ -161,7 +189,7 @@ async def _live(run: Run[P], start: Start[P], lifeline: Lifeline) -> int:
     session = await _connected(start)
     try:
         await _gate(lifeline)
-        bus = Bus(session, service=start.name, cell=start.cell, clock=start.clock)
+        bus = Bus(session, service=start.name, cell=start.cell, clock=start.clock, topics=start.topics)
         root = logging.getLogger()
         to_topic = BusLog(bus)
         root.addHandler(to_topic)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -37,45 +37,47 @@ class Wiring:
 class Recorder(Bus):
     """A bus on a network of its own that notes what is declared, and never gets past `ready`."""
 
-    def __init__(self, service: str = "recorded") -> None:
-        super().__init__(LocalNetwork().session(), service=service, cell="recorded", clock=Clock())
+    def __init__(self, service: str = "recorded", topics: Mapping[str, str] | None = None) -> None:
+        super().__init__(LocalNetwork().session(), service=service, cell="recorded", clock=Clock(), topics=topics)
         self.wiring = Wiring()
 
     def reader(self, topic: Topic[M], *, size: int = 1000, listening: bool = True) -> Reader[M]:
         """A reader that gets nothing."""
-        self.wiring.reads.add(topic)
+        self.wiring.reads.add(self._in_cell(topic))
         return super().reader(topic, size=size, listening=listening)
 
     def writer(self, topic: Topic[M]) -> Writer[M]:
         """A writer that nobody listens to."""
-        self.wiring.writes.add(topic)
+        self.wiring.writes.add(self._in_cell(topic))
         return super().writer(topic)
 
     def serve(self, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]]) -> None:
         """Note what is served."""
-        self.wiring.serves.add(topic)
+        self.wiring.serves.add(self._in_cell(topic))
         super().serve(topic, handler)
 
     def client(self, topic: Request[Q, A]) -> Client[Q, A]:
         """A client whose calls nobody answers."""
-        self.wiring.calls.add(topic)
+        self.wiring.calls.add(self._in_cell(topic))
         return super().client(topic)
 
     async def ready(self) -> None:
         """Wait to be ended: all is declared."""
+        self._remapping.require_used(self.service)
         self.ready_event.set()
         await asyncio.get_running_loop().create_future()
 
 
 async def wiring(
-    run: Callable[[Bus, C], Coroutine[Any, Any, None]], config: C, *, service: str = "recorded", timeout: float = 30.0
+    run: Callable[[Bus, C], Coroutine[Any, Any, None]], config: C, *, service: str = "recorded", timeout: float = 30.0,
+    topics: Mapping[str, str] | None = None,
 ) -> Wiring:
-    """What `run` declares, under a service's name, before it says that it is ready.
+    """What `run` declares, under a service's name, before it says that it is ready, with its keys as in the cell.
 
     Raises:
         RuntimeError: it ended, or `timeout` seconds passed, before it was ready. What it raises itself is raised.
     """
-    recorder = Recorder(service)
+    recorder = Recorder(service, topics)
     task = asyncio.create_task(recorder.run(run(recorder, config)))
     is_ready = asyncio.create_task(recorder.ready_event.wait())
     try:
@@ -100,4 +102,5 @@ async def wiring_of(cell: Cell, entry: ServiceEntry) -> Wiring:
         ConfigError: it can not be configured so.
     """
     module = importlib.import_module(entry.module)
-    return await wiring(module.run, service_config(cell, entry.name, module.Config))
+    config = service_config(cell, entry.name, module.Config)
+    return await wiring(module.run, config, service=entry.name, topics=entry.topics)

@@ -45,7 +45,7 @@ class Launch:
 
     def service_command(self, entry: ServiceEntry, *, gate: bool = True) -> list[str]:
         """Command line of a service, which waits behind its gate unless told otherwise."""
-        command = [*python_module(entry.module), "--cell", self.cell]
+        command = [*python_module(entry.module), *entry.name_option, "--cell", self.cell]
         for text in self.overrides:
             command += ["--set", text]
         if self.world is not None:
@@ -110,8 +110,8 @@ def require_modules(cell: Cell) -> None:
     Raises:
         ConfigError: names the first that can not.
     """
-    for key, entry in cell.services.items():
-        require_module(key, entry)
+    for entry in cell.services.values():
+        require_module(entry.name if entry.name != entry.kind else entry.module.removeprefix("services."), entry)
 
 
 def require_module(key: str, entry: ServiceEntry) -> None:

@@ -6,12 +6,14 @@ import asyncio
 import contextlib
 import logging
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
+from dataclasses import replace
 from typing import Any, TypeVar
 
 from common import topics
 from common.clock import Clock
 from common.messages import Header, Message, ServiceCounters
+from common.remapping import Remapping
 from common.topics import PublishedKind, Request, Topic
 from common.transport.alive import Alive
 from common.transport.codec import DEFAULT_LIMIT
@@ -29,6 +31,7 @@ __all__ = ["Bus", "Client", "Reader", "Writer"]  # what the type hints of a serv
 M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=Message)
 A = TypeVar("A", bound=Message)
+T = TypeVar("T", bound=Topic[Any] | Request[Any, Any])
 
 REPEAT_SECONDS = 1.0  # wall time between repetitions of a state, and between counters
 _MOST_RAW = 1000
@@ -41,6 +44,7 @@ class Bus:
 
     def __init__(
         self, session: Session, *, service: str, cell: str, clock: Clock, limit: int = DEFAULT_LIMIT,
+        topics: Mapping[str, str] | None = None,
     ) -> None:
         """Take a place in a cell.
 
@@ -50,6 +54,7 @@ class Bus:
             cell: name of the cell, first part of every key.
             clock: the cell's clock.
             limit: largest payload that is read [bytes].
+            topics: keys of the cell by the service's own words for them, as common/remapping.py has it.
         """
         self.service = service
         self.cell = cell
@@ -58,6 +63,7 @@ class Bus:
         self.ready_event = asyncio.Event()
         self._session = session
         self._limit = limit
+        self._remapping = Remapping(topics)
         self._loop = asyncio.get_running_loop()
         self._crash: asyncio.Future[BaseException] = self._loop.create_future()
         self._readers: list[Reader[Any]] = []
@@ -84,7 +90,7 @@ class Bus:
 
         With `listening=False` nothing comes until `listen` says so.
         """
-        reader = Reader(topic, self._loop, self.log, size=size, limit=self._limit)
+        reader = Reader(self._in_cell(topic), self._loop, self.log, size=size, limit=self._limit)
         self._readers.append(reader)
         if listening:
             self.listen(reader, True)
@@ -111,7 +117,7 @@ class Bus:
 
     def writer(self, topic: Topic[M]) -> Writer[M]:
         """A writer of the topic."""
-        writer = Writer(self._session, self.cell, self.service, topic)
+        writer = Writer(self._session, self.cell, self.service, self._in_cell(topic))
         self._writers.append(writer)
         return writer
 
@@ -120,19 +126,26 @@ class Bus:
 
         The handler raises `Refused` to refuse one; any other exception is told to the requester and ends the service.
         """
+        served = self._in_cell(topic)
         self._servers.append(
             Server(
-                self._session, self.cell, self.service, topic, handler, loop=self._loop, log=self.log,
+                self._session, self.cell, self.service, served, handler, loop=self._loop, log=self.log,
                 ready=self.ready_event, crash=self._on_crash, limit=self._limit,
             )
         )
         if self.ready_event.is_set():
-            self._declare_token(serves_key(self.cell, topic.key, self.service))
+            self._declare_token(serves_key(self.cell, served.key, self.service))
 
     def client(self, topic: Request[Q, A]) -> Client[Q, A]:
         """A client of the request key."""
-        servers = self._watch(serves_key(self.cell, topic.key))
-        return Client(self._session, self.cell, self.service, topic, servers, loop=self._loop, limit=self._limit)
+        asked = self._in_cell(topic)
+        servers = self._watch(serves_key(self.cell, asked.key))
+        return Client(self._session, self.cell, self.service, asked, servers, loop=self._loop, limit=self._limit)
+
+    def _in_cell(self, topic: T) -> T:
+        """The topic or request under its key in the cell."""
+        key = self._remapping.key(topic.key)
+        return topic if key == topic.key else replace(topic, key=key)
 
     def on_parameters(self, callback: Callable[[], None]) -> None:
         """Have `callback()` called after parameters of this service were changed, for what is not read at each use."""
@@ -144,7 +157,12 @@ class Bus:
             callback()
 
     async def ready(self) -> None:
-        """Tell the cell that this service is ready: what it serves first, its own token last."""
+        """Tell the cell that this service is ready: what it serves first, its own token last.
+
+        Raises:
+            ConfigError: a key was to be renamed that the service does not have.
+        """
+        self._remapping.require_used(self.service)
         self._counters = Writer(self._session, self.cell, self.service, topics.COUNTERS)
         for server in self._servers:
             self._declare_token(serves_key(self.cell, server.topic.key, self.service))
