@@ -51,8 +51,8 @@ class Cell(Section):
     pipeline: Pipeline
     watchdogs: Watchdogs = Watchdogs()
     services: dict[str, ServiceEntry]
-    application: str = Field(description="what the cell is for: a name of common/applications, or a dotted module")
     task: str = Field(description="the service that runs the task and ends in DONE")
+    application: str = Field(description="what the cell is for: a name of common/applications, or a dotted module")
 
     @property
     def name(self) -> str:

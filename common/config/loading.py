@@ -94,7 +94,8 @@ def load_cell(
             parts[1] = by_name[parts[1]]
         if parts[0] == "world":
             _name_camera(tree["world"], parts)
-        if parts[:2] in (["world", "camera"], ["world", "cameras"]) and isinstance(value, str):
+        is_camera = parts == ["world", "camera"] or (len(parts) == 3 and parts[:2] == ["world", "cameras"])
+        if is_camera and isinstance(value, str):
             before = _at(tree, parts)
             camera = {**(before if isinstance(before, dict) else {}), **read_camera(Path(value).expanduser())}
             _override(tree, parts, camera)
@@ -104,8 +105,8 @@ def load_cell(
     if seed is not None:
         run["seed"] = seed
     tree["run"] = run
-    _name_application(tree)
     tree["services"] = _service_entries(services)
+    _name_application(tree)
     return check(Cell, tree)
 
 
@@ -116,11 +117,12 @@ def _name_application(tree: dict[str, Any]) -> None:
         UnknownName, ConfigError: there is no such application.
     """
     task, given = tree.get("task"), tree.get("application")
+    kinds = {name: entry["module"].rpartition(".")[2] for name, entry in tree["services"].items()}
     if given is None and isinstance(task, str):
-        tree["application"] = application_of_task(task)
+        tree["application"] = application_of_task(kinds.get(task, task))
     elif isinstance(given, str):
-        found = find_application(given)
-        tree.setdefault("task", found.task or given.rpartition(".")[2])
+        kind = find_application(given).task or given.rpartition(".")[2]
+        tree.setdefault("task", next((name for name in kinds if kinds[name] == kind), kind))
 
 
 def _name_camera(world: dict[str, Any], path: list[str]) -> None:

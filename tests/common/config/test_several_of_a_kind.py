@@ -1,0 +1,109 @@
+"""One module as several services of a cell: their names, their keys, and the camera that each looks through."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from common.config import Surroundings, load_cell, service_config
+from common.errors import ConfigError, UnknownName
+from common.remapping import Remapping, checked_table
+from services import camera_opencv, vision_detector
+
+TWO = ["services={motion_planner: {}, "
+       "left_camera: {service: camera_opencv, camera: left, source: a.avi, topics: {camera/*: left_camera/*}}, "
+       "right_camera: {service: camera_opencv, camera: right, source: b.avi, topics: {camera/*: right_camera/*}}, "
+       "smart_pick_place: {}}",
+       "world.cameras={left: {position: [0.3, 0, 0.8]}, right: {position: [0.6, 0, 0.8], frame: the_right_one}}"]
+
+
+def cell_of(*services: str) -> list[str]:
+    return [f"services={{{', '.join(services)}}}"]
+
+
+def test_each_has_its_name_its_keys_and_its_parameters() -> None:
+    cell = load_cell("panda", TWO)
+    assert list(cell.services) == ["motion_planner", "left_camera", "right_camera", "smart_pick_place"]
+    left, planner = cell.services["left_camera"], cell.services["motion_planner"]
+    assert (left.name, left.kind, left.module) == ("left_camera", "camera_opencv", "services.camera_opencv")
+    assert left.topics == {"camera/*": "left_camera/*"} and "topics" not in left.parameters
+    assert left.name_option == ["--name", "left_camera"] and planner.name_option == []
+    sources = [service_config(cell, name, camera_opencv.Config).source for name in ("left_camera", "right_camera")]
+    assert sources == ["a.avi", "b.avi"]
+
+
+def test_override_finds_it_by_its_own_name() -> None:
+    cell = load_cell("panda", [*TWO, "services.left_camera.rate=5", "services.right_camera.topics={camera/*: r/*}"])
+    rates = [service_config(cell, name, camera_opencv.Config).rate for name in ("left_camera", "right_camera")]
+    assert rates == [5.0, 10.0]
+    assert cell.services["right_camera"].topics == {"camera/*": "r/*"}
+    with pytest.raises(UnknownName, match="left_camera"):
+        load_cell("panda", [*TWO, "services.camera_opencv.rate=5"])
+
+
+def test_camera_of_a_service_is_the_one_that_it_chose() -> None:
+    cell = load_cell("panda", TWO)
+    left, right = (service_config(cell, name, camera_opencv.Config).world for name in ("left_camera", "right_camera"))
+    assert (left.camera.position, left.camera.frame) == ((0.3, 0, 0.8), "left_optical_frame")
+    assert (right.camera.position, right.camera.frame) == ((0.6, 0, 0.8), "the_right_one")
+    assert list(left.cameras) == ["left", "right"]
+    assert service_config(cell, "vision_detector", vision_detector.Config).world.camera == left.camera  # the first
+    wrong = load_cell("panda", [*TWO, "services.left_camera.camera=middle"])
+    with pytest.raises(ConfigError, match=r"services\.left_camera\.camera: 'middle' must be one of left, right"):
+        service_config(wrong, "left_camera", camera_opencv.Config)
+
+
+def test_a_single_camera_is_a_mapping_of_one_and_both_words_set_it(tmp_path: Path) -> None:
+    around = load_cell("panda", ["world.camera.fx=500", "world.cameras.camera.fy=510"]).section(Surroundings)
+    assert isinstance(around, Surroundings)
+    assert (around.camera.fx, around.camera.fy) == (500, 510) and around.cameras == {"camera": around.camera}
+    assert load_cell("panda", ["world.camera.frame=eye"]).world.camera.frame == "eye"
+    file = tmp_path / "left.yaml"
+    file.write_text("{width: 64, height: 48, fx: 50, fy: 50, cx: 32, cy: 24, position: [0, 0, 1], rpy: [0, 0, 0]}")
+    several = load_cell("panda", [*TWO, f"world.cameras.left={file}"]).world.cameras
+    assert (several["left"].width, several["right"].width) == (64, 640)
+
+
+@pytest.mark.parametrize(("overrides", "said"), [
+    (["world.cameras={}"], r"world\.cameras: "),
+    (["world.cameras={a: {}, b: {}}", "world.camera.fx=400"], r"camera is for a world with one: this one has a, b"),
+    (["world.cameras={a: {frame: x}, b: {frame: x}}"], r"cameras\.b has the frame of a: x"),
+    (["world.cameras={a: {fz: 3}}"], r"world\.cameras\.a\.fz: 3 is not a parameter; choices: cx, cy"),
+    (cell_of("a: {service: camera_open}"), r"unknown service 'camera_open' \(did you mean 'camera_opencv'"),
+    (cell_of("a: {service: 3}"), r"services\.a\.service: 3 must be a service"),
+    (cell_of("my.cam:", "your.cam:"), r"services\.your\.cam: my\.cam goes by the name cam already.*another_cam"),
+    (cell_of("a-b: {service: viewer}"), r"services: 'a-b' is not a name that a service can have"),
+    (cell_of("supervisor: {service: viewer}"), r"services: 'supervisor' is not a name"),
+    (cell_of("viewer: {topics: [1]}"), r"services\.viewer\.topics: \[1\] must be a mapping of keys"),
+    (cell_of("viewer: {topics: {camera/*: left}}"), r"services\.viewer\.topics: .* must have \* at both ends"),
+    (cell_of("viewer: {topics: {camera//a: b}}"), r"services\.viewer\.topics: 'camera//a' is no key such as"),
+    (cell_of("viewer: {topics: {'a*b': b}}"), r"services\.viewer\.topics: 'a\*b' is no key"),
+    (cell_of("viewer: {topics: {log: b}}"), r"services\.viewer\.topics: 'log' is a key of all services"),
+])
+def test_what_can_not_be_is_said_in_one_line(overrides: list[str], said: str) -> None:
+    with pytest.raises((ConfigError, UnknownName), match=said) as error:
+        load_cell("panda", overrides)
+    assert "\n" not in str(error.value)
+
+
+def test_task_under_a_name_of_its_own_is_still_that_of_its_application() -> None:
+    given = [*cell_of("picker: {service: smart_pick_place}"), "task=picker"]
+    cell, named = load_cell("panda", given), load_cell("panda", [*given, "application=pick_place"])
+    assert (cell.task, cell.application) == ("picker", "pick_place")
+    assert (named.task, named.application) == ("picker", "pick_place")
+
+
+def test_longest_beginning_that_fits_renames_a_key_and_shared_keys_stay() -> None:
+    table = {"*": "x/*", "camera/*": "left/*", "tf": "t", "tf_static": "tf_static"}
+    remapping = Remapping(checked_table("topics", table))
+    asked = ["camera/image_raw", "camera/depth/a", "tf", "tf_static", "motion/plan", "log", "counters", "param/viewer"]
+    assert [remapping.key(key) for key in asked] == [
+        "left/image_raw", "left/depth/a", "t", "tf_static", "x/motion/plan", "log", "counters", "param/viewer"]
+
+
+def test_entry_that_renames_nothing_is_told_with_the_keys_that_there_are() -> None:
+    remapping = Remapping({"camra/*": "left/*"})
+    assert remapping.key("camera/image_raw") == "camera/image_raw"
+    with pytest.raises(ConfigError, match=r"services\.left\.topics: 'camra/\*' .* choices: camera/image_raw"):
+        remapping.require_used("left")
