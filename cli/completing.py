@@ -106,8 +106,9 @@ def _doc(path: Path) -> str:
 
 
 def _topics() -> Iterator[tuple[str, str, str]]:
-    """Key, Topic or Request, and description, as common/topics.py has them."""
-    for node in tree_of(ROOT / "common" / "topics.py").body:
+    """Key, Topic or Request, and description, as common/topics.py and the applications have them."""
+    files = [ROOT / "common" / "topics.py", *sorted((ROOT / "common" / "applications").glob("*/topics.py"))]
+    for node in (node for file in files for node in tree_of(file).body):
         match node:
             case ast.Assign(value=ast.Call(func=ast.Name(id="Topic" | "Request" as kind), args=[*arguments])):
                 texts = [each.value for each in arguments if isinstance(each, ast.Constant)]

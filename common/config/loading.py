@@ -27,6 +27,7 @@ from common.errors import ConfigError, UnknownName
 from common.remapping import SERVICE_NAME, checked_table
 
 NOT_A_SERVICE = ("router", "supervisor", "recorder")  # processes beside the services, which have names too
+WHOLE = ("robot", "world", "pipeline", "services")  # overrides of all of these come before those of their parts
 P = TypeVar("P", bound=Parameters)
 
 
@@ -69,7 +70,7 @@ def load_cell(
     parsed = [parse_override(text) for text in expanded(overrides)]
     given = {parts[0]: value for parts, value in parsed if len(parts) == 1}  # which file to read may be overridden
     given |= {"world": world} if world is not None else {}
-    tree |= {part: given[part] for part in ("robot", "world", "pipeline") if part in given}
+    tree |= {part: given[part] for part in WHOLE if part in given}
     for part in ("robot", "world", "pipeline"):
         value = tree.get(part)
         if isinstance(value, str):
@@ -99,7 +100,7 @@ def load_cell(
             before = _at(tree, parts)
             camera = {**(before if isinstance(before, dict) else {}), **read_camera(Path(value).expanduser())}
             _override(tree, parts, camera)
-        elif len(parts) > 1 or parts[0] not in ("robot", "world", "pipeline"):
+        elif len(parts) > 1 or parts[0] not in WHOLE:
             _override(tree, parts, value)
     run = {"cell": tree.pop("cell", path.stem), "autostart": tree.pop("autostart", True), "seed": tree.pop("seed", 0)}
     if seed is not None:
