@@ -12,7 +12,7 @@ from common.application import all_topics
 from common.errors import DecodeError
 from common.messages import SupervisorStatus
 from common.recording.sample import Sample, message_of
-from common.recording.sequences import Sequences
+from common.recording.stamps import Sequences
 from common.recording.writing import RUN
 from common.transport.codec import decode, decode_attachment
 from common.transport.credentials import secure_folder

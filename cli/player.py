@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from common.recording.reading import Recording
     from common.recording.sample import Sample
     from common.transport.bus import Bus
-    from common.transport.raw_writer import RawWriter
+    from common.transport.writer import RawWriter
 
 BACK = 5.0  # [s] that a key jumps back
 PICTURE = "Image"

@@ -10,8 +10,8 @@ from pydantic import Field
 from common import topics
 from common.config import Parameters, RobotConfig, Run, Surroundings, Tunable
 from common.messages import WorldObjects
+from common.perception.depth import point_cloud
 from common.perception.image import array_to_image
-from common.perception.point_cloud import point_cloud
 from common.process.pace import Pace
 from common.process.service import main
 from common.robot.model import RobotModel

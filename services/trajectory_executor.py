@@ -14,10 +14,9 @@ from pydantic import Field
 from common import topics
 from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import Grasp, Members, Parameters, RobotConfig, Run, Tunable, World
-from common.control.alone import Alone, WhenAlone
 from common.control.checks import Tolerances
 from common.control.cycle import ControlCycle
-from common.control.timely import objection
+from common.control.requester import Alone, WhenAlone, objection
 from common.hardware.interface import Limits
 from common.hardware.loading import find_backend, load_hardware
 from common.messages import (

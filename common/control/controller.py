@@ -13,8 +13,7 @@ import numpy as np
 
 from common.control.checks import Tolerances, checked_trajectory
 from common.control.goals import REMEMBERED, GoalMemory
-from common.control.pacing import next_rate, way
-from common.control.trajectory import Trajectory
+from common.control.trajectory import Trajectory, next_rate, way
 from common.errors import Refused
 from common.hardware.interface import Limits, Vector
 from common.messages import GoalState, Holder, JointTrajectory, MotionStatus

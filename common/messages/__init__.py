@@ -19,7 +19,6 @@ from common.messages.execution import (
     StopRequest,
 )
 from common.messages.geometry import Color, Pose, PoseArray, Quaternion, TFMessage, TransformStamped, Vector3
-from common.messages.parameters import Parameter, ParameterReply, ParameterRequest
 from common.messages.planning import (
     ArcGoal,
     JointGoal,
@@ -31,7 +30,15 @@ from common.messages.planning import (
     SequenceGoal,
     SequenceItem,
 )
-from common.messages.processes import LogLine, ServiceCounters, ServiceStatus, SupervisorStatus
+from common.messages.processes import (
+    LogLine,
+    Parameter,
+    ParameterReply,
+    ParameterRequest,
+    ServiceCounters,
+    ServiceStatus,
+    SupervisorStatus,
+)
 from common.messages.robot import JointState, JointTrajectory, JointTrajectoryPoint
 from common.messages.scene import AttachedObject, CollisionObject, PlanningScene
 from common.messages.task import PlanFigure, TaskCommand, TaskStatus

@@ -10,10 +10,12 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import signal
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
-from common.process.frozen import end_if_frozen
 from common.transport.credentials import ROUTER_NAME, common_name, credentials_of, secure_folder
 from common.transport.endpoint import endpoint_of
 from common.transport.keys import ROUTER, alive_key
@@ -58,3 +60,36 @@ def main() -> int:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+PROC = Path("/proc")
+FIRST = 1  # the container's init
+LOOKS, PERIOD = 12, 0.25  # stopped at so many looks [s]: looks and not time, which also passes while nobody runs
+
+
+def stopped_service(parent: int = FIRST) -> int | None:
+    """The process id of a service that was started by `parent` and is stopped; None if there is none.
+
+    One that a debugger holds does not count, nor does one that something else keeps going, such as watchfiles.
+    """
+    for folder in PROC.glob("[0-9]*"):
+        try:
+            state, its_parent = (folder / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()[:2]
+            if int(its_parent) == parent and state == "T" and b"\0-m\0" in (folder / "cmdline").read_bytes():
+                return int(folder.name)
+        except OSError:  # it has ended meanwhile
+            continue
+    return None
+
+
+def end_if_frozen(parent: int = FIRST, wait: Callable[[float], None] = time.sleep) -> bool:
+    """Kill the service if it is stopped and stays so for three seconds; whether it was killed."""
+    found = stopped_service(parent)
+    if found is None:
+        return False
+    for _ in range(LOOKS):
+        wait(PERIOD)
+        if stopped_service(parent) != found:
+            return False
+    os.kill(found, signal.SIGKILL)
+    return True

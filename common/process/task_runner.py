@@ -29,7 +29,6 @@ WAITS = "the arm waits: "
 Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
 
 
-
 class Task(Protocol):
     """A state machine that is fed with what is known and answers with what it wants done."""
 

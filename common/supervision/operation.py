@@ -17,7 +17,7 @@ from common.sources import monotonic
 from common.supervision.elsewhere import Elsewhere
 from common.supervision.interrupts import Interrupts
 from common.supervision.launch import Launch
-from common.supervision.silence import PERIOD, Silence
+from common.supervision.liveness_watchdog import PERIOD, LivenessWatchdog
 from common.supervision.supervisor import Supervisor
 from common.transport.credentials import SUPERVISOR
 
@@ -165,7 +165,7 @@ async def _publish(bus: Bus, cell: Cell, launch: Launch, supervisor: Supervisor,
 
 async def _kill_frozen(bus: Bus, cell: Cell, supervisor: Supervisor) -> None:
     """Kill processes that are there and yet do nothing: they are started again."""
-    silence = Silence(cell.watchdogs)
+    silence = LivenessWatchdog(cell.watchdogs)
 
     async def listen() -> None:
         async for counters in bus.reader(topics.COUNTERS):  # which they tell each second while somebody listens

@@ -14,8 +14,7 @@ from common.config import Cell
 from common.errors import ZencellError
 from common.messages import ServiceStatus
 from common.sources import monotonic
-from common.supervision.backoff import Backoff
-from common.supervision.child import Child, describe_exit
+from common.supervision.child import Backoff, Child, describe_exit
 from common.supervision.launch import Launch
 from common.transport.keys import ROUTER
 

@@ -15,16 +15,14 @@ from common.clock import Clock
 from common.messages import Header, Message, ServiceCounters
 from common.remapping import Remapping
 from common.topics import PublishedKind, Request, Topic
-from common.transport.alive import Alive
 from common.transport.codec import DEFAULT_LIMIT
 from common.transport.handoff import Doorbell, call_on_loop
 from common.transport.keys import alive_key, serves_key
-from common.transport.raw_writer import RawWriter
 from common.transport.reader import Reader
 from common.transport.requests import Client, Server
 from common.transport.session import Declared, Publisher, RawReply, RawSample, Session
-from common.transport.tokens import TokenWatch
-from common.transport.writer import Writer
+from common.transport.tokens import Alive, TokenWatch
+from common.transport.writer import RawWriter, Writer
 
 __all__ = ["Bus", "Client", "Reader", "Writer"]  # what the type hints of a service name
 

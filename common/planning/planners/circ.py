@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from common.planning.arcs import NoArc, arc_poses, circle_about, circle_through
 from common.planning.planners import cartesian, lin
 from common.planning.problem import NOT_APPLICABLE, Arc, Cancel, Problem, Result, ToolPath
-from common.planning.tool_timing import ToolWaypoints, follow_in_time
+from common.planning.timing import ToolWaypoints, follow_in_time
 
 Array = NDArray[np.float64]
 

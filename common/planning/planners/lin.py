@@ -12,7 +12,7 @@ from pydantic import Field
 
 from common.planning.planners import cartesian
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result
-from common.planning.tool_timing import ToolLimits, ToolWaypoints, follow_in_time
+from common.planning.timing import ToolLimits, ToolWaypoints, follow_in_time
 
 Array = NDArray[np.float64]
 

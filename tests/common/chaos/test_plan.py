@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from common.applications.pick_place.messages import PickPlaceStatus
-from common.chaos.damage import damaged, nonsense
+from common.chaos.agent import damaged, nonsense
 from common.chaos.plan import CELL_SECONDS, LABELS, Fault, Form, Kind, faults, plan
 from common.chaos.setting import keys_of
 from common.errors import DecodeError

@@ -2,11 +2,10 @@ import numpy as np
 import pytest
 
 from common.messages import Header
-from common.perception.depth import DepthError, Rays, check_depth
+from common.perception.depth import DepthError, Rays, check_depth, point_cloud
 from common.perception.depth_intake import depth_of
 from common.perception.image import array_to_image
 from common.perception.intake import Unusable, colour_picture
-from common.perception.point_cloud import point_cloud
 from tests.common.applications.outlining.outline_scenes import seen_world
 
 HEADER = Header(frame_id="camera")

@@ -3,7 +3,7 @@ import pytest
 from pydantic import ValidationError
 
 from common.messages import ArcGoal, JointGoal, PlanRequest, PoseGoal, SequenceGoal, SequenceItem, Vector3
-from common.planning.blending import NoBlend, blend, entry, resampled
+from common.planning.planners.sequence import NoBlend, blend, entry, resampled
 from common.planning.problem import Cancel, Result
 from common.planning.validation import fine_samples
 from common.robot.transforms import matrix_to_pose, tool_down

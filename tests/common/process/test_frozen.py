@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from common.process.frozen import end_if_frozen, stopped_service
+from common.process.health import end_if_frozen, stopped_service
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc, as in a container")
 

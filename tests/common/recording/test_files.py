@@ -12,8 +12,8 @@ from mcap.reader import make_reader
 from common.messages import JointState
 from common.recording.reading import Recording
 from common.recording.sample import RecordingError, Sample, encoding_of, message_of
-from common.recording.sequences import Sequences
 from common.recording.splitting import SplitWriter
+from common.recording.stamps import Sequences
 from common.recording.summary import summarise
 from common.recording.writing import RecordingWriter
 from tests.common.recording.samples import START, STEP, joints, status, write

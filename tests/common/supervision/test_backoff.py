@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.supervision.backoff import Backoff
+from common.supervision.child import Backoff
 
 
 def test_delay_doubles_up_to_the_cap() -> None:

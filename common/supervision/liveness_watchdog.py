@@ -29,7 +29,7 @@ class _Heard:
     since: float  # waking time [s] of the newest sign of life
 
 
-class Silence:
+class LivenessWatchdog:
     """Counts for how long each process has been silent, in time in which we ourselves were awake and connected.
 
     A service that is ready says each second what it has counted. While the router is not reached nobody can be heard,

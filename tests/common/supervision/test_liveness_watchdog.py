@@ -6,7 +6,7 @@ import pytest
 
 from common.config import Watchdogs
 from common.messages import ServiceStatus
-from common.supervision.silence import LEASE, PERIOD, Silence
+from common.supervision.liveness_watchdog import LEASE, PERIOD, LivenessWatchdog
 
 NAMES = ["router", "camera", "detector", "task"]
 LIMIT, START = Watchdogs().silence, Watchdogs().start
@@ -16,7 +16,7 @@ class Cell:
     """Services that speak each second unless they are said to be silent."""
 
     def __init__(self, *names: str, **limits: float) -> None:
-        self.silence = Silence(Watchdogs(**limits))
+        self.silence = LivenessWatchdog(Watchdogs(**limits))
         self.states = {name: ServiceStatus(name=name, state="ready", pid=k + 1)
                        for k, name in enumerate(names or NAMES)}
         self.silent: set[str] = set()
