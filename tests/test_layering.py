@@ -1,12 +1,15 @@
 """Who may import whom, held by walking the syntax trees; and what no tracked file may contain."""
 
 import ast
+import importlib
 import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from common.topics import Request, Topic
 
 ROOT = Path(__file__).resolve().parent.parent
 PURE = ("robot", "scene", "planning", "perception", "tasks", "hardware", "sim", "recording", "reporting")
@@ -87,3 +90,253 @@ def test_no_tracked_file_holds_a_path_of_one_machine() -> None:
             if b"\0" not in data[:1024] and (match := MACHINE_PATH.search(data)):
                 found.append(f"{name}: {match.group().decode()}")
     assert found == []
+
+
+# --- the platform knows no application ----------------------------------------------------------------------------
+
+PLATFORM_SERVICES = (
+    "motion_planner", "robot_state_publisher", "trajectory_executor", "viewer", "camera_simulator", "depth_camera",
+    "camera_opencv", "router",
+)
+APPLICATIONS = [path.parent.name for path in sorted((ROOT / "common" / "applications").glob("*/__init__.py"))]
+PARTS_ALL_LOOK_FOR = ("STATUS", "DECIDED_BY", "REJECTED", "ANNOTATED", "VIEWS")
+SHORT_FORMS = ("common/config/short_forms.py",)  # where the fields of older world files are read
+# Files that still do: the lists may only get shorter.
+STILL_IMPORT = (
+    "cli/asking.py",
+    "cli/bringup.py",
+    "cli/commands.py",
+    "cli/outlining.py",
+    "cli/report.py",
+    "common/chaos/agent.py",
+    "common/process/operator_motion.py",
+    "common/recording/foxglove.py",
+    "common/recording/foxglove_scene.py",
+    "common/reporting/gathering.py",
+    "common/supervision/collector.py",
+    "common/supervision/summary.py",
+    "common/supervision/traced.py",
+    "common/viewer/feeds.py",
+    "common/viewer/outline.py",
+    "common/viewer/page.py",
+    "common/viewer/requests.py",
+    "common/viewer/scene_feed.py",
+    "common/viewer/scene_view.py",
+    "common/viewer/task_panel.py",
+    "common/viewer/words.py",
+    "services/camera_simulator.py",
+    "services/trajectory_executor.py",
+    "services/viewer.py",
+)
+STILL_NAME = (
+    "cli/asking.py",
+    "cli/bringup.py",
+    "cli/catalogue.py",
+    "cli/commands.py",
+    "cli/graph.py",
+    "cli/inspection.py",
+    "cli/main.py",
+    "cli/outlining.py",
+    "cli/report.py",
+    "cli/watching.py",
+    "common/chaos/agent.py",
+    "common/chaos/plan.py",
+    "common/chaos/setting.py",
+    "common/control/cycle.py",
+    "common/messages/geometry.py",
+    "common/messages/processes.py",
+    "common/process/operator_motion.py",
+    "common/recording/foxglove.py",
+    "common/recording/foxglove_scene.py",
+    "common/reporting/figures.py",
+    "common/reporting/gathering.py",
+    "common/robot/transforms.py",
+    "common/sim/world.py",
+    "common/supervision/collector.py",
+    "common/supervision/summary.py",
+    "common/supervision/traced.py",
+    "common/topics.py",
+    "common/transport/bus.py",
+    "common/transport/writer.py",
+    "common/viewer/feeds.py",
+    "common/viewer/layers.py",
+    "common/viewer/outline.py",
+    "common/viewer/page.py",
+    "common/viewer/plots.py",
+    "common/viewer/requests.py",
+    "common/viewer/scene_feed.py",
+    "common/viewer/scene_view.py",
+    "common/viewer/task_panel.py",
+    "common/viewer/words.py",
+    "services/camera_simulator.py",
+    "services/trajectory_executor.py",
+    "services/viewer.py",
+)
+STILL_BALLS = (
+    "cli/commands.py",
+    "cli/report.py",
+    "common/chaos/agent.py",
+    "common/chaos/plan.py",
+    "common/chaos/setting.py",
+    "common/config/world.py",
+    "common/control/cycle.py",
+    "common/messages/geometry.py",
+    "common/messages/world.py",
+    "common/perception/resting.py",
+    "common/reporting/gathering.py",
+    "common/scene/slots.py",
+    "common/sim/drawing.py",
+    "common/sim/layout.py",
+    "common/sim/places.py",
+    "common/sim/robot_shapes.py",
+    "common/sim/standing.py",
+    "common/sim/standing_objects.py",
+    "common/sim/world.py",
+    "common/supervision/collector.py",
+    "common/supervision/summary.py",
+    "common/topics.py",
+    "common/viewer/feeds.py",
+    "common/viewer/scene_feed.py",
+    "common/viewer/scene_view.py",
+    "common/viewer/truth.py",
+    "services/camera_simulator.py",
+    "services/trajectory_executor.py",
+)
+
+
+def of_platform() -> list[Path]:
+    applications = ROOT / "common" / "applications"
+    services = [ROOT / "services" / f"{name}.py" for name in PLATFORM_SERVICES]
+    return [path for path in sources("common", "cli") if applications not in path.parents] + services
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def imported_applications(path: Path) -> set[str]:
+    parts = [name.split(".") for name, _ in imports(path) if name.startswith("common.applications.")]
+    return {part[2] for part in parts}
+
+
+def application_words() -> set[str]:
+    """What only an application may say: its name, task, services, messages and keys."""
+    words = {path.stem for path in sources("services") if imported_applications(path)} - set(PLATFORM_SERVICES)
+    for name in APPLICATIONS:
+        package = importlib.import_module(f"common.applications.{name}")
+        keys, shapes = (importlib.import_module(f"{package.__name__}.{part}") for part in ("topics", "messages"))
+        own = [value for value in vars(keys).values() if isinstance(value, Topic | Request)]
+        words |= {name, package.TASK}
+        words |= {topic.key for topic in own if "_" in topic.key or "/" in topic.key}
+        words |= {key for key, value in vars(keys).items() if value in own and key not in PARTS_ALL_LOOK_FOR}
+        words |= {key for key, value in vars(shapes).items()
+                  if isinstance(value, type) and value.__module__ == shapes.__name__}
+    return words
+
+
+def lines_with(pattern: re.Pattern[str], paths: list[Path]) -> list[str]:
+    return [
+        f"{name_of(path)}:{number}: {line.strip()}"
+        for path in paths
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if pattern.search(line)
+    ]
+
+
+def beyond(known: tuple[str, ...], found: list[str]) -> list[str]:
+    """What was found outside of the files that are known for it."""
+    return [line for line in found if line.partition(":")[0] not in known]
+
+
+def test_every_service_is_the_platforms_or_belongs_to_one_application() -> None:
+    for path in sources("services"):
+        if path.stem != "__init__" and path.stem not in PLATFORM_SERVICES:
+            assert len(imported_applications(path)) == 1, f"{path.stem}: of which application?"
+
+
+def test_the_platform_never_imports_an_application() -> None:
+    assert beyond(STILL_IMPORT, offences(of_platform(), tuple(f"common.applications.{n}" for n in APPLICATIONS))) == []
+
+
+def test_an_application_never_imports_another() -> None:
+    for name in APPLICATIONS:
+        for path in sources(f"common/applications/{name}"):
+            assert imported_applications(path) <= {name}, name_of(path)
+
+
+def test_the_platform_names_no_application_and_none_of_its_words() -> None:
+    words = application_words()
+    assert {"smart_pick_place", "contour_tracer", "vision_detector", "PickPlaceStatus", "scene_balls"} <= words
+    either = "|".join(re.escape(word) for word in sorted(words, key=len, reverse=True))
+    assert beyond(STILL_NAME, lines_with(re.compile(rf"(?<![\w/])(?:{either})(?![\w/])"), of_platform())) == []
+
+
+def test_the_platform_names_no_robot_that_comes_with_the_project() -> None:
+    robots = "|".join(path.stem for path in (ROOT / "config" / "robots").glob("*.yaml"))
+    assert "panda" in robots
+    assert beyond(STILL_NAME, lines_with(re.compile(robots, re.IGNORECASE), of_platform())) == []
+
+
+def test_the_platform_says_ball_only_where_the_short_form_is_read() -> None:
+    found = lines_with(re.compile("ball", re.IGNORECASE), of_platform())
+    assert beyond((*STILL_BALLS, *SHORT_FORMS), found) == []
+
+
+# --- no cycles ----------------------------------------------------------------------------------------------------
+
+
+def module_of(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def import_graph() -> dict[str, set[str]]:
+    """Modules of common that each module imports anywhere, for its types and within functions too."""
+    paths = {module_of(path): path for path in sources("common")}
+    graph: dict[str, set[str]] = {}
+    for module, path in paths.items():
+        named = list(imports(path))
+        # `from a import b` says a and then a.b: where a.b is a module, it is that one.
+        more = {(name.rpartition(".")[0], line) for name, line in named if name in paths}
+        graph[module] = {name for name, line in named if name in paths and (name, line) not in more} - {module}
+    return graph
+
+
+def package_of(module: str) -> str:
+    """common.<package>, or the module itself where it lies directly in common; an application is a package."""
+    depth = 3 if module.startswith("common.applications.") else 2
+    return ".".join(module.split(".")[:depth])
+
+
+def cycles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Every group of nodes of which each is reached from each, sorted."""
+    return [sorted(group) for group in _strongly_connected(graph) if len(group) > 1]
+
+
+def _strongly_connected(graph: dict[str, set[str]]) -> list[set[str]]:
+    def reached(start: str) -> set[str]:
+        seen, todo = set[str](), [start]
+        while todo:
+            for following in graph.get(todo.pop(), set()) - seen:
+                seen.add(following)
+                todo.append(following)
+        return seen
+
+    after = {node: reached(node) for node in graph}
+    groups = {frozenset({node} | {other for other in after[node] if node in after.get(other, ())}) for node in graph}
+    return [set(group) for group in groups]
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    assert cycles(import_graph()) == []
+
+
+def test_no_packages_import_each_other_in_a_circle() -> None:
+    packages: dict[str, set[str]] = {}
+    for module, imported in import_graph().items():
+        package = package_of(module)
+        packages.setdefault(package, set()).update({package_of(name) for name in imported} - {package})
+    assert cycles(packages) == []
+
+
+def test_circles_are_seen() -> None:
+    assert cycles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
