@@ -6,9 +6,10 @@ A key on the wire is `<cell>/<topic>`, for example `panda/camera/image_raw`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from common import messages as m
+from common.moved import moved_to_applications
 
 Kind = Literal["stream", "event", "state", "request"]
 PublishedKind = Literal["stream", "event", "state"]
@@ -107,3 +108,7 @@ def parameters_of(service: str) -> Request[m.ParameterRequest, m.ParameterReply]
 def platform_topics() -> dict[str, AnyTopic]:
     """Every topic of this file by key, in its order."""
     return {value.key: value for value in globals().values() if isinstance(value, Topic | Request)}
+
+
+if not TYPE_CHECKING:  # which would take any name for one that is there
+    __getattr__ = moved_to_applications(__name__, "topics")

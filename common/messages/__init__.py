@@ -6,6 +6,8 @@ All models refuse unknown fields and numbers that are not finite. A pose is that
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from common.messages.basics import SCHEMA_VERSION, Finite, Fraction, Header, Message, Name, Positive
 from common.messages.camera import CameraInfo, Image, Marker, MarkerArray, PointCloud2, Rejection, Rejections
 from common.messages.execution import (
@@ -43,3 +45,7 @@ from common.messages.robot import JointState, JointTrajectory, JointTrajectoryPo
 from common.messages.scene import AttachedObject, CollisionObject, PlanningScene
 from common.messages.task import PlanFigure, TaskCommand, TaskStatus
 from common.messages.world import SceneUpdate, WorldEdit, WorldEditReply, WorldObject, WorldObjects
+from common.moved import moved_to_applications
+
+if not TYPE_CHECKING:  # which would take any name for one that is there
+    __getattr__ = moved_to_applications(__name__, "messages")
