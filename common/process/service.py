@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, NoReturn, TypeVar
+from typing import Any, Generic, NoReturn, Protocol, TypeVar
 
 from common.clock import EPOCH_VARIABLE, SPEED_VARIABLE, Clock
 from common.config import Cell, Parameters, Watchdogs, load_cell, service_config
@@ -195,7 +195,7 @@ async def _live(run: Run[P], start: Start[P], lifeline: Lifeline) -> int:
         root.addHandler(to_topic)
         watch = LoopWatch(asyncio.get_running_loop(), lambda: _patience(start.watchdogs, bus.ready_event.is_set()))
         try:
-            return await _run(run, bus, start.config, lifeline)
+            return await serve(run, bus, start.config, lifeline)
         finally:
             watch.stop()
             root.removeHandler(to_topic)
@@ -229,7 +229,20 @@ async def _gate(lifeline: Lifeline) -> None:
     await opened.wait()
 
 
-async def _run(run: Run[P], bus: Bus, config: P, lifeline: Lifeline) -> int:
+class Ending(Protocol):
+    """Says whether and why a service was asked to end."""
+
+    @property
+    def stopping(self) -> bool:
+        """Whether it was."""
+
+    @property
+    def reason(self) -> str:
+        """Why."""
+
+
+async def serve(run: Run[P], bus: Bus, config: P, lifeline: Ending) -> int:
+    """Be the service on a bus; the exit code of its process."""
     try:
         serve_parameters(bus, config)
         await bus.run(run(bus, config))

@@ -104,14 +104,31 @@ async def _work(
         if launch.connect:
             await _require_unused(bus, endpoint, {entry.name for entry in cell.services.values()})
         prepare(bus)
-        bus.alive.on_change(supervisor.mark_alive)
-        watching = beside(_kill_frozen(bus, cell, supervisor), _bring_up_and_work(bus, supervisor, work))
-        elsewhere = Elsewhere(socket.gethostname(), [service.name for service in supervisor.statuses])
-        telling = beside(_hear_elsewhere(bus, elsewhere), _publish(bus, cell, launch, supervisor, elsewhere))
-        return await beside(telling, watching)
+        return await supervise(bus, cell, launch, supervisor, work)
     finally:
         log.removeHandler(to_topic)
         await connecting.__aexit__(None, None, None)
+
+
+async def supervise(
+    bus: Bus, cell: Cell, launch: Launch, supervisor: Supervisor, work: Callable[[Bus], Awaitable[T]],
+    host: str | None = None,
+) -> T:
+    """What the work returns, which is done when all services are ready; meanwhile tell of them, and kill the frozen.
+
+    Args:
+        bus: of the supervisor.
+        cell: the resolved cell.
+        launch: how the cell was asked for.
+        supervisor: of its processes; they have begun.
+        work: is done when all services are ready.
+        host: what this host is called; its own name by default.
+    """
+    bus.alive.on_change(supervisor.mark_alive)
+    watching = beside(_kill_frozen(bus, cell, supervisor), _bring_up_and_work(bus, supervisor, work))
+    elsewhere = Elsewhere(host or socket.gethostname(), [service.name for service in supervisor.statuses])
+    telling = beside(_hear_elsewhere(bus, elsewhere), _publish(bus, cell, launch, supervisor, elsewhere))
+    return await beside(telling, watching)
 
 
 async def _bring_up_and_work(bus: Bus, supervisor: Supervisor, work: Callable[[Bus], Awaitable[T]]) -> T:

@@ -7,8 +7,9 @@ import contextlib
 import json
 import logging
 import re
+from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from common.config import Cell
 from common.errors import ZencellError
@@ -40,10 +41,44 @@ class BadConfiguration(ZencellError):
     """A process refused its configuration; the message is the line that it printed."""
 
 
+class AnyChild(Protocol):
+    """What is asked of a process: see `Child`."""
+
+    name: str
+    tail: deque[str]
+
+    @property
+    def pid(self) -> int | None:
+        """Process id while the process runs."""
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the process is there but was stopped."""
+
+    @property
+    def alive_seconds(self) -> float:
+        """Time [s] since the process was started."""
+
+    def start(self) -> None:
+        """Start the process, behind its gate."""
+
+    def release(self) -> None:
+        """Let the process through its gate."""
+
+    async def wait(self) -> int:
+        """Exit code of the process."""
+
+    def terminate(self) -> None:
+        """Ask the process to end."""
+
+    def kill(self) -> None:
+        """End the process at once."""
+
+
 class Watched:
     """A child, whether it may start and has done so, and how often it died."""
 
-    def __init__(self, child: Child, *, again: bool = True) -> None:
+    def __init__(self, child: AnyChild, *, again: bool = True) -> None:
         self.child = child
         self.again = again  # is started again when it ends
         self.admitted = False
@@ -64,6 +99,7 @@ class Supervisor:
     def __init__(
         self, cell: Cell, launch: Launch, on_line: Callable[[str, str], None],
         watchers: Mapping[str, Sequence[str]] = {},
+        make_child: Callable[[str, Sequence[str], Mapping[str, str], Callable[[str, str], None]], AnyChild] = Child,
     ) -> None:
         """Prepare the processes without starting any; on the running loop.
 
@@ -73,15 +109,18 @@ class Supervisor:
             on_line: called with the name of a process and each line that it writes.
             watchers: commands, by name, of processes that look on: ready before all services and ended after them,
                 not started again when they end, without which the cell goes on.
+            make_child: makes a process from its name, command, environment and `on_line`; a simulation has its own.
         """
         environment = launch.environment()
         self._services = [
-            Watched(Child(name, command, environment, on_line), again=False) for name, command in watchers.items()
+            Watched(make_child(name, command, environment, on_line), again=False) for name, command in watchers.items()
         ] + [
-            Watched(Child(entry.name, launch.service_command(entry), environment, on_line))
+            Watched(make_child(entry.name, launch.service_command(entry), environment, on_line))
             for entry in cell.services.values()
         ]
-        self._router = None if launch.connect else Watched(Child(ROUTER, launch.router_command(), environment, on_line))
+        self._router = None
+        if not launch.connect:
+            self._router = Watched(make_child(ROUTER, launch.router_command(), environment, on_line))
         self._all = [self._router, *self._services] if self._router else list(self._services)
         self._by_name = {watched.child.name: watched for watched in self._all}
         self._tasks: set[asyncio.Task[None]] = set()
@@ -282,7 +321,7 @@ class Supervisor:
         self.changed.set()
 
 
-def _last_message(child: Child) -> str:
+def _last_message(child: AnyChild) -> str:
     """What a process said last, without level and name in front: plain, logged as text, or logged as JSON."""
     said = [_message_of(line) for line in child.tail]
     errors = [message for level, message in said if level == "error"]
