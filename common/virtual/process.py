@@ -6,7 +6,7 @@ import asyncio
 import importlib
 import logging
 from collections import Counter, deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import TypeVar
@@ -22,6 +22,7 @@ from common.process.service import serve
 from common.sources import monotonic
 from common.topics import Request
 from common.transport.bus import Bus, Client
+from common.transport.keys import serves_key
 from common.virtual.loop import Life, VirtualLoop, context_of
 from common.virtual.network import VirtualNetwork, VirtualSession
 
@@ -62,13 +63,12 @@ class _WatchedClient(Client[Q, A]):
     """A client of whose requests is noted how they end."""
 
     noted: Requests
-    service: str
 
     async def call(self, request: Q, timeout: float = 5.0) -> A:
         """The answer to a request."""
         noted = self.noted
         number = noted.begun = noted.begun + 1
-        noted.open[number] = self.service, self.topic.key, monotonic() + timeout
+        noted.open[number] = self._service, self.topic.key, monotonic() + timeout
         try:
             answer = await super().call(request, timeout)
         except RequestFailed as failed:
@@ -78,7 +78,7 @@ class _WatchedClient(Client[Q, A]):
             noted.outcomes["given up"] += 1
             raise
         except BaseException as error:
-            noted.strange.append(f"{self.service}: {self.topic.key} ended in {type(error).__name__}: {error}")
+            noted.strange.append(f"{self._service}: {self.topic.key} ended in {type(error).__name__}: {error}")
             raise
         finally:
             noted.open.pop(number, None)
@@ -99,9 +99,11 @@ class VirtualBus(Bus):
 
     def client(self, topic: Request[Q, A]) -> Client[Q, A]:
         """A client of the request key."""
-        client = super().client(topic)
-        client.__class__ = _WatchedClient
-        client.noted, client.service = self._noted, self.service  # type: ignore[attr-defined]
+        servers = self._watch(serves_key(self.cell, topic.key))
+        client = _WatchedClient(
+            self._session, self.cell, self.service, topic, servers, loop=self._loop, limit=self._limit
+        )
+        client.noted = self._noted
         return client
 
 
@@ -271,6 +273,3 @@ class _Tail(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self._say(self.format(record))
-
-
-Work = Callable[[Bus], Awaitable[None]]

@@ -1,0 +1,58 @@
+"""Whole cells on the virtual clock: every service's own code, from the start to the end of the task."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from common.config import load_cell
+from common.virtual.simulation import Simulation
+
+ROOT = Path(__file__).resolve().parents[2]
+DIGEST = """
+import sys
+from common.config import load_cell
+from common.virtual.simulation import Simulation
+print(Simulation(load_cell(sys.argv[1], sys.argv[3:]), int(sys.argv[2]), digest=True).run().digest)
+"""
+
+
+def digest_in_another_process(hash_seed: int, *arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", DIGEST, *arguments], cwd=ROOT, env={**os.environ, "PYTHONHASHSEED": str(hash_seed)},
+        capture_output=True, text=True, check=True,
+    )
+    return done.stdout.strip()
+
+
+def test_panda_clears_the_table_without_any_time_passing():
+    outcome = Simulation(load_cell("panda"), 1).run()
+    assert (outcome.state, outcome.done, outcome.total) == ("DONE", 7, 7), outcome
+    assert outcome.crashes == [] and outcome.restarts == {}
+    assert outcome.seconds > 3 * outcome.cpu_seconds
+
+
+def test_ur5_traces_its_outline():
+    outcome = Simulation(load_cell("ur5"), 1).run()
+    assert outcome.state == "DONE", outcome
+    assert outcome.crashes == [] and outcome.restarts == {}
+
+
+@pytest.mark.parametrize(("cell", "overrides"), [("panda", ["world.count=1"]), ("ur5", [])])
+def test_same_seed_is_the_same_run_to_the_byte_in_any_process(cell, overrides):
+    here = Simulation(load_cell(cell, overrides), 3, digest=True).run()
+    assert here.messages > 1000
+    assert digest_in_another_process(7, cell, "3", *overrides) == here.digest
+
+
+def test_another_seed_is_another_run():
+    cell = load_cell("panda", ["world.count=1"])
+    digests = {Simulation(cell, seed, digest=True).run().digest for seed in (1, 2)}
+    assert len(digests) == 2
+
+
+def test_task_that_does_not_end_is_told_with_its_state():
+    outcome = Simulation(load_cell("panda", ["autostart=false", "world.count=1"]), 1, limit=12.0).run()
+    assert outcome.state == "NOT ENDED" and "IDLE" in outcome.message
