@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import AsyncGenerator
 from typing import TYPE_CHECKING
 
-from common.errors import DecodeError, UnknownName
+from common.errors import UnknownName
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -32,14 +32,16 @@ async def samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
     Raises:
         SilentKey: nothing came in the first moments.
     """
+    from common.transport.reader import Newness
+
     full = f"{bus.cell}/{key}"
-    newest: dict[str, int] = {}  # sequence number by writer
+    newness = Newness()
     arriving = bus.raw_reader(full)
     following = asyncio.ensure_future(anext(arriving))
     try:
         latched = await bus.raw_get(full, PATIENCE)
         for sample in latched:
-            if is_news(sample, newest):
+            if newness.is_news(sample.attachment):
                 yield sample
         if not latched:
             await asyncio.wait({following}, timeout=PATIENCE)
@@ -48,23 +50,8 @@ async def samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
         while True:
             sample = await following
             following = asyncio.ensure_future(anext(arriving))
-            if is_news(sample, newest):
+            if newness.is_news(sample.attachment):
                 yield sample
     finally:
         following.cancel()  # which closes what it waits for
         await asyncio.wait({following})
-
-
-def is_news(sample: RawSample, newest: dict[str, int]) -> bool:
-    """Whether it is no repetition of a state; a writer that says nothing about itself only has news."""
-    from common.transport.codec import decode_attachment
-
-    try:
-        attachment = decode_attachment(sample.attachment)
-    except DecodeError:
-        attachment = None
-    if attachment is None:
-        return True
-    before = newest.get(attachment.writer)
-    newest[attachment.writer] = attachment.sequence
-    return before != attachment.sequence

@@ -27,26 +27,24 @@ class Hearing:
         self._clock = clock
         self._arrivals = Arrivals()
         self._delays = Delays()
-        self._newest: dict[str, int] = {}  # sequence number by writer
+        from common.transport.reader import Newness
+
+        self._newness = Newness()
         self._lock = threading.Lock()
 
     def know(self, sample: RawSample) -> None:
         """Take note of the value of a state that was said before: its repetitions are no news."""
-        from cli.foreign import is_news
-
         with self._lock:
-            is_news(sample, self._newest)
+            self._newness.is_news(sample.attachment)
 
     def arrive(self, sample: RawSample) -> None:
         """Take a message."""
-        from cli.foreign import is_news
-
         now, stamp = time.monotonic(), stamp_of(sample.payload)
         with self._lock:
             self._arrivals.add(now, len(sample.payload))
             if stamp is None:
                 self.unstamped += 1
-            elif is_news(sample, self._newest):  # a state that is put again was made long ago
+            elif self._newness.is_news(sample.attachment):  # a state that is put again was made long ago
                 self._delays.add(now, self._clock.age_ms(stamp))
 
     def arrivals(self) -> Figures:

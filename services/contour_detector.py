@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
 
 import cv2
 from pydantic import Field
@@ -18,7 +17,7 @@ from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOURS, OUTLIN
 from common.errors import ConfigError, Refused
 from common.messages import Image
 from common.perception.image import array_to_image
-from common.perception.intake import Unusable, colour_picture
+from common.perception.intake import LeftOut, Unusable, colour_picture
 from common.process.service import main
 from common.transport.bus import Bus
 
@@ -51,7 +50,7 @@ async def run(bus: Bus, config: Config) -> None:
     following = Following(initial_choice(config.select))
     last: tuple[Image, Picture, list[Contour]] | None = None
     told = ""
-    unusable: Counter[str] = Counter()
+    left_out = LeftOut(bus.log, "a picture")
 
     def publish(selected: int, message: str) -> None:
         nonlocal told
@@ -84,9 +83,7 @@ async def run(bus: Bus, config: Config) -> None:
         try:
             picture = colour_picture(image)
         except Unusable as error:
-            unusable[error.kind] += 1
-            if unusable[error.kind] == 1:
-                bus.log.warning("picture dropped: %s (told once; further ones are counted)", error)
+            left_out.note(error)
             continue
         last = (image, picture, await asyncio.to_thread(find_contours, picture, config.model_copy()))
         publish(*following.find(last[2]))

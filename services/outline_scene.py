@@ -13,7 +13,7 @@ from common.applications.outlining.topics import CONTOURS
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Image
 from common.perception.image import ImageError, image_to_array
-from common.perception.intake import Cameras, Unusable
+from common.perception.intake import Cameras, LeftOut, Unusable
 from common.process.service import main
 from common.transport.bus import Bus
 
@@ -38,7 +38,7 @@ async def run(bus: Bus, config: Config) -> None:
     home = HomeWatch(config.robot.named_poses["home"])
     cameras = Cameras()
     kept: deque[Image] = deque(maxlen=KEPT)
-    unusable: set[str] = set()
+    left_out = LeftOut(bus.log, "a picture")
     out.put(planning_scene(config.world, [], 0))
     await bus.ready()
 
@@ -72,9 +72,7 @@ async def run(bus: Bus, config: Config) -> None:
             camera = cameras.of(infos.latest, statics.latest, depth.header.frame_id)
             solids = await asyncio.to_thread(perceived_solids, found.contours, image_to_array(depth), camera)
         except (Unusable, ImageError) as error:
-            if error.kind not in unusable:
-                bus.log.warning("picture left out: %s (told once)", error)
-            unusable.add(error.kind)
+            left_out.note(error)
             return
         out.put(planning_scene(config.world, solids, found.header.stamp))
 

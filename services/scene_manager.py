@@ -10,7 +10,7 @@ from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.applications.pick_place.tracks import SceneParameters
 from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError
-from common.perception.intake import Cameras, Unusable
+from common.perception.intake import Cameras, LeftOut, Unusable
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
@@ -35,7 +35,7 @@ async def run(bus: Bus, config: Config) -> None:
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: scene_manager needs a robot with one")
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
-    unusable: set[str] = set()
+    left_out = LeftOut(bus.log, "a frame of detections")
     out.put(scene.scene())
     cameras = Cameras()
     await bus.ready()
@@ -60,9 +60,7 @@ async def run(bus: Bus, config: Config) -> None:
             try:
                 camera = cameras.of(infos.latest, statics.latest, config.world.camera.frame)
             except Unusable as error:
-                if error.kind not in unusable and error.kind != "unknown_camera":  # usual in the first moments
-                    bus.log.warning("detections left out: %s (told once)", error)
-                unusable.add(error.kind)
+                left_out.note(error)
                 continue
             hand()
             measured = joints.latest

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import cv2
 
 from common import topics
@@ -13,7 +11,7 @@ from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IM
 from common.config import Surroundings
 from common.messages import Color, Header, Marker, MarkerArray, Pose, Vector3
 from common.perception.image import array_to_image
-from common.perception.intake import Cameras, Unusable, picture_of
+from common.perception.intake import Cameras, LeftOut, Unusable, picture_of
 from common.process.service import main
 from common.transport.bus import Bus
 
@@ -55,7 +53,7 @@ async def run(bus: Bus, config: Config) -> None:
     found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
     cv2.setNumThreads(1)  # the other cores have other services
     detector = Detector(config.world, config)
-    unusable: Counter[str] = Counter()
+    left_out = LeftOut(bus.log, "a picture")
     cameras = Cameras()
     await bus.ready()
     async for image in images:
@@ -63,9 +61,7 @@ async def run(bus: Bus, config: Config) -> None:
             camera = cameras.of(infos.latest, statics.latest, image.header.frame_id)
             picture = picture_of(image, camera)
         except Unusable as error:
-            unusable[error.kind] += 1
-            if unusable[error.kind] == 1 and error.kind != "unknown_camera":  # which is usual in the first moments
-                bus.log.warning("image dropped: %s (told once; further ones are counted)", error)
+            left_out.note(error)
             continue
         detections = detector.detect(picture, camera)
         found.put(markers(detections, config.world, image.header.stamp))

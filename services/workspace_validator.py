@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
 from contextlib import suppress
 
 from pydantic import Field
@@ -18,7 +17,7 @@ from common.applications.pick_place.topics import (
 from common.applications.pick_place.validation import Validation
 from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
-from common.perception.intake import Cameras, Unusable
+from common.perception.intake import Cameras, LeftOut, Unusable
 from common.perception.pinhole import Pinhole
 from common.process.service import main
 from common.robot.model import RobotModel
@@ -75,7 +74,7 @@ async def run(bus: Bus, config: Config) -> None:
     places: list[tuple[float, float, float]] = []
     work, idle = asyncio.Event(), asyncio.Event()
     unfinished: tuple[MarkerArray, Pinhole] | None = None  # sent without the places that were still worked on
-    unusable: Counter[str] = Counter()
+    left_out = LeftOut(bus.log, "a frame of detections")
     cameras = Cameras()
     await bus.ready()
 
@@ -97,9 +96,7 @@ async def run(bus: Bus, config: Config) -> None:
             try:
                 camera = cameras.of(infos.latest, statics.latest)
             except Unusable as error:
-                unusable[error.kind] += 1
-                if unusable[error.kind] == 1 and error.kind != "unknown_camera":  # usual in the first moments
-                    bus.log.warning("detections dropped: %s (told once; further ones are counted)", error)
+                left_out.note(error)
                 continue
             places[:] = validation.unknown(frame, camera)
             if places:

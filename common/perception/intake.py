@@ -1,6 +1,9 @@
-"""From messages to a picture and the camera that took it, or the reason why that can not be."""
+"""From messages to a picture and the camera that took it, or the reason why that cannot be."""
 
 from __future__ import annotations
+
+import logging
+from collections import Counter
 
 import cv2
 import numpy as np
@@ -14,13 +17,30 @@ from common.robot.transforms import pose_to_matrix
 
 Picture = npt.NDArray[np.uint8]
 
+UNKNOWN_CAMERA = "unknown_camera"
+
 
 class Unusable(ZencellError):
-    """A picture that can not be looked at. `kind` tells causes apart: unknown_camera, camera, size, encoding, ..."""
+    """A picture that cannot be looked at. `kind` tells causes apart: unknown_camera, camera, size, encoding, ..."""
 
     def __init__(self, kind: str, message: str) -> None:
         super().__init__(message)
         self.kind = kind
+
+
+class LeftOut:
+    """Frames that could not be used: told once for each cause, counted after that."""
+
+    def __init__(self, log: logging.Logger, what: str) -> None:
+        """Tell of frames that are called `what` in the log of a service."""
+        self._log, self._what = log, what
+        self.counts: Counter[str] = Counter()
+
+    def note(self, error: Unusable | ImageError) -> None:
+        """Take note of a frame that was left out; that no camera is known yet is usual in the first moments."""
+        self.counts[error.kind] += 1
+        if self.counts[error.kind] == 1 and error.kind != UNKNOWN_CAMERA:
+            self._log.warning("%s left out: %s (told once; further ones are counted)", self._what, error)
 
 
 def camera_of(info: CameraInfo | None, transforms: TFMessage | None, frame_id: str = "") -> Pinhole:
@@ -36,7 +56,7 @@ def camera_of(info: CameraInfo | None, transforms: TFMessage | None, frame_id: s
     """
     if info is None or transforms is None:
         missing = "camera_info" if info is None else "tf_static"
-        raise Unusable("unknown_camera", f"no {missing} came yet")
+        raise Unusable(UNKNOWN_CAMERA, f"no {missing} came yet")
     frame = frame_id or info.header.frame_id
     pose = next((t.transform for t in transforms.transforms if t.child_frame_id == frame), None)
     if pose is None:

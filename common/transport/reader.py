@@ -69,6 +69,14 @@ class Newness:
         _remember(self._last, attachment.writer, attachment.sequence)
         return True
 
+    def is_news(self, attachment: bytes | None) -> bool:
+        """The same of an attachment as it came; a writer that says nothing about itself only has news."""
+        try:
+            known = decode_attachment(attachment)
+        except DecodeError:
+            return True
+        return known is None or self.is_new(known)
+
 
 class Reader(Generic[M]):
     """Messages of one topic, checked. Counters: `received`, `dropped`, `invalid`, `overflow`.

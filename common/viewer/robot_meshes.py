@@ -77,25 +77,8 @@ def _simplified(mesh: trimesh.Trimesh, kept: float) -> trimesh.Trimesh:
     Each connected part by itself, since among others small ones are lost first; those of few triangles stay as they
     are, as do those that would shrink.
     """
-    parts = [_simplified_part(part, kept) for part in _connected_parts(mesh)]
+    parts = [_simplified_part(part, kept) for part in mesh.split(only_watertight=False)]
     return cast(trimesh.Trimesh, trimesh.util.concatenate(parts))
-
-
-def _connected_parts(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
-    """The parts of a mesh whose triangles share no edge (trimesh's own `split` needs a graph library)."""
-    labels = np.arange(len(mesh.faces))
-    one, other = mesh.face_adjacency.T
-    while True:  # the smallest number of a part spreads over it, in leaps
-        before = labels.copy()
-        smallest = np.minimum(labels[one], labels[other])
-        np.minimum.at(labels, one, smallest)
-        np.minimum.at(labels, other, smallest)
-        labels = labels[labels]
-        if np.array_equal(labels, before):
-            break
-    faces = [np.flatnonzero(labels == label) for label in np.unique(labels)]
-    parts = mesh.submesh(faces, only_watertight=False)
-    return parts if isinstance(parts, list) else [parts]
 
 
 def _simplified_part(part: trimesh.Trimesh, kept: float) -> trimesh.Trimesh:

@@ -128,7 +128,7 @@ async def test_a_picture_that_can_not_be_looked_at_is_dropped_and_told_once(bad,
             rig.images.put(picture(stamp=3))
             while (await rig.next()).header.stamp != 3:
                 pass
-    lines = [record.getMessage() for record in caplog.records if "image dropped" in record.getMessage()]
+    lines = [record.getMessage() for record in caplog.records if "picture left out" in record.getMessage()]
     assert len(lines) == 1 and told in lines[0]
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from common.config import RobotConfig
 from common.errors import ConfigError
 from common.robot.model import RobotModel
-from common.viewer.robot_meshes import _connected_parts, coarse, visual_pieces
+from common.viewer.robot_meshes import coarse, visual_pieces
 from tests.common.viewer.scene_cell import pieces_of, robot_of
 
 URDF = """<robot name="post">
@@ -141,9 +141,3 @@ def test_mesh_that_is_not_there_and_shape_that_is_not_known_are_named(tmp_path: 
     robot.urdf = good.replace('<box size="0.2 0.4 1.0" />', "<torus/>")
     with pytest.raises(ConfigError, match="'torus' is no visual shape; choices: box, capsule"):
         visual_pieces(robot)
-
-
-def test_parts_that_share_no_edge_are_told_apart_without_a_graph_library() -> None:
-    solids = [trimesh.creation.box(), trimesh.creation.icosphere().apply_translation([3, 0, 0])]
-    parts = _connected_parts(trimesh.util.concatenate(solids))
-    assert sorted(len(part.faces) for part in parts) == sorted(len(solid.faces) for solid in solids)
