@@ -67,6 +67,11 @@ class Player:
         now = self.head.position(time.time_ns())
         return max(0.0, min(now, self._recording.end) - self._recording.start) * 1e-9
 
+    @property
+    def heard(self) -> bool:
+        """Whether anybody listens to what is played."""
+        return any(writer.matched for writer in self._writers.values())
+
     def declare(self, bus: Bus, topics: dict[str, tuple[str, str]]) -> None:
         """Declare a writer for each topic, given with message class and kind: who listens is known before it speaks.
 

@@ -7,7 +7,7 @@ import re
 import socket
 import sys
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,7 +28,8 @@ Topics = dict[str, tuple[str, str]]  # message class and kind by topic
 TOOL = "player"
 SHOW_PERIOD = 0.2  # [s]
 PROBE_TIMEOUT = 0.5  # [s]
-LINGER = 0.5  # [s] that a router of our own stays, so that what was sent last arrives
+LINGER = 2.0  # [s] that a router of our own stays for who listens: what they make of the last message travels over it
+CLOSE = 0.5  # [s] that its end may take
 MOST_RATE = 1000.0
 HELP = "space pauses, right steps a message, down a picture, left goes back 5 s, q quits"
 
@@ -163,8 +164,10 @@ async def _play(
                     sys.stderr.write("\r\x1b[K")
                     sys.stderr.flush()
         typer.echo(f"played {player.published:,} messages")
-        if own and not interrupts.stop.is_set():
-            await asyncio.sleep(LINGER)
+        if own and player.heard:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(LINGER):
+                    await interrupts.stop.wait()
     return 128 + interrupts.signal if interrupts.signal else 0
 
 
@@ -181,7 +184,7 @@ async def _router(endpoint: str, *, may_start: bool) -> AsyncIterator[bool]:
     try:
         yield True
     finally:
-        await close_bounded(session, LINGER)
+        await close_bounded(session, CLOSE)
 
 
 def _listens(endpoint: str) -> bool:

@@ -31,6 +31,7 @@ MOST_PENDING = 32  # of these that have not shown who they are yet
 ACCEPT_MS = 3000  # in which they must; a loaded machine takes 1 s
 STATE_BATCHES = 16  # of states and events, the most there can be: seconds of them for a reader that is held up
 STREAM_WAIT_US = 5000  # that a stream's message waits for room before it is dropped, once until there is room again
+PARTS_WAIT_US = 100_000  # that one of several batches does, in all: a point cloud of 12 MB has 192 of them
 
 
 def parse_domain(value: object, field: str = "--domain") -> int:
@@ -207,6 +208,8 @@ def _settings(**values: Any) -> dict[str, Any]:
         # By default two batches and 1 ms: on a busy machine every hundredth joint state fell victim to a picture.
         "transport__link__tx__queue__size__data": STREAM_BATCHES,
         "transport__link__tx__queue__congestion_control__drop__wait_before_drop": STREAM_WAIT_US,
+        # By default 50 ms, in which a busy machine does not take a point cloud: every second one was dropped.
+        "transport__link__tx__queue__congestion_control__drop__max_wait_before_drop_fragments": PARTS_WAIT_US,
         # Shared memory goes round the size limits of a link, and queries over it were lost when a receiver stalled.
         "transport__shared_memory__enabled": False,
         # What is longer ends the link that it comes from; by default a message may have 1 GB.

@@ -147,3 +147,15 @@ async def test_moved_stamps_keep_ages_and_what_was_exposed_together(tmp_path: Pa
     assert first == second
     assert third - first == 3 * STEP  # of wall time
     assert 0 < time.time_ns() - first < 30e9
+
+
+async def test_player_knows_whether_anybody_listens(tmp_path: Path) -> None:
+    net = LocalNetwork()
+    with Recording(write(tmp_path / "a.mcap", [image(0)])) as recording:
+        player = Player(recording, lambda topic: True, lambda topic: topic)
+        player.declare(net.bus("player", cell="panda"), recording.topics())
+        assert not player.heard
+        reader = net.bus("listener", cell="panda").reader(topics.CAMERA_IMAGE)
+        assert player.heard
+        await player.run()
+        assert (await reader.next()).data == b"x"
