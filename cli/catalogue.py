@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from cli import completing, options
+from cli import completion, options
 from common.errors import UnknownName
 
 
@@ -41,10 +41,10 @@ def _first_line(path: Path) -> str:
 def service(
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="of `zencell services`, of the cell, or a module",
-                            autocompletion=completing.services)
+                            autocompletion=completion.services)
     ],
     cell: Annotated[
-        str, typer.Option("--cell", metavar="CELL", help="the cell that it belongs to", autocompletion=completing.cells)
+        str, typer.Option("--cell", metavar="CELL", help="the cell that it belongs to", autocompletion=completion.cells)
     ] = "panda",
     overrides: options.Overrides = None,
     world: options.WorldName = None,

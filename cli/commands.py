@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import completing, options
+from cli import completion, options
 from common.applications.outlining.topics import OUTLINE_SELECT
 from common.errors import ConfigError, UnknownName
 
@@ -29,7 +29,7 @@ NEGATIVE_NUMBERS = {"ignore_unknown_options": True}  # -0.2 is a coordinate, not
 def call(
     key: Annotated[
         str, typer.Argument(metavar="KEY", help="of a request, as in `zencell topic list`",
-                            autocompletion=completing.requests)
+                            autocompletion=completion.requests)
     ],
     body: Annotated[str, typer.Argument(metavar="JSON", help="its fields; `zencell topic info KEY` has an example")],
     cell: options.CellName = None,
@@ -54,7 +54,7 @@ def call(
 
 
 def _parse(key: str, body: str) -> dict[str, Any]:
-    from cli.rendering import from_json
+    from cli.schema import from_json
 
     try:
         given = from_json(json.loads(body))
@@ -69,9 +69,8 @@ def _send(
     request: Request[Any, Any], message: Message, timeout: float, cell: str | None, domain: str | None,
     connect: str | None,
 ) -> None:
-    from cli.inspection import inspect
-    from cli.presence import cell_clock
-    from cli.rendering import to_json
+    from cli.inspection import cell_clock, inspect
+    from cli.schema import to_json
     from common.messages import Header
 
     async def visit(bus: Bus) -> Message:
@@ -122,18 +121,18 @@ def stop(cell: options.CellName = None, domain: options.Domain = None, connect: 
 @task.command()
 def home(
     planner: Annotated[
-        str, typer.Option("--planner", metavar="NAME", help="use only this one", autocompletion=completing.planners)
+        str, typer.Option("--planner", metavar="NAME", help="use only this one", autocompletion=completion.planners)
     ] = "",
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Plan a way home and go there, while no task has the robot; Ctrl-C stops the robot."""
     from cli.inspection import inspect
-    from cli.rendering import to_json
+    from cli.schema import to_json
     from common.messages import JointGoal
     from common.process.operator_motion import OperatorMotion
 
     async def visit(bus: Bus) -> Message:
-        from cli.presence import cell_clock
+        from cli.inspection import cell_clock
 
         bus.clock = await cell_clock(bus)  # requests to move say when they were decided
         return await OperatorMotion(bus).move(JointGoal(named="home"), planner=planner)

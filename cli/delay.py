@@ -14,7 +14,7 @@ from cli import options
 from common.errors import RequestFailed
 
 if TYPE_CHECKING:
-    from cli.stamps import DelayFigures
+    from cli.measuring import DelayFigures
     from common.clock import Clock
     from common.transport.bus import Bus
 
@@ -38,7 +38,7 @@ def delay(
     connect: options.Connect = None,
 ) -> None:
     """Show how old messages are when they come, until Ctrl-C or N lines: wall time since the stamp in the header."""
-    from cli.presence import cell_clock
+    from cli.inspection import cell_clock
     from cli.topic import published_or_foreign, visit_topic
 
     most = options.whole("--count", count, 1)
@@ -64,7 +64,7 @@ async def windows(bus: Bus, key: str, clock: Clock, *, foreign: bool = False) ->
         SilentKey: nothing came on a foreign key.
     """
     from cli.foreign import samples
-    from cli.hearing import Hearing
+    from cli.measuring import Hearing
 
     full = f"{bus.cell}/{key}"
     if foreign:

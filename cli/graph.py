@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli import completing, options
+from cli import completion, options
 from common.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class Graph:
 
 def graph(
     cell: Annotated[
-        str, typer.Argument(metavar="[CELL]", help="name or path of the cell file", autocompletion=completing.cells)
+        str, typer.Argument(metavar="[CELL]", help="name or path of the cell file", autocompletion=completion.cells)
     ] = "panda",
     output: Annotated[
         str, typer.Option("-o", "--output", metavar="FILE", help="*.svg, *.dot or *.mmd; without it Mermaid on stdout")
@@ -52,7 +53,7 @@ def graph(
     connect: options.Connect = None,
 ) -> None:
     """Draw services and topics of a cell, up or not; while it is up, what is not alive is dashed."""
-    from cli.presence import look
+    from cli.inspection import look
     from common.config import load_cell
 
     path = Path(output).expanduser() if output else None
@@ -74,8 +75,8 @@ def graph(
 
 
 def _writer_of(path: Path | None) -> Callable[[Graph], str]:
+    from cli.graph import dot, mermaid
     from cli.graph_svg import svg
-    from cli.graph_text import dot, mermaid
 
     writers = dict(zip(FORMATS, (svg, dot, mermaid), strict=True))
     if path is None:
@@ -128,3 +129,65 @@ def graph_of(cell: str, services: list[Wired], alive: frozenset[str] | None = No
 def names(graph: Graph) -> list[str]:
     """The services of a graph."""
     return [service.name for service in graph.services]
+
+
+DOT_SHAPES = {"stream": "ellipse", "event": "ellipse", "state": "ellipse", "request": "hexagon"}
+DOT_FILLS = {"stream": "#e3effb", "event": "#e4f4e1", "state": "#fdf3d4", "request": "#efe4f7"}
+
+
+def edges(graph: Graph) -> Iterator[tuple[str, str, bool, bool]]:
+    """From, to, whether a request goes there, and whether all of it is alive; each end a service or a key."""
+    for service in graph.services:
+        lit = graph.is_lit(service.name)
+        for key in service.writes:
+            yield service.name, f"key {key}", False, lit
+        for key in service.reads:
+            yield f"key {key}", service.name, False, lit
+        for key in service.calls:
+            yield service.name, f"key {key}", True, lit
+        for key in service.serves:
+            yield f"key {key}", service.name, True, lit
+    for key in graph.outside:
+        yield OUTSIDE, f"key {key}", True, True
+
+
+def dot(graph: Graph) -> str:
+    """The graph as Graphviz DOT: `dot -Tsvg`."""
+    lines = [
+        f"digraph {json.dumps(graph.cell)} {{", "  rankdir=LR;", '  node [fontname="sans-serif", fontsize=11];',
+        '  edge [color="#666666", arrowsize=0.7];',
+    ]
+    for service in graph.services:
+        style = "filled,bold" if graph.is_lit(service.name) else "dashed"
+        lines.append(f"  {json.dumps(service.name)} [shape=box, style={json.dumps(style)}, fillcolor=white];")
+    if graph.outside:
+        lines.append(f"  {json.dumps(OUTSIDE)} [shape=plaintext];")
+    for key, kind in graph.kinds.items():
+        lines.append(f"  {json.dumps(f'key {key}')} [label={json.dumps(key)}, shape={DOT_SHAPES[kind]}, style=filled, "
+                     f'fillcolor="{DOT_FILLS[kind]}"];')
+    for start, end, asked, lit in edges(graph):
+        marks = ", ".join(mark for mark, there in (("style=dashed", asked or not lit), ('color="#bbbbbb"', not lit))
+                          if there)
+        lines.append(f"  {json.dumps(start)} -> {json.dumps(end)}{f' [{marks}]' if marks else ''};")
+    return "\n".join([*lines, "}", ""])
+
+
+def mermaid(graph: Graph) -> str:
+    """The graph as Mermaid: what GitHub draws in a ```mermaid block."""
+    ids = {service.name: f"s{number}" for number, service in enumerate(graph.services)}
+    ids |= {f"key {key}": f"k{number}" for number, key in enumerate(graph.kinds)}
+    ids[OUTSIDE] = "you"
+    lines = ["flowchart LR"]
+    for service in graph.services:
+        lines.append(f'  {ids[service.name]}["{service.name}"]:::{"alive" if graph.is_lit(service.name) else "gone"}')
+    if graph.outside:
+        lines.append(f'  you(["{OUTSIDE}"])')
+    for key, kind in graph.kinds.items():
+        opened, closed = ("{{", "}}") if kind == "request" else ("([", "])")
+        lines.append(f'  {ids[f"key {key}"]}{opened}"{key}"{closed}:::{kind}')
+    for start, end, asked, lit in edges(graph):
+        lines.append(f"  {ids[start]} {'-.->' if asked or not lit else '-->'} {ids[end]}")
+    lines += [f"  classDef {kind} fill:{fill},stroke:#888,color:#222" for kind, fill in DOT_FILLS.items()]
+    lines += ["  classDef alive fill:#fff,stroke:#222,stroke-width:2px,color:#222",
+              "  classDef gone fill:#f6f6f6,stroke:#aaa,stroke-dasharray:4 3,color:#888"]
+    return "\n".join([*lines, ""])

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import completing, options
+from cli import completion, options
 from common.errors import UnknownName
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from cli.presence import Presence
+    from cli.inspection import Presence
     from cli.wired import Wired
     from common.config import Cell, ServiceEntry
     from common.messages import Parameter, ParameterReply
@@ -53,18 +53,18 @@ SIDES = ("reads", "writes", "serves", "calls")
 @app.command()
 def info(
     service: Annotated[
-        str, typer.Argument(metavar="SERVICE", help="as in the cell file", autocompletion=completing.services)
+        str, typer.Argument(metavar="SERVICE", help="as in the cell file", autocompletion=completion.services)
     ],
     cell: Annotated[
         str | None, typer.Option("--cell", metavar="CELL", help="name or YAML file of its cell",
-                                 autocompletion=completing.cells)
+                                 autocompletion=completion.cells)
     ] = None,
     as_json: options.Json = False,
     domain: options.Domain = None,
     connect: options.Connect = None,
 ) -> None:
     """Show what a service reads, writes, serves and calls, its parameters, and how it is while a cell is up."""
-    from cli.presence import look
+    from cli.inspection import look
     from cli.wired import wired
 
     cells = look(domain, connect)

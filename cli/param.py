@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import completing, options
+from cli import completion, options
 from common.errors import ConfigError, NoResponder, RemoteError, RequestFailed, UnknownName, ZencellError
 
 if TYPE_CHECKING:
@@ -27,11 +27,11 @@ BAD_INPUT = ("unknown_parameter", "bad_value")  # codes of a refusal that is the
 
 PathArgument = Annotated[
     str, typer.Argument(metavar="PATH", help="as in `zencell param list`; services. may be left out",
-                        autocompletion=completing.parameters)
+                        autocompletion=completion.parameters)
 ]
 Assignments = Annotated[
     list[str], typer.Argument(metavar="PATH=VALUE...", help="values as YAML; @FILE: all of a file of `param dump`",
-                              autocompletion=completing.overrides)
+                              autocompletion=completion.overrides)
 ]
 
 
@@ -39,7 +39,7 @@ Assignments = Annotated[
 def list_(
     service: Annotated[
         str | None, typer.Argument(metavar="SERVICE", help="of one; of all if not given",
-                                   autocompletion=completing.services)
+                                   autocompletion=completion.services)
     ] = None,
     cell: options.CellName = None,
     as_json: options.Json = False,
@@ -48,7 +48,7 @@ def list_(
 ) -> None:
     """List parameters: path, value, whether a change needs a restart, range, and what it is."""
     from cli.inspection import inspect
-    from cli.rendering import to_json
+    from cli.schema import to_json
     from common.config import yaml_line
 
     async def visit(bus: Bus) -> Listing:
@@ -79,7 +79,7 @@ def get(
 ) -> None:
     """Print the value of a parameter as YAML; with --json everything that is known of it."""
     from cli.inspection import inspect
-    from cli.rendering import to_json
+    from cli.schema import to_json
     from common.config import yaml_line
 
     async def visit(bus: Bus) -> tuple[str, Parameter]:
@@ -128,7 +128,7 @@ def set_(
 def dump(
     services: Annotated[
         list[str] | None, typer.Argument(metavar="SERVICE...", help="all if none is given",
-                                         autocompletion=completing.services)
+                                         autocompletion=completion.services)
     ] = None,
     everything: Annotated[bool, typer.Option("--all", help="what is as by default, too")] = False,
     output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="write there, not here")] = "",

@@ -52,7 +52,7 @@ def pub(
     message = checked(topic, key, body)
 
     async def visit(bus: Bus) -> None:
-        from cli.presence import cell_clock
+        from cli.inspection import cell_clock
 
         bus.clock = await cell_clock(bus)
         _warn_of_writers(await _others(bus, topic), key)
@@ -83,7 +83,7 @@ def checked(topic: Topic[Any] | None, key: str, body: str) -> Any:
     Raises:
         ConfigError: it is not JSON, or not the key's message; names the field and what would do.
     """
-    from cli.rendering import from_json
+    from cli.schema import from_json
     from common.config import check
 
     try:

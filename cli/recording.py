@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import completing, options
+from cli import completion, options
 from common.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ LEAST_FILE = 1.0  # [MB] of a recording that is split
 File = Annotated[str, typer.Argument(metavar="FILE.mcap", help="a recording")]
 Keys = Annotated[
     list[str] | None, typer.Argument(metavar="KEY", help="without the cell; * and ** as wildcards",
-                                     autocompletion=completing.published)
+                                     autocompletion=completion.published)
 ]
 Exclude = Annotated[str | None, typer.Option("--exclude", metavar="RE", help="leave out keys in which RE is found")]
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cli import completing, options
+from cli import completion, options
 from common.errors import ConfigError
 
 app = typer.Typer(help="Prepare a robot.", no_args_is_help=True)
@@ -23,7 +23,7 @@ def robot() -> None:
 def collisions(
     name: Annotated[
         str, typer.Argument(metavar="ROBOT", help="a name of config/robots, or the path of a YAML file",
-                            autocompletion=completing.robots)
+                            autocompletion=completion.robots)
     ],
     samples: Annotated[str, typer.Option("--samples", metavar="N", help="random configurations")] = "10000",
     margin: Annotated[str, typer.Option("--margin", metavar="M", help="pairs that come this close are checked [m]")]

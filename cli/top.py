@@ -41,7 +41,7 @@ def top(
     most = 1 if once else options.whole("--count", count, 1)
 
     async def visit(bus: Bus) -> None:
-        from cli.presence import cell_clock
+        from cli.inspection import cell_clock
         from cli.watching import Watch
 
         async with Watch(bus, await cell_clock(bus)) as watch:

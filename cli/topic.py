@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import completing, delay, options, publishing
+from cli import completion, delay, options, publishing
 from common.errors import UnknownName
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Topics: what there is, what it carries, what comes and how often.", no_args_is_help=True)
 
 AnyKey = Annotated[
-    str, typer.Argument(metavar="KEY", help="as in `zencell topic list`", autocompletion=completing.keys)
+    str, typer.Argument(metavar="KEY", help="as in `zencell topic list`", autocompletion=completion.keys)
 ]
 
 
@@ -94,7 +94,7 @@ def echo(
 
 
 async def _messages(bus: Bus, topic: Topic[Any], as_json: bool) -> AsyncGenerator[str, None]:
-    from cli.rendering import one_line, to_json
+    from cli.schema import one_line, to_json
 
     async for message in bus.reader(topic):
         yield to_json(message.model_dump()) if as_json else one_line(message.model_dump())
@@ -104,7 +104,7 @@ async def _foreign_messages(bus: Bus, key: str, as_json: bool) -> AsyncGenerator
     import msgpack
 
     from cli.foreign import samples
-    from cli.rendering import to_json
+    from cli.schema import to_json
     from cli.zenoh_codec import decode
 
     async with aclosing(samples(bus, key)) as coming:

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from cli.hearing import Hearing
+from cli.measuring import Hearing
 from common.application import all_topics
 
 if TYPE_CHECKING:

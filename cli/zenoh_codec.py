@@ -7,7 +7,7 @@ import json
 import msgpack
 from pydantic import BaseModel
 
-from cli.rendering import from_json, one_line
+from cli.schema import from_json, one_line
 from common.config import check
 from common.errors import ConfigError
 

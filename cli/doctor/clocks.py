@@ -30,7 +30,7 @@ class Skew:
 
 def clocks(endpoint: str) -> Iterator[Finding]:
     """Whether the clocks agree, for each cell that is up at an endpoint."""
-    from cli.presence import somebody_listens
+    from cli.inspection import somebody_listens
 
     if not somebody_listens(endpoint):
         return
@@ -91,8 +91,7 @@ async def skews_of(bus: Bus, clock: Clock, services: set[str]) -> dict[str, Skew
 
 
 async def _all_skews(endpoint: str) -> dict[str, dict[str, Skew]]:
-    from cli.inspection import TOOL, alive
-    from cli.presence import cell_clock
+    from cli.inspection import TOOL, alive, cell_clock
     from common.errors import NoRouter
     from common.transport.connect import connect
 

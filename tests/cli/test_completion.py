@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from cli import completing
+from cli import completion
 from common.application import all_topics
 from common.config import load_cell, service_config, service_names
 from common.planning.planners import planner_names
@@ -55,7 +55,7 @@ def test_cells_of_a_configuration_of_ones_own_are_completed(tmp_path: Path) -> N
     assert offered("zencell run m", tmp_path, ZENCELL_CONFIG=str(tmp_path)) == ["mine"]
 
 
-@pytest.mark.parametrize("shell", completing.SHELLS)
+@pytest.mark.parametrize("shell", completion.SHELLS)
 def test_what_a_shell_needs_is_shown_and_asks_us(shell: str, tmp_path: Path) -> None:
     done = ask(tmp_path, "--show-completion", shell)
     assert (done.returncode, done.stderr) == (0, "")
@@ -96,37 +96,37 @@ def words(offers: list[tuple[str, str]]) -> set[str]:
 
 def test_keys_are_those_of_the_topic_table() -> None:
     topics = all_topics()
-    assert words(completing.keys("")) == set(topics)
-    assert words(completing.published("")) == {key for key, topic in topics.items() if isinstance(topic, Topic)}
-    assert dict(completing.keys("tf")) == {key: topics[key].doc for key in ("tf", "tf_static")}
-    for _, about in (*completing.parameters(""), *completing.keys(""), *completing.services("")):
-        assert len(about) <= completing.LONGEST_DOC and "[" not in about
+    assert words(completion.keys("")) == set(topics)
+    assert words(completion.published("")) == {key for key, topic in topics.items() if isinstance(topic, Topic)}
+    assert dict(completion.keys("tf")) == {key: topics[key].doc for key in ("tf", "tf_static")}
+    for _, about in (*completion.parameters(""), *completion.keys(""), *completion.services("")):
+        assert len(about) <= completion.LONGEST_DOC and "[" not in about
 
 
 def test_services_and_planners_are_those_that_there_are() -> None:
-    assert words(completing.services("")) == set(service_names()) - {"router"}
-    assert words(completing.planners("")) == set(planner_names())
+    assert words(completion.services("")) == set(service_names()) - {"router"}
+    assert words(completion.planners("")) == set(planner_names())
 
 
 def test_parameters_are_those_of_the_models() -> None:
     from common.config.tunables import leaves
 
     cell = load_cell("panda")
-    offers = words(completing.parameters("services."))
+    offers = words(completion.parameters("services."))
     names = [name for name in service_names() if name != "router"]
     wanted: set[str] = set()
     for name in names:
         config = service_config(cell, name, importlib.import_module(f"services.{name}").Config)
         wanted |= {path for path in leaves(config, name) if path.startswith("services.")}
     assert offers == wanted
-    assert {"motion.velocity_scaling", "world.count", "robot.hardware.backend"} <= words(completing.parameters(""))
+    assert {"motion.velocity_scaling", "world.count", "robot.hardware.backend"} <= words(completion.parameters(""))
 
 
 @pytest.mark.parametrize("typed", ["", "s", "services", "services.v", "services.viewer.po", "motion", "motion.", "x"])
 def test_what_was_typed_leaves_out_nothing_that_begins_so(typed: str) -> None:
-    wanted = {word for word in words(completing.parameters("")) if word.startswith(typed)}
-    assert words(completing.parameters(typed)) == wanted
+    wanted = {word for word in words(completion.parameters("")) if word.startswith(typed)}
+    assert words(completion.parameters(typed)) == wanted
 
 
 def test_every_override_can_be_completed_further() -> None:
-    assert all(word.endswith("=") for word in words(completing.overrides("world.")))
+    assert all(word.endswith("=") for word in words(completion.overrides("world.")))

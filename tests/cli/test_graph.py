@@ -3,9 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from cli.graph import OUTSIDE, Graph, graph_of
+from cli.graph import OUTSIDE, Graph, dot, edges, graph_of, mermaid
 from cli.graph_svg import svg
-from cli.graph_text import dot, edges, mermaid
 from cli.main import app
 from cli.wired import Wired
 

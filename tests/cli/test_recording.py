@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.runs import free_domain
-from cli.keys import names_of
+from cli.playing import names_of
 from cli.recording import in_bytes, outcome, progress
 from common.recording.reading import Recording
 from common.recording.sink import Figures

@@ -5,8 +5,7 @@ import logging
 import pytest
 from rich.console import Console
 
-from cli.live import render
-from cli.screens import Content, JsonScreen, PlainScreen, ScreenHandler, open_screen
+from cli.screens import Content, JsonScreen, PlainScreen, ScreenHandler, open_screen, render
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.messages import ServiceStatus
 
