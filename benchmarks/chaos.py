@@ -71,7 +71,7 @@ def problems(outcome: dict[str, Any]) -> list[str]:
             found.append(f"{outline['fraction']:.1%} outlined, off by {off} mm")
         return found
     truth = summary["truth"] or {"in_box": 0, "on_table": 0, "elsewhere": 0}
-    if truth != {"in_box": outcome["balls"], "on_table": 0, "elsewhere": 0}:
+    if [truth[place] for place in ("in_box", "on_table", "elsewhere")] != [outcome["balls"], 0, 0]:
         found.append(f"{truth['in_box']} of {outcome['balls']} in the box, {truth['on_table']} on the table, "
                      f"{truth['elsewhere']} elsewhere")
     return found

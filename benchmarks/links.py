@@ -60,7 +60,7 @@ def main() -> int:
             result = campaign(split, alone, when, options.speed, options.seconds, Path(folder))
         sys.stdout.write(json.dumps(result) + "\n")
         sys.stdout.flush()
-        good &= result["state"] == "DONE" and result["truth"] == {"in_box": COUNT, "on_table": 0, "elsewhere": 0}
+        good &= result["state"] == "DONE" and result["truth"]["in_box"] == COUNT
     return 0 if good else 1
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from benchmarks.runs import RunningCell, beside, folder_for
 from common import topics
+from common.applications.outlining.figures import distances
 from common.applications.outlining.messages import OutlinePoints, OutlineStatus
 from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_STATUS
 from common.config import Cell, Surroundings, load_cell
@@ -34,7 +35,6 @@ from common.planning.collision import CollisionWorld, Hit, interpolate
 from common.robot.model import RobotModel
 from common.scene.fixtures import fixture_objects
 from common.sim.objects import world_object
-from common.supervision.traced import distances
 from common.transport.bus import Bus, Reader
 
 Array = NDArray[np.float64]

@@ -10,7 +10,6 @@ from rich.table import Table
 from rich.text import Text
 
 from cli.screens import Content
-from common.supervision.summary import progress_line
 
 STATE_STYLES = {"ready": "green", "starting": "cyan", "waiting": "dim", "restarting": "yellow", "failed": "bold red"}
 REFRESHES = 4  # [1/s]
@@ -71,4 +70,4 @@ def render(content: Content) -> Group:
             Text(key, style="dim"),
             f"{rate:.1f}" if key else "",
         )
-    return Group(table, Text(progress_line(content.task), style="bold"))
+    return Group(table, Text(content.progress, style="bold"))

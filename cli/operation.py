@@ -52,8 +52,10 @@ class Operation:
         Raises:
             ConfigError, UnknownName: one line naming the option, the value and the choices.
         """
+        from common.application import find_application
         from common.config import expanded, load_cell
         from common.errors import ConfigError
+        from common.reporting.fold import Fold
         from common.supervision.launch import (
             Launch,
             clock_of,
@@ -62,7 +64,6 @@ class Operation:
             require_free_port,
             require_modules,
         )
-        from common.supervision.summary import Summary
         from common.transport.endpoint import endpoint_of
 
         self.began = process_began()
@@ -81,7 +82,9 @@ class Operation:
             kept = {name: entry for name, entry in loaded.services.items() if entry.kind != viewing.VIEWER}
             loaded = loaded.model_copy(update={"services": kept})
         self.cell: Cell = loaded
-        self.summary = Summary(loaded.name, loaded.run.seed, self.launch.clock.speed)
+        self.fold = Fold(loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
+                         speed=self.launch.clock.speed)
+        self.summary = self.fold.summary
         require_modules(loaded)
         if endpoint is None:
             require_free_port(endpoint_of(number))
@@ -166,7 +169,7 @@ class Operation:
 
     def run_to_end(self) -> int:
         """Exit code of a run: 0 when the task is DONE, 1 when it is not, 130 after Ctrl-C."""
-        from common.supervision.summary import describe
+        from common.reporting.summary import describe
         from common.supervision.supervisor import StartFailed
 
         try:
@@ -176,7 +179,7 @@ class Operation:
             self._write_summary()
             raise
         self._write_summary()
-        for line in describe(self.summary.as_dict()):
+        for line in describe(self.summary.as_dict(), self.fold.figures):
             typer.echo(line)
         return code
 
@@ -242,16 +245,15 @@ class Operation:
         assert self._supervisor is not None
         statuses = self._supervisor.statuses
         if self._collector is None:
-            return Content(statuses, {}, None)
+            return Content(statuses, {}, self.fold.progress)
         rates = {status.name: self._collector.rates.busiest_of(status.name) for status in statuses}
-        return Content(statuses, {name: rate for name, rate in rates.items() if rate}, self._collector.task_status)
+        return Content(statuses, {name: rate for name, rate in rates.items() if rate}, self.fold.progress)
 
     def _prepare(self, bus: Bus) -> None:
         from common.supervision.collector import Collector
 
         assert self._screen is not None
-        self._collector = Collector(bus, self.cell.task, self.summary, self.began, self._screen.progress,
-                                    self.cell.robot)
+        self._collector = Collector(bus, self.fold, self.began, self._screen.progress)
 
     async def _until_ended(self, bus: Bus) -> int:
         from common import topics

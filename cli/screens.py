@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from common.messages import ServiceStatus, TaskStatus
+from common.messages import ServiceStatus
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Content:
 
     services: list[ServiceStatus]
     rates: dict[str, tuple[str, float]]  # by service: the topic that it writes most often, and how often [Hz]
-    task: TaskStatus | None
+    progress: str  # of the task
 
 
 class Screen(Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 
 import msgpack
 from pydantic import ValidationError
@@ -15,13 +16,18 @@ from common.recording.sample import Sample
 class Decoder:
     """Turns samples into messages and counts, by topic, what could not be: somebody else's, or of another version."""
 
-    def __init__(self) -> None:
-        """Nothing was skipped yet."""
+    def __init__(self, own: Iterable[type[Message]] = ()) -> None:
+        """Nothing was skipped yet.
+
+        Args:
+            own: message classes of a person's own, beside those that come with the project.
+        """
+        self._own = {model.__name__: model for model in own}
         self.skipped: Counter[str] = Counter()
 
     def message(self, sample: Sample) -> Message | None:
         """The message that a sample holds, or None for one that cannot be told."""
-        model = message_class(sample.message)
+        model = self._own.get(sample.message) or message_class(sample.message)
         if model is not None:
             try:
                 values = msgpack.unpackb(sample.payload, raw=False, strict_map_key=True)

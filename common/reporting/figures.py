@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO
 from typing import Any
@@ -19,16 +19,13 @@ from common.reporting.gathering import SAME_PLACE, Gathering, Span
 Array = npt.NDArray[np.float64]
 
 MOST_POINTS = 1200  # of a line: more than a page has pixels for
-STATE_COLORS = {
-    "IDLE": "#c9ced6", "SELECTING": "#e6c229", "GRASPING": "#2f7ed8", "PLACING": "#17a398", "HOMING": "#8d6cc2",
-    "PLANNING": "#e6c229", "APPROACHING": "#2f7ed8", "TRACING": "#17a398", "RETREATING": "#8d6cc2",
-    "DONE": "#5fb35f", "ERROR": "#d64545",
-}
+STATE_COLORS = {"IDLE": "#c9ced6", "DONE": "#5fb35f", "ERROR": "#d64545"}  # those of every task
 MOTION_COLORS = {"succeeded": "#5d6a7a", "cancelled": "#e6a229", "aborted": "#d64545", "rejected": "#d64545",
                  "not ended": "#c9ced6"}
 LINES = ("#2f7ed8", "#d64545", "#17a398", "#e6a229", "#8d6cc2", "#5d6a7a", "#b3528c", "#7a9a01")
+MARKS = ("#e6a229", LINES[0], "#b3528c")
 BAD, QUIET = "#d64545", "#8a94a3"
-_STYLE: Any = {  # matplotlib lists every name in its type
+STYLE: Any = {  # matplotlib lists every name in its type
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9, "axes.spines.top": False,
     "axes.spines.right": False, "axes.edgecolor": QUIET, "axes.labelcolor": "#3c4654", "xtick.color": "#3c4654",
     "ytick.color": "#3c4654", "axes.grid": True, "grid.color": "#e8ebef", "axes.axisbelow": True,
@@ -46,16 +43,24 @@ class JointLimits:
     velocity: Array
 
 
-def timeline(run: Gathering) -> str:
-    """What the task, the motion, the gripper and the processes did, over time."""
+def timeline(run: Gathering, state_colors: Mapping[str, str]) -> str:
+    """What the task, the motion, the gripper and the processes did, over time.
+
+    Args:
+        run: what was gathered of the run.
+        state_colors: of the task's own states; one without gets one.
+    """
+    colors = {**STATE_COLORS, **state_colors}
+    for k, state in enumerate(dict.fromkeys(span.label for span in run.tasks if span.label not in colors)):
+        colors[state] = LINES[k % len(LINES)]
     rows: list[tuple[str, list[tuple[Span, str, str]]]] = [
-        ("task", [(s, STATE_COLORS.get(s.label, QUIET), s.label) for s in run.tasks]),
+        ("task", [(s, colors[s.label], s.label) for s in run.tasks]),
         ("motion", [(s, MOTION_COLORS.get(s.note, QUIET), s.note) for s in run.motions]),
         ("held", [(s, "#e6a229", "held") for s in [*run.held, *run.paused]]),
         ("gripper", [(s, "#b3528c", "holds something") for s in run.holding]),
     ]
     rows = [row for row in rows if row[1] or row[0] != "held"]
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10, 0.55 * len(rows) + 1.5), layout="constrained")
         axes = figure.subplots()
         handles: dict[str, Any] = {}
@@ -82,7 +87,7 @@ def timeline(run: Gathering) -> str:
 
 def plans(planners: Sequence[str], milliseconds: Sequence[float], durations: Sequence[float]) -> str:
     """Planning time of each plan by planner, and below it how long the planned motions take."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10, 4.2), layout="constrained")
         above, below = figure.subplots(2, 1, sharex=True)
         for k, planner in enumerate(dict.fromkeys(planners)):
@@ -100,7 +105,7 @@ def plans(planners: Sequence[str], milliseconds: Sequence[float], durations: Seq
 
 def latency(milliseconds: Sequence[float], marks: dict[str, float]) -> str:
     """How long frames took, as a histogram with marks."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10, 2.8), layout="constrained")
         axes = figure.subplots()
         values = np.asarray(milliseconds, dtype=float)
@@ -117,7 +122,7 @@ def latency(milliseconds: Sequence[float], marks: dict[str, float]) -> str:
 def joints(times: Array, positions: Array, velocities: Array, names: Sequence[str], limits: JointLimits | None) -> str:
     """Positions and speeds of each joint over time, with their limits."""
     chosen = thinned(times, velocities)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10, 1.15 * len(names) + 0.8), layout="constrained")
         grid = figure.subplots(len(names), 2, sharex=True, squeeze=False)
         for k, name in enumerate(names):
@@ -139,9 +144,15 @@ def joints(times: Array, positions: Array, velocities: Array, names: Sequence[st
         return svg(figure, "joints")
 
 
-def top_view(run: Gathering, tool: Array) -> str:
-    """The table from above, as a person at the robot sees it: +x up, +y to the left."""
-    with mpl.rc_context(_STYLE):
+def top_view(run: Gathering, tool: Array, marks: Mapping[str, Mapping[tuple[int, int], int]]) -> str:
+    """The place of work from above, as a person at the robot sees it: +x up, +y to the left.
+
+    Args:
+        run: what was gathered of the run.
+        tool: (n, 3) way of the tool [m].
+        marks: more places by what they are, in steps of `SAME_PLACE`; what comes later is smaller and lies above.
+    """
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.5, 6.5), layout="constrained")
         axes = figure.subplots()
         for thing in run.footprints.values():
@@ -149,43 +160,19 @@ def top_view(run: Gathering, tool: Array) -> str:
                       edgecolor=(*thing.color, 0.7), linewidth=0.8)
         if len(tool):
             axes.plot(tool[:, 1], tool[:, 0], color=QUIET, linewidth=0.6, alpha=0.8, label="way of the tool")
-        for places, color, size, label in ((run.detections, "#e6a229", 34, "detections"),
-                                           (run.targets, LINES[0], 9, "targets")):
-            if places:
-                x, y = (np.array(list(places), dtype=float) * SAME_PLACE).T
-                axes.scatter(y, x, s=size, color=color, label=label, linewidths=0)
+        for k, (label, places) in enumerate(marks.items()):
+            x, y = (np.array(list(places), dtype=float) * SAME_PLACE).T
+            axes.scatter(y, x, s=34 / 4**k, color=MARKS[k % len(MARKS)], label=label, linewidths=0)
         for crosses, marker, color, label in ((run.rejections, "x", BAD, "rejected"),
                                               (run.picks, "+", "#17a398", "picked")):
             if crosses:
                 axes.scatter([p.position[1] for p in crosses], [p.position[0] for p in crosses], marker=marker,
                              s=70, color=color, linewidths=1.8, label=label)
-        if run.truth:
-            axes.scatter([p.position[1] for p in run.truth], [p.position[0] for p in run.truth], s=200,
+        if truth := run.truth.things:
+            axes.scatter([p.position[1] for p in truth], [p.position[0] for p in truth], s=200,
                          facecolors="none", edgecolors="#3c4654", linewidths=0.8, label="truth at the end")
-        _from_above(figure, axes)
+        from_above(figure, axes)
         return svg(figure, "top_view")
-
-
-def outline(run: Gathering, tips: Array) -> str:
-    """The contour that was detected and the way that the tool tip took along it, from above."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(7.5, 6.0), layout="constrained")
-        axes = figure.subplots()
-        for edge in run.outlines:
-            closed = np.vstack([edge, edge[:1]])
-            axes.plot(closed[:, 1], closed[:, 0], color=QUIET, linewidth=0.8, label="true edge")
-        if len(run.contour):
-            closed = np.vstack([run.contour, run.contour[:1]])
-            axes.plot(closed[:, 1], closed[:, 0], color="#e6a229", linewidth=3.0, alpha=0.7, label="detected contour")
-        if len(tips):
-            axes.plot(tips[:, 1], tips[:, 0], color=LINES[0], linewidth=1.0, label="traced")
-        shown = [part for part in (run.contour[:, :2], tips[:, :2]) if len(part)]
-        if shown:
-            low, high = np.vstack(shown).min(axis=0) - 0.03, np.vstack(shown).max(axis=0) + 0.03
-            axes.set_xlim(low[1], high[1])
-            axes.set_ylim(low[0], high[0])
-        _from_above(figure, axes)
-        return svg(figure, "outline")
 
 
 def thinned(times: Array, values: Array) -> npt.NDArray[np.intp]:
@@ -211,7 +198,8 @@ def svg(figure: Figure, name: str) -> str:
     return re.sub(r' id="[A-Za-z]\w*_\d+"', "", body).strip()
 
 
-def _from_above(figure: Figure, axes: Axes) -> None:
+def from_above(figure: Figure, axes: Axes) -> None:
+    """Axes as a person at the robot sees the place of work: +x up, +y to the left."""
     axes.set_aspect("equal")
     axes.invert_xaxis()
     axes.set_xlabel("y [m]")
@@ -223,4 +211,4 @@ def _from_above(figure: Figure, axes: Axes) -> None:
 
 
 def _short(name: str) -> str:
-    return name.removesuffix("_joint").removeprefix("panda_")
+    return re.sub(r"^[a-z]+_(?=joint\d)|_joint$", "", name)

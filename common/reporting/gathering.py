@@ -1,15 +1,18 @@
-"""Gathers from the messages of a run what its report shows. Times are wall time since the recording began [s]."""
+"""Gathers from the messages of a run what every report shows. Times are wall time since the recording began [s]."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from common import messages as m
-from common.applications.outlining.messages import OutlinePoints, OutlineStatus
-from common.applications.pick_place.messages import PickPlaceStatus
+from common import topics as t
+from common.reporting.truth import Truth
+from common.topics import Topic
 
 Array = npt.NDArray[np.float64]
 
@@ -89,31 +92,34 @@ class Gathering:
     latencies: list[float] = field(default_factory=list)  # of frames [ms]
     joint_times: list[float] = field(default_factory=list)
     joint_states: list[m.JointState] = field(default_factory=list)
-    detections: dict[tuple[int, int], int] = field(default_factory=dict)  # how often, by place in steps of SAME_PLACE
-    targets: dict[tuple[int, int], int] = field(default_factory=dict)
     rejections: list[Place] = field(default_factory=list)
     skipped: dict[tuple[float, float, float], Place] = field(default_factory=dict)
     picks: list[Place] = field(default_factory=list)
     footprints: dict[str, Footprint] = field(default_factory=dict)
-    truth: list[Place] = field(default_factory=list)
-    contour: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    outlines: list[Array] = field(default_factory=list)  # true edges (n, 2) [m]
     services: dict[str, Service] = field(default_factory=dict)
     restarts: list[Event] = field(default_factory=list)
     log: list[Event] = field(default_factory=list)
     lines_left_out: int = 0
     counters: dict[str, m.ServiceCounters] = field(default_factory=dict)
+    truth: Truth = field(default_factory=Truth)  # that of the fold which feeds this
     end: float = 0.0
     _target: str = ""
     _scene: dict[str, tuple[float, float, float]] = field(default_factory=dict)
 
-    def on_task(self, time: float, status: PickPlaceStatus | OutlineStatus) -> None:
+    def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
+        """What of the platform's topics is listened to."""
+        return {
+            t.MOTION_STATUS: self.on_motion, t.GRIPPER_STATE: self.on_gripper, t.DISPLAY_TRAJECTORY: self.on_trajectory,
+            t.JOINT_STATES: self.on_joints, t.PLANNING_SCENE: self.on_scene, t.SUPERVISOR_STATUS: self.on_services,
+            t.LOG: self.on_log, t.COUNTERS: self.on_counters,
+        }
+
+    def on_task(self, time: float, status: m.TaskStatus) -> None:
         """Take note of how far the task is."""
-        thing = status.object if isinstance(status, OutlineStatus) else status.target
-        self._target = thing or self._target
-        _change(self.tasks, time, status.state, thing)
+        self._target = status.subject or self._target
+        _change(self.tasks, time, status.state, status.subject)
         _while(self.paused, time, status.paused, "paused")
-        for place in getattr(status, "skipped", []):
+        for place in status.skipped:
             p = place.position
             self.skipped.setdefault((p.x, p.y, p.z), Place(time, (p.x, p.y, p.z), place.reason))
 
@@ -142,17 +148,6 @@ class Gathering:
         self.joint_times.append(time)
         self.joint_states.append(state)
 
-    def on_detections(self, _time: float, found: m.MarkerArray) -> None:
-        """Take note of what the detector found."""
-        for marker in found.markers:
-            _count(self.detections, marker.pose.position)
-
-    def on_targets(self, _time: float, targets: m.PoseArray, age_ms: float) -> None:
-        """Take note of what is offered to the task, and how old [ms] the frame was when it came."""
-        self.latencies.append(age_ms)
-        for pose in targets.poses:
-            _count(self.targets, pose.position)
-
     def on_rejections(self, time: float, rejections: m.Rejections) -> None:
         """Take note of what is not offered, and why."""
         for one in rejections.rejected:
@@ -166,27 +161,6 @@ class Gathering:
                 self._scene[thing.id] = (p.x, p.y, p.z)
             elif thing.id not in self.footprints:
                 self.footprints[thing.id] = footprint(thing)
-
-    def on_truth(self, time: float, balls: m.PoseArray) -> None:
-        """Take note of where everything really is."""
-        labels = balls.labels or [""] * len(balls.poses)
-        self.truth = [Place(time, (p.position.x, p.position.y, p.position.z), label)
-                      for p, label in zip(balls.poses, labels, strict=False)]
-
-    def on_objects(self, _time: float, objects: m.WorldObjects) -> None:
-        """Take note of the true edges of objects."""
-        self.outlines = [np.array(edge) for thing in objects.objects for edge in (thing.outline, thing.hole)
-                         if len(edge) > 2]
-
-    def on_contour(self, _time: float, path: OutlinePoints) -> None:
-        """Take note of the contour that is to be traced; once the arm moves it may hide a part of it."""
-        before = not self.tasks or self.tasks[-1].label in ("IDLE", "SELECTING", "PLANNING")
-        if path.poses and (before or not len(self.contour)):
-            self.contour = np.array([(p.position.x, p.position.y, p.position.z) for p in path.poses])
-
-    def on_picture(self, age_ms: float) -> None:
-        """Take note of how old [ms] a frame was when what was seen in it came."""
-        self.latencies.append(age_ms)
 
     def on_services(self, time: float, status: m.SupervisorStatus) -> None:
         """Take note of the processes."""
@@ -269,6 +243,8 @@ def _while(spans: list[Span], time: float, lasts: bool, label: str) -> bool:
     return False
 
 
-def _count(places: dict[tuple[int, int], int], position: m.Vector3) -> None:
-    key = round(position.x / SAME_PLACE), round(position.y / SAME_PLACE)
-    places[key] = places.get(key, 0) + 1
+def count_places(places: dict[tuple[int, int], int], poses: Iterable[m.Pose]) -> None:
+    """Count how often something was at a place from above, by place in steps of `SAME_PLACE`."""
+    for pose in poses:
+        key = round(pose.position.x / SAME_PLACE), round(pose.position.y / SAME_PLACE)
+        places[key] = places.get(key, 0) + 1

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.reporting import figures
+from common.reporting.application import Figures
 from common.reporting.gathering import MOST_LINES, Gathering
 
 Array = npt.NDArray[np.float64]
@@ -43,8 +44,8 @@ class Report:
         run: what was gathered.
         limits: of the arm's joints; None when they are not known.
         names: of the arm's joints.
+        application: what the application says of the run.
         tool: (n, 3) way of the tool [m], empty when the robot is not known.
-        tips: (n, 3) the part of it in which an outline was traced.
         notes: what is missing in the report, and why.
         lost: messages that did not get into the recording, by topic.
     """
@@ -55,19 +56,19 @@ class Report:
     run: Gathering
     limits: figures.JointLimits | None
     names: list[str]
+    application: Figures
     tool: Array
-    tips: Array
     notes: list[str]
     lost: dict[str, int]
 
 
 def page(report: Report) -> str:
     """The document."""
+    picture = report.application.picture(report.run, report.tool)
     sections = [
         ("summary", "", _head(report)),
-        ("timeline", "Timeline", figures.timeline(report.run)),
-        ("outline", "Outline", _outline(report)),
-        ("top", "From above", _top(report)),
+        ("timeline", "Timeline", figures.timeline(report.run, report.application.STATE_COLORS)),
+        *([picture] if picture is not None else []),
         ("plans", "Plans", _plans(report)),
         ("latency", "From the picture to what was seen in it", _latency(report)),
         ("joints", "Joints", _joints(report)),
@@ -90,19 +91,7 @@ def page(report: Report) -> str:
 def _head(report: Report) -> str:
     s, seconds = report.summary, report.summary["seconds"]
     state = {"DONE": "good", "ERROR": "bad"}.get(s["state"], "quiet")
-    facts: list[tuple[str, str]] = []
-    if "outline" in s:
-        o = s["outline"]
-        facts += [("outlined", o["object"] or "nothing"), ("traced", f"{o['fraction']:.1%} of {o['length_m']:.3f} m")]
-        for key, name in (("deviation_mm", "from the true edge"), ("tracking_mm", "from the contour")):
-            if o[key]:
-                facts.append((name, f"{o[key]['mean']:.2f} mm ({o[key]['max']:.2f} at most)"))
-    else:
-        facts += [("placed", f"{s['placed']} of {s['targets']}"), ("rejected places", str(len(s["rejected"])))]
-        if s["truth"]:
-            t = s["truth"]
-            facts.append(("truth", f"{t['in_box']} in the box, {t['on_table']} on the table"
-                          + (f", {t['elsewhere']} elsewhere" if t["elsewhere"] else "")))
+    facts = report.application.facts(s)
     facts += [("task", _seconds(seconds["task"])), ("moving", _seconds(seconds["moving"])),
               ("planning", f"{_seconds(seconds['planning'])} in {len(s['plans'])} plans"),
               ("failures, retries", f"{s['failures']}, {s['retries']}")]
@@ -165,22 +154,6 @@ def _joints(report: Report) -> str:
     head += ["limits [rad]", "limit [rad/s]", "of the limit"] if report.limits is not None else []
     picture = figures.joints(times, positions, velocities, report.names, report.limits)
     return f"{picture}<div class=scroll>{_table(head, rows, numbers=range(1, len(head)))}</div>"
-
-
-def _top(report: Report) -> str:
-    run = report.run
-    if "outline" in report.summary or not (run.detections or run.targets or run.footprints):
-        return ""
-    return (f"{figures.top_view(run, report.tool)}<p>{len(run.picks)} picked, {len(run.rejections)} rejected. "
-            "The truth is shown for comparison only.</p>")
-
-
-def _outline(report: Report) -> str:
-    if "outline" not in report.summary:
-        return ""
-    o = report.summary["outline"]
-    return (f"{figures.outline(report.run, report.tips)}<p>{o['points']} points of the contour; the true edge is shown "
-            "for comparison only.</p>")
 
 
 def _problems(report: Report) -> str:

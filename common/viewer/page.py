@@ -20,7 +20,7 @@ from common.applications.pick_place.topics import (
 from common.config import Members, check
 from common.errors import ZencellError
 from common.messages import Image
-from common.supervision.summary import Rejected
+from common.reporting.summary import Rejected
 from common.topics import Topic
 from common.viewer.desk import Desk
 from common.viewer.feeds import Feeds

@@ -36,7 +36,7 @@ async def test_task_and_scene_manager_are_killed_with_a_ball_in_the_hand(tmp_pat
             assert await cell.ended(90) == 0, cell.tail()
         summary = cell.summary
         assert not cell.processes()
-    assert summary["truth"] == {"in_box": 3, "on_table": 0, "elsewhere": 0}
+    assert summary["truth"] == {"in_box": 3, "on_table": 0, "elsewhere": 0, "containers": {"box": 3}}
     assert (summary["state"], summary["placed"]) == ("DONE", 3)
     assert {name: n for name, n in summary["restarts"].items() if n} == {"smart_pick_place": 1, "scene_manager": 1}
 
@@ -53,7 +53,7 @@ async def test_the_router_is_killed_in_the_middle_of_a_motion(tmp_path: Path) ->
             assert await cell.ended(90) == 0, cell.tail()
         summary = cell.summary
         assert not cell.processes()
-    assert summary["truth"] == {"in_box": 2, "on_table": 0, "elsewhere": 0}
+    assert summary["truth"] == {"in_box": 2, "on_table": 0, "elsewhere": 0, "containers": {"box": 2}}
     assert summary["state"] == "DONE"
     assert {name: n for name, n in summary["restarts"].items() if n} == {"router": 1}
 
@@ -80,7 +80,7 @@ async def test_balls_that_are_moved_added_and_taken_away_end_up_where_they_shoul
         cell.interrupt()
         assert await cell.ended(10) == 0
         summary = cell.summary
-    assert summary["truth"] == {"in_box": 4, "on_table": 0, "elsewhere": 0}
+    assert summary["truth"] == {"in_box": 4, "on_table": 0, "elsewhere": 0, "containers": {"box": 4}}
     assert summary["rejected"] == []
 
 
@@ -100,7 +100,7 @@ async def test_what_can_not_be_taken_is_reported_and_the_run_ends_done(tmp_path:
         assert await cell.ended(90) == 0, cell.tail()
         summary = cell.summary
     assert summary["state"] == "DONE"
-    assert summary["truth"] == {"in_box": 8, "on_table": 4, "elsewhere": 0}
+    assert summary["truth"] == {"in_box": 8, "on_table": 4, "elsewhere": 0, "containers": {"box": 8}}
     told = {place["reason"].partition(":")[0] for place in summary["rejected"]}
     assert told == set(places) - {"", "inside the container"}
     assert len(summary["rejected"]) == 4

@@ -101,13 +101,13 @@ def test_the_default_layout_ends_in_the_box_with_all_figures(tmp_path: Path) -> 
         assert not cell.processes()
         assert not descendants(cell)
         summary = cell.summary
-    assert summary["truth"] == {"in_box": 7, "on_table": 0, "elsewhere": 0}
+    assert summary["truth"] == {"in_box": 7, "on_table": 0, "elsewhere": 0, "containers": {"box": 7}}
     assert {k: summary[k] for k in ("cell", "state", "placed", "targets", "rejected", "seed", "speed")} == {
         "cell": "panda", "state": "DONE", "placed": 7, "targets": 7, "rejected": [], "seed": 5, "speed": 10.0,
     }
     assert set(summary) == {
         "cell", "state", "placed", "targets", "rejected", "failures", "retries", "seconds", "plans",
-        "frame_to_target_ms", "restarts", "seed", "speed", "truth",
+        "frame_to_target_ms", "restarts", "seed", "speed", "truth", "figures",
     }
     seconds = summary["seconds"]
     assert set(seconds) == {"ready", "first_motion", "task", "moving", "planning"}

@@ -5,14 +5,14 @@ import logging
 import pytest
 from rich.console import Console
 
-from cli.screens import Content, JsonScreen, PlainScreen, ScreenHandler, open_screen, render
-from common.applications.pick_place.messages import PickPlaceStatus
+from cli.live import render
+from cli.screens import Content, JsonScreen, PlainScreen, ScreenHandler, open_screen
 from common.messages import ServiceStatus
 
 CONTENT = Content(
     [ServiceStatus(name="router", state="ready", pid=12), ServiceStatus(name="vision", state="restarting", restarts=2)],
     {"vision": ("detected_objects", 9.96)},
-    PickPlaceStatus(placed=3, targets=7, state="GRASPING", target="ball_4", started=True),
+    "3 of 7 placed - GRASPING ball_4",
 )
 
 

@@ -66,7 +66,7 @@ def test_a_run_completes_with_perception_behind_one_router_and_the_arm_behind_an
                 assert camera.ask("panda/motion/status", timeout=1.0) == []
                 assert asyncio.run(arm.ended(240)) == 0, f"{arm.tail()}\nand the eye:\n{eye.tail()}"
         assert arm.summary["state"] == "DONE"
-        assert arm.summary["truth"] == {"in_box": 1, "on_table": 0, "elsewhere": 0}
+        assert arm.summary["truth"] == {"in_box": 1, "on_table": 0, "elsewhere": 0, "containers": {"box": 1}}
         eye.interrupt()
         assert asyncio.run(eye.ended(60)) == 0
     assert "panda/detected_objects" in heard.keys

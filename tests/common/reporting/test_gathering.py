@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from common import messages as m
-from common.applications.outlining.messages import OutlinePoints, OutlineStatus
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.reporting import figures
 from common.reporting.gathering import MOST_LINES, Gathering
@@ -75,21 +74,6 @@ def test_only_warnings_and_errors_are_kept_and_not_too_many():
         run.on_log(k, m.LogLine(service="a", level="info", message="fine"))
         run.on_log(k, m.LogLine(service="a", level="error", message="bad"))
     assert len(run.log) == MOST_LINES and run.lines_left_out == 5 and {e.level for e in run.log} == {"error"}
-
-
-def test_the_contour_of_before_the_arm_moved_stays():
-    run = Gathering()
-
-    def path(n):
-        poses = [m.Pose(position=m.Vector3(x=k)) for k in range(n)]
-        return OutlinePoints(header=m.Header(), poses=poses)
-
-    run.on_task(0, OutlineStatus(state="SELECTING"))
-    run.on_contour(1, path(3))
-    run.on_contour(2, path(4))
-    run.on_task(3, OutlineStatus(state="TRACING"))
-    run.on_contour(4, path(9))
-    assert len(run.contour) == 4
 
 
 def test_joints_are_taken_by_name_and_states_without_them_left_out():

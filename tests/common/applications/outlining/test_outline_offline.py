@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from common import messages as m
 from common.applications.outlining.contours import ContourOptions
+from common.applications.outlining.figures import distances
 from common.applications.outlining.legs import Legs, TracingParameters
 from common.applications.outlining.messages import OutlineSelect
 from common.applications.outlining.offline import Impossible, Perceived, perceive, plan_outline
@@ -22,7 +23,6 @@ from common.planning.pipeline import PlanningPipeline
 from common.robot.model import RobotModel
 from common.sim.depth_view import DepthView
 from common.sim.objects import world_object
-from common.supervision.traced import distances
 
 CELL = load_cell("ur5")
 AROUND = CELL.section(Surroundings)

@@ -1,31 +1,14 @@
-import asyncio
 import json
 import math
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common import topics
-from common.application import all_topics
 from common.applications.pick_place.messages import PickPlaceStatus
-from common.applications.pick_place.topics import PICK_PLACE_STATUS, REJECTED_TARGETS, SCENE_BALLS, VALIDATED_TARGETS
-from common.clock import Clock
-from common.messages import (
-    Header,
-    MotionStatus,
-    PlanFigure,
-    Pose,
-    PoseArray,
-    Rejection,
-    Rejections,
-    ServiceCounters,
-    Vector3,
-)
-from common.supervision.collector import Collector
-from common.supervision.rates import Rates
-from common.supervision.summary import Rejected, Summary, count_truth, describe, percentile, progress_line
-from common.transport.local import LocalNetwork
+from common.messages import Header, MotionStatus, PlanFigure, Pose, PoseArray, Rejection, Vector3, WorldObjects
+from common.reporting.application import Figures
+from common.reporting.summary import Rejected, Summary, describe, percentile
+from common.reporting.truth import Truth
 
 PLAN = PlanFigure(planner="cartesian", seconds=0.01, fraction=1.0, attempts=1)
 
@@ -47,7 +30,7 @@ def test_summary_has_the_fields_that_scripts_read() -> None:
     summary = Summary("panda", 3, 5.0).as_dict()
     assert list(summary) == [
         "cell", "state", "placed", "targets", "rejected", "failures", "retries", "seconds", "plans",
-        "frame_to_target_ms", "restarts", "seed", "speed", "truth",
+        "frame_to_target_ms", "restarts", "seed", "speed", "truth", "figures",
     ]
     assert list(summary["seconds"]) == ["ready", "first_motion", "task", "moving", "planning"]
     assert list(summary["frame_to_target_ms"]) == ["p50", "p99"]
@@ -96,17 +79,22 @@ def test_figures_of_a_task_that_was_restarted_add_up() -> None:
 
 def test_only_the_first_motion_counts() -> None:
     summary = Summary("panda", 0, 1.0)
-    summary.on_motion(MotionStatus(state="none"), 3.0)
-    summary.on_motion(MotionStatus(state="active"), 4.5)
-    summary.on_motion(MotionStatus(state="active"), 9.0)
+    summary.on_motion(3.0, MotionStatus(state="none"))
+    summary.on_motion(4.5, MotionStatus(state="active"))
+    summary.on_motion(9.0, MotionStatus(state="active"))
     assert summary.as_dict()["seconds"]["first_motion"] == 4.5
 
 
-def test_truth_is_counted_by_where_balls_lie() -> None:
-    assert count_truth(balls("box", "box", "table", "held", "falling")) == {
-        "in_box": 2, "on_table": 1, "elsewhere": 2
-    }
-    assert count_truth(None) is None
+def test_truth_is_counted_by_where_things_lie() -> None:
+    truth = Truth(("box", "tray"))
+    assert truth.counted() is None and truth.settled
+    truth.on_labels(balls("box", "box", "table", "held", "falling"))
+    assert truth.counted() == {"in_box": 2, "on_table": 1, "elsewhere": 2, "containers": {"box": 2, "tray": 0}}
+    assert not truth.settled
+    truth.on_objects(WorldObjects())  # of a recording from before balls were objects: nobody lies there
+    assert truth.counted() == {"in_box": 2, "on_table": 1, "elsewhere": 2, "containers": {"box": 2, "tray": 0}}
+    truth.on_labels(balls("box"))
+    assert truth.settled
 
 
 @given(st.lists(st.floats(0, 1e6), min_size=1), st.floats(0.01, 1))
@@ -120,66 +108,27 @@ def test_lines_for_people_name_what_was_left_and_what_was_restarted() -> None:
     summary = Summary("panda", 0, 1.0)
     summary.on_status(status("DONE", 10, placed=6, targets=6))
     summary.rejected.add([at(0.9, 0.0)])
-    summary.truth = balls(*["box"] * 6, "table")
+    summary.truth.on_labels(balls(*["box"] * 6, "table"))
     summary.restarts = {"router": 0, "scene_manager": 2}
-    text = "\n".join(describe(summary.as_dict()))
-    assert "panda: DONE, 6 of 6 placed (truth: 6 in the box, 1 on the table)" in text
+    text = "\n".join(describe(summary.as_dict(), Figures()))
+    assert "panda: DONE, 6 of 6 done (truth: 6 in the box, 1 on the table)" in text
     assert "left at (0.900, 0.000, 0.030): too far" in text
     assert "scene_manager 2 x" in text
     assert "router" not in text
 
 
-@pytest.mark.parametrize(
-    ("values", "line"),
-    [
-        ({"placed": 3, "targets": 7, "state": "GRASPING", "target": "ball_4", "started": True},
-         "3 of 7 placed - GRASPING ball_4"),
-        ({"targets": 2}, "0 of 2 placed - IDLE (waits for `zencell task start`)"),
-        ({"paused": True, "started": True}, "0 of 0 placed - IDLE (paused)"),
-    ],
-)
-def test_progress_in_one_line(values: dict[str, object], line: str) -> None:
-    assert progress_line(PickPlaceStatus.model_validate(values)) == line
-
-
-def test_rates_come_from_what_readers_count() -> None:
-    rates = Rates(all_topics())
-    for second in range(3):
-        received = {"camera/image_raw": 10 * second, "joint_states": 100 * second}
-        rates.update(ServiceCounters(service="vision_detector", received=received), float(second))
-    assert rates.busiest_of("camera_simulator") == ("camera/image_raw", 10.0)
-    assert rates.busiest_of("trajectory_executor") == ("joint_states", 100.0)
-    assert rates.busiest_of("smart_pick_place") is None
-    rates.update(ServiceCounters(service="vision_detector", received={"camera/image_raw": 0}), 3.0)
-    assert rates.of_topic("camera/image_raw") == 0.0  # it was started again
-
-
-async def test_collector_hears_the_cell_and_waits_for_what_still_falls() -> None:
-    net = LocalNetwork()
-    clock = Clock(2.0)
-    cell = net.bus("cell", cell="test", clock=clock)
-    summary = Summary("test", 0, 2.0)
-    progress: list[str] = []
-    bus = net.bus("supervisor", cell="test", clock=clock)
-    collector = Collector(bus, "smart_pick_place", summary, 0.0, progress.append)
-    listening = asyncio.create_task(collector.run())
-    truth = cell.writer(SCENE_BALLS)
-    truth.put(balls("box", "falling"))
-    cell.writer(REJECTED_TARGETS).put(Rejections(header=cell.header(), rejected=[at(0.9, 0.0)]))
-    cell.writer(topics.MOTION_STATUS).put(MotionStatus(state="active"))
-    stamp = clock.now_ns() - int(0.020 * 2.0 * 1e9)
-    cell.writer(VALIDATED_TARGETS).put(PoseArray(header=Header(stamp=stamp)))
-    cell.writer(PICK_PLACE_STATUS).put(status("DONE", 1, placed=2, targets=2))
-    async with asyncio.timeout(10):
-        await collector.ended.wait()
-        settling = asyncio.create_task(collector.settle())
-        await asyncio.sleep(0)
-        truth.put(balls("box", "box"))
-        await settling
-    listening.cancel()
+def test_what_the_task_believes_after_restarts_is_what_it_said_last() -> None:
+    summary = Summary("panda", 0, 1.0)
+    lives = [("PLACING", 50, 5), ("IDLE", 55, 0), ("IDLE", 56, 5), ("PLACING", 60, 6), ("IDLE", 65, 0), ("DONE", 70, 7)]
+    for state, seconds, done in lives:
+        summary.on_status(status(state, seconds, done=done, total=7))
     figures = summary.as_dict()
-    assert figures["truth"] == {"in_box": 2, "on_table": 0, "elsewhere": 0}
-    assert figures["rejected"] == [{"position": [0.9, 0.0, 0.03], "reason": "too far"}]
-    assert figures["seconds"]["first_motion"] is not None
-    assert figures["frame_to_target_ms"]["p50"] >= 20
-    assert progress == ["2 of 2 placed - DONE"]
+    assert (figures["placed"], figures["targets"], figures["state"]) == (7, 7, "DONE")
+
+
+def test_figures_of_the_task_stand_in_the_summary_as_they_are() -> None:
+    summary = Summary("mine", 0, 1.0)
+    summary.on_status(status("DONE", 10, done=1, total=1, figures={"moved_m": 0.31, "by": "edge"}))
+    figures = summary.as_dict()
+    assert figures["figures"] == {"moved_m": 0.31, "by": "edge"}
+    assert describe(figures, Figures())[:2] == ["mine: DONE, 1 of 1 done", "  moved_m 0.31, by edge"]

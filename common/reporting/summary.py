@@ -1,4 +1,4 @@
-"""The figures of a run, gathered from what the cell publishes; the file that `run` writes."""
+"""The figures of a run that every cell has; the file that `run` writes."""
 
 from __future__ import annotations
 
@@ -6,21 +6,11 @@ import math
 from array import array
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from common.applications.outlining.messages import OutlineStatus
-from common.applications.pick_place.messages import PickPlaceStatus
-from common.messages import (
-    MotionStatus,
-    PlanFigure,
-    PoseArray,
-    Rejection,
-    TaskStatus,
-    Vector3,
-)
-
-if TYPE_CHECKING:
-    from common.supervision.traced import Traced
+from common.messages import MotionStatus, PlanFigure, Rejection, Rejections, TaskStatus, Vector3
+from common.reporting.application import Figures
+from common.reporting.truth import Truth
 
 SAME_PLACE = 0.03  # [m] rejections closer than this are of the same thing
 NOT_LEFT_BEHIND = "inside the container"  # such a detection is of what was placed
@@ -59,8 +49,7 @@ class Counted:
     @classmethod
     def of(cls, status: TaskStatus) -> Counted:
         """The figures in a status."""
-        retries = status.retries if isinstance(status, PickPlaceStatus) else 0
-        return cls(status.failures, retries, status.moving_seconds, status.planning_seconds, list(status.plans))
+        return cls(status.failures, status.retries, status.moving_seconds, status.planning_seconds, list(status.plans))
 
     def __add__(self, other: Counted) -> Counted:
         """Figures of one life of the process and of the next."""
@@ -86,22 +75,26 @@ class Counted:
 class Summary:
     """Gathers the figures of one run."""
 
-    def __init__(self, cell: str, seed: int, speed: float) -> None:
+    def __init__(
+        self, cell: str, seed: int, speed: float, figures: Figures | None = None, containers: Sequence[str] = ()
+    ) -> None:
         """Start with nothing seen.
 
         Args:
             cell: name of the cell.
             seed: of the run.
             speed: seconds of cell time per second of wall time.
+            figures: what the application says of the run.
+            containers: ids of those that the cell has.
         """
+        self.figures = figures or Figures()
         self.cell = cell
         self.seed = seed
         self.speed = speed
-        self.status: TaskStatus = PickPlaceStatus()
-        self.traced: Traced | None = None  # of a cell that outlines objects
+        self.status = TaskStatus()
         self.ready: float | None = None  # wall time [s] from the start of the process to the cell being ready
         self.first_motion: float | None = None  # wall time [s] from the start of the process
-        self.truth: PoseArray | None = None
+        self.truth = Truth(tuple(containers))
         self.rejected = Rejected()
         self.restarts: dict[str, int] = {}
         self.failed = False  # the cell did not come up
@@ -114,8 +107,6 @@ class Summary:
 
     def on_status(self, status: TaskStatus) -> None:
         """Take note of the task's status."""
-        if isinstance(status, OutlineStatus) and self.traced is not None:
-            self.traced.on_status(status)
         figures = Counted.of(status)
         if figures.restarted_since(self._now):
             self._before = self._before + self._now
@@ -127,10 +118,14 @@ class Summary:
                 self._task_since = stamp - status.task_seconds
             self._task_until = stamp
 
-    def on_motion(self, status: MotionStatus, seconds: float) -> None:
+    def on_motion(self, time: float, status: MotionStatus) -> None:
         """Take note of a motion's status at a wall time [s] from the start of the process."""
         if status.state == "active" and self.first_motion is None:
-            self.first_motion = seconds
+            self.first_motion = time
+
+    def on_rejections(self, _time: float, rejections: Rejections) -> None:
+        """Take note of what the task is not offered, and why."""
+        self.rejected.add(rejections.rejected)
 
     def on_latency(self, milliseconds: float) -> None:
         """Take note of the time [ms] from a frame's exposure to the arrival of the targets seen in it."""
@@ -146,15 +141,14 @@ class Summary:
     def as_dict(self) -> dict[str, Any]:
         """The summary file."""
         rejected = Rejected(list(self.rejected.places))
-        task = self.status if isinstance(self.status, PickPlaceStatus) else PickPlaceStatus()
-        rejected.add(task.skipped)
+        rejected.add(self.status.skipped)
         figures = self._before + self._now
         took = self._task_until - self._task_since if self._task_since is not None else 0.0
         return {
             "cell": self.cell,
             "state": self.state,
-            "placed": task.done,
-            "targets": task.total,
+            "placed": self.status.done,
+            "targets": self.status.total,
             "rejected": [{"position": _xyz(place.position), "reason": place.reason} for place in rejected.places],
             "failures": figures.failures,
             "retries": figures.retries,
@@ -173,24 +167,11 @@ class Summary:
             "restarts": dict(self.restarts),
             "seed": self.seed,
             "speed": self.speed,
-            "truth": count_truth(self.truth),
-            **({"outline": self.traced.figures()} if self.traced else {}),
+            "truth": self.truth.counted(),
+            "figures": dict(self.status.figures),
+            **self.figures.blocks(),
             **({"chaos": list(self.chaos)} if self.chaos is not None else {}),
         }
-
-
-def count_truth(balls: PoseArray | None) -> dict[str, int] | None:
-    """How many balls really lie in the box, on the table and anywhere else; None without simulated hardware."""
-    if balls is None:
-        return None
-    in_box = sum(label == "box" for label in balls.labels)
-    on_table = sum(label == "table" for label in balls.labels)
-    return {"in_box": in_box, "on_table": on_table, "elsewhere": len(balls.poses) - in_box - on_table}
-
-
-def is_settled(balls: PoseArray | None) -> bool:
-    """Whether nothing is on its way any more."""
-    return balls is None or not any(label in ("falling", "held") for label in balls.labels)
 
 
 def percentile(values: Sequence[float], fraction: float) -> float | None:
@@ -200,45 +181,28 @@ def percentile(values: Sequence[float], fraction: float) -> float | None:
     return sorted(values)[max(0, math.ceil(fraction * len(values)) - 1)]
 
 
-def progress_line(task: TaskStatus | None) -> str:
-    """Where the task is, as "3 of 7 placed - GRASPING ball_4" or "TRACING Object_1, 0.400 m"."""
-    if task is None:
-        return "the task has not spoken yet"
-    if isinstance(task, OutlineStatus):
-        line = f"{task.state} {task.object}, {task.length_m:.3f} m" if task.object else task.state
-    else:
-        line = f"{task.done} of {task.total} placed - {task.state}"
-        if task.subject:
-            line += f" {task.subject}"
-    if task.paused:
-        line += " (paused)"
-    elif not task.started and task.state == "IDLE":
-        line += " (waits for `zencell task start`)"
-    return line
+def describe(summary: dict[str, Any], application: Figures) -> list[str]:
+    """A summary in a few lines for people.
 
-
-def describe(summary: dict[str, Any]) -> list[str]:
-    """The summary in a few lines for people."""
+    Args:
+        summary: as a file has it.
+        application: says how the run ended.
+    """
     seconds = summary["seconds"]
-    lines = [f"{summary['cell']}: {summary['state']}, "]
-    if "outline" in summary:
-        lines[0] += _outlined(summary["outline"])
-    else:
-        lines[0] += f"{summary['placed']} of {summary['targets']} placed"
-    if (truth := summary["truth"]) and "outline" not in summary:
-        lines[0] += f" (truth: {truth['in_box']} in the box, {truth['on_table']} on the table"
-        lines[0] += f", {truth['elsewhere']} elsewhere)" if truth["elsewhere"] else ")"
+    lines = [f"{summary['cell']}: {summary['state']}, {application.headline(summary)}"]
+    if summary["figures"]:
+        lines.append("  " + ", ".join(f"{name} {value}" for name, value in summary["figures"].items()))
     for place in summary["rejected"]:
         x, y, z = place["position"]
         lines.append(f"  left at ({x:.3f}, {y:.3f}, {z:.3f}): {place['reason']}")
-    figures = [
+    times = [
         f"ready {_seconds(seconds['ready'])}",
         f"first motion {_seconds(seconds['first_motion'])}",
         f"task {_seconds(seconds['task'])}",
         f"moving {_seconds(seconds['moving'])}",
         f"planning {_seconds(seconds['planning'])} in {len(summary['plans'])} plans",
     ]
-    lines.append("  " + ", ".join(figures))
+    lines.append("  " + ", ".join(times))
     if summary["failures"] or summary["retries"]:
         lines.append(f"  {summary['failures']} failures, {summary['retries']} retries")
     if summary["frame_to_target_ms"]["p50"] is not None:
@@ -249,17 +213,6 @@ def describe(summary: dict[str, Any]) -> list[str]:
     if restarted := {name: count for name, count in summary["restarts"].items() if count}:
         lines.append("  started again: " + ", ".join(f"{name} {count} x" for name, count in restarted.items()))
     return lines
-
-
-def _outlined(outline: dict[str, Any]) -> str:
-    """What was traced and how exactly."""
-    if not outline["object"]:
-        return "nothing outlined"
-    text = f"{outline['object']} outlined: {outline['fraction']:.1%} of {outline['length_m']:.3f} m"
-    for what, name in (("deviation_mm", "the true outline"), ("tracking_mm", "the contour")):
-        if figures := outline[what]:
-            text += f", {figures['mean']:.2f} mm from {name} ({figures['max']:.2f} mm at most)"
-    return text
 
 
 def _seconds(value: float | None) -> str:

@@ -5,15 +5,21 @@ The truth is read for this evaluation only.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.applications.outlining.messages import OutlinePoints, OutlineStatus
+from common.applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
 from common.config import RobotConfig
-from common.messages import JointState, WorldObjects
+from common.messages import JointState, TaskStatus, WorldObjects
+from common.reporting import application
+from common.topics import JOINT_STATES, SCENE_OBJECTS, Topic
+
+if TYPE_CHECKING:
+    from common.reporting.gathering import Gathering
 
 Array = NDArray[np.float64]
 
@@ -23,14 +29,79 @@ CLOSED = 1e-3  # [m] first and last place of a closed outline are no farther apa
 MOST_STATES = 100_000  # joint states of one tracing that are kept: a quarter of an hour at 100 Hz
 
 
+class Figures(application.Figures):
+    """The block "outline" of a summary, and what a report shows of the outline."""
+
+    STATE_COLORS: ClassVar = {
+        "SELECTING": "#e6c229", "PLANNING": "#e6c229", "APPROACHING": "#2f7ed8", "TRACING": "#17a398",
+        "RETREATING": "#8d6cc2", "HOMING": "#8d6cc2",
+    }
+
+    def __init__(self, robot: RobotConfig | None = None, *, pictured: bool = False) -> None:
+        """Start with nothing heard; without a robot only what the task itself tells is known."""
+        super().__init__(robot, pictured=pictured)
+        self.traced = Traced(robot)
+
+    def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
+        """The task, the contour, the arm and the truth."""
+        traced = self.traced
+        return {
+            OUTLINE_STATUS: lambda _, status: traced.on_status(status),
+            CONTOUR_PATH: lambda _, path: traced.on_path(path),
+            SCENE_OBJECTS: lambda _, truth: traced.on_truth(truth),
+            **({JOINT_STATES: lambda _, state: traced.on_joints(state)} if self.robot is not None else {}),
+        }
+
+    def exposed(self, message: OutlinePoints) -> int:
+        """Stamp of the picture in which a contour was found; what was given by a file is in none."""
+        return 0 if message.given else message.header.stamp
+
+    def blocks(self) -> dict[str, Any]:
+        """How much of what was traced, and how exactly."""
+        return {"outline": self.traced.figures()}
+
+    def progress(self, status: TaskStatus) -> str:
+        """As "TRACING Object_1, 0.400 m"."""
+        assert isinstance(status, OutlineStatus)
+        return f"{status.state} {status.object}, {status.length_m:.3f} m" if status.object else status.state
+
+    def headline(self, summary: Mapping[str, Any]) -> str:
+        """What was traced and how exactly."""
+        outline = summary["outline"]
+        if not outline["object"]:
+            return "nothing outlined"
+        text = f"{outline['object']} outlined: {outline['fraction']:.1%} of {outline['length_m']:.3f} m"
+        for what, name in (("deviation_mm", "the true outline"), ("tracking_mm", "the contour")):
+            if figures := outline[what]:
+                text += f", {figures['mean']:.2f} mm from {name} ({figures['max']:.2f} mm at most)"
+        return text
+
+    def facts(self, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """The same, each by its name."""
+        outline = summary["outline"]
+        traced = f"{outline['fraction']:.1%} of {outline['length_m']:.3f} m"
+        facts = [("outlined", outline["object"] or "nothing"), ("traced", traced)]
+        for what, name in (("deviation_mm", "from the true edge"), ("tracking_mm", "from the contour")):
+            if figures := outline[what]:
+                facts.append((name, f"{figures['mean']:.2f} mm ({figures['max']:.2f} at most)"))
+        return facts
+
+    def picture(self, run: Gathering, tool: Array) -> application.Section:
+        """The contour that was detected and the way that the tool tip took along it, from above."""
+        return application.Section("outline", "Outline", (
+            f"{self.traced.picture()}<p>{self.traced.figures()['points']} points of the contour; the true edge is "
+            "shown for comparison only.</p>"
+        ))
+
+
 class Traced:
     """Follows one cell that outlines objects; tells of the newest outline."""
 
-    def __init__(self, robot: RobotConfig) -> None:
+    def __init__(self, robot: RobotConfig | None) -> None:
         """Start with nothing seen.
 
         Args:
-            robot: whose tool tip traces.
+            robot: whose tool tip traces; None when that is not known.
         """
         self._robot = robot
         self._status = OutlineStatus()
@@ -79,14 +150,40 @@ class Traced:
             "points": self._status.points,
             "fraction": round(self._fraction(tips), 4),
             "length_m": round(self._status.length_m, 4),
-            "closed": self._status.closed and _is_closed(tips),
+            "closed": self._status.closed and (self._robot is None or _is_closed(tips)),
             "deviation_mm": _millimetres(min(near, key=lambda d: float(d.mean()), default=None)),
             "tracking_mm": _millimetres(distances(tips, path) if len(tips) and len(path) > 1 else None),
         }
 
+    def picture(self) -> str:
+        """The contour, the true edges and the way of the tool tip from above, as an `svg` element."""
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+
+        from common.reporting.figures import LINES, QUIET, STYLE, from_above, svg
+
+        contour, tips, edges = self._path_points(), self._tips(), self._outlines()
+        with mpl.rc_context(STYLE):
+            figure = Figure(figsize=(7.5, 6.0), layout="constrained")
+            axes = figure.subplots()
+            lines = [(edge, QUIET, 0.8, 1.0, "true edge") for edge in edges]
+            lines += [(contour, "#e6a229", 3.0, 0.7, "detected contour")] if len(contour) else []
+            for line, color, width, alpha, label in lines:
+                closed = np.vstack([line, line[:1]])
+                axes.plot(closed[:, 1], closed[:, 0], color=color, linewidth=width, alpha=alpha, label=label)
+            if len(tips):
+                axes.plot(tips[:, 1], tips[:, 0], color=LINES[0], linewidth=1.0, label="traced")
+            shown = [part[:, :2] for part in (contour, tips) if len(part)]
+            if shown:
+                low, high = np.vstack(shown).min(axis=0) - 0.03, np.vstack(shown).max(axis=0) + 0.03
+                axes.set_xlim(low[1], high[1])
+                axes.set_ylim(low[0], high[0])
+            from_above(figure, axes)
+            return svg(figure, "outline")
+
     def _fraction(self, tips: Array) -> float:
         """How much of the contour was traced; what the status tells is how much of it was planned."""
-        if self._status.closed or not self._status.length_m:
+        if self._status.closed or not self._status.length_m or self._robot is None:
             return self._status.fraction
         way = float(np.linalg.norm(np.diff(tips, axis=0), axis=1).sum()) if len(tips) > 1 else 0.0
         return min(self._status.fraction, way / self._status.length_m)
@@ -94,7 +191,7 @@ class Traced:
     def _tips(self) -> Array:
         """Places (N, 3) [m] of the tool tip while it traced."""
         began, ended = self._began, self._ended
-        if began is None:
+        if began is None or self._robot is None:
             return np.zeros((0, 3))
         from common.robot.model import RobotModel  # takes as long to load as all else: only when it is needed
 

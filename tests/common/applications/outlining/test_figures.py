@@ -11,15 +11,17 @@ import pytest
 
 from common import messages as m
 from common import topics
+from common.application import Application
+from common.applications.outlining.figures import Figures, Traced, distances
 from common.applications.outlining.messages import OutlinePoints, OutlineStatus
 from common.applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
 from common.config import load_cell
+from common.reporting.fold import Fold
+from common.reporting.summary import describe
 from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
 from common.supervision.collector import Collector
-from common.supervision.summary import Summary, describe, progress_line
-from common.supervision.traced import Traced, distances
 from common.transport.local import LocalNetwork
 
 CELL = load_cell("ur5")
@@ -127,16 +129,30 @@ def test_distance_from_a_closed_polyline_counts_its_last_side_too() -> None:
 
 
 def test_progress_of_an_outline_in_one_line() -> None:
-    assert progress_line(status("TRACING", 1)) == "TRACING Object_1, 0.400 m"
-    assert progress_line(OutlineStatus(started=True, state="SELECTING")) == "SELECTING"
+    assert Figures().progress(status("TRACING", 1)) == "TRACING Object_1, 0.400 m"
+    assert Figures().progress(OutlineStatus(started=True, state="SELECTING")) == "SELECTING"
+
+
+def test_without_its_robot_what_the_task_tells_is_all_that_is_known() -> None:
+    told = Figures()
+    told.hears()[OUTLINE_STATUS](0.0, status("DONE", 1, closed=True, fraction=0.75))
+    outline = told.blocks()["outline"]
+    assert outline["object"] == "Object_1" and outline["closed"] and outline["fraction"] == 0.75
+    assert outline["deviation_mm"] is None and outline["tracking_mm"] is None
+
+
+def test_an_outline_that_a_file_gave_is_no_picture() -> None:
+    assert Figures().exposed(path(stamp=5)) == 5
+    assert Figures().exposed(path(stamp=5).model_copy(update={"given": True})) == 0
 
 
 async def test_collector_follows_an_outline_to_its_end() -> None:
     net = LocalNetwork()
     cell = net.bus("cell", cell="test")
-    summary = Summary("test", 0, 1.0)
+    fold = Fold("test", Application("outlining"), robot=CELL.robot)
+    assert isinstance(fold.figures, Figures)
     bus, lines = net.bus("supervisor", cell="test"), asyncio.Queue[str]()
-    collector = Collector(bus, "contour_tracer", summary, 0.0, lines.put_nowait, CELL.robot)
+    collector = Collector(bus, fold, 0.0, lines.put_nowait)
     listening = asyncio.create_task(collector.run())
     cell.writer(topics.SCENE_OBJECTS).put(truth())
     statuses, states = cell.writer(OUTLINE_STATUS), cell.writer(topics.JOINT_STATES)
@@ -147,15 +163,15 @@ async def test_collector_follows_an_outline_to_its_end() -> None:
             assert state in await lines.get()
         for k, (x, y) in enumerate([*SQUARE, SQUARE[0]]):
             states.put(joints_at(x, y, TOP, 21 + k))
-            while len(summary.traced._states) <= k:  # type: ignore[union-attr]  # noqa: ASYNC110
+            while len(fold.figures.traced._states) <= k:  # noqa: ASYNC110
                 await asyncio.sleep(0.001)
         statuses.put(status("DONE", 30, closed=True))
         await collector.ended.wait()
     listening.cancel()
-    figures = summary.as_dict()
+    figures = fold.summary.as_dict()
     assert figures["outline"]["closed"]
     assert figures["outline"]["deviation_mm"]["max"] < 0.02
-    assert describe(figures)[0].startswith("test: DONE, Object_1 outlined: 100.0% of 0.400 m, 0.0")
+    assert describe(figures, fold.figures)[0].startswith("test: DONE, Object_1 outlined: 100.0% of 0.400 m, 0.0")
 
 
 def test_trace_that_was_interrupted_counts_as_far_as_it_went_however_much_was_planned() -> None:
