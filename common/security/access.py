@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from common.application import all_topics
 from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, parameters_of
 from common.transport.credentials import OBSERVER, OPERATOR, ROUTER_NAME, common_name
-from common.transport.keys import alive_key, serves_key
+from common.transport.keys import alive_key, owns_key, serves_key
 
 MESSAGES = [
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
@@ -114,7 +114,8 @@ def _rules(cell: str, process: str, rights: Rights) -> Iterable[dict[str, Any]]:
     written, answered = in_cell["write"] + in_cell["keep"], in_cell["keep"] + in_cell["serve"]
     asked = sorted({*in_cell["get"], *in_cell["call"]})
     own = [alive_key(cell, process), *(serves_key(cell, key, process) for key in sorted(rights.serve))]
-    everyone = [f"{cell}/alive/*", f"{cell}/serves/**"]
+    own += [owns_key(cell, key, service=process) for key in sorted({*rights.write, *rights.keep, *rights.serve})]
+    everyone = [f"{cell}/alive/*", f"{cell}/serves/**", f"{cell}/owns/**"]
     for name, flow, messages, keys in (
         ("writes", "ingress", ["put", "delete"], written),
         ("hears of readers", "egress", ["declare_subscriber"], written),

@@ -14,10 +14,12 @@ from common import topics
 from common.clock import Clock
 from common.messages import Header, Message, ServiceCounters
 from common.remapping import Remapping
+from common.sources import new_id
 from common.topics import PublishedKind, Request, Topic
 from common.transport.codec import DEFAULT_LIMIT
 from common.transport.handoff import Doorbell, call_on_loop
-from common.transport.keys import alive_key, serves_key
+from common.transport.keys import alive_key, owns_key, serves_key
+from common.transport.ownership import SHARED, Owner, require_only
 from common.transport.reader import Reader
 from common.transport.requests import Client, Server
 from common.transport.session import Declared, Publisher, RawReply, RawSample, Session
@@ -69,6 +71,8 @@ class Bus:
         self._raw_states: list[RawWriter] = []
         self._servers: list[Server[Any, Any]] = []
         self._tokens: list[Declared] = []
+        self._process = new_id()
+        self._owned: dict[str, Owner] = {}  # by key
         self._watches: dict[str, TokenWatch] = {}
         self._heard: dict[Reader[Any], Declared] = {}  # readers that are subscribed
         self._retuned: list[Callable[[], None]] = []
@@ -115,7 +119,9 @@ class Bus:
 
     def writer(self, topic: Topic[M]) -> Writer[M]:
         """A writer of the topic."""
-        writer = Writer(self._session, self.cell, self.service, self._in_cell(topic))
+        written = self._in_cell(topic)
+        writer = Writer(self._session, self.cell, self.service, written)
+        self._own(written.key, topic.key)
         self._writers.append(writer)
         return writer
 
@@ -125,6 +131,7 @@ class Bus:
         The handler raises `Refused` to refuse one; any other exception is told to the requester and ends the service.
         """
         served = self._in_cell(topic)
+        self._own(served.key, topic.key)
         self._servers.append(
             Server(
                 self._session, self.cell, self.service, served, handler, loop=self._loop, log=self.log,
@@ -155,17 +162,28 @@ class Bus:
             callback()
 
     async def ready(self) -> None:
-        """Tell the cell that this service is ready: what it serves first, its own token last.
+        """Tell the cell that this service is ready: what it writes and serves first, its own token last.
 
         Raises:
-            ConfigError: a key was to be renamed that the service does not have.
+            ConfigError: somebody else writes or serves the same, or a key was to be renamed that the service has not.
         """
         self._remapping.require_used(self.service)
+        for owner in self._owned.values():
+            self._declare_token(f"{self.cell}{owner.token}")
+        await require_only(self._owned, self.owners)
         self._counters = Writer(self._session, self.cell, self.service, topics.COUNTERS)
         for server in self._servers:
             self._declare_token(serves_key(self.cell, server.topic.key, self.service))
         self.ready_event.set()
         self._declare_token(alive_key(self.cell, self.service))
+
+    def _own(self, key: str, own: str) -> None:
+        """Take note that a key is written or served here."""
+        if key in SHARED or key in self._owned:
+            return
+        self._owned[key] = Owner(key, own, self.service, self._process)
+        if self.ready_event.is_set():
+            self._declare_token(f"{self.cell}{self._owned[key].token}")
 
     def _watch(self, key: str) -> TokenWatch:
         # One for each key: a second would be answered from what the first has seen so far, which may be nothing yet.
@@ -189,6 +207,11 @@ class Bus:
         if self._alive is None:
             self._alive = Alive(self._watch(alive_key(self.cell)))
         return self._alive
+
+    async def owners(self) -> list[Owner]:
+        """Who writes or serves what in the cell now: services that are ready or just become so."""
+        found = [Owner.of(token) for token in await self.raw_tokens(owns_key(self.cell))]
+        return sorted(found, key=lambda owner: (owner.service, owner.key))
 
     def header(self, frame_id: str = "") -> Header:
         """A header with the cell time of now."""

@@ -10,6 +10,11 @@ def alive_key(cell: str, service: str = "*") -> str:
     return f"{cell}/alive/{service}"
 
 
+def owns_key(cell: str, key: str = "*", own: str = "*", service: str = "*", process: str = "*") -> str:
+    """Key of the token with which a process says that it writes or serves a key, under a word of its own."""
+    return f"{cell}/owns/{key.replace('/', '|')}/{own.replace('/', '|')}/{service}/{process}"
+
+
 def serves_key(cell: str, key: str, service: str = "*") -> str:
     """Key of the token with which a service says that it serves a request key."""
     return f"{cell}/serves/{key}/{service}"

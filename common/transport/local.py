@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from typing import Any, Literal
 
@@ -273,6 +273,6 @@ class LocalNetwork:
         return LocalSession(self)
 
     def bus(self, service: str = "tester", *, cell: str = "test", clock: Clock | None = None,
-            limit: int = DEFAULT_LIMIT) -> Bus:
+            limit: int = DEFAULT_LIMIT, topics: Mapping[str, str] | None = None) -> Bus:
         """A bus on this network; made on a running loop."""
-        return Bus(self.session(), service=service, cell=cell, clock=clock or Clock(), limit=limit)
+        return Bus(self.session(), service=service, cell=cell, clock=clock or Clock(), limit=limit, topics=topics)

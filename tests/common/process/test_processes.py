@@ -211,7 +211,7 @@ async def reach(stage: Stage, state: str) -> list[subprocess.Popen[bytes]]:
             await stage.connected(toy)
         return toys
     mode = state if state in ("busy", "stubborn") else "serve"
-    toys = [stage.toy(mode=mode) for _ in range(2)]
+    toys = [stage.toy(mode=mode), stage.toy("--set", "cell=another", mode=mode)]  # one cell has only one of it
     for toy in toys:
         await stage.said(toy, "is ready")
     if state == "router dead":

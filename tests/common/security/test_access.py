@@ -44,7 +44,9 @@ def test_a_service_may_do_exactly_what_it_declares() -> None:
     assert camera["writes"] == {"panda/camera/image_raw", "panda/camera/camera_info", "panda/log", "panda/counters"}
     assert camera["answers"] == {"panda/camera/camera_info", "panda/param/camera"}
     assert camera["reads"] == camera["asks"] == {"panda/scene_balls"}
-    assert camera["is there"] == {"panda/alive/camera", "panda/serves/param/camera/camera"}
+    owned = ("camera|image_raw", "camera|camera_info", "log", "counters", "param|camera")
+    assert camera["is there"] == {"panda/alive/camera", "panda/serves/param/camera/camera",
+                                  *(f"panda/owns/{key}/*/camera/*" for key in owned)}
 
 
 def test_who_calls_may_ask_and_who_serves_may_answer() -> None:

@@ -1,0 +1,107 @@
+"""A key is written or served by one service: the second finds out when it becomes ready, over Zenoh and in process."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from common import topics
+from common.errors import ConfigError
+from common.messages import TaskCommand, TaskStatus
+from common.transport import ownership
+from common.transport.bus import Bus
+from common.transport.local import LocalNetwork
+from common.transport.ownership import Owner
+
+NewBus = Callable[..., Awaitable[Bus]]
+
+
+async def obey(_: TaskCommand) -> TaskStatus:
+    return TaskStatus()
+
+
+@pytest.fixture(autouse=True)
+def _hurry(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ownership, "GIVE_UP", 0.0)
+
+
+async def test_second_writer_is_refused_with_both_names_and_a_remedy(new_bus: NewBus) -> None:
+    left, right = await new_bus("left_camera"), await new_bus("right_camera")
+    for bus in (left, right):
+        bus.writer(topics.CAMERA_INFO)
+    await left.ready()
+    with pytest.raises(ConfigError) as refused:
+        await right.ready()
+    assert str(refused.value) == (
+        "services.right_camera: left_camera has camera/camera_info already, and a key is written or served by one "
+        "service: give right_camera or left_camera keys of its own, as in topics: {camera/*: right_camera/*}")
+    assert (await left.alive.known()) == {"left_camera"}
+
+
+async def test_second_server_is_refused_and_so_is_a_second_process_of_one_name(new_bus: NewBus) -> None:
+    first, second = await new_bus("task"), await new_bus("task")
+    for bus in (first, second):
+        bus.serve(topics.TASK_COMMAND, obey)
+    await first.ready()
+    with pytest.raises(ConfigError, match=r"services\.task: another task is up, which has task/command already"):
+        await second.ready()
+
+
+async def test_what_all_services_write_has_no_owner_and_readers_are_none(new_bus: NewBus) -> None:
+    writer, reader = await new_bus("writer"), await new_bus("reader")
+    for bus in (writer, reader):
+        for shared in (topics.LOG, topics.COUNTERS, topics.SUPERVISOR_STATUS):
+            bus.writer(shared)
+    writer.writer(topics.CAMERA_IMAGE)
+    reader.reader(topics.CAMERA_IMAGE)
+    await writer.ready()
+    await reader.ready()
+    found = await reader.owners()
+    assert [(owner.key, owner.own, owner.service) for owner in found] == [
+        ("camera/image_raw", "camera/image_raw", "writer")]
+
+
+async def test_second_writer_waits_for_the_first_to_go(new_bus: NewBus, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ownership, "GIVE_UP", 20.0)
+    before, after = await new_bus("camera"), await new_bus("camera")
+    for bus in (before, after):
+        bus.writer(topics.CAMERA_IMAGE)
+    await before.ready()
+    looked, look = asyncio.Event(), after.owners
+
+    async def owners() -> list[Owner]:
+        found = await look()
+        looked.set()
+        return found
+
+    monkeypatch.setattr(after, "owners", owners)
+    becoming = asyncio.create_task(after.ready())
+    await looked.wait()
+    assert not becoming.done()
+    await before.close()
+    await asyncio.wait_for(becoming, 20)
+
+
+async def test_of_two_that_start_at_once_never_are_both_ready(new_bus: NewBus) -> None:
+    buses = [await new_bus(f"camera_{number}") for number in range(2)]
+    for bus in buses:
+        bus.writer(topics.CAMERA_IMAGE)
+    ended = await asyncio.gather(*(bus.ready() for bus in buses), return_exceptions=True)
+    assert any(isinstance(each, ConfigError) for each in ended)
+
+
+async def test_keys_are_told_under_the_name_in_the_cell_with_the_own_word() -> None:
+    net = LocalNetwork()
+    camera = net.bus("left", topics={"camera/*": "left/camera/*"})
+    camera.writer(topics.CAMERA_IMAGE)
+    await camera.ready()
+    camera.writer(topics.CAMERA_INFO)  # later, as few do
+    assert {(owner.key, owner.own) for owner in await net.bus("tool").owners()} == {
+        ("left/camera/image_raw", "camera/image_raw"), ("left/camera/camera_info", "camera/camera_info")}
+
+
+def test_token_says_who_holds_it() -> None:
+    owner = Owner("left/image_raw", "camera/image_raw", "left", "a1")
+    assert Owner.of(f"panda{owner.token}") == owner
