@@ -6,7 +6,7 @@ import asyncio
 import importlib
 import logging
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import TypeVar
@@ -89,9 +89,12 @@ class _WatchedClient(Client[Q, A]):
 class VirtualBus(Bus):
     """A bus of whose requests is noted how they end, with a log of its own."""
 
-    def __init__(self, session: VirtualSession, service: str, cell: str, clock: Clock, noted: Requests) -> None:
+    def __init__(
+        self, session: VirtualSession, service: str, cell: str, clock: Clock, noted: Requests,
+        topics: Mapping[str, str] | None = None,
+    ) -> None:
         """Take a place in a cell."""
-        super().__init__(session, service=service, cell=cell, clock=clock)
+        super().__init__(session, service=service, cell=cell, clock=clock, topics=topics)
         self.session = session
         self.log = logging.Logger(service, logging.INFO)  # known to nobody else in this process
         self.log.addHandler(BusLog(self))
@@ -99,9 +102,10 @@ class VirtualBus(Bus):
 
     def client(self, topic: Request[Q, A]) -> Client[Q, A]:
         """A client of the request key."""
-        servers = self._watch(serves_key(self.cell, topic.key))
+        asked = self._in_cell(topic)
+        servers = self._watch(serves_key(self.cell, asked.key))
         client = _WatchedClient(
-            self._session, self.cell, self.service, topic, servers, loop=self._loop, limit=self._limit
+            self._session, self.cell, self.service, asked, servers, loop=self._loop, limit=self._limit
         )
         client.noted = self._noted
         return client
@@ -199,7 +203,7 @@ class VirtualProcess:
         module: ModuleType = importlib.import_module(self._entry.module)
         config = service_config(host.cell, self.name, module.Config)
         clock = SkewedClock(host.clock, round(host.skews.get(self.name, 0.0) * 1e9))
-        self.bus = bus = VirtualBus(session, self.name, host.cell.name, clock, host.requests)
+        self.bus = bus = VirtualBus(session, self.name, host.cell.name, clock, host.requests, self._entry.topics)
         bus.log.addHandler(_Tail(self._say))
         try:
             return await serve(module.run, bus, config, self._ending)
