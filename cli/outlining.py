@@ -146,11 +146,12 @@ def _stages(cell: Cell, place: Path, wanted: OutlineSelect, *, keep: bool) -> No
     from common.applications.outlining.legs import Legs
     from common.applications.outlining.offline import perceive, plan_outline
     from common.applications.outlining.scene import planning_scene
+    from common.applications.outlining.task import Config
     from common.config import Surroundings, service_config
     from common.perception.pinhole import Pinhole
     from common.planning.pipeline import PlanningPipeline
     from common.robot.model import RobotModel
-    from services import contour_detector, contour_tracer, duplicate_remover, pixel_to_world
+    from services import contour_detector, duplicate_remover, pixel_to_world
 
     around = cell.section(Surroundings)
     assert isinstance(around, Surroundings)
@@ -172,7 +173,7 @@ def _stages(cell: Cell, place: Path, wanted: OutlineSelect, *, keep: bool) -> No
     else:
         stage_files.write_points(place / stage_files.CLEARED, cleared)
     typer.echo(f"{found.label}: {len(found.pixels)} pixels, {len(cleared)} points to trace; the stages are in {place}")
-    parameters = service_config(cell, "contour_tracer", contour_tracer.Config)
+    parameters = service_config(cell, "contour_tracer", Config)
     assert parameters.robot.gripper is not None  # the tracer needs one as well
     pipeline = PlanningPipeline(RobotModel.load(cell.robot), cell.motion, cell.pipeline, seed=cell.run.seed)
     scene = planning_scene(around, found.solids, 1)

@@ -5,14 +5,19 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from common import messages as m
 from common import topics
 from common.errors import RemoteError
 from common.process.persist import persist
-from common.sources import monotonic
-from common.tasks.reliance import LOOK_PERIOD, Reliance
+from common.robot.model import RobotModel
+from common.robot.transforms import matrix_to_pose
+from common.sources import monotonic, new_id
+from common.tasks.engine import Task, TaskConfig
+from common.tasks.stages import Command, View
+from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
+from common.topics import Topic
 from common.transport.bus import Bus
 from common.transport.reader import Reader
 from common.transport.requests import Client
@@ -26,35 +31,78 @@ PLAN_OVERTIME = 5.0  # [s] wall: that a plan may take beyond its planning time
 LONGEST_STEP = LOOK_PERIOD  # [s] wall: time passes too
 WAITS = "the arm waits: "
 
-Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
+C = TypeVar("C", bound=TaskConfig)
+S = TypeVar("S", bound=m.TaskStatus)
+V = TypeVar("V", bound=View)
+V_contra = TypeVar("V_contra", bound=View, contravariant=True)
 
 
-class Task(Protocol):
-    """A state machine that is fed with what is known and answers with what it wants done."""
+async def run_task(
+    bus: Bus, config: C, make: Callable[[C, S, str, float], Task[V]], status: Topic[S], view: Callable[..., V],
+    **reads: Topic[Any],
+) -> None:
+    """Be the service of a task: step it whenever something is heard, and at least 20 times a second.
+
+    Args:
+        bus: of the service.
+        config: of the task.
+        make: the class of the task.
+        status: where it says how far it is.
+        view: the class of what it knows: `View`, or one of the application's own.
+        reads: by the name of a field of that view, the topic whose newest message stands in it.
+    """
+    scene, gripper = bus.reader(topics.PLANNING_SCENE), bus.reader(topics.GRIPPER_STATE)
+    motion, joints = bus.reader(topics.MOTION_STATUS), bus.reader(topics.JOINT_STATES)
+    own = {name: bus.reader(topic) for name, topic in reads.items()}
+    out = bus.writer(status)
+    robot = RobotModel.load(config.robot)
+    task = make(config, status.message(), new_id(), bus.clock.speed)
+    known = view(now=bus.clock.now())
+
+    def look() -> V:
+        known.now = bus.clock.now()
+        known.scene, known.motion = scene.latest, motion.latest
+        known.gripper = gripper.latest if config.robot.gripper is not None else m.GripperState()
+        for name, reader in own.items():
+            setattr(known, name, reader.latest)
+        measured = joints.latest
+        q = robot.order(measured.name, measured.position) if measured else None
+        if q is not None:
+            known.q, known.tcp = q.tolist(), matrix_to_pose(robot.fk(q))
+        return known
+
+    watchdog = LivenessWatchdog(lambda: joints.received, lambda: config.joint_states_timeout)
+    runner = TaskRunner(bus, task, look, out, lambda: config.planning_time, watchdog)
+    await bus.ready()
+    await runner.run((*own.values(), scene, gripper, motion))
+
+
+class Stepped(Protocol[V_contra]):
+    """A state machine that is fed with what is known and answers with what it wants done, as `Task` is."""
 
     @property
     def status(self) -> m.TaskStatus:
         """How far it is."""
 
-    def step(self, view: Any) -> list[Command]:
+    def step(self, view: V_contra) -> list[Command]:
         """What to ask for now."""
 
-    def command(self, command: str, view: Any) -> list[Command]:
+    def command(self, command: str, view: V_contra) -> list[Command]:
         """Do what a person says."""
 
-    def on_plan(self, response: m.PlanResponse, view: Any) -> None:
+    def on_plan(self, response: m.PlanResponse, view: V_contra) -> None:
         """Take in a plan."""
 
-    def on_goal(self, answer: m.MotionStatus | m.GripperState, view: Any) -> None:
+    def on_goal(self, answer: m.MotionStatus | m.GripperState, view: V_contra) -> None:
         """Take in whether a goal was accepted."""
 
 
-class TaskRunner:
+class TaskRunner(Generic[V]):
     """Steps a task, sends what it asks for and brings the answers back."""
 
     def __init__(
-        self, bus: Bus, task: Task, look: Callable[[], Any], status: Writer[Any], planning_time: Callable[[], float],
-        reliance: Reliance | None = None,
+        self, bus: Bus, task: Stepped[V], look: Callable[[], V], status: Writer[Any],
+        planning_time: Callable[[], float], watchdog: LivenessWatchdog | None = None,
     ) -> None:
         """Declare the requests of a task and the command that it serves.
 
@@ -64,13 +112,13 @@ class TaskRunner:
             look: what is known now.
             status: where the task's status goes.
             planning_time: that the task asks for now [s, wall].
-            reliance: holds the arm while those are missing that the task relies on.
+            watchdog: holds the arm while those are missing that the task relies on.
         """
         self._task, self._look, self._status, self._bus = task, look, status, bus
         self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
         self._stop, self._grip = bus.client(topics.MOTION_STOP), bus.client(topics.GRIPPER_COMMAND)
         self._hold = bus.client(topics.MOTION_HOLD)
-        self._planning_time, self._reliance = planning_time, reliance
+        self._planning_time, self._watchdog = planning_time, watchdog
         self._woken = asyncio.Event()
         self._told: list[Command] = []
         self._asking: dict[str, asyncio.Task[None]] = {}  # the newest of each kind
@@ -94,13 +142,13 @@ class TaskRunner:
                     self._begin(group, command)
                 self._tell()
 
-    def _mind(self, view: Any) -> list[m.HoldRequest]:
+    def _mind(self, view: V) -> list[m.HoldRequest]:
         """The holds to ask for, because something is missing or is back again; the view has what is missing."""
-        if self._reliance is None:
+        if self._watchdog is None:
             return []
         serving = {client.topic.writer: client.available for client in (self._plan, self._execute)}
-        holds = self._reliance.look(monotonic(), serving, view.motion)
-        view.trouble = self._reliance.trouble
+        holds = self._watchdog.look(monotonic(), serving, view.motion)
+        view.trouble = self._watchdog.trouble
         return holds
 
     async def _obey(self, command: m.TaskCommand) -> m.TaskStatus:
@@ -116,7 +164,7 @@ class TaskRunner:
     def _tell(self) -> None:
         """Publish the status when more of it has changed than the time."""
         now, before = self._task.status, self._before
-        trouble = self._reliance.trouble if self._reliance else ""
+        trouble = self._watchdog.trouble if self._watchdog else ""
         if trouble and now.state not in ("DONE", "ERROR"):
             now.message = f"{WAITS}{trouble}"
         elif now.message.startswith(WAITS):

@@ -3,68 +3,30 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 from pydantic import Field
 
 from common import messages as m
-from common.applications.outlining.messages import OutlinePoints, OutlineState
+from common.applications.outlining.messages import OutlinePoints
 from common.config import GripperConfig, Number, Parameters, Tunable
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
+from common.tasks.stages import Cycle, Move, Place, View, place_of
 
-Place = tuple[float, float, float]
 NEAR = 0.01  # [m] an object that was perceived is this exact
 
 
-@dataclass(eq=False)
-class Leg:
-    """A motion of the arm; `trajectory` is there once it was planned. `touches` are pairs that may touch in it."""
-
-    name: str
-    state: OutlineState
-    goal: m.PoseGoal | m.PathGoal | m.JointGoal
-    straight: bool = False
-    touches: list[tuple[str, str]] = field(default_factory=list)
-    trajectory: m.JointTrajectory | None = None
-
-    def end(self) -> list[float]:
-        """Joint positions [rad] at its end; empty when it is not planned."""
-        return self.trajectory.points[-1].positions if self.trajectory else []
-
-    @property
-    def seconds(self) -> float:
-        """How long it takes, cell time."""
-        return self.trajectory.points[-1].time_from_start if self.trajectory else 0.0
-
-
-@dataclass(eq=False)
-class Close:
-    """The fingers come together: they trace closed."""
-
-    name = "close"
-    state: OutlineState = "PLANNING"
-
-
 @dataclass
-class OutlineView:
-    """What the task knows at an instant: only what was perceived or reported. Times are cell time [s]."""
+class OutlineView(View):
+    """What the task knows, and the path along the contour that was chosen."""
 
-    now: float
     path: OutlinePoints | None = None
-    scene: m.PlanningScene | None = None
-    gripper: m.GripperState | None = None
-    motion: m.MotionStatus | None = None
-    q: list[float] | None = None
-    tcp: m.Pose | None = None
-    trouble: str = ""  # why no motion may begin
 
     @property
-    def missing(self) -> list[str]:
-        """Topics that have not said anything yet, without which nothing can be done."""
-        known = {"gripper/state": self.gripper, "planning_scene": self.scene, "joint_states": self.q,
-                 "motion/status": self.motion}
-        return [key for key, value in known.items() if value is None]
+    def stamps(self) -> tuple[float, ...]:
+        """When the picture was taken in which the contour was found [s]."""
+        return (self.path.header.stamp * 1e-9 if self.path else 0.0,)
 
     def solid(self) -> str | None:
         """Id of the perceived object that the path goes round; None while the planning scene does not have it.
@@ -73,7 +35,7 @@ class OutlineView:
         """
         if self.path is None or self.scene is None or self.scene.header.stamp < self.path.header.stamp:
             return None
-        places = [(p.position.x, p.position.y, p.position.z) for p in self.path.poses]
+        places = [place_of(pose) for pose in self.path.poses]
         beside = {o.id: sum(_beside(o, at) for at in places) for o in self.scene.objects if o.role == "target"}
         if self.path.given:
             return max((name for name, count in beside.items() if count), key=beside.__getitem__, default="")
@@ -97,7 +59,7 @@ def _area(thing: m.CollisionObject) -> float:
 
 def closed(path: OutlinePoints) -> list[Place]:
     """The points of a path [m] and the first once more."""
-    points = [(p.position.x, p.position.y, p.position.z) for p in path.poses]
+    points = [place_of(pose) for pose in path.poses]
     return [*points, points[0]]
 
 
@@ -130,32 +92,25 @@ class Legs:
     p: TracingParameters
     gripper: GripperConfig
 
-    def outline(self, points: list[Place], solid: str) -> list[Leg]:
+    def outline(self, points: list[Place], solid: str, cycle: Cycle) -> list[Move]:
         """Above the first point, down, along all points, up, home."""
         x, y, z = points[0]
         touches = [(link, solid) for link in self.gripper.links] if solid else []
         trace = m.PathGoal(waypoints=[self._pose(p) for p in points], step=self.p.step,
                            min_fraction=self.p.min_fraction, tool_speed=self.p.tool_speed)
         above = m.PoseGoal(pose=self._pose((x, y, z + self.p.approach_clearance)))
+        down = m.PoseGoal(pose=self._pose(points[0]))
         return [
-            Leg("approach", "APPROACHING", above),
-            Leg("descend", "APPROACHING", m.PoseGoal(pose=self._pose(points[0])), straight=True, touches=touches),
-            Leg("trace", "TRACING", trace, touches=touches),
-            Leg("retreat", "RETREATING", above, straight=True, touches=touches),
-            self.home(),
+            Move("approach", "APPROACHING", cycle, goal=above, fresh=True, whole=True),
+            Move("descend", "APPROACHING", cycle, goal=down, straight=True, touches=touches),
+            Move("trace", "TRACING", cycle, goal=trace, touches=touches),
+            Move("retreat", "RETREATING", cycle, goal=above, straight=True, touches=touches),
+            self.home(cycle),
         ]
 
-    def home(self) -> Leg:
+    def home(self, cycle: Cycle) -> Move:
         """To the pose from which the camera sees everything."""
-        return Leg("home", "HOMING", m.JointGoal(named="home"))
-
-    def retreat(self, tcp: m.Pose, scene: m.PlanningScene, contact: tuple[str, str] | None = None) -> Leg:
-        """Straight up from where the tool is, whatever its finger tips touch there now."""
-        at = tcp.position
-        pose = tcp.model_copy(update={"position": m.Vector3(x=at.x, y=at.y, z=at.z + self.p.approach_clearance)})
-        touches = [(link, o.id) for link in self.gripper.links for o in scene.objects if o.role == "target"]
-        return Leg("retreat", "RETREATING", m.PoseGoal(pose=pose), straight=True,
-                   touches=[*touches, *([contact] if contact else [])])
+        return Move("home", "HOMING", cycle, goal=m.JointGoal(named="home"))
 
     def _pose(self, at: Place) -> m.Pose:
         x, y, z = at

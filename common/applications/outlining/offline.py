@@ -12,7 +12,7 @@ from common import messages as m
 from common.applications.outlining.contours import ContourOptions, find_contours, is_hole
 from common.applications.outlining.contours_choice import NoSuchContour, choose
 from common.applications.outlining.duplicates import simplified, without_duplicates
-from common.applications.outlining.legs import Leg, Legs, OutlineView, closed
+from common.applications.outlining.legs import Legs, OutlineView, closed
 from common.applications.outlining.messages import Contour, OutlinePoints, OutlineSelect
 from common.applications.outlining.perceived_solids import PerceivedSolid, perceived_solids
 from common.applications.outlining.top_face import TopFaceOptions, top_face
@@ -20,6 +20,7 @@ from common.errors import ZencellError
 from common.perception.depth import Depth, check_depth
 from common.perception.pinhole import Pinhole
 from common.planning.pipeline import PlanningPipeline
+from common.tasks.stages import Cycle, Move
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -79,7 +80,7 @@ def perceive(
 
 def plan_outline(
     pipeline: PlanningPipeline, legs: Legs, points: Array, label: str, scene: m.PlanningScene, *, given: bool
-) -> list[tuple[Leg, m.PlanResponse]]:
+) -> list[tuple[Move, m.PlanResponse]]:
     """All motions of outlining points (n, 3) [m], from home to home, each planned from the end of the one before.
 
     Args:
@@ -100,7 +101,7 @@ def plan_outline(
         raise Impossible(f"{label}: nothing in the planning scene lies within the outline")
     end: Sequence[float] = pipeline.robot.named("home").tolist()
     planned = []
-    for leg in legs.outline(closed(path), solid):
+    for leg in legs.outline(closed(path), solid, Cycle(label)):
         response = pipeline.plan(m.PlanRequest(
             id=leg.name, stage=leg.name, start=list(end), goal=leg.goal, straight=leg.straight,
             allowed_collisions=leg.touches,

@@ -1,42 +1,93 @@
-"""Which ball comes next: the nearest that is seen, validated, reachable between its neighbours, and not given up."""
+"""Which ball comes next, and which way the hand is turned for it.
+
+The nearest that is seen, validated, not given up, and that the open fingers can reach between its neighbours.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from common import messages as m
-from common.applications.pick_place.grasp import grasp_yaws
-from common.applications.pick_place.parameters import PickPlaceParameters
-from common.applications.pick_place.stages import Cycle, Place, Spots, Target, View, appeared, same_place
+from common.applications.pick_place.parameters import Config, HandShape
 from common.config import Container
+from common.tasks.engine import appeared
+from common.tasks.stages import Cycle, Place, View, place_of
 
+Spots = list[tuple[float, float]]
 FULL = "the container is full"
 SETTLING = 1.5  # [s] from letting go until the ball lies in the container and was seen there
+
+
+@dataclass
+class Target:
+    """An object that was seen: its place [m] in world, and its track id in the planning scene."""
+
+    id: str
+    position: Place
+
+
+@dataclass(eq=False)
+class Pick(Cycle):
+    """Taking one object to the container, and the yaws that are still to be tried for it."""
+
+    target: Target = field(kw_only=True)
+    yaws: list[float] = field(default_factory=list, kw_only=True)
+    first_error: str = ""
+
+    def __post_init__(self) -> None:
+        """Its subject is the target."""
+        self.subject = self.target.id
+
+
+@dataclass
+class PickPlaceView(View):
+    """What the task knows, and `seen`: the places that were validated in the newest picture."""
+
+    seen: m.PoseArray | None = None
+
+    @property
+    def targets(self) -> list[Place]:
+        """Where something was seen that may be taken, in world [m]."""
+        return [place_of(pose) for pose in self.seen.poses] if self.seen else []
+
+    @property
+    def stamps(self) -> tuple[float, ...]:
+        """When the picture was taken of which the targets are, and that of which the planning scene is [s]."""
+        return (self.seen.header.stamp * 1e-9 if self.seen else 0.0), self.scene_stamp
+
+    def balls(self) -> list[Target]:
+        """Balls on the table according to the planning scene, reachable or not."""
+        return [Target(o.id, place_of(o.pose)) for o in self.objects("target")]
+
+    def spots(self, but: Target | None, radius: float) -> Spots:
+        """(x, y) of the balls on the table, without the one in work."""
+        return [b.position[:2] for b in self.balls() if but is None or not same_place(b.position, but.position, radius)]
 
 
 class Choice:
     """Chooses targets and remembers which places were missed or given up."""
 
-    def __init__(self, parameters: PickPlaceParameters, container: Container, radius: float) -> None:
+    def __init__(self, config: Config, container: Container, radius: float) -> None:
         """Start with nothing given up.
 
         Args:
-            parameters: shape of the open fingers, what counts as moved, and how often a place is tried.
+            config: shape of the open fingers, what counts as moved, and how often a place is tried.
             container: where balls go.
             radius: of a ball [m].
         """
-        self.p, self.container, self.radius = parameters, container, radius
+        self.p, self.container, self.radius = config, container, radius
         self._misses: list[tuple[Place, int]] = []
         self._given_up: list[tuple[Target, str, Spots]] = []
         self._judged_by: dict[str, Any] = {}  # values of the parameters
         self._expected = (0, 0.0)  # balls that will be in the container soon, and until when that is only expected
 
-    def next(self, view: View, origin: Sequence[float], under_way: Sequence[Cycle]) -> Cycle | None:
+    def next(self, view: PickPlaceView, origin: Sequence[float], under_way: Sequence[Pick]) -> Pick | None:
         """The nearest ball to `origin` (x, y) that can be taken, with its yaws; None when there is none now."""
         spots = view.spots(None, self.radius)
-        moved, judged_by = self.p.moved, self.p.model_dump(include=set(PickPlaceParameters.model_fields))
+        moved, judged_by = self.p.moved, self.p.model_dump(exclude={"robot", "run", "world", "grasp"})
         if judged_by != self._judged_by:  # what was impossible may not be so any more
             self._given_up, self._judged_by = [], judged_by
         # Only while the table stays as it was: one ball less may be all that was needed.
@@ -56,29 +107,29 @@ class Choice:
             elif not yaws:
                 self.give_up(ball, "no turn of the hand clears what stands beside it", view)
             else:
-                return Cycle(ball, yaws)
+                return Pick(target=ball, yaws=yaws)
         return None
 
-    def _is_open(self, ball: Target, view: View, under_way: Sequence[Cycle]) -> bool:
+    def _is_open(self, ball: Target, view: PickPlaceView, under_way: Sequence[Pick]) -> bool:
         seen = any(math.dist(t[:2], ball.position[:2]) <= self.p.moved for t in view.targets)
         taken = any(same_place(c.target.position, ball.position, self.radius) for c in under_way)
         given_up = any(same_place(g[0].position, ball.position, self.radius) for g in self._given_up)
         return seen and not taken and not given_up
 
-    def _is_full(self, view: View, carrying: bool) -> bool:
+    def _is_full(self, view: PickPlaceView, carrying: bool) -> bool:
         """Whether no slot is left, counting what is on its way into the container."""
         return self._contained(view) + int(carrying) >= 4 * self.container.layers
 
-    def _contained(self, view: View) -> int:
+    def _contained(self, view: PickPlaceView) -> int:
         count, until = self._expected
         return max(len(view.objects("contained")), count if view.scene_stamp < until else 0)
 
-    def released(self, target: Target, view: View) -> None:
+    def released(self, target: Target, view: PickPlaceView) -> None:
         """A ball was let go above the container, where it will be seen when it has come to rest."""
         self._expected = (self._contained(view) + 1, view.now + SETTLING)
         self._forget(target)
 
-    def missed(self, target: Target, view: View) -> None:
+    def missed(self, target: Target, view: PickPlaceView) -> None:
         """The fingers closed on nothing there; after `max_retries` retries the place is given up."""
         count = 1 + next((n for p, n in self._misses if same_place(p, target.position, self.radius)), 0)
         self._forget(target)
@@ -90,7 +141,7 @@ class Choice:
     def _forget(self, target: Target) -> None:
         self._misses = [(p, n) for p, n in self._misses if not same_place(p, target.position, self.radius)]
 
-    def give_up(self, target: Target, reason: str, view: View) -> None:
+    def give_up(self, target: Target, reason: str, view: PickPlaceView) -> None:
         """Leave a ball alone until something changes on the table."""
         self._given_up = [g for g in self._given_up if not same_place(g[0].position, target.position, self.radius)]
         self._given_up.append((target, reason, view.spots(None, self.radius)))
@@ -101,3 +152,73 @@ class Choice:
             m.Rejection(position=m.Vector3(x=t.position[0], y=t.position[1], z=t.position[2]), reason=reason)
             for t, reason, _ in self._given_up
         ]
+
+
+def same_place(a: Place, b: Place, radius: float) -> bool:
+    """Whether two places are of one ball: two balls are never closer than their diameter."""
+    return math.dist(a[:2], b[:2]) < radius
+
+
+def yaw_candidates(count: int) -> list[float]:
+    """Yaws [rad] in (-pi/2, pi/2], from the smallest turn to the largest; a parallel gripper repeats after pi."""
+    step = math.pi / count
+    yaws = [k * step if k * step <= math.pi / 2 + 1e-9 else k * step - math.pi for k in range(count)]
+    return sorted(yaws, key=lambda yaw: (abs(yaw), -yaw))
+
+
+def finger_clearance(
+    shape: HandShape, center: Sequence[float], yaw: float, neighbours: Sequence[Sequence[float]], radius: float,
+    container: Container | None = None,
+) -> float:
+    """Least gap [m] between the open fingers and any neighbour, negative when they overlap.
+
+    The fingers open along the tool's y axis, which for the tool pointing down and yaw 0 is the -y axis of the world.
+
+    Args:
+        shape: the fingers.
+        center: (x, y) of the object to take [m], world.
+        yaw: of the tool about world z [rad].
+        neighbours: (x, y) of other balls [m], world.
+        radius: of the balls [m].
+        container: an open box whose walls must be cleared as well.
+    """
+    c, s = math.cos(yaw), math.sin(yaw)
+    half_length = (shape.finger_outer - shape.finger_inner) / 2
+    middle = (shape.finger_outer + shape.finger_inner) / 2
+    best = math.inf
+    for x, y in neighbours:
+        dx, dy = x - center[0], y - center[1]
+        lateral, along = c * dx + s * dy, -s * dx + c * dy
+        gap_lateral = max(abs(lateral) - shape.finger_half_width, 0.0)
+        gap_along = max(abs(abs(along) - middle) - half_length, 0.0)
+        best = min(best, math.hypot(gap_lateral, gap_along) - radius)
+    if container is not None:
+        best = min(best, _container_gap(shape, center, c, s, container))
+    return best
+
+
+def _container_gap(shape: HandShape, center: Sequence[float], c: float, s: float, container: Container) -> float:
+    """Gap between the corners of the fingers and the container's outer square, negative inside."""
+    best = math.inf
+    for along in (-shape.finger_outer, -shape.finger_inner, shape.finger_inner, shape.finger_outer):
+        for lateral in (-shape.finger_half_width, shape.finger_half_width):
+            x = center[0] + c * lateral - s * along - container.x
+            y = center[1] + s * lateral + c * along - container.y
+            dx, dy = abs(x) - container.half_side, abs(y) - container.half_side
+            inside = min(max(dx, dy), 0.0)
+            best = min(best, math.hypot(max(dx, 0.0), max(dy, 0.0)) + inside)
+    return best
+
+
+def grasp_yaws(
+    shape: HandShape, center: Sequence[float], neighbours: Sequence[Sequence[float]], radius: float,
+    container: Container | None = None,
+) -> list[float]:
+    """Yaws [rad] with clear fingers, the least turn first; empty when the neighbours leave no room."""
+    near = [n for n in neighbours if math.dist(n[:2], center[:2]) < shape.finger_outer + 2 * radius + 0.05]
+    near_xy = [(n[0], n[1]) for n in near]
+    return [
+        yaw
+        for yaw in yaw_candidates(shape.yaw_count)
+        if finger_clearance(shape, center, yaw, near_xy, radius, container) >= shape.min_clearance
+    ]

@@ -4,13 +4,29 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from common.applications.pick_place.grasp import HandShape
-from common.config import Parameters, Tunable
+from common.config import Grasp, Parameters, Surroundings, Tunable
+from common.tasks.engine import TaskConfig
 
 
-class PickPlaceParameters(Parameters):
+class HandShape(Parameters):
+    """The open fingers as seen from above: two rectangles beside the object, in the frame of the tool centre point."""
+
+    finger_inner: Tunable[float] = Field(0.040, gt=0, le=0.2, description="centre to inner finger face, open [m]")
+    finger_outer: Tunable[float] = Field(
+        0.056, gt=0, le=0.2, description="centre to outer end of a finger tip, open [m]"
+    )
+    finger_half_width: Tunable[float] = Field(0.011, gt=0, le=0.1, description="half the width of a finger tip [m]")
+    min_clearance: Tunable[float] = Field(
+        0.003, ge=0, le=0.05, description="least gap between a finger and a neighbour [m]"
+    )
+    yaw_count: Tunable[int] = Field(8, ge=1, le=36, description="orientations tried, spread over half a turn")
+
+
+class Config(TaskConfig):
     """How the task behaves; times are cell time unless they say wall."""
 
+    world: Surroundings
+    grasp: Grasp
     grasp_pos_tol: Tunable[float] = Field(
         0.04, gt=0, le=0.2, description="side of the goal box of pre-grasp and lift [m]"
     )
@@ -21,7 +37,6 @@ class PickPlaceParameters(Parameters):
     orient_yaw_tol_rad: Tunable[float] = Field(
         3.14, ge=0, le=3.1415, description="turn about the tool that a goal allows [rad]"
     )
-    planning_time: Tunable[float] = Field(2.0, gt=0, le=600, description="wall time for one plan [s]")
     goal_timeout: Tunable[float] = Field(
         60.0, gt=0, le=3600, description="a motion that takes longer is stopped [s]"
     )
@@ -30,16 +45,6 @@ class PickPlaceParameters(Parameters):
     )
     empty: Tunable[float] = Field(
         1.0, ge=0.1, le=600, description="wait with an empty table before the task is done [s]"
-    )
-    frame_timeout: Tunable[float] = Field(
-        1.0, ge=0.1, le=60, description="an older picture starts no motion [s, wall time]"
-    )
-    clock_tolerance: Tunable[float] = Field(
-        0.2, ge=0.01, le=10, description="a picture from so far in the future starts no motion: the clocks of camera "
-                                         "and task differ [s, wall time]"
-    )
-    joint_states_timeout: Tunable[float] = Field(
-        0.2, ge=0.05, le=60, description="without joint states for so long the arm is held on its path [s, wall time]"
     )
     max_retries: Tunable[int] = Field(3, ge=0, le=100, description="grasps of one place that may close on nothing")
     max_failures: Tunable[int] = Field(

@@ -5,81 +5,79 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from common import messages as m
-from common.applications.pick_place.parameters import PickPlaceParameters
-from common.applications.pick_place.stages import Cycle, Grip, Move, Place, Stage, View
-from common.config import Grasp, GripperConfig, Surroundings
+from common.applications.pick_place.choice import Pick, PickPlaceView
+from common.applications.pick_place.parameters import Config
+from common.config import GripperConfig
 from common.robot.transforms import matrix_to_pose, tool_down
+from common.tasks.stages import Grip, Move, Place, Stage
 
 
 @dataclass(frozen=True)
 class Rows:
     """Builds rows of stages; knows heights and tolerances, nothing of what happens."""
 
-    grasp: Grasp
-    around: Surroundings
+    p: Config
     gripper: GripperConfig
-    parameters: PickPlaceParameters
 
-    def pick_and_place(self, cycle: Cycle) -> list[Stage]:
+    def pick_and_place(self, cycle: Pick) -> list[Stage]:
         """Above the ball, straight down, close, up, across, release; uses up one yaw of the cycle."""
         yaw = cycle.yaws.pop(0)
         x, y, z = cycle.target.position
         low = self.grasp_height(z)
+        grasp = m.PoseGoal(pose=matrix_to_pose(tool_down(x, y, low, yaw)))
         return [
-            self._move("pre-grasp", (x, y, low + self.grasp.approach_clearance), yaw, cycle),
-            Move("descend", "GRASPING", m.PoseGoal(pose=matrix_to_pose(tool_down(x, y, low, yaw))), cycle,
-                 straight=True, touches_target=True),
-            Grip("close", "GRASPING", 0.0, cycle),
-            self._move("lift", (x, y, low + self.grasp.lift_height), yaw, cycle, carries=True),
+            Move("pre-grasp", "GRASPING", cycle, whole=True, fresh=True,
+                 goal=self._region((x, y, low + self.p.grasp.approach_clearance), yaw)),
+            Move("descend", "GRASPING", cycle, goal=grasp, straight=True, fresh=True),
+            Grip("close", "GRASPING", cycle, width=0.0, holds=True),
+            self._lift((x, y, low + self.p.grasp.lift_height), yaw, cycle),
             *self._across(cycle, yaw),
         ]
 
-    def place_held(self, cycle: Cycle, tcp: Place) -> list[Stage]:
+    def place_held(self, cycle: Pick, tcp: Place) -> list[Stage]:
         """What is left to do with a ball that is in the hand at `tcp`."""
         x, y, z = tcp
-        height = self.grasp_height(self.around.table_height + self.around.ball_radius) + self.grasp.lift_height
-        lift = [self._move("lift", (x, y, height), 0.0, cycle, carries=True)] if z < height - 0.01 else []
+        height = self.grasp_height(self.p.world.table_height + self.p.world.ball_radius) + self.p.grasp.lift_height
+        lift = [self._lift((x, y, height), 0.0, cycle)] if z < height - 0.01 else []
         return [*lift, *self._across(cycle, 0.0)]
 
-    def _across(self, cycle: Cycle, yaw: float) -> list[Stage]:
-        box = self.around.container
-        across = self._move("across", (box.x, box.y, self.grasp.drop_z), yaw, cycle, carries=True)
-        across.state = "PLACING"
-        return [across, Grip("release", "PLACING", self.gripper.max_width, cycle)]
+    def _lift(self, to: Place, yaw: float, cycle: Pick) -> Stage:
+        return Move("lift", "GRASPING", cycle, goal=self._region(to, yaw), carries=True)
 
-    def open(self, cycle: Cycle | None) -> Grip:
+    def _across(self, cycle: Pick, yaw: float) -> list[Stage]:
+        box = self.p.world.container
+        above = self._region((box.x, box.y, self.p.grasp.drop_z), yaw, self.p.place_pos_tol)
+        return [
+            Move("across", "PLACING", cycle, goal=above, carries=True),
+            Grip("release", "PLACING", cycle, width=self.gripper.max_width, carries=True, holds=False),
+        ]
+
+    def open(self) -> Grip:
         """Fingers apart."""
-        return Grip("open", "GRASPING", self.gripper.max_width, cycle)
+        return Grip("open", "GRASPING", width=self.gripper.max_width)
 
-    def home(self, view: View) -> Move:
-        """To the recovery pose, with whatever is held."""
-        return Move("home", "HOMING", m.JointGoal(named="home"), carries=view.holding)
-
-    def retreat(self, view: View, contact: tuple[str, str] | None = None) -> Move:
+    def retreat(self, view: PickPlaceView, contact: tuple[str, str] | None = None) -> Move:
         """Up from where the hand is, whatever its fingers touch there now."""
-        x, y, z = view.tcp or (0.0, 0.0, 0.0)
-        reach = 4 * self.around.ball_radius
+        x, y, z = view.tool
+        reach = 4 * self.p.world.ball_radius
         near = [b.id for b in view.balls() if abs(b.position[0] - x) < reach and abs(b.position[1] - y) < reach]
-        move = self._move("retreat", (x, y, z + self.grasp.approach_clearance), 0.0, None, carries=view.holding)
-        move.allowed = [(link, ball) for link in self.gripper.links for ball in near]
-        if contact is not None:
-            move.allowed.append(contact)
-        return move
+        touches = [(link, ball) for link in self.gripper.links for ball in near]
+        return Move("retreat", "GRASPING", goal=self._region((x, y, z + self.p.grasp.approach_clearance), 0.0),
+                    carries=view.holding, touches=[*touches, *([contact] if contact else [])])
 
-    def attach_pose(self, cycle: Cycle) -> m.Pose:
+    def attach_pose(self, cycle: Pick) -> m.Pose:
         """Where the ball will lie in the tool frame, whose z axis points down."""
         z = cycle.target.position[2]
         return m.Pose(position=m.Vector3(z=self.grasp_height(z) - z))
 
     def grasp_height(self, z: float) -> float:
         """Height of the tool centre point at the grasp of a ball whose centre is at z [m]."""
-        return max(z + self.grasp.grasp_clearance, self.grasp.min_grasp_z)
+        return max(z + self.p.grasp.grasp_clearance, self.p.grasp.min_grasp_z)
 
-    def _move(self, name: str, at: Place, yaw: float, cycle: Cycle | None, *, carries: bool = False) -> Move:
-        p = self.parameters
-        side = p.place_pos_tol if name == "across" else p.grasp_pos_tol
-        goal = m.PoseGoal(
+    def _region(self, at: Place, yaw: float, side: float | None = None) -> m.PoseGoal:
+        """Above a place with the tool pointing down, as far as it matters."""
+        side = self.p.grasp_pos_tol if side is None else side
+        return m.PoseGoal(
             pose=matrix_to_pose(tool_down(*at, yaw)), position_tolerance=m.Vector3(x=side, y=side, z=side),
-            tilt_tolerance=p.orient_tol_rad, yaw_tolerance=p.orient_yaw_tol_rad,
+            tilt_tolerance=self.p.orient_tol_rad, yaw_tolerance=self.p.orient_yaw_tol_rad,
         )
-        return Move(name, "GRASPING", goal, cycle, carries=carries)

@@ -9,12 +9,12 @@ from typing import Any
 
 from common import messages as m
 from common import topics
-from common.applications.outlining.legs import OutlineView
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.process.in_process import running_service
-from common.process.task_runner import Command, TaskRunner
-from common.tasks.reliance import Reliance
+from common.process.task_runner import TaskRunner
+from common.tasks.stages import Command, View
+from common.tasks.watchdogs import LivenessWatchdog
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 
@@ -130,13 +130,13 @@ async def test_what_is_missing_is_told_in_the_status_and_holds_the_arm_until_it_
     net = LocalNetwork()
     executor = Executor(net)
     await executor.bus.ready()
-    view = OutlineView(now=0.0, motion=m.MotionStatus(id="go", state="active"))
+    view = View(now=0.0, motion=m.MotionStatus(id="go", state="active"))
 
     async def run(bus: Bus, config: None) -> None:
         joints = bus.reader(topics.JOINT_STATES)
-        reliance = Reliance(lambda: joints.received, lambda: 0.2)
+        watchdog = LivenessWatchdog(lambda: joints.received, lambda: 0.2)
         writer = bus.writer(PICK_PLACE_STATUS)
-        runner = TaskRunner(bus, Silent(), lambda: view, writer, lambda: 1.0, reliance)
+        runner = TaskRunner(bus, Silent(), lambda: view, writer, lambda: 1.0, watchdog)
         await bus.ready()
         await runner.run(())
 

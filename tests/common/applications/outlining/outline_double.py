@@ -7,8 +7,8 @@ from collections.abc import Callable
 from common import messages as m
 from common.applications.outlining.legs import OutlineView
 from common.applications.outlining.messages import OutlinePoints, OutlineStatus
-from common.applications.outlining.task import Outline, OutlineParameters
-from common.config import RobotConfig, check, find_file, read_robot
+from common.applications.outlining.task import Config, Outline
+from common.config import RobotConfig, Run, check, find_file, read_robot
 
 ROBOT = check(RobotConfig, read_robot(find_file("robots", "ur5")))
 HOME = ROBOT.named_poses["home"]
@@ -34,8 +34,9 @@ class OutlineDouble:
     """A cube that was seen; plans succeed, motions take five steps and end where their plan does."""
 
     def __init__(self, started: bool = True, **parameters: object) -> None:
-        assert ROBOT.gripper is not None
-        self.task = Outline(OutlineParameters(**parameters), ROBOT.gripper, HOME, "t", started)
+        run = Run(cell="ur5", autostart=started)
+        config = Config.model_validate({"robot": ROBOT, "run": run} | parameters)
+        self.task = Outline(config, OutlineStatus(), "t")
         self.now = 100.0
         self.path: OutlinePoints | None = outline_of(SQUARE, self.stamp)
         self.objects = [prism("Object_1", 0.5, 0.0, 0.05), prism("Object_2", 0.5, 0.3, 0.02)]
@@ -68,7 +69,7 @@ class OutlineDouble:
             self.path = self.path.model_copy(update={"header": m.Header(stamp=stamp, frame_id="world")})
         scene = m.PlanningScene(header=m.Header(stamp=self.stamp, frame_id="world"), objects=self.objects)
         tcp = m.Pose(position=m.Vector3(x=0.5, z=1.1))
-        return OutlineView(self.now, self.path, scene, self.gripper, self.motion, list(self.q), tcp)
+        return OutlineView(self.now, scene, self.gripper, self.motion, list(self.q), tcp, path=self.path)
 
     def tell(self, command: str) -> list[m.Message]:
         """Say something to the task; what it asks for is answered."""

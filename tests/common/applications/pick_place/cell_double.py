@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 from common import messages as m
-from common.applications.pick_place.parameters import PickPlaceParameters
-from common.applications.pick_place.stages import View
+from common.applications.pick_place.choice import PickPlaceView
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.parameters import Config
 from common.applications.pick_place.task import PickPlace
-from common.config import load_cell
+from common.config import Surroundings, load_cell
 
 CELL = load_cell("panda")
 
@@ -17,8 +18,9 @@ class CellDouble:
     """Balls on a table; plans succeed, motions take five steps, fingers hold what lies at the tool."""
 
     def __init__(self, balls: list[tuple[float, float]], **parameters: object) -> None:
-        assert CELL.robot.gripper is not None
-        self.task = PickPlace(PickPlaceParameters(**parameters), CELL.grasp, CELL.world, CELL.robot.gripper, "t")
+        sections = {"robot": CELL.robot, "run": CELL.run, "world": CELL.section(Surroundings), "grasp": CELL.grasp}
+        config = Config.model_validate({**sections, **parameters})
+        self.task = PickPlace(config, PickPlaceStatus(), "t")
         self.balls = {f"track_{k}": (x, y, 0.03) for k, (x, y) in enumerate(balls)}
         self.unreachable: list[tuple[float, float]] = []
         self.held: str = ""
@@ -38,7 +40,7 @@ class CellDouble:
         self._ends: list[m.ExecuteRequest] = []
         self._goals: dict[str, m.Pose] = {}
 
-    def view(self) -> View:
+    def view(self) -> PickPlaceView:
         if self.camera_on:
             self._stamp = self.now + self.camera_ahead
         objects = [self._sphere(name, "target", p) for name, p in self.balls.items()]
@@ -49,7 +51,9 @@ class CellDouble:
         header = m.Header(stamp=int(self._stamp * 1e9), frame_id="world")
         reachable = [p for p in self.balls.values() if p[:2] not in self.unreachable]
         scene = m.PlanningScene(header=header, objects=objects, attached=attached)
-        return View(self.now, reachable, self._stamp, scene, self.gripper, self.motion, self.tcp)
+        seen = m.PoseArray(header=header, poses=[m.Pose(position=m.Vector3(x=x, y=y, z=z)) for x, y, z in reachable])
+        tcp = m.Pose(position=m.Vector3(x=self.tcp[0], y=self.tcp[1], z=self.tcp[2]))
+        return PickPlaceView(self.now, scene, self.gripper, self.motion, [0.0], tcp, seen=seen)
 
     @staticmethod
     def _sphere(name: str, role: str, p: tuple[float, float, float]) -> m.CollisionObject:

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from common.applications.pick_place.grasp import HandShape, finger_clearance, grasp_yaws, yaw_candidates
+from common.applications.pick_place.choice import finger_clearance, grasp_yaws, yaw_candidates
+from common.applications.pick_place.parameters import HandShape
 from common.config import Container
 from common.robot.transforms import tool_down
 

@@ -134,7 +134,8 @@ def test_scene_that_shows_nothing_yet_does_not_end_the_task_while_targets_are_se
     for _ in range(50):
         cell.now += 0.1
         view = cell.view()
-        view.targets = [(0.40, -0.30, 0.03)]  # a scene manager that was started again has to see it twice
+        pose = m.Pose(position=m.Vector3(x=0.40, y=-0.30, z=0.03))
+        view.seen.poses = [pose]  # a scene manager that was started again has to see it twice
         assert cell.task.step(view) == []
         assert cell.task.status.state == "IDLE"
     cell.balls = known
@@ -202,6 +203,43 @@ def test_restart_while_holding_carries_the_ball_to_the_container() -> None:
     assert again.stages()[:2] == ["lift", "across"]
     again.until("DONE")
     assert (again.contained, again.held) == (2, "")
+
+
+def restarted(cell: CellDouble) -> None:
+    cell.task = CellDouble([]).task
+    cell.task.prefix = f"again{cell.now:.1f}"
+
+
+@pytest.mark.parametrize("late", [0, 5, 25])
+def test_after_a_restart_what_lies_in_the_container_counts_as_placed_however_late_it_is_seen(late: int) -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    restarted(cell)
+    cell.contained, contained = 0, 6  # as a scene manager says that was started again as well
+    for _ in range(late):
+        cell.step()
+    cell.contained += contained
+    cell.until("DONE")
+    assert (cell.contained, cell.task.status.placed, cell.task.status.targets) == (7, 7, 7)
+
+
+@pytest.mark.parametrize("stage", ["pre-grasp", "lift", "across", "release"])
+def test_every_ball_counts_once_when_the_task_was_started_again_in_any_stage(stage: str) -> None:
+    cell = CellDouble(SEVEN)
+    cell.until("release")
+    cell.until("pre-grasp")
+    if stage != "pre-grasp":
+        cell.until(stage)
+    restarted(cell)
+    cell.until("DONE")
+    assert (cell.contained, cell.task.status.placed, cell.task.status.targets) == (7, 7, 7)
+
+
+def test_what_is_seen_in_the_container_for_a_moment_only_does_not_count() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    for k in range(300):
+        cell.contained += {10: 3, 12: -3}.get(k, 0)
+        cell.step()
+    assert (cell.contained, cell.task.status.placed) == (1, 1)
 
 
 def test_restart_waits_for_what_the_task_before_it_had_begun() -> None:
@@ -300,8 +338,7 @@ def test_whatever_slips_falls_moves_or_restarts_every_ball_ends_in_the_container
             if all(abs(0.45 - p[0]) + abs(0.05 - p[1]) > 0.15 for p in cell.balls.values()):
                 cell.balls[name] = (0.45, 0.05, 0.03)
         elif event == "restart":
-            cell.task = CellDouble([]).task
-            cell.task.prefix = f"again{cell.now:.1f}"
+            restarted(cell)
         elif event == "abort" and cell.motion.state == "active":
             cell._ends.clear()
             cell.motion = cell.motion.model_copy(update={"state": "aborted"})
@@ -309,4 +346,4 @@ def test_whatever_slips_falls_moves_or_restarts_every_ball_ends_in_the_container
             cell._ends.clear()
             cell.motion = m.MotionStatus(header=m.Header(stamp=int((cell.now + 0.01) * 1e9)))
     cell.until("DONE", most=5000)
-    assert (cell.contained, cell.balls, cell.held) == (7, {}, "")
+    assert (cell.contained, cell.balls, cell.held, cell.task.status.placed) == (7, {}, "", 7)

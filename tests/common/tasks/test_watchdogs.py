@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common import messages as m
-from common.tasks.reliance import LOOK_PERIOD, Reliance
+from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
 from tests.common.applications.outlining.outline_double import OutlineDouble
 from tests.common.applications.pick_place.cell_double import CellDouble
 
@@ -25,7 +25,7 @@ class Setting:
         self.there = {PLANNER: True, EXECUTOR: True}
         self.came = 0.0
         self.asked: list[m.HoldRequest] = []
-        self.reliance = Reliance(lambda: int(self.came), lambda: 0.2)
+        self.watchdog = LivenessWatchdog(lambda: int(self.came), lambda: 0.2)
 
     def wait(self, seconds: float, step: float = LOOK_PERIOD) -> list[bool]:
         """The holds (True) and releases (False) that were asked for meanwhile."""
@@ -33,13 +33,13 @@ class Setting:
         while self.now < end - 1e-9:
             self.now += step
             self.came += step * self.rate
-            self.asked += self.reliance.look(self.now, dict(self.there), self.motion)
+            self.asked += self.watchdog.look(self.now, dict(self.there), self.motion)
         return [hold.hold for hold in self.asked[before:]]
 
 
 def test_nothing_is_held_while_all_is_well() -> None:
     setting = Setting()
-    assert setting.wait(60) == [] and setting.reliance.trouble == ""
+    assert setting.wait(60) == [] and setting.watchdog.trouble == ""
 
 
 def test_without_joint_states_the_arm_is_held_within_a_quarter_second_and_let_go_when_they_are_back() -> None:
@@ -52,7 +52,7 @@ def test_without_joint_states_the_arm_is_held_within_a_quarter_second_and_let_go
     assert setting.wait(60) == []
     setting.rate = 100.0
     assert setting.wait(0.1) == [False]
-    assert setting.wait(60) == [] and setting.reliance.trouble == ""
+    assert setting.wait(60) == [] and setting.watchdog.trouble == ""
 
 
 @pytest.mark.parametrize("name", [PLANNER, EXECUTOR])
@@ -80,13 +80,13 @@ def test_with_no_motion_there_is_nothing_to_hold_but_trouble_is_known() -> None:
     setting = Setting(motion=IDLE)
     setting.wait(1)
     setting.there[PLANNER] = False
-    assert setting.wait(1) == [] and setting.reliance.trouble == "motion_planner is gone"
+    assert setting.wait(1) == [] and setting.watchdog.trouble == "motion_planner is gone"
 
 
 def test_what_was_never_there_is_not_missing() -> None:
     setting = Setting(rate=0.0)
     setting.there = {PLANNER: False, EXECUTOR: False}
-    assert setting.wait(10) == [] and setting.reliance.trouble == ""
+    assert setting.wait(10) == [] and setting.watchdog.trouble == ""
 
 
 @pytest.mark.parametrize("late", [0.5, 2.0, 60.0])

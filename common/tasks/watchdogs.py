@@ -1,8 +1,9 @@
-"""What a task relies on while the arm moves: joint states that keep coming, a planner, and an executor.
+"""What a task watches while the arm moves: that those it relies on are there, and that its pictures are fresh.
 
-Without them the arm is held on its path, and goes on along the same path when they are back. It could finish a motion
-that was planned; but without joint states nobody sees where it is, and without a planner nobody could bring it away
-from where something goes wrong. A hold loses nothing and does nothing twice.
+It relies on joint states that keep coming, on a planner, and on an executor. Without them the arm is held on its path,
+and goes on along the same path when they are back. It could finish a motion that was planned; but without joint states
+nobody sees where it is, and without a planner nobody could bring it away from where something goes wrong. A hold loses
+nothing and does nothing twice.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ LOOK_PERIOD = 0.05  # [s] the longest time between two looks of a task that is n
 USUAL_GAPS = 4  # joint states that come slowly are missed after so many of their usual gaps
 SLOWEST_GAP = 2.0  # [s] a longer one is a silence
 REMEMBERED = 2.0  # [s] for which our own lateness counts: who waits for a processor is seldom alone
+STEADY = 0.2  # [s] a camera's clock that is this much further ahead than was said is worth saying so again
 HOPS = 2  # processes between the robot and us, each as late as we are
 
 
-class Reliance:
-    """Judges by our own waking time whether the task can rely on the others. Times are wall time [s]."""
+class LivenessWatchdog:
+    """Judges by our own waking time whether those are there that the task relies on. Times are wall time [s]."""
 
     def __init__(self, received: Callable[[], int], timeout: Callable[[], float]) -> None:
         """Begin without having heard anything, which is no trouble yet.
@@ -76,6 +78,52 @@ class Reliance:
             return ""
         patience = max(self._timeout(), USUAL_GAPS * self._gap) + HOPS * self._late
         return f"no joint states for {1e3 * self._timeout():.0f} ms" if awake - self._heard > patience else ""
+
+
+class FrameAge:
+    """Judges pictures by when they were taken. Tolerances are wall time [s], stamps cell time [s]."""
+
+    def __init__(self, speed: float) -> None:
+        """Judge in a cell whose time passes `speed` times as fast as that on the wall."""
+        self._speed = speed
+        self._ahead: float | None = None  # as it was last said [s, wall]
+
+    def problem(self, now: float, stamps: tuple[float, ...], frame_timeout: float, clock_tolerance: float) -> str:
+        """Why pictures that were taken then cannot be decided by now; empty when they can.
+
+        A picture that is late by the clock on the wall is later still by that of a fast cell.
+
+        Args:
+            now: cell time.
+            stamps: when the newest picture was taken, as each of those says who looked at it.
+            frame_timeout: one of this age is too old.
+            clock_tolerance: one that is this far in the future was stamped by a clock that cannot be relied on.
+        """
+        ahead = (max(stamps) - now) / self._speed
+        if ahead > clock_tolerance:
+            if self._ahead is None or abs(ahead - self._ahead) > STEADY:  # else it would be told with each picture
+                self._ahead = ahead
+            return f"the camera's clock is {self._ahead:.1f} s ahead"
+        self._ahead = None
+        return "" if now - min(stamps) < frame_timeout * self._speed else "no fresh picture"
+
+
+class Patience:
+    """For how long the same reason to wait has lasted."""
+
+    def __init__(self) -> None:
+        """Begin without a reason."""
+        self._since: tuple[object, float] | None = None
+
+    def lasts(self, reason: object, now: float) -> float:
+        """How long ago that reason was given for the first time, with no other since [s]."""
+        if self._since is None or self._since[0] != reason:
+            self._since = reason, now
+        return now - self._since[1]
+
+    def reset(self) -> None:
+        """Begin anew."""
+        self._since = None
 
 
 def _hold(hold: bool, reason: str) -> m.HoldRequest:

@@ -1,0 +1,174 @@
+"""What a task's row is made of, one stage in the hands of the controllers, and what a task knows when it decides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from common import messages as m
+
+Place = tuple[float, float, float]
+Goal = m.JointGoal | m.PoseGoal | m.PathGoal | m.ArcGoal | m.SequenceGoal
+Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
+Report = m.MotionStatus | m.GripperState
+
+
+@dataclass(eq=False)
+class Cycle:
+    """What some stages of a row are for: one object, for example. An application adds what it has to remember."""
+
+    subject: str = ""  # what the status calls it
+    begun: bool = False
+
+
+@dataclass(eq=False)
+class Stage:
+    """A piece of a row: `state` and `name` are what the status says while it lasts."""
+
+    name: str
+    state: str
+    cycle: Cycle | None = None
+    carries: bool = field(default=False, kw_only=True)  # needs something in the hand from its begin to its end
+
+
+@dataclass(eq=False)
+class Move(Stage):
+    """A motion of the arm; `trajectory` is there once it was planned, around what stood at `planned_around`."""
+
+    goal: Goal = field(kw_only=True)
+    straight: bool = field(default=False, kw_only=True)
+    touches: list[tuple[str, str]] = field(default_factory=list, kw_only=True)  # pairs that may touch in it
+    attach: str = field(default="", kw_only=True)  # id of what it carries; empty: of what is in the hand
+    attach_pose: m.Pose | None = field(default=None, kw_only=True)  # in the tool's frame, when not held yet
+    fresh: bool = field(default=False, kw_only=True)  # begins only while pictures come
+    whole: bool = field(default=False, kw_only=True)  # begins only once all of its cycle is planned
+    trajectory: m.JointTrajectory | None = field(default=None, init=False)
+    planned_around: list[tuple[float, float]] = field(default_factory=list, init=False)  # (x, y) [m]
+
+    def end(self) -> list[float]:
+        """Joint positions [rad] at its end; empty when it is not planned."""
+        return self.trajectory.points[-1].positions if self.trajectory else []
+
+    @property
+    def seconds(self) -> float:
+        """How long it takes, cell time."""
+        return self.trajectory.points[-1].time_from_start if self.trajectory else 0.0
+
+
+@dataclass(eq=False)
+class Grip(Stage):
+    """A motion of the fingers to a width [m]; `holds` says whether something must be between them at its end."""
+
+    width: float = field(kw_only=True)
+    holds: bool | None = field(default=None, kw_only=True)
+
+
+@dataclass(eq=False)
+class Look(Stage):
+    """What was seen up to here decides nothing any more: what follows is decided by a later picture."""
+
+    name: str = "look"
+    state: str = ""
+
+
+@dataclass(eq=False)
+class Execution:
+    """A stage that was begun: `command` was sent and may have been accepted. Times are cell time [s].
+
+    While the arm is held no time counts, and at a share of its speed only that share of it.
+    """
+
+    stage: Stage
+    command: m.ExecuteRequest | m.GripperCommand
+    counted: float  # up to when; from the begin on
+    moving: float = 0.0  # in motion so far
+    spent: float = 0.0  # as if the motion were at full speed: what time-outs go by
+    accepted: int | None = None  # stamp of the answer that accepted it
+
+    @property
+    def moves_arm(self) -> bool:
+        """Whether the arm moves, and not the fingers."""
+        return isinstance(self.command, m.ExecuteRequest)
+
+    def count(self, now: float, motion: m.MotionStatus) -> None:
+        """Count the time up to now."""
+        passed, self.counted = max(0.0, now - self.counted), max(now, self.counted)
+        if self.moves_arm and motion.held:
+            return
+        self.moving += passed
+        self.spent += passed * (motion.speed_scaling if self.moves_arm else 1.0)
+
+    def accept(self, answer: Report) -> bool:
+        """Take in the answer to the command: whether it was accepted."""
+        if answer.state != "rejected":
+            self.accepted = answer.header.stamp
+        return answer.state != "rejected"
+
+    def outcome(self, motion: m.MotionStatus, gripper: m.GripperState) -> Literal["running", "ended", "forgotten"]:
+        """What the controllers say of it; forgotten once they accepted it and tell of another goal."""
+        reported = self.report(motion, gripper)
+        if reported.id == self.command.id:
+            return "ended" if reported.state in ("succeeded", "aborted", "cancelled") else "running"
+        later = self.accepted is not None and reported.header.stamp > self.accepted
+        return "forgotten" if later else "running"
+
+    def report(self, motion: m.MotionStatus, gripper: m.GripperState) -> Report:
+        """The report of the controller that the command went to."""
+        return motion if self.moves_arm else gripper
+
+
+@dataclass
+class View:
+    """What a task knows at an instant: only what was perceived or reported. An application adds what it reads.
+
+    `now` and stamps are cell time [s]; `q` is where the joints are [rad], `tcp` the pose of the tool in world.
+    """
+
+    now: float
+    scene: m.PlanningScene | None = None
+    gripper: m.GripperState | None = None
+    motion: m.MotionStatus | None = None
+    q: list[float] | None = None
+    tcp: m.Pose | None = None
+    trouble: str = ""  # why no motion may begin
+
+    @property
+    def missing(self) -> list[str]:
+        """Topics that have not said anything yet, without which nothing can be done."""
+        known = {"gripper/state": self.gripper, "planning_scene": self.scene, "joint_states": self.q,
+                 "motion/status": self.motion}
+        return [key for key, value in known.items() if value is None]
+
+    @property
+    def stamps(self) -> tuple[float, ...]:
+        """When the newest picture was taken [s], as each of those says by whom it is decided."""
+        return (self.scene_stamp,)
+
+    @property
+    def scene_stamp(self) -> float:
+        """Time of the newest frame that the planning scene holds [s]."""
+        return self.scene.header.stamp * 1e-9 if self.scene else 0.0
+
+    @property
+    def tool(self) -> Place:
+        """Where the tool centre point is, in world [m]; the origin as long as nobody has said."""
+        return place_of(self.tcp) if self.tcp else (0.0, 0.0, 0.0)
+
+    @property
+    def attached(self) -> str:
+        """Id of the object in the hand according to the planning scene, or an empty string."""
+        return self.scene.attached[0].object.id if self.scene and self.scene.attached else ""
+
+    @property
+    def holding(self) -> bool:
+        """Whether the gripper reports something between its fingers."""
+        return self.gripper is not None and self.gripper.holding
+
+    def objects(self, role: str) -> list[m.CollisionObject]:
+        """Objects of the planning scene with that role."""
+        return [o for o in self.scene.objects if o.role == role] if self.scene else []
+
+
+def place_of(pose: m.Pose) -> Place:
+    """The position of a pose [m]."""
+    return pose.position.x, pose.position.y, pose.position.z

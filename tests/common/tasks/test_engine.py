@@ -1,0 +1,208 @@
+"""The task engine with a task that is as small as one can be: what is no application's own."""
+
+from __future__ import annotations
+
+import pytest
+
+from common import messages as m
+from common.config import load_cell
+from common.errors import ConfigError
+from common.tasks.engine import Task, TaskConfig
+from common.tasks.stages import Command, Grip, Look, Move, View
+from common.tasks.watchdogs import Patience
+
+CELL = load_cell("panda")
+THERE = m.PoseGoal(pose=m.Pose(position=m.Vector3(x=0.4, z=0.3)))
+
+
+class Fetch(Task[View]):
+    """Takes what lies in front of it, once."""
+
+    def decide(self, view: View) -> None:
+        if not self.sees(view):
+            return
+        if view.holding:
+            self.end("DONE", "it is in the hand")
+        else:
+            self.row += [Move("reach", "REACHING", goal=THERE), Grip("close", "REACHING", width=0.0, holds=True),
+                         Move("lift", "LIFTING", goal=THERE, carries=True), Look()]
+
+
+class Cell:
+    """A planner, an arm and fingers that do what they are told when a test says so."""
+
+    def __init__(self, **robot: object) -> None:
+        config = TaskConfig(robot=CELL.robot.model_copy(update=robot), run=CELL.run)
+        self.task = Fetch(config, m.TaskStatus(), "t")
+        self.now, self.objects, self.asked = 100.0, [thing("cube", 0.4)], list[Command]()
+        self.motion, self.gripper = m.MotionStatus(), m.GripperState(width=0.08)
+
+    @property
+    def view(self) -> View:
+        scene = m.PlanningScene(header=m.Header(stamp=int(self.now * 1e9)), objects=self.objects)
+        return View(self.now, scene, self.gripper, self.motion, [0.0] * 7, m.Pose(position=m.Vector3(x=0.3, z=0.2)))
+
+    def step(self) -> list[Command]:
+        """One step; plans are made at once, motions and grips are begun."""
+        self.now += 0.1
+        asked = self.task.step(self.view)
+        for command in asked:
+            self.answer(command)
+        self.asked += asked
+        return asked
+
+    def answer(self, command: Command) -> None:
+        header = m.Header(stamp=int(self.now * 1e9))
+        if isinstance(command, m.PlanRequest):
+            point = m.JointTrajectoryPoint(
+                time_from_start=1.0, positions=[len(self.asked)], velocities=[0.0], accelerations=[0.0])
+            self.task.on_plan(m.PlanResponse(id=command.id, ok=True, planner="double", trajectory=m.JointTrajectory(
+                joint_names=["j"], points=[point])), self.view)
+        elif isinstance(command, m.ExecuteRequest):
+            self.motion = m.MotionStatus(header=header, id=command.id, state="active")
+            self.task.on_goal(self.motion, self.view)
+        elif isinstance(command, m.GripperCommand):
+            self.gripper = m.GripperState(header=header, id=command.id, state="active", moving=True)
+            self.task.on_goal(self.gripper, self.view)
+
+    def until(self, stage: str) -> None:
+        """Step, with every motion and grip before that stage well done."""
+        for _ in range(100):
+            self.step()
+            if self.task.running is not None and self.task.running.stage.name == stage:
+                return
+            self.finish()
+        raise AssertionError(f"never {stage}: {self.task.status}")
+
+    def finish(self, state: str = "succeeded") -> None:
+        running = self.task.running
+        if running is None:
+            return
+        if running.moves_arm:
+            self.motion = self.motion.model_copy(update={"state": state})
+        else:
+            width = running.stage.width
+            self.gripper = self.gripper.model_copy(update={
+                "state": state, "moving": False, "holding": width == 0.0, "width": width})
+
+    def plans(self) -> list[m.PlanRequest]:
+        return [r for r in self.asked if isinstance(r, m.PlanRequest)]
+
+
+def thing(name: str, x: float, y: float = 0.0) -> m.CollisionObject:
+    return m.CollisionObject(id=name, role="target", shape="box", dimensions=[0.05, 0.05, 0.05],
+                             pose=m.Pose(position=m.Vector3(x=x, y=y, z=0.025)))
+
+
+def test_row_is_worked_off_planned_ahead_and_the_end_is_said() -> None:
+    cell = Cell()
+    cell.until("reach")
+    cell.step()
+    assert [p.stage for p in cell.plans()] == ["reach", "lift"], "the lift is planned while the arm reaches"
+    assert [bool(p.start) for p in cell.plans()] == [False, True]
+    assert [p.release for p in cell.plans()] == [True, False]
+    cell.until("lift")
+    assert cell.task.status.state == "LIFTING"
+    cell.finish()
+    cell.step()
+    cell.step()
+    status = cell.task.status
+    assert (status.state, status.message, status.failures, len(status.plans)) == ("DONE", "it is in the hand", 0, 2)
+
+
+def test_what_follows_a_look_is_decided_by_a_later_picture() -> None:
+    cell = Cell()
+    cell.until("lift")
+    cell.finish()
+    view = cell.view
+    assert cell.task.step(view) == [] and cell.task.status.state == "LIFTING", "its picture is from before"
+    assert cell.task.look_after == view.now
+
+
+@pytest.mark.parametrize("where", ["during", "before"])
+def test_what_falls_out_of_the_hand_is_a_failure_and_is_taken_again(where: str) -> None:
+    cell = Cell()
+    cell.until("lift" if where == "during" else "close")
+    if where == "before":
+        cell.finish()
+        view = cell.view
+        view.trouble = "the planner is gone"
+        assert cell.task.step(view) == []  # the fingers have closed, the motion that carries has not begun
+    cell.gripper = cell.gripper.model_copy(update={"holding": False})
+    asked = cell.step()
+    assert any(isinstance(command, m.StopRequest) for command in asked) == (where == "during")
+    assert cell.task.status.failures == 1 and f"fell {where} lift" in cell.task.status.message
+    cell.motion = cell.motion.model_copy(update={"state": "cancelled"})
+    cell.until("reach")
+
+
+def test_fingers_that_close_on_nothing_open_and_go_up_before_the_next_try() -> None:
+    cell = Cell()
+    cell.until("close")
+    cell.gripper = cell.gripper.model_copy(update={"state": "succeeded", "moving": False, "holding": False})
+    cell.until("open")
+    cell.until("retreat")
+    goal = cell.plans()[-1].goal
+    assert isinstance(goal, m.PoseGoal) and goal.pose.position.z == pytest.approx(0.3)
+    assert ("panda_hand", "cube") in cell.plans()[-1].allowed_collisions
+    cell.until("reach")
+
+
+def test_what_appears_beside_the_way_has_the_motions_planned_anew() -> None:
+    cell = Cell()
+    cell.until("close")
+    cell.objects = [*cell.objects, thing("other", 0.5)]
+    cell.until("lift")
+    assert [p.stage for p in cell.plans()] == ["reach", "lift", "lift"]
+
+
+def test_failure_sends_the_arm_home_and_too_many_in_a_row_are_an_error() -> None:
+    cell = Cell()
+    for _ in range(cell.task.most_failures - 1):
+        cell.until("reach")
+        cell.finish("aborted")
+        cell.until("home")
+    cell.until("reach")
+    cell.finish("aborted")
+    cell.step()
+    assert cell.task.status.state == "ERROR" and "10 failures in a row" in cell.task.status.message
+    assert cell.step() == []
+    cell.task.command("start", cell.view)
+    cell.until("reach")
+
+
+def test_failures_between_which_something_was_done_are_not_in_a_row() -> None:
+    cell = Cell()
+    for k in range(30):
+        cell.until("reach")
+        cell.finish("aborted")
+        cell.until("home")
+        cell.task.status.done = k
+    assert cell.task.status.state == "HOMING" and cell.task.status.failures == 30
+
+
+def test_start_after_the_end_counts_the_time_anew() -> None:
+    cell = Cell()
+    cell.task.status.state = "DONE"
+    cell.now += 1000
+    cell.task.command("start", cell.view)
+    cell.step()
+    cell.step()
+    assert cell.task.status.task_seconds == pytest.approx(0.1)
+
+
+def test_task_that_needs_a_gripper_says_so_of_a_robot_without_one() -> None:
+    with pytest.raises(ConfigError, match=r"robot\.gripper: is missing: the task needs a robot with one"):
+        _ = Cell(gripper=None).task.gripper
+
+
+def test_no_id_is_minted_twice() -> None:
+    cell = Cell()
+    assert len({cell.task.mint() for _ in range(1000)}) == 1000
+
+
+def test_patience_counts_from_when_a_reason_was_given_first() -> None:
+    patience = Patience()
+    assert [patience.lasts("a", 1.0), patience.lasts("a", 3.0), patience.lasts("b", 4.0)] == [0.0, 2.0, 0.0]
+    patience.reset()
+    assert patience.lasts("b", 9.0) == 0.0
