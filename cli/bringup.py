@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from cli import hosts, options, securing, viewing
+from cli import hosts, options, securing, verbs, viewing
 from cli.operation import Operation
 
 Speed = Annotated[str, typer.Option("--speed", metavar="X", help="cell time per wall time, 0.1 to 10")]
@@ -22,8 +20,6 @@ ChaosSeed = Annotated[
 ChaosRate = Annotated[
     str | None, typer.Option("--chaos-rate", metavar="N", help="faults per minute of wall time, on average [30]")
 ]
-Ask = Annotated[bool, typer.Option("--ask", help="outlining: ask at the terminal which object")]
-From = Annotated[str | None, typer.Option("--from", metavar="DIR", help="outlining: trace coordinates stored there")]
 
 
 def run(
@@ -45,20 +41,19 @@ def run(
     summary: SummaryFile = None,
     log_json: LogJson = False,
     record: Record = None,
-    ask: Ask = False,
-    source: From = None,
     chaos: ChaosSeed = None,
     chaos_rate: ChaosRate = None,
+    **of_applications: Any,
 ) -> None:
     """Bring a cell up, run its task to the end, print a summary and shut down; exit 0 only if the task is DONE."""
     securing.choose(secure)
-    chosen = choices(cell, overrides, world, ask=ask, source=source)
-    operation = Operation(cell, chosen, world, seed, speed, domain, connect, no_viewer, summary, log_json,
+    before = verbs.before_run(cell, overrides, world, of_applications)
+    operation = Operation(cell, before.overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json,
                           hosts.Share(listen, link, only, without))
     operation.serve_page(viewer_host, viewer_port)
     operation.record_to(record)
     operation.disturb(chaos, chaos_rate, until_ended=True)
-    operation.ask = ask
+    operation.first = before.first
     raise typer.Exit(operation.run_to_end())
 
 
@@ -92,32 +87,3 @@ def up(
     operation.record_to(record)
     operation.disturb(chaos, chaos_rate, until_ended=False)
     raise typer.Exit(operation.stay())
-
-
-def choices(
-    cell: str, overrides: list[str] | None, world: str | None, *, ask: bool, source: str | None
-) -> list[str]:
-    """The overrides, and before them those that say how the object to outline is chosen.
-
-    Raises:
-        ConfigError: nobody can be asked, the coordinates can not be used, or the cell outlines nothing.
-    """
-    given = list(overrides or ())
-    if not ask and source is None:
-        return given
-    from cli.asking import CHOOSE_BY_HAND, require_terminal
-    from common.applications.outlining.stage_files import CLEARED, read_coordinates
-    from common.config import load_cell
-    from common.errors import ConfigError
-
-    for option, wanted in (("--ask", ask), ("--from", source is not None)):
-        if wanted and load_cell(cell, given, world=world).task != "contour_tracer":
-            raise ConfigError(option, cell, "needs a cell that outlines objects, such as ur5")
-    if ask and source is not None:
-        raise ConfigError("--ask", ..., "and --from are two ways to choose: give one of them")
-    if ask:
-        require_terminal()
-        return [*CHOOSE_BY_HAND, *given]
-    file = (Path(source or "") / CLEARED).absolute()
-    read_coordinates(file)
-    return [f"services.duplicate_remover.coordinates={json.dumps(str(file))}", *given]

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import completion, options
-from common.applications.outlining.topics import OUTLINE_SELECT
 from common.errors import ConfigError, UnknownName
 
 if TYPE_CHECKING:
@@ -22,7 +21,7 @@ world = typer.Typer(help="Change the simulated world.", no_args_is_help=True)
 TIMEOUT = 5.0  # [s]
 X = Annotated[str, typer.Argument(metavar="X", help="[m] in world")]
 Y = Annotated[str, typer.Argument(metavar="Y", help="[m] in world")]
-Id = Annotated[str, typer.Argument(metavar="ID", help="as in `zencell topic echo scene_balls`")]
+Id = Annotated[str, typer.Argument(metavar="ID", help="as in `zencell topic echo scene_objects`")]
 NEGATIVE_NUMBERS = {"ignore_unknown_options": True}  # -0.2 is a coordinate, not an option
 
 
@@ -50,7 +49,7 @@ def call(
     seconds = options.number("--timeout", timeout)
     if seconds <= 0:
         raise ConfigError("--timeout", timeout, "must be more than 0")
-    _send(request, message, seconds, cell, domain, connect)
+    send(request, message, seconds, cell, domain, connect)
 
 
 def _parse(key: str, body: str) -> dict[str, Any]:
@@ -65,10 +64,11 @@ def _parse(key: str, body: str) -> dict[str, Any]:
     return given
 
 
-def _send(
+def send(
     request: Request[Any, Any], message: Message, timeout: float, cell: str | None, domain: str | None,
     connect: str | None,
 ) -> None:
+    """Send a request to a cell that is up and print the answer as JSON."""
     from cli.inspection import cell_clock, inspect
     from cli.schema import to_json
     from common.messages import Header
@@ -91,7 +91,7 @@ def _task(command: str, cell: str | None, domain: str | None, connect: str | Non
     from common.messages import TaskCommand
 
     message: TaskCommand = check(TaskCommand, {"command": command})
-    _send(topics.TASK_COMMAND, message, TIMEOUT, cell, domain, connect)
+    send(topics.TASK_COMMAND, message, TIMEOUT, cell, domain, connect)
 
 
 @task.command()
@@ -140,20 +140,6 @@ def home(
     typer.echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
 
 
-@task.command()
-def select(
-    which: Annotated[str, typer.Argument(metavar="N", help="an index, a label such as Object_2, a colour, or auto")],
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
-) -> None:
-    """Choose the object to outline."""
-    from common.applications.outlining.contours_choice import parse_choice
-
-    wanted = parse_choice(which)
-    if wanted is None:
-        raise ConfigError("task select", which, "chooses nothing; choices: an index, a label, a colour, or auto")
-    _send(OUTLINE_SELECT, wanted, TIMEOUT, cell, domain, connect)
-
-
 # --- world ------------------------------------------------------------------------------------------------------
 
 
@@ -167,7 +153,7 @@ def _edit(values: dict[str, Any], cell: str | None, domain: str | None, connect:
     from common.messages import WorldEdit
 
     message: WorldEdit = check(WorldEdit, values, "world")
-    _send(topics.WORLD_EDIT, message, TIMEOUT, cell, domain, connect)
+    send(topics.WORLD_EDIT, message, TIMEOUT, cell, domain, connect)
 
 
 @world.command(context_settings=NEGATIVE_NUMBERS)
@@ -176,7 +162,7 @@ def add(
     name: Annotated[str, typer.Option("--id", metavar="ID", help="chosen for you if not given")] = "",
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
-    """Put one more ball on the table."""
+    """Put one more object on the table."""
     _edit({"op": "add", "id": name, "position": _position(x, y)}, cell, domain, connect)
 
 
@@ -185,7 +171,7 @@ def move(
     name: Id, x: X, y: Y,
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
-    """Put a ball elsewhere."""
+    """Put an object elsewhere."""
     _edit({"op": "move", "id": name, "position": _position(x, y)}, cell, domain, connect)
 
 
@@ -193,7 +179,7 @@ def move(
 def remove(
     name: Id, cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
 ) -> None:
-    """Take a ball away."""
+    """Take an object away."""
     _edit({"op": "remove", "id": name}, cell, domain, connect)
 
 

@@ -24,7 +24,6 @@ from cli import (
     exporting,
     graph,
     node,
-    outlining,
     param,
     playing,
     recording,
@@ -35,6 +34,7 @@ from cli import (
     tf,
     top,
     topic,
+    verbs,
 )
 from common.errors import RequestFailed, ZencellError
 
@@ -53,7 +53,9 @@ class CommandLine(typer.Typer):
         """Exit code of a verb, which is run; an error is shown."""
         completion.prepare()
         try:
-            code = typer.main.get_command(self)(list(arguments), standalone_mode=False, prog_name="zencell")
+            of_applications.take_own(arguments)
+            command = typer.main.get_command(self)
+            code = command(list(arguments), standalone_mode=False, prog_name="zencell", obj=verbs.CommandShell())
         except typer.TyperException as error:
             code = _fail(error.format_message(), error.exit_code)
         except RequestFailed as error:
@@ -88,6 +90,7 @@ app = CommandLine(
     rich_markup_mode=None,
 )
 app.callback()(completion.root)
+of_applications = verbs.ApplicationVerbs(app, {"task": commands.task}, bringup.run, last="chaos")
 app.command()(bringup.run)
 app.command()(bringup.up)
 app.command()(catalogue.cells)
@@ -102,8 +105,7 @@ app.add_typer(tf.app, name="tf")
 app.command()(graph.graph)
 app.add_typer(commands.task, name="task")
 app.add_typer(commands.world, name="world")
-app.command()(outlining.snapshot)
-app.command()(outlining.outline)
+of_applications.take_all()
 app.add_typer(robot.app, name="robot")
 app.add_typer(calibrate.app, name="calibrate")
 app.command()(recording.record)

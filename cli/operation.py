@@ -97,7 +97,7 @@ class Operation:
         self._watchers: dict[str, list[str]] = {}  # commands by name
         self._disturbance: Disturbance | None = None
         self._chaos: Chaos | None = None
-        self.ask = False  # the person at the terminal which object is to be outlined
+        self.first: Callable[[Bus], Awaitable[None]] | None = None  # is done at the terminal once the cell is up
 
     def serve_page(self, host: str | None, port: str | None) -> None:
         """Say where the operator's page is to be, if the cell has one; without this the cell's own words hold.
@@ -232,7 +232,7 @@ class Operation:
     def _open_screen(self, early: list[tuple[str, str]]) -> None:
         from cli.screens import ScreenHandler, open_screen
 
-        self._screen = open_screen(self._content, log_json=self.launch.log_json, plain=self.ask)
+        self._screen = open_screen(self._content, log_json=self.launch.log_json, plain=self.first is not None)
         for name, text in early:
             self._screen.line(name, text)
         root = logging.getLogger()
@@ -265,10 +265,8 @@ class Operation:
             await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"), START_REQUEST_TIMEOUT)
 
         async def end() -> None:
-            if self.ask:
-                from cli.asking import ask
-
-                await ask(bus, Path.cwd())
+            if self.first is not None:
+                await self.first(bus)
             await collector.ended.wait()
             await collector.settle()
 

@@ -12,7 +12,7 @@ What it brings lies in modules of these names within the package, or else in the
                            published by whoever simulates the world
     figures   (optional) what the summary, the report and the recheck say of a run
     page      (optional) labels and layers of the operator's page
-    verbs     (optional) verbs of the command line
+    verbs     (optional) verbs of the command line, as common/verbs.py says
 
 `TASK` in the package itself names the service that decides; without it the cell's `task` does.
 """
@@ -22,9 +22,11 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import pkgutil
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
 
@@ -102,6 +104,8 @@ def find_application(name: str) -> Application:
     """
     if "." not in name and name not in application_names():
         raise UnknownName("application", name, application_names())
+    if "." in name and (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)  # a person's own is also found where they stand
     found = Application(name)
     try:
         _ = found.module

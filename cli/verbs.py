@@ -1,0 +1,173 @@
+"""Verbs and options that applications bring: of those that come with the project, and of a cell's own."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import inspect
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
+
+import typer
+
+from cli import options
+from common.application import Application, applications, find_application
+from common.errors import ConfigError
+from common.verbs import BeforeRun
+
+if TYPE_CHECKING:
+    from common.config import Cell
+    from common.messages import Message
+    from common.topics import Request
+    from common.transport.bus import Bus
+
+T = TypeVar("T")
+
+TIMEOUT = 5.0  # [s] of a request
+SHARED = {
+    "overrides": options.Overrides, "world": options.WorldName, "seed": options.Seed, "domain": options.Domain,
+    "connect": options.Connect,
+}
+
+
+class CommandShell:
+    """See `common.verbs.Shell`."""
+
+    def send(
+        self, request: Request[Any, Any], message: Message, cell: str | None, domain: str | None, connect: str | None
+    ) -> None:
+        """Send a request to a cell that is up and print the answer as JSON."""
+        from cli.commands import send
+
+        send(request, message, TIMEOUT, cell, domain, connect)
+
+    def visit(
+        self, visit: Callable[[Bus], Awaitable[T]], cell: str, overrides: list[str] | None, world: str | None,
+        seed: str | None, domain: str | None, connect: str | None,
+    ) -> T:
+        """What a visit to a cell returns: to one that is up, or one that is brought up for it without its task."""
+        from cli.inspection import inspect as look
+        from cli.operation import Operation
+        from common.config import load_cell
+        from common.supervision.launch import place_of, require_free_port
+        from common.transport.endpoint import endpoint_of
+        from common.transport.router import PortInUse
+
+        number, endpoint = place_of(domain, connect)
+        try:
+            if endpoint is None:
+                require_free_port(endpoint_of(number))
+            is_up = endpoint is not None
+        except PortInUse:  # somebody has the port: a router, if it is zencell's
+            is_up = True
+        if is_up:
+            name = load_cell(cell, tuple(overrides or ()), world=world).name
+            return look(visit, cell=name, domain=domain, connect=connect)
+        operation = Operation(cell, overrides, world, seed, "1", domain, connect, no_viewer=True)
+        operation.leave_out(operation.cell.task)
+        return operation.visit(visit)
+
+    def parameters(self, cell: Cell, service: str) -> Any:
+        """The checked parameters of a service of a cell."""
+        from common.config import service_config
+
+        found = (entry.module for entry in cell.services.values() if entry.name == service)
+        return service_config(cell, service, importlib.import_module(next(found, f"services.{service}")).Config)
+
+
+class ApplicationVerbs:
+    """Takes up what applications bring."""
+
+    def __init__(self, app: typer.Typer, groups: dict[str, typer.Typer], run: Callable[..., None], last: str) -> None:
+        """Begin without any.
+
+        Args:
+            app: gets the verbs.
+            groups: get those of theirs.
+            run: the verb that gets options; takes `befores` and what they ask for as keywords.
+            last: the parameter of `run` before which they stand in its help.
+        """
+        self._app, self._groups, self._run, self._last = app, groups, run, last
+        self._known: set[str] = set()
+
+    def take_all(self) -> None:
+        """Those of the applications that come with the project."""
+        for found in applications():
+            self.take(found)
+
+    def take_own(self, arguments: Sequence[str]) -> None:
+        """Those of the application of a cell file that is named on the command line, if it is a module of its own."""
+        for name in own_applications(arguments):
+            with contextlib.suppress(ConfigError):  # whoever loads the cell says it
+                self.take(find_application(name))
+
+    def take(self, application: Application) -> None:
+        """Those of one application."""
+        if application.name in self._known:
+            return
+        self._known.add(application.name)
+        for name, verb in (application.find("verbs", "VERBS") or {}).items():
+            group, _, last = name.rpartition(" ")
+            (self._groups[group] if group else self._app).command(last)(with_shared_options(verb))
+        if (before := application.find("verbs", "before_run")) is not None:
+            add_options(self._run, before, self._last)
+            BEFORE_RUN.append(before)
+
+
+BEFORE_RUN: list[Callable[..., BeforeRun]] = []
+
+
+def before_run(cell: str, overrides: list[str] | None, world: str | None, given: dict[str, Any]) -> BeforeRun:
+    """What a run starts with, as all applications have it.
+
+    Args:
+        cell: as it was given.
+        overrides: as they were given.
+        world: as it was given.
+        given: options that applications have added to `run`, by their parameters.
+    """
+    so_far = BeforeRun(list(overrides or ()))
+    for before in BEFORE_RUN:
+        names = inspect.signature(before).parameters
+        found = before(cell, so_far.overrides, world, **{name: given[name] for name in given if name in names})
+        so_far = BeforeRun(found.overrides, found.first or so_far.first)
+    return so_far
+
+
+def with_shared_options(verb: Callable[..., None]) -> Callable[..., None]:
+    """The verb, with the options that others have where it names them and says nothing of its own."""
+    hints = get_type_hints(verb, include_extras=True)
+    for name, parameter in inspect.signature(verb).parameters.items():
+        if hasattr(hints[name], "__metadata__"):
+            continue
+        if name == "cell":
+            hints[name] = options.CellArgument if parameter.default is parameter.empty else options.CellName
+        elif name in SHARED:
+            hints[name] = SHARED[name]
+    verb.__annotations__ = hints
+    return verb
+
+
+def add_options(run: Callable[..., None], before: Callable[..., BeforeRun], last: str) -> None:
+    """Let a verb have the keyword-only parameters of `before` as options of its own, before its parameter `last`."""
+    signature = inspect.signature(run, eval_str=True)
+    parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    more = [p for p in inspect.signature(before, eval_str=True).parameters.values() if p.kind is p.KEYWORD_ONLY]
+    at = next(i for i, parameter in enumerate(parameters) if parameter.name == last)
+    parameters[at:at] = [p.replace(kind=p.POSITIONAL_OR_KEYWORD) for p in more]
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+
+
+def own_applications(arguments: Sequence[str]) -> Iterator[str]:
+    """Dotted modules that cell files on the command line name as their applications."""
+    for argument in arguments:
+        path = Path(argument.rpartition("=")[2])
+        if path.suffix == ".yaml" and path.is_file():
+            import yaml
+
+            with contextlib.suppress(OSError, UnicodeDecodeError, yaml.YAMLError):
+                values = yaml.safe_load(path.read_text(encoding="utf-8"))
+                name = values.get("application") if isinstance(values, dict) else None
+                if isinstance(name, str) and "." in name:
+                    yield name

@@ -1,0 +1,147 @@
+"""Visits to a cell that outlines: the person at the terminal is asked which object; what the camera sees is stored."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from common import topics
+from common.applications.outlining import stage_files
+from common.applications.outlining.contours_choice import NoSuchContour, described, parse_choice
+from common.applications.outlining.messages import Contours, OutlinePoints, OutlineSelect
+from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
+from common.errors import ConfigError, RemoteError, ZencellError
+from common.perception.depth_intake import depth_of
+from common.perception.image import image_to_array
+from common.perception.intake import colour_picture
+
+if TYPE_CHECKING:
+    from common.messages import Image
+    from common.transport.bus import Bus, Reader
+
+TIMEOUT = 30.0  # [s] for a picture and its outline
+ALL_WITHIN = 3.0  # [s, cell time] after the first picture for a contour to be chosen
+CHOOSE_BY_HAND = ("services.contour_detector.select=none", "services.contour_tracer.selection_timeout=0")
+
+
+class NoOutline(ZencellError):
+    """The picture was stored, but it has no outline."""
+
+    exit_code = 1
+
+
+def require_terminal() -> None:
+    """Return when somebody can be asked.
+
+    Raises:
+        ConfigError: nobody can.
+    """
+    if not sys.stdin.isatty():
+        raise ConfigError("--ask", ..., "needs a terminal; without one choose with `zencell task select N`")
+
+
+async def ask_person(bus: Bus, folder: Path) -> None:
+    """Store the picture with its contours in a folder, and ask until one of them is chosen."""
+    contours, images = bus.reader(CONTOURS), bus.reader(CONTOUR_IMAGE)
+    select = bus.client(OUTLINE_SELECT)
+    while not (found := await contours.next()).contours:
+        say("no contour in the picture yet")
+    path = folder / f"{bus.cell}_contours.png"
+    await _keep(path, found, await images.next())
+    say(f"{path} shows them: {described(found.contours)}")
+    while True:
+        say("outline which one? ", end="")
+        try:
+            wanted = parse_choice(await _line())
+            if wanted is not None:
+                answer = await select.call(wanted)
+                say(f"{answer.label} is chosen")
+                return
+        except NoSuchContour as error:
+            say(str(error))
+        except RemoteError as error:
+            say(error.message)
+
+
+def say(text: str, end: str = "\n") -> None:
+    """Show a text to the person."""
+    sys.stdout.write(text + end)
+    sys.stdout.flush()
+
+
+async def _keep(path: Path, contours: Contours, image: Image) -> None:
+    import cv2
+
+    written, data = cv2.imencode(".png", image_to_array(image))
+    assert written  # a picture of 8 bits can be
+    try:
+        await asyncio.to_thread(path.write_bytes, data.tobytes())
+    except OSError as error:
+        raise ConfigError("--ask", str(path), f"can not be written: {error.strerror or error}") from None
+
+
+async def _line() -> str:
+    """The next line from the terminal. Read without a thread, which could not be ended by Ctrl-C.
+
+    Raises:
+        ConfigError: there will be none.
+    """
+    loop, arrived = asyncio.get_running_loop(), asyncio.Event()
+    loop.add_reader(sys.stdin.fileno(), arrived.set)
+    try:
+        await arrived.wait()
+    finally:
+        loop.remove_reader(sys.stdin.fileno())
+    line = sys.stdin.readline()  # a terminal gives whole lines
+    if not line:
+        raise ConfigError("--ask", ..., "nothing was chosen")
+    return line.strip()
+
+
+async def store(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
+    """Put a picture, its depth and the stages of its outline into a folder; returns what was stored.
+
+    Raises:
+        NoOutline: there is a picture and no outline in it.
+        StageFileError: a file can not be written.
+    """
+    pictures, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
+    contours, points = bus.reader(CONTOURS), bus.reader(CONTOUR_POINTS)
+    paths = bus.reader(CONTOUR_PATH)
+    try:
+        async with asyncio.timeout(TIMEOUT):
+            first = await pictures.next()
+            if wanted is not None and wanted.rule != "auto":
+                await contours.next()
+                await bus.client(OUTLINE_SELECT).call(wanted)
+            picture, depth = await _pair(pictures, depths)
+            stage_files.write_pictures(folder, colour_picture(picture), depth_of(depth))
+            path = await paths.next()
+            while path.header.stamp < picture.header.stamp or not path.poses:
+                if path.message and path.header.stamp - first.header.stamp > ALL_WITHIN * 1e9:
+                    raise NoOutline(f"{path.message}; the picture is in {folder}")
+                path = await paths.next()
+    except TimeoutError:
+        raise NoOutline(f"no outline came within {TIMEOUT:g} s: does the cell have a depth camera?") from None
+    found, seen = points.latest, contours.latest
+    chosen = next((c for c in seen.contours if c.label == path.object), None) if seen else None
+    if chosen is not None:
+        stage_files.write_points(folder / stage_files.PIXELS, chosen.pixels)
+    if found is not None:
+        stage_files.write_points(folder / stage_files.COORDINATES, _points(found))
+    stage_files.write_points(folder / stage_files.CLEARED, _points(path))
+    return f"{path.object}, {len(path.poses)} points: the picture and the stages are in {folder}"
+
+
+async def _pair(pictures: Reader[Image], depths: Reader[Image]) -> tuple[Image, Image]:
+    """A picture and the depth image that was taken with it."""
+    while True:
+        picture, depth = await pictures.next(), depths.latest
+        if depth is not None and depth.header.stamp == picture.header.stamp:
+            return picture, depth
+
+
+def _points(outline: OutlinePoints) -> list[tuple[float, float, float]]:
+    return [(p.position.x, p.position.y, p.position.z) for p in outline.poses]
