@@ -37,7 +37,7 @@ audit: setup  ## known vulnerabilities in the dependencies, where the database c
 	.ci/audit $(BIN)
 
 bench: setup  ## every published figure, one module each
-	@for script in $$(grep -l __main__ benchmarks/*.py | grep -v subscribers); do module=benchmarks.$$(basename $$script .py); \
+	@for script in $$(grep -l __main__ benchmarks/*.py); do module=benchmarks.$$(basename $$script .py); \
 	  echo "== $$module"; $(BIN)/python -m $$module || exit 1; done
 
 chaos: setup  ## fifty runs, each under a plan of faults of its own: all of them have to end well

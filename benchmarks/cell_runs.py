@@ -17,9 +17,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from benchmarks.recheck import Contact, Recheck, record
-from benchmarks.runs import RunningCell, folder_for
 from common.config import load_cell
+from tests.cells.recheck import Contact, Recheck, record
+from tests.harness import RunningCell, folder_for
 
 CELL = "panda"
 TIMEOUT = 180.0  # [s] for one run

@@ -17,8 +17,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from benchmarks.runs import LOG, SUMMARY, RunningCell, folder_for
 from common.chaos.plan import LABELS
+from tests.harness import LOG, SUMMARY, RunningCell, folder_for
 
 USUAL = "panda"
 WORLD = {USUAL: [], "ur5": ["--world", "w2"]}

@@ -15,12 +15,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from benchmarks.runs import RunningCell, beside, folder_for, until
 from common import topics
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.config import load_cell
 from common.messages import SupervisorStatus
 from common.transport.bus import Bus
+from tests.harness import RunningCell, beside, folder_for, until
 
 CELL = "panda"
 SPARED = "viewer"  # nothing depends on it

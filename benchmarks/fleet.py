@@ -31,7 +31,6 @@ import numpy as np
 import psutil
 import zenoh
 
-from benchmarks.runs import RunningCell, free_domain
 from benchmarks.transport import router
 from common import topics
 from common.application import all_topics
@@ -42,6 +41,7 @@ from common.transport.connect import connect
 from common.transport.endpoint import client_config, endpoint_of
 from common.transport.session import RawSample
 from common.transport.zenoh_session import ZenohSession
+from tests.harness import RunningCell, free_domain
 
 CELL = "panda"
 CELLS = (1, 2, 5, 10, 25, 50, 100)

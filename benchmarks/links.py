@@ -14,8 +14,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cut_cell import SPLITS, CutCell
-from benchmarks.two_hosts import two_hosts, why_not
+from tests.hosts.cut_cell import SPLITS, CutCell
+from tests.hosts.two_hosts import two_hosts, why_not
 
 COUNT = 3  # balls
 SECONDS = (1.0, 10.0, 60.0)

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.runs import RunningCell, beside, folder_for
 from common import topics
 from common.applications.outlining.figures import distances
 from common.applications.outlining.messages import OutlinePoints, OutlineStatus
@@ -36,6 +35,7 @@ from common.robot.model import RobotModel
 from common.scene.fixtures import fixture_objects
 from common.sim.objects import world_object
 from common.transport.bus import Bus, Reader
+from tests.harness import RunningCell, beside, folder_for
 
 Array = NDArray[np.float64]
 

@@ -24,10 +24,10 @@ from pathlib import Path
 import psutil
 
 from benchmarks.first_picture import chromium, openings
-from benchmarks.runs import RunningCell, until
 from common import topics
 from common.messages import SupervisorStatus
 from tests.common.viewer.browser_double import BrowserDouble, opened
+from tests.harness import RunningCell, until
 
 SETTLE = 5.0  # [s] after the cell is up, for meshes to be read
 MEASURE = 15.0  # [s]

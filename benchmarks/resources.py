@@ -18,8 +18,8 @@ import psutil
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from benchmarks.runs import RunningCell, folder_for, until
 from common import topics
+from tests.harness import RunningCell, folder_for, until
 
 CELL = "panda"
 STARTS = 3

@@ -17,9 +17,9 @@ from pathlib import Path
 import psutil
 import zenoh
 
-from benchmarks.runs import command_line, environment, free_domain
 from common.transport.credentials import Credentials, credentials_of
 from common.transport.endpoint import client_config, endpoint_of
+from tests.harness import command_line, environment, free_domain
 
 SESSIONS, MESSAGES, PERIOD = 20, 300, 0.01
 SIZES = {"100 B": 100, "921,600 B": 921_600}

@@ -29,15 +29,15 @@ from statistics import median
 
 import psutil
 
-from benchmarks.losses import Losses
-from benchmarks.runs import LOG, RunningCell, beside, until
-from benchmarks.subscribers import Subscriber
 from common import topics
 from common.application import all_topics
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.errors import RequestFailed
 from common.messages import WorldEdit
 from common.transport.bus import Bus
+from tests.cells.losses import Losses
+from tests.cells.subscribers import Subscriber
+from tests.harness import LOG, RunningCell, beside, until
 
 CELL = "panda"
 PERIOD = 10.0  # [s] between looks

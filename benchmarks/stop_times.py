@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.runs import RunningCell, beside, folder_for, until
 from common import topics
 from common.applications.outlining.topics import OUTLINE_STATUS
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
@@ -24,6 +23,7 @@ from common.config import load_cell
 from common.messages import JointState, TaskCommand, TaskStatus, WorldEdit
 from common.robot.model import RobotModel
 from common.transport.bus import Bus, Client, Reader
+from tests.harness import RunningCell, beside, folder_for, until
 
 FAST = 0.6  # share of the fastest that the cell's default scaling allows
 SETTLE = 0.3  # [s] between two looks

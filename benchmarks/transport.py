@@ -20,12 +20,12 @@ from multiprocessing.process import BaseProcess
 
 import numpy as np
 
-from benchmarks.runs import ROOT, environment, free_domain
 from common import messages as m
 from common.topics import Request, Topic
 from common.transport.bus import Bus
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
+from tests.harness import ROOT, environment, free_domain
 
 CELL = "transport"
 WRITER = "writer"

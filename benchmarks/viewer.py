@@ -22,8 +22,8 @@ import viser
 from websockets import Subprotocol
 from websockets.asyncio.client import connect
 
-from benchmarks.runs import RunningCell, until
 from common import topics
+from tests.harness import RunningCell, until
 
 PAGES = (0, 1, 10)
 SECONDS = 12.0  # measured for each number of pages

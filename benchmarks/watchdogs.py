@@ -14,12 +14,12 @@ from pathlib import Path
 
 import psutil
 
-from benchmarks.runs import RunningCell, until
 from common import topics
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import MotionStatus, ServiceStatus, SupervisorStatus
 from common.transport.bus import Bus
+from tests.harness import RunningCell, until
 
 FROZEN = ("vision_detector", "camera_simulator", "trajectory_executor", "router")
 

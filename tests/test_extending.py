@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.runs import free_domain
 from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import check, load_cell, service_config
 from common.errors import ConfigError, UnknownName
@@ -30,6 +29,7 @@ from common.process.wiring import wiring
 from common.robot.model import RobotModel
 from common.topics import CAMERA_IMAGE, CAMERA_INFO
 from common.transport.local import LocalNetwork
+from tests.harness import free_domain
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent

@@ -53,6 +53,10 @@ def test_common_never_imports_services_or_the_command_line() -> None:
     assert offences(sources("common"), ("services", "cli")) == []
 
 
+def test_tests_do_not_import_benchmarks() -> None:
+    assert offences(sources("tests"), ("benchmarks",)) == []
+
+
 def test_only_the_transport_imports_zenoh() -> None:
     transport = ROOT / "common" / "transport"
     others = [path for path in sources("common", "services", "cli") if transport not in path.parents]

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.runs import free_domain
+from tests.harness import free_domain
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.runs import RunningCell, until
 from common import topics
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.topics import PICK_PLACE_STATUS, SCENE_BALLS
 from common.messages import GripperState, MotionStatus, PoseArray
+from tests.harness import RunningCell, until
 
 pytestmark = pytest.mark.cell
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from benchmarks.runs import RunningCell, until
 from common import topics
 from common.applications.outlining.topics import OUTLINE_STATUS
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
@@ -16,6 +15,7 @@ from common.config import load_cell
 from common.messages import JointGoal, JointState, MotionStatus, TaskCommand
 from common.process.operator_motion import MotionFailed, OperatorMotion
 from common.transport.bus import Bus, Reader
+from tests.harness import RunningCell, until
 
 pytestmark = pytest.mark.cell
 

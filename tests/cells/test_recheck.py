@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.recheck import Recheck, Recording
 from common.config import load_cell
 from common.messages import GripperState, Header, JointState, Pose, PoseArray, Vector3
 from common.robot.ik import solve_ik
 from common.robot.transforms import tool_down
+from tests.cells.recheck import Recheck, Recording
 
 Array = NDArray[np.float64]
 CELL = load_cell("panda")

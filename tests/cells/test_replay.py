@@ -12,13 +12,13 @@ from typing import Any
 import msgpack
 import pytest
 
-from benchmarks.runs import RunningCell, command_line, environment, free_domain, until
 from common.applications.outlining.topics import CONTOURS
 from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.recording.reading import Recording
 from common.topics import Topic
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
+from tests.harness import RunningCell, command_line, environment, free_domain, until
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.timeout(240)]
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.losses import Losses
-from benchmarks.runs import RunningCell, beside, until
-from benchmarks.subscribers import Subscriber
 from common import topics
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import ServiceCounters, TaskCommand
 from common.transport.bus import Bus
+from tests.cells.losses import Losses
+from tests.cells.subscribers import Subscriber
+from tests.harness import RunningCell, beside, until
 
 pytestmark = pytest.mark.cell
 

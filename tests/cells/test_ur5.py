@@ -17,13 +17,13 @@ from typing import Any
 
 import pytest
 
-from benchmarks.runs import RunningCell, command_line, environment, free_domain, until
 from common import topics
 from common.applications.outlining import stage_files
 from common.applications.outlining.messages import OutlineStatus
 from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
 from common.config import load_cell
 from common.messages import SupervisorStatus
+from tests.harness import RunningCell, command_line, environment, free_domain, until
 
 pytestmark = pytest.mark.cell
 

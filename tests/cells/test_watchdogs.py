@@ -11,11 +11,11 @@ import psutil
 import pytest
 import yaml
 
-from benchmarks.runs import ROOT, RunningCell, until
 from common import topics
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import MotionStatus, ParameterRequest, SupervisorStatus
 from common.transport.bus import Bus
+from tests.harness import ROOT, RunningCell, until
 
 pytestmark = pytest.mark.cell
 

@@ -16,10 +16,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from benchmarks.runs import RunningCell, until
 from common import topics
 from common.config import load_cell
 from common.messages import SupervisorStatus
+from tests.harness import RunningCell, until
 
 pytestmark = pytest.mark.cell
 

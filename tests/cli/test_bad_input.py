@@ -1,12 +1,13 @@
 """Bad input gets one line that names the thing, the value and the choices; exit code 2 and no traceback."""
 
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 from cli.main import app
-from tests.cli.conftest import ask
+from tests.harness import ask, command_line, environment
 
 CASES: dict[str, tuple[list[str], list[str]]] = {
     "unknown cell": (["run", "pnada"], ["unknown cell 'pnada'", "did you mean 'panda'?", "choices:"]),
@@ -82,7 +83,8 @@ def test_bad_input_is_one_line_and_exit_code_2(
 
 
 def test_the_process_ends_with_the_exit_code_and_without_a_traceback(tmp_path: Path) -> None:
-    done = ask(tmp_path, "run", "pnada")
+    done = subprocess.run(command_line("run", "pnada"), cwd=tmp_path, env=environment(), capture_output=True, text=True,
+                          timeout=100, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith("zencell: unknown cell 'pnada' (did you mean 'panda'?); choices: ")

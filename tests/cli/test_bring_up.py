@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import Zencell
+from tests.harness import Zencell
 
 Start = Callable[..., Zencell]
 UP = "zenoh --mode client"  # the last line that `up` writes when all is ready

@@ -10,7 +10,7 @@ from common.application import all_topics
 from common.config import load_cell, service_config, service_names
 from common.planning.planners import planner_names
 from common.topics import Topic
-from tests.cli.conftest import PATIENCE, ask, command_line, environment
+from tests.harness import PATIENCE, ask, command_line, environment
 
 
 def offered(line: str, folder: Path, shell: str = "bash", **more: str) -> list[str]:
@@ -18,10 +18,7 @@ def offered(line: str, folder: Path, shell: str = "bash", **more: str) -> list[s
     words = line.split(" ")
     asked = {"COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)} if shell == "bash" else {
         "_TYPER_COMPLETE_ARGS": line, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
-    done = subprocess.run(
-        command_line(), cwd=folder, env=environment() | {"_ZENCELL_COMPLETE": f"complete_{shell}"} | asked | more,
-        capture_output=True, text=True, timeout=PATIENCE, check=False,
-    )
+    done = ask(folder, environment={"_ZENCELL_COMPLETE": f"complete_{shell}"} | asked | more)
     assert done.stderr == ""
     return done.stdout.split("\n")[:-1]
 

@@ -19,7 +19,7 @@ from cli.doctor.leftovers import Seen
 from cli.main import app
 from common.errors import DecodeError
 from common.transport.local import LocalNetwork
-from tests.cli.conftest import Zencell
+from tests.harness import Zencell
 
 Disk = namedtuple("Disk", "total used free")
 NOWHERE = "tcp/127.0.0.1:1"
@@ -165,7 +165,6 @@ def test_service_that_can_not_be_imported_fails(folder: Path, monkeypatch: pytes
     monkeypatch.setenv("ZENCELL_CONFIG", str(folder))
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(sys, "modules", dict(sys.modules))
     (finding,) = configuration.cells()
     not_well(finding, "cell tiny", "nothing_of_that_name", "install what is missing", level="fail")
 

@@ -22,7 +22,7 @@ from common.topics import Topic
 from common.transport.codec import decode
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
-from tests.cli.conftest import command_line, environment
+from tests.harness import command_line, environment
 
 DATA = Path(__file__).resolve().parent.parent / "data"
 PATIENCE = 60.0  # [s]

@@ -8,50 +8,29 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.runs import free_domain
-from tests.cli.conftest import CELL, PATIENCE, Zencell, ask, environment, make_folder
+from common.transport.endpoint import endpoint_of
+from tests.cli.conftest import CELL, make_folder
+from tests.harness import PATIENCE, Place, environment, place_of
 
 ZENOH = Path(sys.executable).parent / "zenoh"
 needs_zenoh_cli = pytest.mark.skipif(not ZENOH.exists(), reason="zenoh-cli is not installed beside this Python")
 
 
-class Place:
-    """A cell that is up and talks, and how to ask about it."""
-
-    def __init__(self, folder: Path, domain: int) -> None:
-        self.folder = folder
-        self.domain = domain
-
-    def ask(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return ask(self.folder, *arguments, "--domain", str(self.domain))
-
-    def say(self, *arguments: str) -> list[str]:
-        """The lines of a command that goes well."""
-        done = self.ask(*arguments)
-        assert (done.returncode, done.stderr) == (0, "")
-        return done.stdout.splitlines()
-
-    def zenoh(self, *arguments: str) -> list[str]:
-        endpoint = f"tcp/127.0.0.1:{7447 + self.domain}"
-        done = subprocess.run(
-            [str(ZENOH), "--mode", "client", "--connect", endpoint, *arguments], cwd=self.folder,
-            env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=True,
-        )
-        return done.stdout.splitlines()
+def zenoh(place: Place, *arguments: str) -> list[str]:
+    """What zenoh-cli says about the cell."""
+    done = subprocess.run(
+        [str(ZENOH), "--mode", "client", "--connect", endpoint_of(place.domain), *arguments], cwd=place.folder,
+        env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=True,
+    )
+    return done.stdout.splitlines()
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     folder = make_folder(tmp_path_factory.mktemp("inspect"))
     (folder / "talk.yaml").write_text(CELL.replace("fakes.first", "fakes.talker").replace("cell: tiny", "cell: talk"))
-    domain = free_domain()
-    command = Zencell(folder, domain, "up", "talk.yaml")
-    try:
-        command.until("zenoh --mode client")
-        yield Place(folder, domain)
-    finally:
-        command.interrupt()
-        assert command.end() == 0
+    with place_of(folder, "talk.yaml") as place:
+        yield place
 
 
 def test_node_list_names_who_is_ready(place: Place) -> None:
@@ -127,7 +106,7 @@ def test_a_cell_that_is_named_wrongly_is_told_from_one_that_is_not_up(place: Pla
 
 @needs_zenoh_cli
 def test_zenoh_cli_decodes_states_and_pictures(place: Place) -> None:
-    (line,) = place.zenoh("get", "-s", "talk/pick_place_status", "--decoder", "msgpack", "--line", "{key} {value}")
+    (line,) = zenoh(place, "get", "-s", "talk/pick_place_status", "--decoder", "msgpack", "--line", "{key} {value}")
     key, _, value = line.partition(" ")
     assert key == "talk/pick_place_status"
     assert json.loads(value)["state"] == "IDLE"
@@ -136,7 +115,7 @@ def test_zenoh_cli_decodes_states_and_pictures(place: Place) -> None:
 @needs_zenoh_cli
 def test_zenoh_cli_reads_the_line_that_up_prints(place: Place) -> None:
     listening = subprocess.Popen(
-        [str(ZENOH), "--mode", "client", "--connect", f"tcp/127.0.0.1:{7447 + place.domain}", "subscribe",
+        [str(ZENOH), "--mode", "client", "--connect", endpoint_of(place.domain), "subscribe",
          "-k", "talk/**", "--decoder", "msgpack", "--line", "{key} {value}"],
         stdout=subprocess.PIPE, text=True, env=environment(),
     )
@@ -158,9 +137,8 @@ def test_zenoh_cli_reads_the_line_that_up_prints(place: Place) -> None:
 
 @needs_zenoh_cli
 def test_zenoh_cli_can_ask_a_request(place: Place) -> None:
-    (line,) = place.zenoh(
-        "get", "-s", "talk/task/command", "--encoder", "msgpack", "-v", '{"command": "pause"}', "--decoder", "msgpack"
-    )
+    (line,) = zenoh(place, "get", "-s", "talk/task/command", "--encoder", "msgpack", "-v", '{"command": "pause"}',
+                    "--decoder", "msgpack")
     assert json.loads(line)["paused"] is True
 
 

@@ -1,18 +1,16 @@
 """The verbs that look at a cell that is up, with real processes, at a speed at which wrong clocks show."""
 
 import json
-import subprocess
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
-from pathlib import Path
+from contextlib import contextmanager
 
 import pytest
 
-from benchmarks.runs import free_domain
-from tests.cli.conftest import CELL, Zencell, command_line, environment, make_folder
+from tests.cli.conftest import CELL, make_folder
+from tests.harness import Place, place_of
 
 SPEED = "2"
-LONGEST = 100.0  # [s] until a command is taken for hanging, on a machine however busy
 LATE = 0.4  # [s] of cell time: how old the pictures are when they are sent
 
 FRAMES = f'''"""Says where things are, and sends pictures late."""
@@ -48,39 +46,13 @@ if __name__ == "__main__":
 '''
 
 
-class Place:
-    """A cell that is up, and how to ask about it."""
-
-    def __init__(self, folder: Path, domain: int) -> None:
-        self.folder = folder
-        self.domain = domain
-
-    def ask(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            command_line(*arguments, "--domain", str(self.domain)), cwd=self.folder, env=environment(),
-            capture_output=True, text=True, timeout=LONGEST, check=False,
-        )
-
-    def say(self, *arguments: str) -> list[str]:
-        """The lines of a command that goes well."""
-        done = self.ask(*arguments)
-        assert (done.returncode, done.stderr) == (0, "")
-        return done.stdout.splitlines()
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     folder = make_folder(tmp_path_factory.mktemp("looking"))
     (folder / "fakes" / "frames.py").write_text(FRAMES)
     (folder / "look.yaml").write_text(CELL.replace("fakes.first", "fakes.frames").replace("cell: tiny", "cell: look"))
-    domain = free_domain()
-    command = Zencell(folder, domain, "up", "look.yaml", "--speed", SPEED)
-    try:
-        command.until("zenoh --mode client")
-        yield Place(folder, domain)
-    finally:
-        command.interrupt()
-        assert command.end() == 0
+    with place_of(folder, "look.yaml", "--speed", SPEED) as place:
+        yield place
 
 
 def test_tf_echo_chains_what_is_fixed_and_what_moves(place: Place) -> None:
@@ -104,26 +76,30 @@ def test_delay_is_wall_time_at_any_speed(place: Place) -> None:
     assert figures["min"] <= figures["mean"] <= figures["p99"] <= figures["max"]
 
 
-def test_messages_without_a_stamp_have_no_delay(place: Place) -> None:
-    publishing = Zencell(place.folder, place.domain, "topic", "pub", "my/key", '{"a": 1}', "--rate", "20")
+@contextmanager
+def published(place: Place, key: str, *arguments: str) -> Iterator[None]:
+    """A key that is published during the block, and was heard before."""
+    publishing = place.start("topic", "pub", key, *arguments)
     try:
-        done = place.ask("topic", "delay", "my/key", "--count", "3")
+        place.ask("topic", "echo", key, "--count", "1")
+        yield
     finally:
         publishing.interrupt()
         assert publishing.end() == 130
+
+
+def test_messages_without_a_stamp_have_no_delay(place: Place) -> None:
+    with published(place, "my/key", '{"a": 1}', "--rate", "20"):
+        done = place.ask("topic", "delay", "my/key", "--count", "3")
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert line.startswith("zencell: my/key: its messages have no header with a stamp")
 
 
 def test_published_state_can_be_asked_for_while_it_is_published(place: Place) -> None:
-    publishing = Zencell(place.folder, place.domain, "topic", "pub", "gripper/state", '{"width": 0.04}', "--rate", "5")
-    try:
+    with published(place, "gripper/state", '{"width": 0.04}', "--rate", "5"):
         (line,) = place.say("topic", "echo", "gripper/state", "--count", "1")
         delayed = json.loads(place.say("topic", "delay", "gripper/state", "--count", "2", "--json")[-1])
-    finally:
-        publishing.interrupt()
-        assert publishing.end() == 130
     said = json.loads(line)
     assert said["width"] == 0.04
     assert said["header"]["stamp"] > 0
@@ -131,18 +107,13 @@ def test_published_state_can_be_asked_for_while_it_is_published(place: Place) ->
 
 
 def test_keys_of_ones_own_are_published_as_they_were_written(place: Place) -> None:
-    echoing = Zencell(place.folder, place.domain, "topic", "echo", "my/other", "--count", "1")
-    publishing = Zencell(place.folder, place.domain, "topic", "pub", "my/other", '{"a": [1, {"b": null}]}', "-r", "10")
-    try:
-        assert json.loads(echoing.until("{")) == {"a": [1, {"b": None}]}
-    finally:
-        publishing.interrupt()
-        assert publishing.end() == 130
-    assert echoing.end() == 0
+    with published(place, "my/other", '{"a": [1, {"b": null}]}', "-r", "10"):
+        (line,) = place.say("topic", "echo", "my/other", "--count", "1")
+    assert json.loads(line) == {"a": [1, {"b": None}]}
 
 
 def test_publishing_once_reaches_who_listens_and_ends(place: Place) -> None:
-    echoing = Zencell(place.folder, place.domain, "topic", "echo", "log", "--count", "1", "--json")
+    echoing = place.start("topic", "echo", "log", "--count", "1", "--json")
     # What listens is there as soon as it has heard one; until then each try is one message.
     while echoing.process.poll() is None:
         assert place.ask("topic", "pub", "log", '{"service": "me", "level": "info", "message": "hello"}',
@@ -168,7 +139,7 @@ def test_top_shows_processes_and_topics(place: Place) -> None:
 
 
 def test_top_goes_on_in_plain_lines_until_interrupted(place: Place) -> None:
-    watching = Zencell(place.folder, place.domain, "top")
+    watching = place.start("top")
     for _ in range(2):
         watching.until("look at speed 2")
         watching.until("camera/image_raw")

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import yaml
 
-from benchmarks.runs import free_domain
 from cli import param
 from cli.main import app
 from common.config import load_cell, service_config
@@ -19,7 +18,8 @@ from common.errors import RequestTimeout
 from common.messages import Parameter, ParameterReply, ParameterRequest
 from common.topics import parameters_of
 from common.transport.local import LocalNetwork
-from tests.cli.conftest import Zencell, make_folder
+from tests.cli.conftest import make_folder
+from tests.harness import Zencell, free_domain
 
 TUNED = '''"""Has parameters."""
 import asyncio

@@ -14,14 +14,14 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.runs import free_domain
 from cli.playing import names_of
 from cli.recording import in_bytes, outcome, progress
 from common.recording.reading import Recording
 from common.recording.sink import Figures
 from common.recording.summary import summarise
-from tests.cli.conftest import CELL, PATIENCE, Zencell, ask, command_line, environment, make_folder
+from tests.cli.conftest import CELL, make_folder
 from tests.common.recording.samples import joints, status, write
+from tests.harness import PATIENCE, Place, Zencell, ask, command_line, environment, free_domain, place_of
 
 Start = Callable[..., Zencell]
 
@@ -48,18 +48,8 @@ if __name__ == "__main__":
 '''
 
 
-class Place:
+class Recorded(Place):
     """A cell that is up and sends pictures."""
-
-    def __init__(self, folder: Path, domain: int) -> None:
-        self.folder = folder
-        self.domain = domain
-
-    def start(self, *arguments: str) -> Zencell:
-        return Zencell(self.folder, self.domain, *arguments)
-
-    def ask(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return ask(self.folder, *arguments, "--domain", str(self.domain))
 
     def record(self, name: str, *arguments: str) -> Zencell:
         """A recording under way."""
@@ -69,19 +59,13 @@ class Place:
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
     folder = make_folder(tmp_path_factory.mktemp("recording"))
     (folder / "fakes" / "camera_simulator.py").write_text(CAMERA)
     cell = CELL.replace("fakes.first", "fakes.camera_simulator").replace("cell: tiny", "cell: talk")
     (folder / "talk.yaml").write_text(cell)
-    domain = free_domain()
-    command = Zencell(folder, domain, "up", "talk.yaml", "--seed", "5", "--set", "services.last.placed=2")
-    try:
-        command.until("zenoh --mode client")
-        yield Place(folder, domain)
-    finally:
-        command.interrupt()
-        assert command.end() == 0
+    with place_of(folder, "talk.yaml", "--seed", "5", "--set", "services.last.placed=2") as up:
+        yield Recorded(up.folder, up.domain)
 
 
 def until_it_holds(path: Path, wanted: Callable[[Recording], bool]) -> None:
@@ -100,7 +84,7 @@ def pictures(least: int) -> Callable[[Recording], bool]:
     return lambda recording: sum(1 for s in recording.samples(lambda topic: topic == "camera/image_raw")) >= least
 
 
-def test_ctrl_c_ends_a_recording_that_has_everything_from_the_start(place: Place) -> None:
+def test_ctrl_c_ends_a_recording_that_has_everything_from_the_start(place: Recorded) -> None:
     command = place.record("all.mcap")
     until_it_holds(place.folder / "all.mcap", pictures(5))
     command.interrupt()
@@ -121,7 +105,7 @@ def test_ctrl_c_ends_a_recording_that_has_everything_from_the_start(place: Place
     assert 0 < image.log_time - image.publish_time < PATIENCE * 1e9
 
 
-def test_only_what_is_wanted_is_recorded_for_the_time_that_is_wanted(place: Place) -> None:
+def test_only_what_is_wanted_is_recorded_for_the_time_that_is_wanted(place: Recorded) -> None:
     done = place.ask("record", "camera/image_raw", "--regex", "^pick", "--exclude", "counters", "-o", "some.mcap",
                      "--duration", "0.5")
     assert done.returncode == 0, done.stderr
@@ -134,7 +118,7 @@ def test_only_what_is_wanted_is_recorded_for_the_time_that_is_wanted(place: Plac
     assert any(line.split()[:2] == ["camera/image_raw", "Image"] for line in lines)
 
 
-def test_killed_recorder_leaves_what_recover_makes_whole(place: Place) -> None:
+def test_killed_recorder_leaves_what_recover_makes_whole(place: Recorded) -> None:
     path = place.folder / "killed.mcap"
     command = place.record("killed.mcap")
     until_it_holds(path, pictures(10))
@@ -150,7 +134,7 @@ def test_killed_recorder_leaves_what_recover_makes_whole(place: Place) -> None:
         assert recording.finished and pictures(10)(recording)
 
 
-def test_full_disk_stops_the_recording_with_one_line(place: Place) -> None:
+def test_full_disk_stops_the_recording_with_one_line(place: Recorded) -> None:
     def little_room() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))
 
@@ -167,7 +151,7 @@ def test_full_disk_stops_the_recording_with_one_line(place: Place) -> None:
         assert recording.topics()
 
 
-def test_played_recording_is_new_to_readers_and_its_states_can_be_asked_for(place: Place) -> None:
+def test_played_recording_is_new_to_readers_and_its_states_can_be_asked_for(place: Recorded) -> None:
     command = place.record("again.mcap", "camera/*", "pick_pl*")
     until_it_holds(place.folder / "again.mcap", pictures(5))
     command.interrupt()
@@ -190,7 +174,7 @@ def test_played_recording_is_new_to_readers_and_its_states_can_be_asked_for(plac
     assert {sample.writer.partition(".")[0] for sample in came} == {"player"}
 
 
-def test_play_says_who_else_writes_the_same(place: Place) -> None:
+def test_play_says_who_else_writes_the_same(place: Recorded) -> None:
     write(place.folder / "twice.mcap", [joints(0, key="panda/camera/image_raw"), joints(1)])
     done = place.ask("play", "twice.mcap", "--cell", "talk", "--wait", "camera_simulator")
     assert done.returncode == 0

@@ -12,7 +12,7 @@ from common.config import Cell, load_cell
 from common.errors import ConfigError
 from common.viewer.access import TOKEN_VARIABLE
 from common.viewer.listening import FIRST_PORT
-from tests.cli.conftest import Zencell, ask
+from tests.harness import Zencell, ask
 
 OPTIONS = (("--viewer-port", "9000"), ("--viewer-host", "0.0.0.0"))
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.cut_cell import CutCell
-from benchmarks.two_hosts import two_hosts, why_not
+from tests.hosts.cut_cell import CutCell
+from tests.hosts.two_hosts import two_hosts, why_not
 
 REASON = why_not()
 pytestmark = [pytest.mark.cell, pytest.mark.skipif(bool(REASON), reason=REASON)]

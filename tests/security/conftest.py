@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.runs import command_line, environment
+from tests.harness import command_line, environment
 
 
 @pytest.fixture(scope="session")

@@ -20,7 +20,6 @@ import psutil
 import pytest
 import zenoh
 
-from benchmarks.runs import RunningCell, command_line, environment, until
 from common import messages as m
 from common import topics
 from common.applications.pick_place.topics import DETECTED_OBJECTS
@@ -31,6 +30,7 @@ from common.transport.codec import DEFAULT_LIMIT, decode, encode
 from common.transport.connect import connect
 from common.transport.credentials import ROUTER_NAME, Credentials, credentials_of
 from common.transport.endpoint import MOST_BYTES, MOST_BYTES_BESIDES, client_config, router_config
+from tests.harness import RunningCell, command_line, environment, until
 from tests.security.holders import REFUSED, Heard, Holder
 
 pytestmark = [pytest.mark.cell, pytest.mark.timeout(300)]

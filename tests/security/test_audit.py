@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.runs import ROOT
 from common.security.certificates import Authority
+from tests.harness import ROOT
 
 BIN = Path(sys.executable).parent
 pytestmark = pytest.mark.skipif(not (BIN / "pip-audit").exists(), reason="pip-audit is not installed")

@@ -9,10 +9,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from benchmarks.runs import RunningCell, until
 from common import topics
 from common.messages import SupervisorStatus
 from common.transport.endpoint import port_of
+from tests.harness import RunningCell, until
 from tests.security.holders import Holder
 from tests.security.test_routers import free_port
 

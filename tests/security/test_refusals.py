@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.runs import free_domain
 from cli.hosts import Share
 from cli.main import app
 from cli.securing import require_secured
@@ -18,6 +17,7 @@ from common.errors import ConfigError
 from common.security.certificates import Authority
 from common.supervision.launch import Launch
 from common.transport.credentials import ACCESS, ROUTER_NAME
+from tests.harness import free_domain
 
 CELL = load_cell("panda")
 

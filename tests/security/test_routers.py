@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from benchmarks.runs import ROOT, environment, free_domain
 from cli.main import app
 from common.errors import ConfigError
 from common.security.access import Rights, access_control
@@ -20,6 +19,7 @@ from common.security.certificates import Authority
 from common.transport.credentials import ACCESS, ROUTER_NAME, credentials_of, read_access
 from common.transport.endpoint import port_of, router_config
 from common.transport.router import open_router
+from tests.harness import ROOT, environment, free_domain
 from tests.security.holders import REFUSED, Holder
 
 

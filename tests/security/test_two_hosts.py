@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.runs import RunningCell
 from common.config import load_cell
 from common.transport.credentials import credentials_of
 from common.transport.endpoint import port_of
+from tests.harness import RunningCell
 from tests.security.holders import PATIENCE, Heard, Holder
 
 pytestmark = [pytest.mark.cell, pytest.mark.timeout(300)]

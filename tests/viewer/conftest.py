@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 import pytest
 import pytest_asyncio
 
-from benchmarks.runs import RunningCell
+from tests.harness import RunningCell
 
 if TYPE_CHECKING:
     from playwright.async_api import Browser, BrowserContext, Page, ViewportSize

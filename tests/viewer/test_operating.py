@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from benchmarks.runs import until
 from common import topics
 from common.applications.outlining.messages import OutlineStatus
 from common.applications.outlining.topics import CONTOURS, OUTLINE_STATUS
@@ -24,6 +23,7 @@ from common.messages import (
     SupervisorStatus,
 )
 from common.transport.bus import Client, Reader
+from tests.harness import until
 from tests.viewer.conftest import IN_BROWSER, PATIENCE, Bring, Watched
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ from websockets import Origin, Subprotocol
 from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as connect_socket
 
-from benchmarks.runs import until
 from common import topics
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import TaskCommand
 from common.viewer.guard import close_server, make_server
+from tests.harness import until
 from tests.viewer.conftest import IN_BROWSER, PATIENCE, Bring, Opened, Viewed, Watched
 
 pytestmark = IN_BROWSER

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import signal
 import subprocess
 import sys
@@ -13,15 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.runs import free_domain
 from common.clock import Clock
 from common.transport.bus import Bus
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
 from common.transport.local import LocalNetwork
 from common.transport.zenoh_session import wait_router
+from tests.harness import ROOT, environment, free_domain
 
-ROOT = Path(__file__).resolve().parents[3]
 PATIENCE = 20.0  # only ever waited for by a test that fails
 
 
@@ -40,11 +38,10 @@ class Processes:
         self._started: list[subprocess.Popen[bytes]] = []
 
     def start(self, module: str, *arguments: str) -> subprocess.Popen[bytes]:
-        environment = {k: v for k, v in os.environ.items() if not k.startswith("ZENCELL_")} | {"PYTHONPATH": str(ROOT)}
         with self.log_of(len(self._started)).open("wb") as log:
             process = subprocess.Popen(
                 [sys.executable, "-m", module, *arguments], cwd=ROOT, stdin=subprocess.PIPE, stderr=log,
-                env=environment,
+                env=environment(),
             )
         self._started.append(process)
         return process

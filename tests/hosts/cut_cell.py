@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from benchmarks.two_hosts import TwoHosts
+from tests.hosts.two_hosts import TwoHosts
 
 DOMAIN = "42"  # each host has ports of its own
 PORT = 7447 + int(DOMAIN)
@@ -61,7 +61,7 @@ class CutCell:
         )
         arm = second if self.split == "perception" else first
         self._out = self.folder / "events"
-        arm.start(sys.executable, "-m", "benchmarks.cut_observer", DOMAIN, file=self._out)
+        arm.start(sys.executable, "-m", "tests.hosts.cut_observer", DOMAIN, file=self._out)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:

@@ -1,25 +1,41 @@
-"""Cells as processes of their own, for benchmarks and tests: started, listened to, and none left behind."""
+"""Cells and commands of zencell for tests and benchmarks: as processes of their own, of which none is left behind, and,
+where nothing of a process matters, in this one.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import importlib
+import io
 import json
 import logging
 import os
+import queue
 import random
 import signal
 import socket
 import subprocess
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
+from contextlib import (
+    AbstractAsyncContextManager,
+    asynccontextmanager,
+    chdir,
+    contextmanager,
+    redirect_stderr,
+    redirect_stdout,
+    suppress,
+)
 from pathlib import Path
 from typing import Any, TypeVar
+from unittest.mock import patch
 
 import psutil
 
+from cli.main import app
 from common.messages import Message
 from common.transport.bus import Bus, Reader
 from common.transport.connect import connect
@@ -29,6 +45,7 @@ M = TypeVar("M", bound=Message)
 
 ROOT = Path(__file__).resolve().parent.parent
 DOMAINS = range(60, 233)
+PATIENCE = 40.0  # [s] until a test gives up waiting for an event
 logging.getLogger("watcher").addHandler(logging.NullHandler())  # that the router goes at the end is no news
 _given: deque[int] = deque(maxlen=len(DOMAINS) // 4)  # lately, and perhaps not yet listened at
 SUMMARY, LOG = "summary.json", "cell.log"
@@ -118,7 +135,7 @@ class RunningCell:
 
     def processes(self) -> dict[str, psutil.Process]:
         """The processes that the cell's supervisor started, by service, whoever their parent is now."""
-        return {name: process for name, process in _services() if _domain_of(process) == self.domain}
+        return processes_of(self.domain)
 
     async def ended(self, timeout: float) -> int:
         """Exit code, once the command has ended by itself.
@@ -160,16 +177,146 @@ class RunningCell:
         return subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=30, check=False)
 
 
-def _services() -> Iterator[tuple[str, psutil.Process]]:
+class Zencell:
+    """A running zencell command, its lines as they come, and its processes."""
+
+    def __init__(self, folder: Path, domain: int, *arguments: str) -> None:
+        self.domain = domain
+        self.lines: list[str] = []
+        self._new: queue.Queue[str] = queue.Queue()
+        self.process = subprocess.Popen(
+            command_line(*arguments, "--domain", str(domain)), cwd=folder, env=environment(),
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        )
+        self._reading = threading.Thread(target=self._read, daemon=True)
+        self._reading.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self._new.put(line.rstrip("\n"))
+        self._new.put("")
+
+    def until(self, wanted: Callable[[str], bool] | str, *, timeout: float = PATIENCE) -> str:
+        """The first line from now on that is wanted."""
+        deadline = time.monotonic() + timeout
+        while True:
+            try:
+                line = self._new.get(timeout=max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                raise AssertionError(f"{wanted!r} did not come; so far:\n" + "\n".join(self.lines)) from None
+            self.lines.append(line)
+            if wanted in line if isinstance(wanted, str) else wanted(line):
+                return line
+            if not line and not self._reading.is_alive() and self._new.empty():
+                raise AssertionError(f"{wanted!r} never came:\n" + "\n".join(self.lines))
+
+    def end(self, timeout: float = PATIENCE) -> int:
+        """The exit code, once the command has ended; all its lines are there then."""
+        code = self.process.wait(timeout)
+        self._reading.join(timeout)
+        while not self._new.empty():
+            self.lines.append(self._new.get())
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        return code
+
+    def interrupt(self) -> None:
+        """Press Ctrl-C."""
+        self.process.send_signal(signal.SIGINT)
+
+    def children(self) -> dict[str, psutil.Process]:
+        """All processes of this cell by name, whoever their parent is now."""
+        return processes_of(self.domain)
+
+    def until_childless(self, timeout: float = PATIENCE) -> None:
+        """Return when no process is left."""
+        deadline = time.monotonic() + timeout
+        while left := self.children():
+            assert time.monotonic() < deadline, f"left behind: {sorted(left)}"
+            time.sleep(0.05)
+
+
+def ask(
+    folder: Path, *arguments: str, environment: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """A zencell command that ends by itself, run in this process: its start is most of what it would take.
+
+    Args:
+        folder: where the person stands; modules that lie there are forgotten afterwards.
+        arguments: of the command.
+        environment: variables beside those of this process, of which zencell is told nothing.
+    """
+    out, err = io.StringIO(), io.StringIO()
+    told = {name: value for name, value in os.environ.items() if not name.startswith("ZENCELL_")} | (environment or {})
+    with (chdir(folder), patch.dict(os.environ, told, clear=True), own_modules(folder), redirect_stdout(out),
+          redirect_stderr(err)):
+        try:
+            code = app.execute(arguments)
+        except SystemExit as end:  # what a shell asks to complete words ends so
+            code = int(end.code or 0)
+    return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
+
+
+@contextmanager
+def own_modules(folder: Path) -> Iterator[None]:
+    """Modules of a folder are found during the block and forgotten at its end, so that another may have the same."""
+    with patch.object(sys, "path", [*sys.path]):
+        importlib.invalidate_caches()
+        try:
+            yield
+        finally:
+            for name, module in list(sys.modules.items()):
+                places = [getattr(module, "__file__", None) or "", *getattr(module, "__path__", ())]
+                if any(Path(place).is_relative_to(folder) for place in places if place):
+                    del sys.modules[name]
+
+
+class Place:
+    """A cell that is up in a folder, and how to ask about it."""
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self.folder = folder
+        self.domain = domain
+
+    def start(self, *arguments: str) -> Zencell:
+        """A command as a process of its own."""
+        return Zencell(self.folder, self.domain, *arguments)
+
+    def ask(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """A command that ends by itself."""
+        return ask(self.folder, *arguments, "--domain", str(self.domain))
+
+    def say(self, *arguments: str) -> list[str]:
+        """The lines of a command that goes well."""
+        done = self.ask(*arguments)
+        assert (done.returncode, done.stderr) == (0, "")
+        return done.stdout.splitlines()
+
+
+@contextmanager
+def place_of(folder: Path, file: str, *arguments: str) -> Iterator[Place]:
+    """A cell that is up during the block and ends well."""
+    place = Place(folder, free_domain())
+    command = place.start("up", file, *arguments)
+    try:
+        command.until("zenoh --mode client")
+        yield place
+    finally:
+        command.interrupt()
+        assert command.end() == 0
+
+
+def processes_of(domain: int) -> dict[str, psutil.Process]:
+    """The processes that a supervisor started in a domain, by service, whoever their parent is now."""
+    found = {}
     for process in psutil.process_iter(["cmdline", "status"]):
-        command = process.info["cmdline"] or []
+        command: list[str] = process.info["cmdline"] or []
         if "--gate" in command and "-m" in command and process.info["status"] != psutil.STATUS_ZOMBIE:
-            yield command[command.index("-m") + 1].rpartition(".")[2], process
-
-
-def _domain_of(process: psutil.Process) -> int:
-    command: list[str] = process.info["cmdline"]
-    return int(command[command.index("--domain") + 1]) if "--domain" in command else -1
+            at = command.index("--domain") + 1 if "--domain" in command else 0
+            if command[at] == str(domain):
+                found[command[command.index("-m") + 1].rpartition(".")[2]] = process
+    return found
 
 
 async def until(reader: Reader[M], wanted: Callable[[M], bool], timeout: float = 60.0) -> M:

@@ -1,6 +1,6 @@
 """Subscribers that do not keep up, as processes of their own: one reads slowly, one has stopped reading at all.
 
-`python -m benchmarks.subscribers ENDPOINT KEY SECONDS` is such a subscriber: it rests for so long over each message.
+`python -m tests.cells.subscribers ENDPOINT KEY SECONDS` is such a subscriber: it rests for so long over each message.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import IO
 
 import zenoh
 
-from benchmarks.runs import ROOT, environment
 from common.transport.endpoint import client_config
+from tests.harness import ROOT, environment
 
 CONNECT_MS = 30_000
 
@@ -35,7 +35,7 @@ class Subscriber:
         Raises:
             RuntimeError: it ended instead.
         """
-        command = [sys.executable, "-m", "benchmarks.subscribers", endpoint, key, str(rest)]
+        command = [sys.executable, "-m", "tests.cells.subscribers", endpoint, key, str(rest)]
         self.process = subprocess.Popen(command, cwd=ROOT, env=environment(), stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
         self._told: IO[str] = self.process.stdout
@@ -70,7 +70,7 @@ def main() -> int:
     subscriber = session.declare_subscriber(
         key, zenoh.handlers.Callback(lambda _sample: time.sleep(seconds), indirect=False)
     )
-    print("subscribed to", subscriber.key_expr, flush=True)
+    print("subscribed to", subscriber.key_expr, flush=True)  # noqa: T201
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(0)  # closing would wait for the callback that rests

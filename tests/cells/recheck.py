@@ -11,7 +11,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.runs import beside
 from common import topics
 from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import Cell, Surroundings
@@ -25,6 +24,7 @@ from common.scene.fixtures import fixed_objects
 from common.topics import Topic
 from common.transport.bus import Bus
 from common.transport.codec import decode
+from tests.harness import beside
 
 Array = NDArray[np.float64]
 S = TypeVar("S", JointState, GripperState, PoseArray)
