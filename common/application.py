@@ -107,11 +107,19 @@ def find_application(name: str) -> Application:
     if "." in name and (here := str(Path.cwd())) not in sys.path:
         sys.path.append(here)  # a person's own is also found where they stand
     found = Application(name)
+    look_where_one_stands()
     try:
         _ = found.module
     except ImportError as error:
         raise ConfigError("application", name, f"cannot be imported: {error}") from None
     return found
+
+
+def look_where_one_stands() -> None:
+    """Have modules of a person's own found in the working directory, after all others."""
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
 
 
 def application_of_task(task: str) -> str:

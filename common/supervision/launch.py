@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from common.application import look_where_one_stands
 from common.clock import MAX_SPEED, MIN_SPEED, Clock
 from common.config import Cell, ServiceEntry
 from common.errors import ConfigError
@@ -120,9 +121,7 @@ def require_module(key: str, entry: ServiceEntry) -> None:
     Raises:
         ConfigError: it can not.
     """
-    for folder in python_path().split(os.pathsep):
-        if folder not in sys.path:
-            sys.path.append(folder)
+    look_where_one_stands()
     try:
         found = importlib.util.find_spec(entry.module) is not None
     except ModuleNotFoundError:

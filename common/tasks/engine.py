@@ -116,10 +116,11 @@ class Task(Generic[V]):
         """Take note of what a stage has done."""
 
     def missed(self, stage: Grip, view: V) -> None:
-        """The fingers closed on nothing: open them, go up and look again."""
+        """The fingers closed on nothing: open them, back off and look again."""
+        self.status.retries += 1
         self.fail(f"{stage.name}: the fingers closed on nothing", view, go_home=False)
         if self.status.state != "ERROR":
-            self.row += [Grip("open", stage.state, width=self.gripper.max_width), self.retreat(view), Look()]
+            self.row += [Grip("open", stage.state, width=self.gripper.max_width), *self.back_off(view)]
 
     def forgotten(self, stage: Stage, view: V) -> None:
         """A controller that was started again knows nothing of a stage that it had begun."""
@@ -130,7 +131,7 @@ class Task(Generic[V]):
         if self.stands_against(move, response):
             self.fail(response.message, view, go_home=False)
             if self.status.state != "ERROR":
-                self.row += [self.retreat(view, response.colliding), Look()]
+                self.row += self.back_off(view, response.colliding)
         else:
             # What runs is sound; what was to follow is decided anew when it has ended.
             self.fail(response.message, view, go_home=self.running is None and move.name != "home")
@@ -154,6 +155,10 @@ class Task(Generic[V]):
     def home(self, view: V) -> Move:
         """To the pose from which everything is seen, with whatever is held."""
         return Move("home", "HOMING", goal=m.JointGoal(named="home"), carries=view.holding)
+
+    def back_off(self, view: V, contact: tuple[str, str] | None = None) -> list[Stage]:
+        """Away from where the hand is, whatever it touches there, to where everything is seen."""
+        return [self.retreat(view, contact), self.home(view), Look()]
 
     def retreat(self, view: V, contact: tuple[str, str] | None = None, height: float = RETREAT) -> Move:
         """Straight up from where the tool is, whatever the hand touches there now."""

@@ -116,7 +116,7 @@ class PickPlace(Task[PickPlaceView]):
         self.status.message = f"the fingers closed on nothing at ({x:.3f}, {y:.3f})"
         self._choice.missed(pick.target, view)
         self.clear()
-        self.row += [self._rows.open(), self.retreat(view), Look()]
+        self.row += [self._rows.open(), *self.back_off(view)]
         self.look_after = view.now
 
     def plan_failed(self, move: Move, response: m.PlanResponse, view: PickPlaceView) -> None:
@@ -180,9 +180,9 @@ class PickPlace(Task[PickPlaceView]):
         pick = _pick_of(move)
         return view.spots(pick.target if pick else None, self._around.ball_radius)
 
-    def retreat(self, view: PickPlaceView, contact: tuple[str, str] | None = None, height: float = 0.0) -> Move:
-        """Up from where the hand is."""
-        return self._rows.retreat(view, contact)
+    def back_off(self, view: PickPlaceView, contact: tuple[str, str] | None = None) -> list[Stage]:
+        """Up from where the hand is: the camera sees enough from there."""
+        return [self._rows.retreat(view, contact), Look()]
 
     def time_limit(self, stage: Stage) -> float:
         """A stage that takes longer is stopped [s]."""

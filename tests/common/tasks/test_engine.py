@@ -136,16 +136,18 @@ def test_what_falls_out_of_the_hand_is_a_failure_and_is_taken_again(where: str) 
     cell.until("reach")
 
 
-def test_fingers_that_close_on_nothing_open_and_go_up_before_the_next_try() -> None:
+def test_fingers_that_close_on_nothing_open_and_go_up_and_home_before_the_next_try() -> None:
     cell = Cell()
     cell.until("close")
     cell.gripper = cell.gripper.model_copy(update={"state": "succeeded", "moving": False, "holding": False})
     cell.until("open")
     cell.until("retreat")
-    goal = cell.plans()[-1].goal
-    assert isinstance(goal, m.PoseGoal) and goal.pose.position.z == pytest.approx(0.3)
-    assert ("panda_hand", "cube") in cell.plans()[-1].allowed_collisions
+    retreat = next(plan for plan in cell.plans() if plan.stage == "retreat")
+    assert isinstance(retreat.goal, m.PoseGoal) and retreat.goal.pose.position.z == pytest.approx(0.3)
+    assert ("panda_hand", "cube") in retreat.allowed_collisions
+    cell.until("home")
     cell.until("reach")
+    assert (cell.task.status.failures, cell.task.status.retries) == (1, 1)
 
 
 def test_what_appears_beside_the_way_has_the_motions_planned_anew() -> None:
