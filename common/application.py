@@ -23,7 +23,7 @@ import importlib
 import importlib.util
 import pkgutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -32,7 +32,7 @@ from typing import Any, cast
 
 from common import messages, topics
 from common.errors import ConfigError, UnknownName
-from common.messages import Message, TaskStatus
+from common.messages import Message, TaskStatus, WorldObjects
 from common.remapping import SERVICE_NAME
 from common.topics import AnyTopic, Request, Topic
 
@@ -78,6 +78,11 @@ class Application:
         if not isinstance(found, Topic) or not issubclass(found.message, TaskStatus):
             raise ConfigError("application", self.name, "is no application: its topics have no STATUS")
         return cast("Topic[TaskStatus]", found)
+
+    @property
+    def views(self) -> dict[Topic[Any], Callable[[WorldObjects], Message]]:
+        """What the truth is called in the application: a message for each of these topics, made of the world's."""
+        return self.find("topics", "VIEWS") or {}
 
     @property
     def topics(self) -> dict[str, AnyTopic]:

@@ -12,8 +12,8 @@ import numpy as np
 from pydantic import Field
 
 from common import topics
-from common.applications.pick_place.topics import SCENE_BALLS
-from common.config import Grasp, Members, Parameters, RobotConfig, Run, Tunable, World
+from common.application import find_application
+from common.config import Grasp, Members, Parameters, Reach, RobotConfig, Run, Tunable, World
 from common.control.checks import Tolerances
 from common.control.cycle import ControlCycle
 from common.control.requester import Alone, WhenAlone, objection
@@ -31,10 +31,10 @@ from common.messages import (
 )
 from common.process.service import main
 from common.robot.model import RobotModel
-from common.scene.workspace import reach_reason
+from common.scene.workspace import WorkspaceBounds, bounds_told, reach_reason
+from common.sim.interface import GraspTolerances, load_world
 from common.sim.layout import layout
 from common.sim.standing import Standing, state_file
-from common.sim.world import GraspTolerances, SimulatedWorld
 from common.transport.bus import Bus
 
 MOST_CYCLES = 250.0  # per second of wall time
@@ -48,6 +48,7 @@ class Config(Parameters):
     world: World
     run: Run
     grasp: Grasp
+    reach: Reach = Reach()
     joint_state_rate: float = Field(100.0, ge=10, le=1000, description="control cycles in cell time [Hz]")
     speed_scaling: Tunable[float] = Field(1.0, ge=0.05, le=1, description="trajectories are followed at this share "
                                                                            "of their speed")
@@ -79,10 +80,11 @@ def make_cycle(config: Config, simulated: bool, kept: Standing | None, now: floa
     start = robot.named("home")
     world = None
     if simulated:
-        places = layout(config.world, config.run.seed, lambda x, y: within_reach(robot, x, y, config))
-        world = SimulatedWorld(config.world, places, config.grasp_tolerances)
-        layouts = world.layout, world.objects_layout
-        if kept is not None and ((kept.layout, kept.objects_layout) != layouts or len(kept.q) != robot.dof):
+        bounds = bounds_told(config.reach.told)
+        objects = layout(
+            config.world, config.run.seed, lambda x, y, z: within_reach(robot, (x, y, z), config.grasp, bounds))
+        world = load_world(config.world, objects, config.grasp_tolerances)
+        if kept is not None and (kept.layout != world.layout or len(kept.q) != robot.dof):
             kept = None
         if kept is not None:
             start = np.array(kept.q)
@@ -96,11 +98,14 @@ def make_cycle(config: Config, simulated: bool, kept: Standing | None, now: floa
     return cycle
 
 
-def within_reach(robot: RobotModel, x: float, y: float, config: Config) -> bool:
-    """Whether the arm can take a ball from (x, y) [m], and from a little nearer and farther as well."""
-    z, radius = config.world.table_height + config.world.ball_radius, max(math.hypot(x, y), REACH_MARGIN)
+def within_reach(
+    robot: RobotModel, place: tuple[float, float, float], grasp: Grasp, bounds: WorkspaceBounds
+) -> bool:
+    """Whether the arm can take something from a place [m], and from a little nearer and farther as well."""
+    x, y, z = place
+    radius = max(math.hypot(x, y), REACH_MARGIN)
     scales = (1 + off / radius for off in (REACH_MARGIN, -REACH_MARGIN, 0.0))
-    return all(not reach_reason(robot, (s * x, s * y, z), config.grasp) for s in scales)
+    return all(not reach_reason(robot, (s * x, s * y, z), grasp, bounds) for s in scales)
 
 
 async def run(bus: Bus, config: Config) -> None:
@@ -108,9 +113,11 @@ async def run(bus: Bus, config: Config) -> None:
     simulated = find_backend(config.robot).simulated
     joints, motion = bus.writer(topics.JOINT_STATES), bus.writer(topics.MOTION_STATUS)
     gripper = bus.writer(topics.GRIPPER_STATE) if config.robot.gripper else None
-    balls = bus.writer(SCENE_BALLS) if simulated else None
     updates = bus.writer(topics.SCENE_OBJECT_UPDATES) if simulated else None
     objects = bus.writer(topics.SCENE_OBJECTS) if simulated else None
+    application = config.members.application
+    views = find_application(application).views if simulated and application else {}
+    called = [(bus.writer(topic), view) for topic, view in views.items()]  # the truth in the application's words
 
     async def execute(request: ExecuteRequest) -> MotionStatus:
         age = bus.clock.age_ms(request.header.stamp) * 1e-3
@@ -165,10 +172,10 @@ async def run(bus: Bus, config: Config) -> None:
                     bus.log.warning("goal %s: %s [%s]", report.motion.id, report.motion.message, report.motion.error)
             if report.gripper is not None and gripper is not None:
                 gripper.put(report.gripper)
-            if report.balls is not None and balls is not None:
-                balls.put(report.balls)
             if report.objects is not None and objects is not None:
                 objects.put(report.objects)
+                for writer, view in called:
+                    writer.put(view(report.objects))
             if updates is not None:
                 for update in report.updates:
                     updates.put(update)

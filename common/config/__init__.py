@@ -9,7 +9,7 @@ things really lie) is declared by the simulated hardware alone, everything else 
 from __future__ import annotations
 
 from common.config.basics import Coordinate, Length, Number, Parameters, Point, Rgb, Section, Tunable
-from common.config.cell import Cell, Members, ServiceEntry
+from common.config.cell import Cell, Members, Reach, ServiceEntry
 from common.config.checking import check
 from common.config.files import config_root, find_file, names_of, read_robot, read_yaml
 from common.config.loading import load_cell, service_config, service_names

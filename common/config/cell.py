@@ -40,6 +40,12 @@ class Members(Section):
     application: str = Field("", description="what the cell is for: a name, or a dotted module")
 
 
+class Reach(Section):
+    """What the services of the cell are told: some of it says where the arm can take things from."""
+
+    told: dict[str, dict[str, Any]] = Field({}, description="parameters by service")
+
+
 class Cell(Section):
     """A resolved cell: everything that its services are configured with."""
 
@@ -75,6 +81,8 @@ class Cell(Section):
         if kind is Members:
             names = [entry.name for entry in self.services.values()]
             return Members(services=names, task=self.task, application=self.application)
+        if kind is Reach:
+            return Reach(told={name: entry.parameters for name, entry in self.services.items()})
         for value in (self.run, self.robot, self.world, self.motion, self.grasp, self.pipeline, self.watchdogs):
             if type(value) is kind:
                 return value

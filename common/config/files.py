@@ -69,21 +69,28 @@ def read_robot(path: Path) -> dict[str, Any]:
 
 
 def read_world(path: Path) -> dict[str, Any]:
-    """A world file; when its camera is the path of a file of `zencell calibrate`, relative to it, that one's values.
+    """A world file, with the files that it names: see `with_files`.
 
     Raises:
         ConfigError: as `read_yaml` and `read_camera`.
     """
-    return with_camera(read_yaml(path), path.parent)
+    return with_files(read_yaml(path), path.parent)
 
 
-def with_camera(world: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The world; where a camera is the path of a file, relative to the folder, with the values of that file."""
-    cameras = world.get("cameras")
+def with_files(world: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The world, whose files are relative to the folder.
+
+    A camera that is the path of a file of `zencell calibrate` gets the values of that file; paths of meshes are made
+    absolute.
+    """
+    cameras, objects = world.get("cameras"), world.get("objects")
     for table, names in ((world, ["camera"]), (cameras, list(cameras) if isinstance(cameras, dict) else [])):
         for name in names:
             if isinstance(table, dict) and isinstance(table.get(name), str):
                 table[name] = read_camera(folder / Path(table[name]).expanduser())
+    for thing in objects if isinstance(objects, list) else []:
+        if isinstance(thing, dict) and isinstance(thing.get("mesh"), str):
+            thing["mesh"] = str((folder / Path(thing["mesh"]).expanduser()).resolve())
     return world
 
 

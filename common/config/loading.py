@@ -19,7 +19,7 @@ from common.config.files import (
     read_robot,
     read_world,
     read_yaml,
-    with_camera,
+    with_files,
 )
 from common.config.overrides import expanded, parse_override
 from common.config.world import CAMERA, Surroundings
@@ -81,7 +81,7 @@ def load_cell(
         elif part == "robot" and isinstance(value, dict):
             tree[part] = made_absolute(value, path.parent)
         elif part == "world" and isinstance(value, dict):
-            tree[part] = with_camera(value, path.parent)
+            tree[part] = with_files(value, path.parent)
         elif not isinstance(value, dict):
             raise ConfigError(part, value, f"must be a name or a mapping; choices: {', '.join(names_of(part + 's'))}")
     services = tree.get("services")
@@ -94,7 +94,7 @@ def load_cell(
                 raise UnknownName("service", parts[1], by_name)
             parts[1] = by_name[parts[1]]
         if parts[0] == "world":
-            _name_camera(tree["world"], parts)
+            _name_one(tree["world"], parts)
         is_camera = parts == ["world", "camera"] or (len(parts) == 3 and parts[:2] == ["world", "cameras"])
         if is_camera and isinstance(value, str):
             before = _at(tree, parts)
@@ -126,13 +126,16 @@ def _name_application(tree: dict[str, Any]) -> None:
         tree.setdefault("task", next((name for name in kinds if kinds[name] == kind), kind))
 
 
-def _name_camera(world: dict[str, Any], path: list[str]) -> None:
-    """Have world and override speak of cameras alike: of a single one, or of several by name."""
-    cameras = world.get("cameras")
-    if path[1:2] == ["cameras"] and cameras is None:
-        world["cameras"] = {CAMERA: world.pop("camera", None) or {}}
-    elif path[1:2] == ["camera"] and isinstance(cameras, dict) and len(cameras) == 1:
-        path[1:2] = ["cameras", *cameras]
+def _name_one(world: dict[str, Any], path: list[str]) -> None:
+    """Have world and override speak alike of cameras and of containers: of a single one, or of several by name."""
+    for one, many in (("camera", "cameras"), ("container", "containers")):
+        several = world.get(many)
+        if path[1:2] == [many] and several is None:
+            single = world.pop(one, None) or {}
+            name = CAMERA if one == "camera" else single.get("id", "box")
+            world[many] = {name: single} if single or one == "camera" else {}
+        elif path[1:2] == [one] and isinstance(several, dict) and len(several) == 1:
+            path[1:2] = [many, *several]
 
 
 def _name_of(key: str) -> str:

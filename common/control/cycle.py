@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -23,7 +22,6 @@ from common.messages import (
     HoldRequest,
     JointState,
     MotionStatus,
-    PoseArray,
     SceneUpdate,
     StopRequest,
     WorldEdit,
@@ -31,10 +29,11 @@ from common.messages import (
     WorldObjects,
 )
 from common.robot.finger_joints import finger_positions, finger_velocities
-from common.sim.standing import Standing, StandingBall
+from common.sim.interface import SimulatedWorld
+from common.sim.standing import Standing
 
 PROGRESS_PERIOD = 0.1  # cell time between reports of progress [s]
-WORLD_PERIOD = 0.05  # cell time between reports of a ball that moves [s]
+WORLD_PERIOD = 0.05  # cell time between reports of an object that moves [s]
 
 
 class Kinematics(Protocol):
@@ -44,53 +43,6 @@ class Kinematics(Protocol):
         """(4, 4) T_world_tcp at q (dof,) [rad]."""
 
 
-class Truth(Protocol):
-    """What is asked of the simulated world (common.sim.world)."""
-
-    version: int
-    objects_version: int
-
-    def obstruction(self, T_world_tcp: NDArray[np.float64], width: float) -> float:
-        """Width that the fingers can not close below [m]."""
-
-    def tick(self, now: float, T_world_tcp: NDArray[np.float64], width: float, gripping: bool) -> None:
-        """Move on to a time."""
-
-    def edit(self, request: WorldEdit, now: float) -> str:
-        """Change the world."""
-
-    @property
-    def ids(self) -> list[str]:
-        """What is in it."""
-
-    def scene_balls(self, header: Header) -> PoseArray:
-        """Where everything is."""
-
-    @property
-    def layout(self) -> list[tuple[float, float]]:
-        """Where everything was at first."""
-
-    def standing(self) -> dict[str, StandingBall]:
-        """Everything as it is, for `restore`."""
-
-    @property
-    def objects_layout(self) -> dict[str, tuple[float, float]]:
-        """Where everything else was at first."""
-
-    @property
-    def places(self) -> dict[str, tuple[float, float]]:
-        """Where everything else is, for `restore`."""
-
-    def restore(self, balls: Mapping[str, StandingBall], places: Mapping[str, tuple[float, float]]) -> None:
-        """Put everything where it was."""
-
-    def scene_objects(self, header: Header) -> WorldObjects:
-        """Where everything is that is no ball."""
-
-    def take_events(self) -> list[SceneUpdate]:
-        """What happened since the last call."""
-
-
 @dataclass
 class Report:
     """What there is to say after a cycle; None where nothing is new."""
@@ -98,7 +50,6 @@ class Report:
     joints: JointState | None = None
     motion: MotionStatus | None = None
     gripper: GripperState | None = None
-    balls: PoseArray | None = None
     objects: WorldObjects | None = None
     updates: list[SceneUpdate] = field(default_factory=list)
 
@@ -116,7 +67,7 @@ class ControlCycle:
         gripper: GripperConfig | None = None,
         controller: str = "controller",
         kinematics: Kinematics | None = None,
-        world: Truth | None = None,
+        world: SimulatedWorld | None = None,
     ) -> None:
         """Control this hardware; `world` and `kinematics` with simulated hardware only.
 
@@ -143,7 +94,7 @@ class ControlCycle:
         self._told_motion: MotionStatus | None = None
         self._told_motion_at = self._told_gripper_at = self._told_world_at = -np.inf
         self._told_gripper: GripperState | None = None
-        self._told_version = self._told_objects_version = -1
+        self._told_version = -1
         self._kept: object = None
         self._waits = False  # held by ourselves
 
@@ -165,11 +116,8 @@ class ControlCycle:
             report.updates = [update.model_copy(update={"header": header}) for update in self._world.take_events()]
             due = now - self._told_world_at >= WORLD_PERIOD or bool(report.updates)
             if self._world.version != self._told_version and due:
-                report.balls = self._world.scene_balls(header)
+                report.objects = self._world.objects(header)
                 self._told_version, self._told_world_at = self._world.version, now
-            if self._world.objects_version != self._told_objects_version:
-                report.objects = self._world.scene_objects(header)
-                self._told_objects_version = self._world.objects_version
         return report
 
     def standing(self) -> Standing | None:
@@ -183,14 +131,14 @@ class ControlCycle:
             return None
         self._kept = mark
         return Standing(
-            layout=self._world.layout, q=self._q.tolist(), width=width, told_width=told, balls=self._world.standing(),
-            objects_layout=self._world.objects_layout, objects=self._world.places,
+            layout=self._world.layout, q=self._q.tolist(), width=width, told_width=told,
+            objects=self._world.standing(),
         )
 
     def restore(self, state: Standing, now: float) -> None:
         """Find fingers and world as they were; the arm was begun where it stood."""
         assert self._world is not None
-        self._world.restore(state.balls, state.objects)
+        self._world.restore(state.objects)
         if self._gripper is None or self._obstructible is None or self._kinematics is None or state.width is None:
             return
         self._obstructible.place(state.width)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import math
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from common.messages.basics import Finite, Header, Message, Name, Positive
 from common.messages.geometry import Color, Pose, Vector3
+
+Shape = Literal["sphere", "box", "cylinder", "prism", "ring", "mesh"]
+Corner = tuple[Finite, Finite]
 
 
 class SceneUpdate(Message):
@@ -21,12 +25,21 @@ class SceneUpdate(Message):
 class WorldEdit(Message):
     """Change the simulated world. `reset` brings the first layout back, `drop` lets what is held slip.
 
-    Balls may be added, moved and removed, other objects be moved. `id` may be empty for `add` and `drop`.
+    `id` may be empty for `add` and `drop`. What is added is like the object that `like` names, or like the first of the
+    world, but for what is said here.
     """
 
     op: Literal["add", "move", "remove", "reset", "drop"]
     id: str = ""
     position: Vector3 | None = Field(None, description="centre [m]; z is found from what lies there")
+    yaw: Finite | None = Field(None, description="of what is added or moved [rad]")
+    like: str = Field("", description="id of an object of the world's first layout: add one more of those")
+    shape: Literal["sphere", "box", "cylinder", "prism", "ring"] | None = None
+    size: Vector3 | None = Field(None, description="of the box about it [m]; of a sphere or what is round, x counts")
+    inner_radius: Positive | None = Field(None, description="of a ring [m]")
+    polygon: list[Corner] = Field([], description="cross-section of a prism [m]; its height is z of size")
+    color: Color | None = None
+    mass: Positive | None = Field(None, description="[kg]")
 
 
 class WorldEditReply(Message):
@@ -37,18 +50,41 @@ class WorldEditReply(Message):
 
 
 class WorldObject(Message):
-    """A solid of the simulated world, standing upright: its outline [m] in world and its height.
+    """A solid of the simulated world as it is now.
 
-    `outline` is the outer edge of its top face, anticlockwise; `hole` an inner edge, if it has one.
+    `pose` is that of its own frame: at half its height; on the axis of a sphere, cylinder or ring; in the middle of a
+    box; where the polygon of a prism has its origin; for a mesh that of its file. Of a recording from before objects
+    had poses, the pose is made of the outline.
+
+    What stands upright also has its outer edge in world as `outline`, anticlockwise, its inner edge, if it has one, as
+    `hole`, and where it stands. Spheres, meshes and what is moved have none.
     """
 
     id: Name
-    shape: Literal["box", "cylinder", "prism", "ring"]
-    outline: list[tuple[Finite, Finite]] = Field(min_length=3)
-    hole: list[tuple[Finite, Finite]] = []
-    base: Finite = Field(description="z on which it stands [m]")
-    height: Positive
+    shape: Shape
+    pose: Pose = Pose()
+    size: Vector3 = Field(Vector3(), description="of the box about it, along the axes of its own frame [m]")
+    inner_radius: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="of a ring [m]")
+    polygon: list[Corner] = Field([], description="cross-section of a prism, anticlockwise [m], in its own frame")
+    vertices: list[tuple[Finite, Finite, Finite]] = Field([], description="of a mesh [m], in its own frame")
+    triangles: list[tuple[int, int, int]] = Field([], description="of a mesh: indices of vertices")
     color: Color = Color()
+    state: Literal["table", "held", "falling", "contained", "elsewhere"] = Field(
+        "table", description="lies on something, in the hand, falls, lies in a container, or is out of sight"
+    )
+    container: str = Field("", description="id of the container in which it lies")
+    outline: list[Corner] = Field([], description="of what stands upright [m], world")
+    hole: list[Corner] = Field([], description="of what stands upright and has one [m], world")
+    base: Finite = Field(0.0, description="z on which it stands [m]")
+    height: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="of what stands upright [m]")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _pose_of_an_outline(cls, values: Any) -> Any:
+        """Recordings from before have outlines alone."""
+        if not isinstance(values, dict) or "pose" in values or not values.get("outline"):
+            return values
+        return {**values, **_from_outline(values)}
 
 
 class WorldObjects(Message):
@@ -56,3 +92,27 @@ class WorldObjects(Message):
 
     header: Header = Header()
     objects: list[WorldObject] = []
+
+
+def _from_outline(values: dict[str, Any]) -> dict[str, Any]:
+    """Pose, size and cross-section of a solid of which only outline, hole, base and height are known."""
+    outline, hole = values["outline"], values.get("hole") or []
+    try:
+        xs, ys = zip(*[(float(x), float(y)) for x, y in outline], strict=True)
+        base, height = float(values.get("base", 0.0)), float(values.get("height", 0.0))
+        x, y = (min(xs) + max(xs)) / 2, (min(ys) + max(ys)) / 2
+        across, along, yaw = max(xs) - min(xs), max(ys) - min(ys), 0.0
+        if values.get("shape") == "box" and len(outline) == 4:
+            across, along = math.dist(outline[0], outline[1]), math.dist(outline[1], outline[2])
+            yaw = math.atan2(ys[1] - ys[0], xs[1] - xs[0])
+        inner = (max(a for a, _ in hole) - min(a for a, _ in hole)) / 2 if hole else 0.0
+    except (TypeError, ValueError):
+        return {}  # whatever is wrong with them is told by their own fields
+    found: dict[str, Any] = {
+        "pose": {"position": {"x": x, "y": y, "z": base + height / 2},
+                 "orientation": {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}},
+        "size": {"x": across, "y": along, "z": height}, "inner_radius": inner,
+    }
+    if values.get("shape") == "prism":
+        found["polygon"] = [(a - x, b - y) for a, b in zip(xs, ys, strict=True)]
+    return found

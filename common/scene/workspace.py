@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from common.config import Grasp, Parameters, Surroundings, Tunable
+from common.config import Grasp, Parameters, Surroundings, Tunable, check
 from common.perception.pinhole import Pinhole
 from common.perception.resting import Resting
 from common.robot.ik import solve_ik
@@ -52,6 +53,21 @@ class WorkspaceBounds(Parameters):
             if getattr(self, low) >= getattr(self, high):
                 raise ValueError(f"{low} {getattr(self, low):g} is not below {high} {getattr(self, high):g}")
         return self
+
+
+def bounds_told(told: Mapping[str, Mapping[str, Any]]) -> WorkspaceBounds:
+    """The bounds that the services of a cell are told, whichever of them judges by such.
+
+    Args:
+        told: parameters by service.
+
+    Raises:
+        ConfigError: names the parameter that does not fit.
+    """
+    for service, parameters in told.items():
+        if given := {name: value for name, value in parameters.items() if name in WorkspaceBounds.model_fields}:
+            return check(WorkspaceBounds, given, f"services.{service}")
+    return WorkspaceBounds()
 
 
 def outside_reason(bounds: WorkspaceBounds, position: Sequence[float]) -> str:

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.config import Fixture
-from common.sim.objects import circle
-from common.sim.solids import triangulate
+from common.sim.solids import circle, triangulate
 
 Array = NDArray[np.float64]
 
@@ -74,10 +73,28 @@ def _side(start: Array, end: Array, point: Array) -> Array:
 
 def _covers(a: Array, b: Array) -> bool:
     """Whether a covers a point that is well within b: of outlines that do not cross, one may lie in the other."""
-    points = triangulate(b).mean(axis=1)
-    following = np.roll(a, -1, axis=0)
+    return bool(_inside(a, triangulate(b).mean(axis=1)).any())
+
+
+def covers_point(outline: Array, x: float, y: float) -> bool:
+    """Whether a point [m] lies within an outline (N, 2)."""
+    return bool(_inside(outline, np.array([[x, y]]))[0])
+
+
+def distances(points: Array, outline: Array) -> Array:
+    """Distance [m] of points (N, 2) from an area with this outline (K, 2); 0 within."""
+    side = np.roll(outline, -1, axis=0) - outline
+    way = points[:, None] - outline
+    share = np.clip(np.einsum("nkj,kj->nk", way, side) / np.maximum(np.einsum("kj,kj->k", side, side), 1e-18), 0, 1)
+    away = np.hypot(*np.moveaxis(way - share[..., None] * side, -1, 0)).min(axis=1)
+    return np.where(_inside(outline, points), 0.0, away)
+
+
+def _inside(outline: Array, points: Array) -> NDArray[np.bool_]:
+    """Which points (N, 2) lie within an outline (K, 2): a ray to the right crosses it an odd number of times."""
+    following = np.roll(outline, -1, axis=0)
     x, y = points[:, :1], points[:, 1:]
-    above, above_next = a[:, 1] > y, following[:, 1] > y
-    rise = np.where(following[:, 1] == a[:, 1], 1.0, following[:, 1] - a[:, 1])
-    crossing = a[:, 0] + (y - a[:, 1]) * (following[:, 0] - a[:, 0]) / rise
-    return bool((((above != above_next) & (x < crossing)).sum(axis=1) % 2 == 1).any())
+    above, above_next = outline[:, 1] > y, following[:, 1] > y
+    rise = np.where(following[:, 1] == outline[:, 1], 1.0, following[:, 1] - outline[:, 1])
+    crossing = outline[:, 0] + (y - outline[:, 1]) * (following[:, 0] - outline[:, 0]) / rise
+    return np.asarray(((above != above_next) & (x < crossing)).sum(axis=1) % 2 == 1)

@@ -1,35 +1,34 @@
-"""Where a ball can lie: on the table, clear of other balls and of everything that stands there, or in the box."""
+"""Where a sphere can lie: on the table, clear of everything that stands there, or in a slot of a container."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import Fixture, World
+from common.config import Container, Fixture, World
 from common.scene.slots import slot_positions
-from common.sim.footprints import heights
+from common.sim.footprints import distances, heights
 
 Array = NDArray[np.float64]
 Slot = tuple[int, int]  # layer, index within the layer
 
-GAP = 1e-3  # room that is left to what a ball rolls up to [m]
+GAP = 1e-3  # room that is left to what a sphere rolls up to [m]
 RING = 2e-3  # step of the search for a free place [m]
 
 
 class Table:
-    """The surface on which balls rest, and what stands on it."""
+    """The surface on which spheres of one size rest, and what stands on it."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, radius: float) -> None:
         """Find the tables among the fixtures: boxes whose top is at `table_height`. None: it has no end."""
         self.height = world.table_height
-        self.radius = world.ball_radius
-        self._container = world.container
-        flat = [f for f in world.fixtures if f.shape == "box" and f.rpy[0] == 0.0 and f.rpy[1] == 0.0]
-        self._tables = [f for f in flat if abs(f.position[2] + f.dimensions[2] / 2 - self.height) < 1e-3]
-        self._obstacles = [f for f in world.fixtures if f not in self._tables and _rises_through(f, world)]
+        self.radius = radius
+        self._containers = list(world.containers.values())
+        self._tables = tables(world)
+        self._obstacles = [f for f in world.fixtures if f not in self._tables and _rises_through(f, world, radius)]
 
     def carries(self, x: float, y: float) -> bool:
         """Whether a centre at (x, y) [m] is above a table."""
@@ -47,29 +46,45 @@ class Table:
         """The thing into which a ball resting at (x, y) [m] would reach, or an empty string."""
         point = np.array([[x, y]])
         reach = self.radius - 1e-9
-        if _distance_to_box(point, self._container.x, self._container.y, self._container.half_side)[0] < reach:
-            return self._container.id
+        for c in self._containers:
+            if _distance_to_box(point, c.x, c.y, c.half_side)[0] < reach:
+                return c.id
         return next((f.id for f in self._obstacles if _distance(point, f)[0] < reach), "")
 
-    def free(self, points: Array, others: Array, gap: float = 0.0) -> NDArray[np.bool_]:
-        """Which of the points (N, 2) are on the table, clear of what stands there and of others' centres (M, 2)."""
+    def free(
+        self, points: Array, others: Array, gap: float = 0.0, *, apart: Sequence[float] = (),
+        outlines: Sequence[Array] = (),
+    ) -> NDArray[np.bool_]:
+        """Which of the points (N, 2) are on the table and clear of all that stands there.
+
+        Args:
+            points: centres [m].
+            others: (M, 2) centres of other spheres [m].
+            gap: that is left to everything [m].
+            apart: how far centres are at least from each of the others [m]; without, they are of the same size.
+            outlines: (K, 2) each, of what else lies there [m].
+        """
         good = self._carries(points)
-        c = self._container
-        good &= _distance_to_box(points, c.x, c.y, c.half_side) >= self.radius + gap
+        for c in self._containers:
+            good &= _distance_to_box(points, c.x, c.y, c.half_side) >= self.radius + gap
         for fixture in self._obstacles:
             good &= _distance(points, fixture) >= self.radius + gap
-        for other in others:
-            good &= np.hypot(*(points - other).T) >= 2 * self.radius + gap
+        for other, least in zip(others, apart or [2 * self.radius] * len(others), strict=True):
+            good &= np.hypot(*(points - other).T) >= least + gap
+        for outline in outlines:
+            good &= distances(points, outline) >= self.radius + gap
         return good
 
-    def nearest_free(self, x: float, y: float, others: Array) -> tuple[float, float] | None:
+    def nearest_free(
+        self, x: float, y: float, others: Array, *, apart: Sequence[float] = (), outlines: Sequence[Array] = ()
+    ) -> tuple[float, float] | None:
         """The free place nearest to (x, y) [m], to within the search step; None when the table is full."""
-        if self.free(np.array([[x, y]]), others)[0]:
+        if self.free(np.array([[x, y]]), others, apart=apart, outlines=outlines)[0]:
             return x, y
         for ring in range(1, int(2.5 / RING)):
             angles = np.linspace(0.0, 2 * math.pi, max(8, 2 * ring), endpoint=False)
             points = np.column_stack([x + ring * RING * np.cos(angles), y + ring * RING * np.sin(angles)])
-            good = self.free(points, others, GAP)
+            good = self.free(points, others, GAP, apart=apart, outlines=outlines)
             if good.any():
                 found = points[int(np.argmax(good))]
                 return float(found[0]), float(found[1])
@@ -85,29 +100,20 @@ class Table:
 
 
 class Slots:
-    """The places in the container: 2 x 2 in each layer, a ball of a layer lies on the one below."""
+    """The places of equal spheres in a container: 2 x 2 in each layer, one of a layer lies on the one below."""
 
-    def __init__(self, world: World) -> None:
-        """Lay out the slots."""
-        self._container = world.container
-        self._positions = slot_positions(world.container, world.ball_radius, world.table_height)
+    def __init__(self, container: Container, radius: float, table_height: float) -> None:
+        """Lay out the slots for spheres of that radius [m]."""
+        self._container = container
+        self._positions = slot_positions(container, radius, table_height)
         self.centres = [(float(x), float(y)) for x, y, _ in self._positions[0]]
-        self.layers = world.container.layers
+        self.layers = container.layers
         self.count = 4 * self.layers
 
     def position(self, slot: Slot) -> Array:
-        """Centre of a ball in the slot (3,) [m]."""
+        """Centre of a sphere in the slot (3,) [m]."""
         position: Array = self._positions[slot].copy()
         return position
-
-    def over(self, x: float, y: float) -> bool:
-        """Whether (x, y) is above the container, its walls included."""
-        return max(abs(x - self._container.x), abs(y - self._container.y)) <= self._container.half_side
-
-    def inside(self, x: float, y: float) -> bool:
-        """Whether (x, y) is between the container's walls."""
-        inner = self._container.half_side - self._container.wall_thickness
-        return max(abs(x - self._container.x), abs(y - self._container.y)) < inner
 
     def choose(self, x: float, y: float, taken: Iterable[Slot]) -> Slot | None:
         """The free slot nearest to (x, y) in the lowest layer that is not full; None when the container is."""
@@ -119,10 +125,27 @@ class Slots:
         return None
 
 
-def _rises_through(fixture: Fixture, world: World) -> bool:
-    """Whether a fixture is anywhere as high as a ball on the table."""
+def tables(world: World) -> list[Fixture]:
+    """Fixtures whose flat top is at the table's height."""
+    flat = [f for f in world.fixtures if f.shape == "box" and f.rpy[0] == 0.0 and f.rpy[1] == 0.0]
+    return [f for f in flat if abs(f.position[2] + f.dimensions[2] / 2 - world.table_height) < 1e-3]
+
+
+def is_over(container: Container, x: float, y: float) -> bool:
+    """Whether (x, y) [m] is above a container, its walls included."""
+    return max(abs(x - container.x), abs(y - container.y)) <= container.half_side
+
+
+def is_inside(container: Container, x: float, y: float) -> bool:
+    """Whether (x, y) [m] is between the container's walls."""
+    inner = container.half_side - container.wall_thickness
+    return max(abs(x - container.x), abs(y - container.y)) < inner
+
+
+def _rises_through(fixture: Fixture, world: World, radius: float) -> bool:
+    """Whether a fixture is anywhere as high as a sphere on the table."""
     bottom, top = heights(fixture)
-    return bottom < world.table_height + 2 * world.ball_radius - 1e-6 and top > world.table_height + 1e-6
+    return bottom < world.table_height + 2 * radius - 1e-6 and top > world.table_height + 1e-6
 
 
 def _distance(points: Array, fixture: Fixture) -> Array:

@@ -1,4 +1,4 @@
-"""Solids of the world as triangles, for a camera to see: upright objects and fixtures."""
+"""Solids as triangles, for a camera to see: prisms, primitives, fixtures."""
 
 from __future__ import annotations
 
@@ -9,21 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.config import Fixture
-from common.messages import WorldObject
 from common.robot.transforms import rpy_to_matrix, transform
-from common.sim.objects import circle
 from common.sim.ray_caster import Mesh
 
 Array = NDArray[np.float64]
 
 RINGS = 24  # of a sphere, from pole to pole
+CIRCLE_POINTS = 360  # a circle of 0.06 m is then at most 2.3 um off
 
 
-def object_mesh(thing: WorldObject) -> Mesh:
-    """Top, bottom and walls of an upright object."""
-    outline, hole = np.array(thing.outline), np.array(thing.hole).reshape(-1, 2)
-    color = (thing.color.r, thing.color.g, thing.color.b)
-    return Mesh(upright(outline, hole, thing.base, thing.base + thing.height), color)
+def circle(radius: float) -> Array:
+    """Points (N, 2) [m] on a circle about the origin, anticlockwise."""
+    angles = np.linspace(0, 2 * math.pi, CIRCLE_POINTS, endpoint=False)
+    return radius * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
 def upright(outline: Array, hole: Array, low: float, high: float) -> Array:

@@ -12,39 +12,26 @@ import struct
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+
+from common.sim.interface import StandingObject
 
 STATE_VARIABLE = "ZENCELL_STATE"  # folder for it; without one nothing is kept
 SLOT = 256 * 1024  # [bytes] for each of the two newest states
 _HEAD = struct.Struct("<QII")  # number of the state, its length and checksum
 
 
-class StandingBall(BaseModel):
-    """A ball as the simulated world knows it; positions [m] in world, `grip` in the frame of the tool centre point."""
-
-    position: tuple[float, float, float]
-    state: Literal["table", "held", "falling", "box", "elsewhere"]
-    slot: tuple[int, int] | None = None
-    grip: tuple[float, float, float] | None = None
-    dropped: float = 0.0
-    since: float = 0.0
-    rest: tuple[float, float, float] | None = None
-
-
 class Standing(BaseModel):
-    """Joints (dof,) [rad], fingers [m], balls and places of other objects at one moment; the layouts as at first."""
+    """Joints (dof,) [rad], fingers [m] and objects at one moment; where objects were at first (x, y, z) [m]."""
 
     model_config = ConfigDict(extra="forbid")
 
-    layout: list[tuple[float, float]]
+    layout: dict[str, tuple[float, ...]]
     q: list[float]
     width: float | None = None
     told_width: float | None = None
-    balls: dict[str, StandingBall] = {}
-    objects_layout: dict[str, tuple[float, float]] = {}
-    objects: dict[str, tuple[float, float]] = {}
+    objects: dict[str, StandingObject] = {}
 
 
 class StateFile:

@@ -24,3 +24,16 @@ STATUS = PICK_PLACE_STATUS
 DECIDED_BY = VALIDATED_TARGETS
 REJECTED = REJECTED_TARGETS
 ANNOTATED = DETECTION_IMAGE
+
+
+def scene_balls(truth: m.WorldObjects) -> m.PoseArray:
+    """The spheres of the simulated world, with their states as labels: what lies in a container is in the box."""
+    balls = [thing for thing in truth.objects if thing.shape == "sphere"]
+    return m.PoseArray(
+        header=truth.header, poses=[m.Pose(position=ball.pose.position) for ball in balls],
+        ids=[ball.id for ball in balls],
+        labels=["box" if ball.state == "contained" else ball.state for ball in balls],
+    )
+
+
+VIEWS = {SCENE_BALLS: scene_balls}

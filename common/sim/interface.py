@@ -1,0 +1,137 @@
+"""The seam between the controller and whatever simulates the world about the arm: small, so that physics fits behind.
+
+A simulator is a module (of this folder, or a dotted one of the user's own) that `world.simulator` names, with
+
+    def create(world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances) -> SimulatedWorld
+
+where `objects` are those of the world, each with a place, and `tolerances` tell when the fingers catch something. Times are cell time [s], passed in.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field
+
+from common.config import ObjectConfig, Parameters, Tunable, World
+from common.errors import ConfigError, UnknownName
+from common.messages import Header, SceneUpdate, WorldEdit, WorldObject, WorldObjects
+
+Array = NDArray[np.float64]
+Numbers = tuple[float, ...]
+
+PACKAGE = "common.sim"
+SIMULATORS = ("kinematic",)
+
+
+class StandingObject(BaseModel):
+    """An object as it is found after a restart; poses are x, y, z [m] and a quaternion x, y, z, w.
+
+    `made` is what it is when a person added it; `like` names the object of the first layout whose shape it has.
+    `details` are the simulator's own.
+    """
+
+    pose: Numbers
+    made: WorldObject | None = None
+    like: str = ""
+    details: dict[str, Any] = {}
+
+
+class SimulatedWorld(Protocol):
+    """What is asked of a simulated world: the truth. `version` grows whenever something has changed."""
+
+    version: int
+
+    def obstruction(self, T_world_tcp: Array, width: float) -> float:
+        """The width [m] that the fingers can not close below: what is between them now, or 0.
+
+        Args:
+            T_world_tcp: (4, 4) pose of the hand; its y axis is the direction in which the fingers open.
+            width: between the inner faces of the fingers [m].
+        """
+
+    def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
+        """Move on to a time: grasp what the fingers press on, carry it, let it go, let it fall.
+
+        Args:
+            now: cell time [s].
+            T_world_tcp: (4, 4) pose of the hand.
+            width: between the fingers [m].
+            gripping: whether the fingers press on something.
+        """
+
+    def edit(self, request: WorldEdit, now: float) -> str:
+        """Change the world as a person asks; the id of what was changed, empty for a reset.
+
+        Raises:
+            Refused: says why, and what would do. Nothing has changed then.
+        """
+
+    @property
+    def ids(self) -> list[str]:
+        """What is in it."""
+
+    def objects(self, header: Header) -> WorldObjects:
+        """Where everything is."""
+
+    def take_events(self) -> list[SceneUpdate]:
+        """What was taken away or came to lie since the last call, in order."""
+
+    @property
+    def layout(self) -> dict[str, Numbers]:
+        """Where everything was at first, (x, y, z) [m] by id."""
+
+    def standing(self) -> dict[str, StandingObject]:
+        """Everything as it is, for `restore`."""
+
+    def restore(self, objects: Mapping[str, StandingObject]) -> None:
+        """Put everything where it was."""
+
+
+class GraspTolerances(Parameters):
+    """Where a thing must be for the fingers to catch it, in the frame of the tool centre point."""
+
+    across: Tunable[float] = Field(
+        0.010, gt=0, le=0.05, description="half the width of a finger pad: off its middle, tool x axis [m]"
+    )
+    along: Tunable[float] = Field(
+        0.010, gt=0, le=0.05, description="half the height of a finger pad: off its middle, tool z axis [m]"
+    )
+    sideways: Tunable[float] = Field(
+        0.002, ge=0, le=0.05, description="a thing may overlap an open finger by this, tool y [m]"
+    )
+    release: Tunable[float] = Field(0.002, gt=0, le=0.02, description="let go when the fingers are this much wider [m]")
+
+
+class Simulator(Protocol):
+    """A module that simulates a world."""
+
+    def create(
+        self, world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances, /
+    ) -> SimulatedWorld:
+        """The world with its objects, each of which has a place."""
+
+
+def load_world(
+    world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances | None = None
+) -> SimulatedWorld:
+    """The simulated world that `world.simulator` names, with these objects, each of which has a place.
+
+    Raises:
+        UnknownName: no such simulator; lists the choices.
+        ConfigError: a module that can not be imported or is no simulator, or an object that can not be where it is.
+    """
+    name = world.simulator
+    if "." not in name and name not in SIMULATORS:
+        raise UnknownName("simulator", name, SIMULATORS)
+    try:
+        module = importlib.import_module(name if "." in name else f"{PACKAGE}.{name}")
+    except ImportError as error:
+        raise ConfigError("world.simulator", name, f"cannot be imported: {error}") from None
+    if not hasattr(module, "create"):
+        raise ConfigError("world.simulator", name, "is no simulator: it has no create")
+    return cast(Simulator, module).create(world, objects, tolerances or GraspTolerances())

@@ -1,0 +1,410 @@
+"""The truth beside simulated hardware: where everything really is. Read by cameras, by nothing that decides.
+
+Grasping, carrying, falling and coming to rest are simulated; pushing a thing aside, and rolling, are not: what cannot
+stay where it falls appears at the nearest place where it can.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.config import ObjectConfig, World
+from common.errors import ConfigError, Refused, UnknownName
+from common.messages import Header, Pose, SceneUpdate, Vector3, WorldEdit, WorldObject, WorldObjects
+from common.robot.transforms import invert, matrix_to_pose, matrix_to_quaternion, quaternion_to_matrix, transform
+from common.sim.interface import GraspTolerances, StandingObject
+from common.sim.objects import Solid, pose_of, prism, round_one, solid_of, solid_of_message, sphere
+from common.sim.resting import Body, Ground, Rest
+
+Array = NDArray[np.float64]
+
+GRAVITY = 9.81  # [m/s^2]
+LINES = 5  # across a finger pad, along which it is felt what is between the fingers
+
+
+def create(world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances) -> KinematicWorld:
+    """The world with its objects, each of which has a place."""
+    return KinematicWorld(world, objects, tolerances)
+
+
+class KinematicWorld:
+    """The objects, and what becomes of them while a hand moves among them.
+
+    Attributes:
+        version: grows whenever something has changed.
+    """
+
+    def __init__(
+        self, world: World, objects: Sequence[ObjectConfig] | None = None, tolerances: GraspTolerances | None = None
+    ) -> None:
+        """Put every object where it lies at first; a sphere above a container lies in it.
+
+        Raises:
+            ConfigError: an object can not lie where it is to.
+        """
+        self.version = 0
+        self._config = world
+        self._tolerances = tolerances or GraspTolerances()
+        self._ground = Ground(world)
+        self._first = {thing.id: thing for thing in (world.objects if objects is None else objects)}
+        self._solids = {name: solid_of(thing) for name, thing in self._first.items()}
+        self._bodies: dict[str, Body] = {}
+        self._between: dict[str, tuple[float, float]] = {}  # what the fingers would press on: its ends along tool y [m]
+        self._events: list[SceneUpdate] = []
+        try:
+            self._lay_out()
+        except Refused as refusal:
+            raise ConfigError("world.objects", ..., f"cannot be laid out: {refusal}") from None
+        self._events.clear()
+
+    # --- over a restart ---
+
+    @property
+    def layout(self) -> dict[str, tuple[float, ...]]:
+        """Where everything was at first, (x, y, z) [m] by id."""
+        return {name: tuple(pose_of(thing, self._solids[name])[:3, 3].tolist()) for name, thing in self._first.items()}
+
+    def standing(self) -> dict[str, StandingObject]:
+        """Everything as it is, for `restore`."""
+        return {
+            name: StandingObject(
+                pose=_numbers(b.T), like=b.like, made=b.message() if b.added and not b.like else None,
+                details={
+                    "state": b.state, "container": b.container, "slot": b.slot, "dropped": b.dropped, "since": b.since,
+                    "width": b.width, "grip": None if b.grip is None else _numbers(b.grip), "added": b.added,
+                    "rest": None if b.rest is None else [
+                        _numbers(b.rest.T), b.rest.state, b.rest.container, b.rest.slot],
+                },
+            )
+            for name, b in self._bodies.items()
+        }
+
+    def restore(self, objects: Mapping[str, StandingObject]) -> None:
+        """Put everything where it was; what is of a shape that there is not is passed over."""
+        self._bodies = {name: body for name, kept in objects.items() if (body := self._restored(name, kept))}
+        self._between = {}
+        self.version += 1
+
+    def _restored(self, name: str, kept: StandingObject) -> Body | None:
+        first = self._first.get(kept.like or name)
+        if kept.made is not None:
+            solid, c = solid_of_message(kept.made), kept.made.color
+            color = (c.r, c.g, c.b)
+        elif first is not None:
+            solid, color = self._solids[first.id], first.color
+        else:
+            return None
+        d: dict[str, Any] = kept.details
+        body = Body(
+            name, solid, color, _matrix(kept.pose), d["state"], d["container"], _slot(d["slot"]),
+            None if d["grip"] is None else _matrix(d["grip"]), d["width"], d["dropped"], d["since"],
+            added=d["added"], like=kept.like,
+        )
+        if d["rest"] is not None:
+            T, state, container, slot = d["rest"]
+            body.rest = Rest(_matrix(T), state, container, _slot(slot))
+        return body
+
+    # --- the hand ---
+
+    def obstruction(self, T_world_tcp: Array, width: float) -> float:
+        """The width [m] that the fingers can not close below: see `common.sim.interface`."""
+        if held := self.held:
+            return self._bodies[held].width
+        found: dict[str, tuple[float, float]] = {}
+        for name, body in self._bodies.items():
+            if body.state in ("table", "contained") and (ends := self._felt(body, T_world_tcp, width)):
+                found[name] = ends
+        self._between = found
+        return max((high - low for low, high in found.values()), default=0.0)
+
+    def _felt(self, body: Body, T_world_tcp: Array, width: float) -> tuple[float, float] | None:
+        """The ends along tool y [m] of what the pads would press on; None when the body is not between them.
+
+        Once clear of both fingers a thing stays between them: the closing finger pushes it to the middle.
+        """
+        allowed, solid = self._tolerances, body.solid
+        away = body.T[:3, 3] - T_world_tcp[:3, 3]
+        reach = allowed.across + allowed.along + max(width / 2, solid.reach)
+        if abs(away[2]) > reach + solid.reach or float(np.linalg.norm(away)) > reach + solid.reach:
+            return None
+        if solid.shape == "sphere":
+            x, y, z = T_world_tcp[:3, :3].T @ away
+            if abs(x) > allowed.across or abs(z) > allowed.along:
+                return None
+            low, high, half = float(y - solid.radius), float(y + solid.radius), solid.radius
+            fits, near = abs(y) <= width / 2 - half + allowed.sideways, abs(y) < max(width / 2, half)
+        else:
+            ends = _pressed(solid, invert(T_world_tcp) @ body.T, width, allowed)
+            if ends is None:
+                return None
+            (low, high), half = ends, (ends[1] - ends[0]) / 2
+            fits = low >= -width / 2 - allowed.sideways and high <= width / 2 + allowed.sideways
+            near = abs(low + high) / 2 < max(width / 2, half)
+        enters = width / 2 >= half and fits
+        return (low, high) if enters or (body.name in self._between and near) else None
+
+    def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
+        """Move on to a time: see `common.sim.interface`."""
+        held = self.held
+        if not held and gripping and self._between:
+            held = min(self._between,
+                       key=lambda n: float(np.linalg.norm(self._bodies[n].T[:3, 3] - T_world_tcp[:3, 3])))
+            self._grasp(self._bodies[held], T_world_tcp, now)
+        if held:
+            body = self._bodies[held]
+            self._carry(body, T_world_tcp)
+            if width > body.width + self._tolerances.release:
+                self._release(body, now)
+        for body in self._bodies.values():
+            if body.state == "falling":
+                self._fall(body, now)
+
+    def _grasp(self, body: Body, T_world_tcp: Array, now: float) -> None:
+        low, high = self._between[body.name]
+        body.grip = invert(T_world_tcp) @ body.T
+        body.grip[1, 3] -= (low + high) / 2  # the fingers centre it
+        body.width = 2 * body.solid.radius if body.solid.shape == "sphere" else high - low
+        slot, block = body.slot_taken, self._ground.block(body)
+        body.state, body.container, body.slot, body.told = "held", "", None, None
+        self._between = {}
+        self._say("remove", body)
+        self._sink(slot, now)
+        self._lose(block, now)
+
+    def _carry(self, body: Body, T_world_tcp: Array) -> None:
+        assert body.grip is not None
+        T = T_world_tcp @ body.grip
+        if body.solid.shape == "sphere":
+            T[:3, :3] = body.T[:3, :3]
+        if not np.array_equal(T, body.T):
+            body.T, body.told = T, None
+            self.version += 1
+
+    def _release(self, body: Body, now: float) -> None:
+        body.rest = self._ground.below(body, self._bodies)
+        self._drop(body, now)
+
+    def _drop(self, body: Body, now: float) -> None:
+        body.state, body.grip, body.dropped, body.since = "falling", None, float(body.T[2, 3]), now
+        body.container, body.slot, body.told = "", None, None
+        self.version += 1
+
+    def _fall(self, body: Body, now: float) -> None:
+        assert body.rest is not None
+        self.version += 1
+        z = body.dropped - GRAVITY * (now - body.since) ** 2 / 2
+        if z > body.rest.T[2, 3]:
+            body.T, body.told = transform(body.T[:3, :3], (float(body.T[0, 3]), float(body.T[1, 3]), z)), None
+            return
+        body.lie(body.rest)
+        if body.state != "elsewhere":
+            self._say("add", body)
+
+    def _sink(self, taken: tuple[str, tuple[int, int]] | None, now: float) -> None:
+        """Let the spheres above a slot that was vacated fall by one layer."""
+        if taken is None:
+            return
+        container, (layer, index) = taken
+        for body in self._bodies.values():
+            mine = body.slot_taken
+            if mine is not None and mine[0] == container and mine[1][1] == index and mine[1][0] > layer:
+                slot = (mine[1][0] - 1, index)
+                position = self._ground.slot_position(container, body.solid.radius, slot)
+                lies = body.state == "contained"
+                body.rest = Rest(transform(body.T[:3, :3], position), "contained", container, slot)
+                if lies:
+                    self._say("remove", body)
+                    self._drop(body, now)
+
+    def _lose(self, gone: Any, now: float) -> None:
+        """Let what lay on something fall, which is no longer there."""
+        for body in self._ground.carries_nothing_any_more(gone, self._bodies):
+            block = self._ground.block(body)
+            self._say("remove", body)
+            self._release(body, now)
+            self._lose(block, now)
+
+    # --- edits ---
+
+    def edit(self, request: WorldEdit, now: float) -> str:
+        """Change the world as a person asks: see `common.sim.interface`."""
+        if request.op == "reset":
+            return self._reset()
+        name = request.id
+        if request.op == "drop":
+            return self._slip(name, now)
+        old = self._bodies.get(name)
+        if request.op == "add":
+            body = self._made(request)
+        elif old is None:
+            raise Refused("unknown_id", str(UnknownName("object", name, list(self._bodies))))
+        else:
+            body = old
+        rest = None
+        if request.op != "remove":
+            if request.position is None:
+                raise Refused("no_position", f"position: {request.op} needs one, for example {{x: 0.5, y: 0.0}}")
+            rest = self._ground.put(body, request.position.x, request.position.y, request.yaw, self._bodies)
+        lay, slot = old is not None and old.state in ("table", "contained"), body.slot_taken
+        block = self._ground.block(body) if lay else None
+        if lay:
+            self._say("remove", body)
+        if rest is not None:
+            body.lie(rest)
+            self._bodies[body.name] = body
+            self._say("add", body)
+        else:
+            del self._bodies[name]
+        self._between.pop(body.name, None)
+        if body.slot_taken != slot or rest is None:
+            self._sink(slot, now)
+        if block is not None:
+            self._lose(block, now)
+        self.version += 1
+        return body.name
+
+    def _made(self, request: WorldEdit) -> Body:
+        """What a request adds, nowhere yet."""
+        model = self._first.get(request.like) if request.like else self._config.spare
+        if model is None:
+            raise Refused("unknown_id", str(UnknownName("object of the first layout", request.like, self._first)))
+        name = request.id or self._free_name(request.shape or re.sub(r"_\d+$", "", model.id))
+        if name in self._bodies:
+            raise Refused("id_exists", f"id: {name!r} exists already; leave it empty for a new one")
+        if not re.fullmatch(r"[A-Za-z0-9_.-]{1,60}", name):
+            raise Refused("bad_id", f"id: {name[:60]!r} must be letters, digits, '_', '.' and '-', at most 60")
+        c = request.color
+        color = model.color if c is None else (c.r, c.g, c.b)
+        if request.shape is None:
+            solid = self._solids.get(model.id) or solid_of(model)
+            like = model.id if model.id in self._first and c is None else ""
+        else:
+            solid, like = _requested(request), ""
+        return Body(name, solid, color, np.eye(4), "elsewhere", added=True, like=like)
+
+    def _free_name(self, kind: str) -> str:
+        return next(n for i in range(1, len(self._bodies) + 2) if (n := f"{kind}_{i}") not in self._bodies)
+
+    def _slip(self, name: str, now: float) -> str:
+        """Let what is held slip out of the fingers, which close on without it; its id. Raises Refused without one."""
+        held = self.held
+        if not held or name not in ("", held):
+            raise Refused("not_held", f"{name or 'nothing'} is {'not ' if name else ''}between the fingers")
+        self._release(self._bodies[held], now)
+        return held
+
+    def _reset(self) -> str:
+        for body in self._bodies.values():
+            if body.state in ("table", "contained"):
+                self._say("remove", body)
+        self._bodies, self._between = {}, {}
+        self._lay_out()
+        return ""
+
+    def _lay_out(self) -> None:
+        for name, thing in self._first.items():
+            solid = self._solids[name]
+            body = Body(name, solid, thing.color, pose_of(thing, solid))
+            if solid.shape == "sphere" and thing.x is not None and thing.y is not None and (
+                thing.z == self._config.table_height
+            ):
+                body.lie(self._ground.put(body, thing.x, thing.y, None, self._bodies))
+            elif container := self._ground.container_of(body):
+                body.lie(Rest(body.T, "contained", container))
+            self._bodies[name] = body
+            self._say("add", body)
+
+    # --- what there is ---
+
+    @property
+    def ids(self) -> list[str]:
+        """What is in it."""
+        return list(self._bodies)
+
+    @property
+    def held(self) -> str:
+        """The id of what is between the fingers, or an empty string."""
+        return next((name for name, body in self._bodies.items() if body.state == "held"), "")
+
+    def objects(self, header: Header) -> WorldObjects:
+        """Where everything is; what is "elsewhere" is off the table, out of sight."""
+        return WorldObjects(header=header, objects=[body.message() for body in self._bodies.values()])
+
+    def take_events(self) -> list[SceneUpdate]:
+        """What was taken away or came to lie since the last call, in order."""
+        events, self._events = self._events, []
+        return events
+
+    def _say(self, what: Literal["add", "remove"], body: Body) -> None:
+        pose = None
+        if what == "add":
+            x, y, z = (float(v) for v in body.T[:3, 3])
+            pose = Pose(position=Vector3(x=x, y=y, z=z)) if body.solid.shape == "sphere" else matrix_to_pose(body.T)
+        self._events.append(SceneUpdate(data=f"{what}:{body.name}", pose=pose))
+        self.version += 1
+
+
+def _pressed(
+    solid: Solid, T_tcp_object: Array, width: float, allowed: GraspTolerances
+) -> tuple[float, float] | None:
+    """The ends along tool y [m] of what of a solid is between the pads; None when the line between their middles
+    meets nothing of it."""
+    x, z = (np.linspace(-half, half, LINES) for half in (allowed.across, allowed.along))
+    lines = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
+    spans = solid.spans(T_tcp_object, lines)
+    middle = spans[len(spans) // 2]
+    if not (np.abs(middle).min(axis=1) < width / 2).any() and not ((middle[:, 0] < 0) & (middle[:, 1] > 0)).any():
+        return None
+    parts = sorted(tuple(span) for found in spans for span in found.tolist())
+    merged: list[list[float]] = []
+    for low, high in parts:
+        if merged and low <= merged[-1][1] + 1e-4:
+            merged[-1][1] = max(merged[-1][1], high)
+        else:
+            merged.append([low, high])
+    inside = [part for part in merged if part[0] < width / 2 and part[1] > -width / 2]
+    return (inside[0][0], inside[-1][1]) if inside else None
+
+
+def _requested(request: WorldEdit) -> Solid:
+    """The shape that a request describes. Raises Refused when something of it is missing."""
+    size = request.size
+    if size is None or size.x <= 0 or (request.shape != "sphere" and size.z <= 0):
+        raise Refused("no_size", f"size: a {request.shape} needs one, for example {{x: 0.04, y: 0.04, z: 0.04}}")
+    if request.shape == "sphere":
+        return sphere(size.x / 2)
+    if request.shape in ("cylinder", "ring"):
+        inner = request.inner_radius or 0.0
+        if request.shape == "ring" and not 0 < inner < size.x / 2:
+            raise Refused("no_size", f"inner_radius: a ring needs one below {size.x / 2:g} m")
+        return round_one(request.shape, size.x / 2, inner, size.z)
+    if request.shape == "box":
+        x, y = size.x / 2, size.y / 2
+        if y <= 0:
+            raise Refused("no_size", "size: a box needs x, y and z")
+        return prism("box", np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), size.z)
+    if len(request.polygon) < 3:
+        raise Refused("no_size", "polygon: a prism needs at least 3 corners")
+    return prism("prism", np.array(request.polygon), size.z)
+
+
+def _numbers(T: Array) -> tuple[float, ...]:
+    return (*(float(v) for v in T[:3, 3]), *matrix_to_quaternion(T[:3, :3]))
+
+
+def _matrix(numbers: Sequence[float]) -> Array:
+    x, y, z, *q = numbers
+    return transform(quaternion_to_matrix(*q), (x, y, z))
+
+
+def _slot(value: Any) -> tuple[int, int] | None:
+    return None if value is None else (int(value[0]), int(value[1]))
+
+
+__all__ = ["GraspTolerances", "KinematicWorld", "WorldObject", "create"]
