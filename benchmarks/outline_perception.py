@@ -24,9 +24,9 @@ from common.messages import Header, JointState, WorldObject
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
 from common.sim.depth_view import GROUND, DepthView
-from common.sim.objects import world_object
+from common.sim.objects import object_mesh, world_object
 from common.sim.ray_caster import Mesh, View, cast, empty_view
-from common.sim.solids import fixture_mesh, object_mesh
+from common.sim.solids import fixture_mesh
 
 Array = npt.NDArray[np.float64]
 

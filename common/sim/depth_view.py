@@ -11,9 +11,10 @@ from common.config import Surroundings
 from common.messages import JointState, WorldObject
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
+from common.sim.objects import object_mesh
 from common.sim.ray_caster import Mesh, View, cast, empty_view
 from common.sim.robot_shapes import robot_shapes
-from common.sim.solids import fixture_mesh, object_mesh, placed
+from common.sim.solids import fixture_mesh, placed
 
 Depth = npt.NDArray[np.float32]
 

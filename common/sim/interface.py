@@ -4,7 +4,8 @@ A simulator is a module (of this folder, or a dotted one of the user's own) that
 
     def create(world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances) -> SimulatedWorld
 
-where `objects` are those of the world, each with a place, and `tolerances` tell when the fingers catch something. Times are cell time [s], passed in.
+where `objects` are those of the world, each with a place, and `tolerances` tell when the fingers catch something.
+Times are cell time [s], passed in.
 """
 
 from __future__ import annotations

@@ -59,10 +59,11 @@ def random_layout(
     largest = max(radii)
 
     def fits(place: Place, others: list[Place], radius: float, height: float) -> bool:
-        least = max(world.min_separation, radius + largest)
+        apart = [radius + largest] * len(others)
+        centres, gap = np.array(others).reshape(-1, 2), world.container_clearance
         return (
-            all(math.dist(place, other) >= least for other in others)
-            and bool(table[radius].free(np.array([place]), np.empty((0, 2)), world.container_clearance)[0])
+            all(math.dist(place, other) >= world.min_separation for other in others)
+            and bool(table[radius].free(np.array([place]), centres, gap, apart=apart)[0])
             and any(wholly_in_picture(camera, place, world.table_height + radius, radius)
                     for camera in world.cameras.values())
             and accepts(*place, world.table_height + height)

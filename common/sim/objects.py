@@ -191,21 +191,21 @@ def load_mesh(name: str, path: Path, scale: float) -> Array:
     import trimesh  # takes a third of a second, and few worlds have meshes
 
     try:
-        loaded = trimesh.load(str(path), force="mesh", process=False)
-        triangles = scale * np.asarray(loaded.vertices, float)[np.asarray(loaded.faces, int)]
+        triangles = scale * np.array(trimesh.load_mesh(str(path), process=False).triangles, dtype=np.float64)
     except (OSError, ValueError, AttributeError, IndexError, KeyError, NotImplementedError) as error:
         raise ConfigError(f"world.objects.{name}.mesh", str(path), f"can not be read: {error}") from None
     if not 0 < len(triangles) <= MOST_TRIANGLES:
         raise ConfigError(f"world.objects.{name}.mesh", str(path),
                           f"has {len(triangles)} triangles; 1 to {MOST_TRIANGLES} can be simulated: simplify it")
-    return np.asarray(triangles)
+    return triangles
 
 
 def pose_of(thing: ObjectConfig, solid: Solid) -> Array:
     """(4, 4) T_world_object at the start."""
     if thing.position is not None:
         return transform(rpy_to_matrix(*thing.rpy), thing.position)
-    return transform(rpy_to_matrix(0.0, 0.0, thing.yaw), (thing.x or 0.0, thing.y or 0.0, thing.z - float(solid.low[2])))
+    height = thing.z - float(solid.low[2])
+    return transform(rpy_to_matrix(0.0, 0.0, thing.yaw), (thing.x or 0.0, thing.y or 0.0, height))
 
 
 def message_of(
@@ -216,7 +216,8 @@ def message_of(
     triangles: list[tuple[int, int, int]] = []
     if solid.shape == "mesh":
         points, index = np.unique(solid.mesh.reshape(-1, 3), axis=0, return_inverse=True)
-        vertices, triangles = points.tolist(), index.reshape(-1, 3).tolist()
+        vertices = [(x, y, z) for x, y, z in points.tolist()]
+        triangles = [(a, b, c) for a, b, c in index.reshape(-1, 3).tolist()]
     stands = len(solid.section) > 0 and T[2, 2] > LEVEL and state not in ("held", "falling")
     at, turn = T[:2, 3], T[:2, :2].T
     size = solid.size

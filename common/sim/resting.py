@@ -135,13 +135,14 @@ class Ground:
             if box is None or self._in_slots(box, body, bodies):
                 return self._roll(body, x, y, bodies)
         rotation = body.solid.settled(body.T[:3, :3])
-        outline, bottom = body.solid.footprint(rotation), float(body.T[2, 3]) + body.solid.lowest(body.T[:3, :3])
-        blocks = self._blocks(body, bodies)
-        if box is not None and (place := self._nearest(outline, (x, y), bottom, blocks, box)):
+        outline, middle = _centred(body.solid.footprint(rotation))
+        bottom = float(body.T[2, 3]) + body.solid.lowest(body.T[:3, :3])
+        at, blocks = (x + float(middle[0]), y + float(middle[1])), self._blocks(body, bodies)
+        if box is not None and (place := self._nearest(outline, at, bottom, blocks, box)):
             return self._rest(body, rotation, place, box.id)
-        if self._is_carried(x, y, blocks) and (place := self._nearest(outline, (x, y), bottom, blocks, None)):
+        if self._is_carried(*at, blocks) and (place := self._nearest(outline, at, bottom, blocks, None)):
             return self._rest(body, rotation, place)
-        return self._rest(body, rotation, (x, y, self._world.table_height - FLOOR_BELOW_TABLE), state="elsewhere")
+        return self._rest(body, rotation, (*at, self._world.table_height - FLOOR_BELOW_TABLE), state="elsewhere")
 
     def carries_nothing_any_more(self, gone: Block, bodies: Mapping[str, Body]) -> list[Body]:
         """Bodies that lay on something that is no longer there, lowest first."""
@@ -228,7 +229,7 @@ class Ground:
     # --- put down by a person ---
 
     def put(self, body: Body, x: float, y: float, yaw: float | None, bodies: Mapping[str, Body]) -> Rest:
-        """Where a body lies that is put at (x, y) [m].
+        """Where a body lies that is put at (x, y) [m], with the middle of what it covers.
 
         Raises:
             Refused: it cannot lie there.
@@ -243,7 +244,7 @@ class Ground:
             count = self._slots_of(box, body.solid.radius).count
             raise Refused("container_full", f"{box.id} is full: it holds {count} of {body.name}'s size")
         rotation = body.solid.settled(body.T[:3, :3]) if yaw is None else rpy_to_matrix(0.0, 0.0, yaw)
-        outline = body.solid.footprint(rotation)
+        outline, _ = _centred(body.solid.footprint(rotation))
         if box is not None:
             place = self._nearest(outline, (x, y), math.inf, self._blocks(body, bodies), box)
             if place is None:
@@ -299,7 +300,7 @@ class Ground:
 
     def container_of(self, body: Body) -> str:
         """The id of the container in which a body lies as a world's file has it; empty when in none."""
-        x, y, z = body.T[:3, 3]
+        x, y = body.T[:2, 3]
         rim = self._world.table_height
         return next((c.id for c in self._containers
                      if is_inside(c, x, y) and rim - LEVEL < body.bottom < rim + c.wall_height), "")
@@ -308,7 +309,10 @@ class Ground:
         self, body: Body, rotation: Array, place: tuple[float, float, float], container: str = "",
         state: State = "table",
     ) -> Rest:
+        """There with the middle of its outline."""
         x, y, height = place
+        _, middle = _centred(body.solid.footprint(rotation))
+        x, y = x - float(middle[0]), y - float(middle[1])
         T = transform(rotation, (x, y, height - body.solid.lowest(rotation)))
         return Rest(T, "contained" if container else state, container)
 
@@ -349,6 +353,12 @@ class Ground:
         return Block(body.name, outline, low, high, flat=body.solid.shape != "sphere")
 
 
+def _centred(outline: Array) -> tuple[Array, Array]:
+    """An outline (N, 2) about the middle (2,) of the box around it, and that middle [m]."""
+    middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    return outline - middle, middle
+
+
 def _container(body: Body) -> str:
     return body.rest.container if body.rest is not None else body.container
 
@@ -363,7 +373,7 @@ def _panels(box: Container, table_height: float) -> list[Block]:
     floor = table_height + box.floor_thickness
 
     def block(x0: float, x1: float, y0: float, y1: float, top: float, *, flat: bool) -> Block:
-        corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]) + (box.x, box.y)
+        corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]) + np.array([box.x, box.y])
         return Block(box.id, corners, table_height, top, flat)
 
     rim = table_height + box.wall_height

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from common.messages import CollisionObject, WorldObject
 from common.planning.prism import convex_hull
-from common.sim.objects import centre_of
-from common.sim.solids import object_mesh, upright
+from common.sim.objects import centre_of, object_mesh
+from common.sim.solids import upright
 from common.viewer.poses import Rgb, position_of, rgb_of, wxyz_of
 
 Solid = viser.BoxHandle | viser.IcosphereHandle | viser.CylinderHandle | viser.MeshHandle

@@ -17,7 +17,8 @@ from common.config import Parameters, World
 from common.config.tunables import apply, checked, leaves, tunable_sections
 from common.messages import PlanRequest
 from common.robot.transforms import tool_down
-from common.sim.world import GraspTolerances, SimulatedWorld
+from common.sim.interface import GraspTolerances
+from common.sim.kinematic import KinematicWorld
 from tests.common.applications.outlining.outline_double import OutlineDouble
 from tests.common.applications.pick_place.cell_double import CellDouble
 from tests.services.service_turns import CELLS, SCENARIOS, Running, config_of
@@ -112,7 +113,7 @@ def test_an_outline_under_way_is_stopped_after_a_shorter_time() -> None:
 
 def test_fingers_catch_and_let_go_by_the_tolerances_of_now() -> None:
     tolerances = GraspTolerances()
-    world = SimulatedWorld(World(balls=[(0.5, 0.0)]), [(0.5, 0.0)], tolerances)
+    world = KinematicWorld(World(balls=[(0.5, 0.0)]), tolerances=tolerances)
     beside = tool_down(0.5, 0.015, 0.03)
     assert world.obstruction(beside, 0.08) == 0.0  # 5 mm into a finger
     change(tolerances, sideways=0.01)

@@ -30,8 +30,8 @@ from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.process.wiring import wiring
 from common.robot.transforms import rpy_to_matrix, transform
+from common.sim.kinematic import KinematicWorld
 from common.sim.objects import world_object
-from common.sim.world import SimulatedWorld
 from common.transport.local import LocalNetwork
 from services import contour_detector, depth_camera, duplicate_remover, pixel_to_world
 from services.robot_state_publisher import stamped
@@ -94,7 +94,7 @@ async def test_the_largest_object_is_chosen_and_its_outline_becomes_a_path():
 
 
 async def test_object_that_was_moved_is_seen_and_outlined_where_it_lies_now():
-    world = SimulatedWorld(W5, [])
+    world = KinematicWorld(W5)
     async with AsyncExitStack() as stack:
         cell = Cell()
         await running(stack, cell)

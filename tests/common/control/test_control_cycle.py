@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from common.applications.pick_place.topics import scene_balls
 from common.config import Fixture, GripperConfig, World
 from common.control.cycle import ControlCycle
 from common.errors import ConfigError, Refused
@@ -10,7 +11,7 @@ from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware
 from common.messages import ExecuteRequest, GripperCommand, Header, StopRequest, Vector3, WorldEdit
 from common.robot.transforms import tool_down
-from common.sim.world import SimulatedWorld
+from common.sim.kinematic import KinematicWorld
 
 START = np.zeros(2)
 GRIPPER = GripperConfig(joints=["left", "right"], links=[])
@@ -28,7 +29,7 @@ class Rig:
     def __init__(self, limits, hardware=None, balls=((0.5, 0.0),), **changes):
         self.hardware = hardware or MockHardware(START, Fingers(GRIPPER, 0.08))
         config = World(fixtures=[TABLE], balls=list(balls))
-        self.world = SimulatedWorld(config, config.balls)
+        self.world = KinematicWorld(config)
         given = {"gripper": GRIPPER, "kinematics": Gantry(), "world": self.world, **changes}
         self.cycle = ControlCycle(self.hardware, limits, START, **given)
         self.stamp = int(1.7e18)
@@ -43,7 +44,7 @@ class Rig:
         report = self.cycle.step(Header(stamp=self.stamp, frame_id="world"))
         self.motions += [report.motion] if report.motion else []
         self.grippers += [report.gripper] if report.gripper else []
-        self.balls += [report.balls] if report.balls else []
+        self.balls += [scene_balls(report.objects)] if report.objects else []
         self.joints += [report.joints] if report.joints else []
         self.updates += [update.data for update in report.updates]
         return report
@@ -185,7 +186,7 @@ def test_real_hardware_has_no_world_to_edit(limits):
     cycle.command(GripperCommand(id="close", width=0.0), 1.0)
     for tick in range(200):
         report = cycle.step(Header(stamp=int(1e9 + tick * 1e7)))
-        assert report.balls is None and not report.updates
+        assert report.objects is None and not report.updates
     assert report.joints is not None and report.joints.position[2:] == [0, 0]
 
 

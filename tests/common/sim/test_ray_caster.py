@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import rpy_to_matrix, transform
-from common.sim.objects import world_object
+from common.sim.objects import object_mesh, world_object
 from common.sim.ray_caster import NEAREST, Mesh, cast, empty_view
-from common.sim.solids import fixture_mesh, object_mesh
+from common.sim.solids import fixture_mesh
 from tests.common.applications.outlining.outline_scenes import WORLDS, seen_world, world
 
 GREY = (178 / 255,) * 3

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.config import Fixture, ObjectConfig
-from common.sim.objects import circle, world_object
-from common.sim.solids import between, fixture_mesh, object_mesh, primitive, triangulate, upright
+from common.sim.objects import object_mesh, world_object
+from common.sim.solids import between, circle, fixture_mesh, primitive, triangulate, upright
 
 
 def area(triangles):
@@ -73,7 +73,7 @@ def test_a_fixture_stands_where_it_is_put():
 def test_an_object_goes_from_what_it_stands_on_to_its_top():
     ring = ObjectConfig(id="r", shape="ring", x=0.5, y=0, z=1.0, radius=0.06, inner_radius=0.04, height=0.03)
     corners = object_mesh(world_object(ring)).corners
-    assert (corners[..., 2].min(), corners[..., 2].max()) == (1.0, 1.03)
+    assert (corners[..., 2].min(), corners[..., 2].max()) == pytest.approx((1.0, 1.03))
     radii = np.linalg.norm(corners[..., :2] - (0.5, 0), axis=-1)
     assert radii.min() == pytest.approx(0.04) and radii.max() == pytest.approx(0.06)
     assert len(upright(circle(1.0)[::90], np.empty((0, 2)), 0, 1)) == 4 + 4 + 8

@@ -9,34 +9,44 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from common.config import World
 from common.messages import Header
 from common.robot.transforms import tool_down
-from common.sim.standing import SLOT, STATE_VARIABLE, Standing, StandingBall, StateFile, state_file
-from common.sim.world import SimulatedWorld
+from common.sim.interface import StandingObject
+from common.sim.kinematic import KinematicWorld
+from common.sim.standing import SLOT, STATE_VARIABLE, Standing, StateFile, state_file
 
 PLACES = [(0.40, -0.30), (0.52, -0.30), (0.40, -0.17)]
 OPEN, GRIP, R = 0.08, 0.06, 0.03
 
 
 def a_state(number: int) -> Standing:
-    return Standing(layout=PLACES, q=[0.1 * number] * 7, width=0.01 * number, told_width=None,
-                    balls={"ball_1": StandingBall(position=(0.4, -0.3, 0.01 * number), state="table")})
+    return Standing(layout={"ball_1": (0.4, -0.3, 0.03)}, q=[0.1 * number] * 7, width=0.01 * number, told_width=None,
+                    objects={"ball_1": StandingObject(pose=(0.4, -0.3, 0.01 * number, 0, 0, 0, 1))})
 
 
-def move(world: SimulatedWorld, hand, width: float, now: float, gripping: bool = False) -> None:
+def the_world(config: World) -> KinematicWorld:
+    return KinematicWorld(World.model_validate(config.model_dump(exclude={"objects"}) | {"balls": PLACES}))
+
+
+def states(world: KinematicWorld) -> list[str]:
+    return sorted(thing.state for thing in world.objects(Header()).objects)
+
+
+def move(world: KinematicWorld, hand, width: float, now: float, gripping: bool = False) -> None:
     world.obstruction(hand, width)
     world.tick(now, hand, width, gripping)
 
 
-def grasp(world: SimulatedWorld, hand, now: float) -> None:
+def grasp(world: KinematicWorld, hand, now: float) -> None:
     move(world, hand, OPEN, now)
     move(world, hand, GRIP, now + 0.01, gripping=True)
 
 
 @pytest.fixture
-def world(world_config) -> SimulatedWorld:
+def world(world_config) -> KinematicWorld:
     """One ball in the box, one falling, one in the hand."""
-    world = SimulatedWorld(world_config, PLACES)
+    world = the_world(world_config)
     over_box, over_table = tool_down(0.55, 0.25, 0.25), tool_down(0.60, -0.05, 0.5)
     grasp(world, tool_down(*PLACES[0], R), 1.0)
     move(world, over_box, GRIP, 1.1, gripping=True)
@@ -47,32 +57,32 @@ def world(world_config) -> SimulatedWorld:
     move(world, over_table, OPEN, 3.2)
     move(world, over_table, OPEN, 3.21)
     grasp(world, tool_down(*PLACES[2], R), 3.22)
-    assert sorted(ball.state for ball in world.standing().values()) == ["box", "falling", "held"]
+    assert states(world) == ["contained", "falling", "held"]
     return world
 
 
 def test_balls_that_are_held_that_fall_and_that_lie_in_the_box_go_on_where_they_were(
-    world: SimulatedWorld, world_config, tmp_path: Path
+    world: KinematicWorld, world_config, tmp_path: Path
 ) -> None:
     file = StateFile(tmp_path / "state")
-    file.save(Standing(layout=world.layout, q=[0.0], balls=world.standing()))
+    file.save(Standing(layout=world.layout, q=[0.0], objects=world.standing()))
     found = StateFile(tmp_path / "state").load()
     assert found is not None
-    again = SimulatedWorld(world_config, PLACES)
-    again.restore(found.balls, found.objects)
+    again = the_world(world_config)
+    again.restore(found.objects)
     assert again.held == world.held != ""
     hand = tool_down(0.45, 0.0, 0.3)
     for k in range(100):  # the falling one comes to rest, the held one moves with the hand
         for each in (world, again):
             move(each, hand, GRIP, 3.3 + 0.01 * k, gripping=True)
-        assert again.scene_balls(Header()) == world.scene_balls(Header())
-    assert sorted(again.scene_balls(Header()).labels) == ["box", "held", "table"]
+        assert again.objects(Header()) == world.objects(Header())
+    assert states(again) == ["contained", "held", "table"]
     for each in (world, again):
         move(each, tool_down(0.55, 0.25, 0.25), OPEN, 5.0)
         for k in range(100):
             move(each, hand, OPEN, 5.1 + 0.01 * k)
-    assert sorted(again.scene_balls(Header()).labels) == ["box", "box", "table"], "not where the first one lies"
-    assert again.scene_balls(Header()) == world.scene_balls(Header())
+    assert states(again) == ["contained", "contained", "table"], "not where the first one lies"
+    assert again.objects(Header()) == world.objects(Header())
 
 
 def test_without_a_file_there_is_nothing(tmp_path: Path) -> None:

@@ -13,8 +13,9 @@ from common.config import ObjectConfig, World, check, config_root, read_yaml
 from common.errors import Refused
 from common.messages import Header, Vector3, WorldEdit, WorldObject
 from common.sim.footprints import overlap, within
+from common.sim.interface import StandingObject
+from common.sim.kinematic import KinematicWorld
 from common.sim.objects import centre_of
-from common.sim.world import SimulatedWorld
 
 WORLDS = ("w1", "w2", "w3", "w4", "w5", "w6")
 SQUARE = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
@@ -25,16 +26,16 @@ def config_of(name: str) -> World:
     return world
 
 
-def world_of(name: str) -> SimulatedWorld:
-    return SimulatedWorld(config_of(name), [])
+def world_of(name: str) -> KinematicWorld:
+    return KinematicWorld(config_of(name))
 
 
-def move(world: SimulatedWorld, name: str, x: float, y: float) -> str:
+def move(world: KinematicWorld, name: str, x: float, y: float) -> str:
     return world.edit(WorldEdit(op="move", id=name, position=Vector3(x=x, y=y)), 0.0)
 
 
-def solids(world: SimulatedWorld) -> dict[str, WorldObject]:
-    return {thing.id: thing for thing in world.scene_objects(Header()).objects}
+def solids(world: KinematicWorld) -> dict[str, WorldObject]:
+    return {thing.id: thing for thing in world.objects(Header()).objects}
 
 
 @pytest.mark.parametrize("name", WORLDS)
@@ -48,18 +49,20 @@ def test_every_object_of_the_worlds_can_be_moved_and_keeps_its_shape(name: str) 
         np.testing.assert_allclose(np.array(after.outline) - (0.002, -0.003), before.outline, atol=1e-12)
         if before.hole:
             np.testing.assert_allclose(np.array(after.hole) - (0.002, -0.003), before.hole, atol=1e-12)
-        assert after.model_copy(update={"outline": before.outline, "hole": before.hole}) == before
+        where = {"outline": before.outline, "hole": before.hole, "pose": before.pose}
+        assert after.model_copy(update=where) == before
 
 
-def test_move_is_news_of_objects_and_a_ball_is_none() -> None:
+def test_move_is_news_and_what_is_refused_is_none() -> None:
     world = world_of("w5")
-    version = world.objects_version
+    version = world.version
     move(world, "red_cylinder", 0.5, 0.05)
-    assert world.objects_version > version
-    version = world.objects_version
+    assert world.version > version
+    assert [update.data for update in world.take_events()] == ["remove:red_cylinder", "add:red_cylinder"]
+    version = world.version
     with pytest.raises(Refused):
         move(world, "red_cylinder", 5.0, 0.0)
-    assert world.objects_version == version
+    assert world.version == version
 
 
 @pytest.mark.parametrize(
@@ -71,8 +74,9 @@ def test_move_is_news_of_objects_and_a_ball_is_none() -> None:
         ("move", "green_box", (0.4, -0.12), "off_table", "for green_box, which takes 0.06 x 0.09 m"),
         ("move", "green_box", (0.52, -0.01), "occupied", "would reach into red_cylinder"),
         ("move", "green_box", None, "no_position", "position"),
-        ("remove", "green_box", None, "no_ball", "can be moved, but not be removed"),
-        ("add", "", (0.5, 0.0), "no_balls", "no balls"),
+        ("remove", "green_bx", None, "unknown_id", "did you mean 'green_box'"),
+        ("add", "", (0.52, 0.02), "occupied", "would reach into red_cylinder"),
+        ("add", "green_box", (0.5, 0.3), "id_exists", "green_box"),
     ],
 )
 def test_what_can_not_be_is_refused_in_one_line_and_changes_nothing(
@@ -89,23 +93,28 @@ def test_what_can_not_be_is_refused_in_one_line_and_changes_nothing(
 
 def test_object_on_the_ground_may_stand_anywhere_but_not_in_a_fixture() -> None:
     post = ObjectConfig(id="post", shape="cylinder", x=1.5, y=1.5, radius=0.05, height=0.3)
-    world = SimulatedWorld(config_of("w2").model_copy(update={"objects": [post]}), [])
+    world = KinematicWorld(config_of("w2").model_copy(update={"objects": [post]}))
     move(world, "post", -3.0, 2.0)
     with pytest.raises(Refused, match="would reach into target_base"):
         move(world, "post", 0.5, 0.0)
     assert centre_of(solids(world)["post"])[:2] == pytest.approx((-3.0, 2.0))
 
 
+def places(world: KinematicWorld) -> dict[str, tuple[float, ...]]:
+    return {name: centre_of(thing) for name, thing in solids(world).items()}
+
+
 def test_reset_and_restore_bring_objects_back_to_where_they_were() -> None:
     world = world_of("w5")
-    first = world.places
+    first = places(world)
     move(world, "red_cylinder", 0.5, 0.05)
     again = world_of("w5")
-    again.restore({}, world.places | {"stranger": (0.0, 0.0)})
-    assert again.places["red_cylinder"] == pytest.approx((0.5, 0.05)) and set(again.places) == set(first)
-    assert world.objects_layout == first
+    stranger = StandingObject(pose=(0, 0, 0, 0, 0, 0, 1))
+    again.restore(world.standing() | {"stranger": stranger})
+    assert places(again) == places(world) and places(again)["red_cylinder"][:2] == pytest.approx((0.5, 0.05))
+    assert world.layout == world_of("w5").layout
     assert world.edit(WorldEdit(op="reset"), 0.0) == ""
-    assert world.places == first
+    assert places(world) == first
 
 
 @given(st.floats(-2, 2), st.floats(-2, 2), st.floats(0, math.pi), st.floats(0.1, 1.5))

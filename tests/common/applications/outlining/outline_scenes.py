@@ -6,9 +6,9 @@ import numpy as np
 
 from common.config import ObjectConfig, World, check, config_root, read_yaml
 from common.perception.pinhole import Pinhole
-from common.sim.objects import world_object
+from common.sim.objects import object_mesh, world_object
 from common.sim.ray_caster import cast, empty_view
-from common.sim.solids import fixture_mesh, object_mesh
+from common.sim.solids import fixture_mesh
 
 WORLDS = ["w1", "w2", "w3", "w4", "w5", "w6"]
 GROUND = (178 / 255,) * 3
