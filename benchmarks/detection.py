@@ -17,11 +17,12 @@ import numpy.typing as npt
 
 from common.applications.pick_place.detector import Detector
 from common.config import Surroundings, load_cell
+from common.messages import Color, Pose, Vector3, WorldObject
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import wholly_in_view
 from common.robot.model import RobotModel
 from common.scene.workspace import reach_reason
-from common.sim.drawing import draw
+from common.sim.rendering import draw
 
 Array = npt.NDArray[np.float64]
 Shape = Callable[[np.random.Generator], Array]
@@ -75,6 +76,16 @@ def box(count: int, around: Surroundings) -> Array:
     return np.array(slots[:count])
 
 
+def objects(balls: Array, around: Surroundings) -> list[WorldObject]:
+    """Balls with their centres (n, 3) there [m]."""
+    size, (r, g, b) = 2 * around.ball_radius, around.ball_color
+    return [
+        WorldObject(id=f"ball_{number}", shape="sphere", pose=Pose(position=Vector3(x=x, y=y, z=z)),
+                    size=Vector3(x=size, y=size, z=size), color=Color(r=r, g=g, b=b))
+        for number, (x, y, z) in enumerate(balls.tolist(), 1)
+    ]
+
+
 def measure(scenes: list[Array], pictures: list[npt.NDArray[np.uint8]], detector: Detector, camera: Pinhole) -> str:
     """Errors, balls that were not found, what was found too much, and times over the pictures of known scenes."""
     errors, times, missed, surplus = [], [], 0, 0
@@ -122,12 +133,13 @@ def main() -> None:
                     points = scattered(rng)
                     scenes.append(np.column_stack([points, np.full(len(points), radius)]))
             pictures = [
-                draw(b, camera, around, noise_std=noise, brightness=light, rng=rng, rim_width=rim) for b in scenes
+                draw(objects(b, around), camera, around, noise_std=noise, brightness=light, rng=rng, rim_width=rim)
+                for b in scenes
             ]
             print(f"{name:22s} {noise:5d} {light:5d} {rim:3d}   {measure(scenes, pictures, detector, camera)}")
     for count in (1, 4, 7, 8):
         scenes = [box(count, around)] * 10
-        pictures = [draw(b, camera, around) for b in scenes]
+        pictures = [draw(objects(b, around), camera, around) for b in scenes]
         print(f"{f'{count} in the box':22s} {0:5d} {0:5d} {2:3d}   {measure(scenes, pictures, detector, camera)}")
     print("(in the box, balls that others cover count as missed)")
     robot = RobotModel.load(cell.robot)

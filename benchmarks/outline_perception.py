@@ -23,9 +23,9 @@ from common.config import RobotConfig, Surroundings, World, check, config_root, 
 from common.messages import Header, JointState, WorldObject
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
-from common.sim.depth_view import GROUND, DepthView
 from common.sim.objects import object_mesh, world_object
 from common.sim.ray_caster import Mesh, View, cast, empty_view
+from common.sim.rendering import GROUND, Renderer
 from common.sim.solids import fixture_mesh
 
 Array = npt.NDArray[np.float64]
@@ -96,7 +96,7 @@ def arm(repeat: int) -> None:
     world, objects, meshes = load("w5")
     robot = RobotModel.load(check(RobotConfig, read_robot(find_file("robots", "ur5"))))
     around = Surroundings.model_validate({f: getattr(world, f) for f in Surroundings.model_fields})
-    camera = DepthView(around, robot)
+    camera = Renderer(around, robot)
     positions = np.array(OVER)
     times = []
     for _ in range(repeat + 1):

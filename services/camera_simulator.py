@@ -6,17 +6,13 @@ import numpy as np
 from pydantic import Field
 
 from common import topics
-from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import Parameters, Run, Surroundings, Tunable
-from common.messages import PoseArray
+from common.messages import WorldObjects
 from common.perception.image import array_to_image
-from common.perception.pinhole import Pinhole
 from common.process.pace import Pace
 from common.process.service import main
-from common.sim.drawing import draw
+from common.sim.rendering import Renderer, disturbed
 from common.transport.bus import Bus
-
-UNSEEN = ("held", "elsewhere")  # hidden by the hand; off the table
 
 
 class Config(Parameters):
@@ -30,38 +26,21 @@ class Config(Parameters):
     brightness: Tunable[float] = Field(0.0, ge=-255, le=255, description="added to every channel [0..255]")
 
 
-def seen(balls: PoseArray) -> list[tuple[float, float, float]]:
-    """Centres of the balls that the camera can see (x, y, z) [m], world."""
-    labels = balls.labels or [""] * len(balls.poses)
-    return [
-        (pose.position.x, pose.position.y, pose.position.z)
-        for pose, label in zip(balls.poses, labels, strict=True)
-        if label not in UNSEEN
-    ]
-
-
 async def run(bus: Bus, config: Config) -> None:
-    """Send a picture at the rate, from the first time on that the world says where its balls are."""
-    truth = bus.reader(SCENE_BALLS)
+    """Send a picture at the rate, from the first time on that the world says where everything is."""
+    truth = bus.reader(topics.SCENE_OBJECTS)
     images, infos = bus.writer(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_INFO)
     frame = config.world.camera.frame
-    camera = Pinhole.from_config(config.world.camera)
+    renderer = Renderer(config.world, plain=True)
     rng = np.random.default_rng(config.run.seed)
     await bus.ready()
     await truth.next()
-    infos.put(camera.info(bus.header(frame)))
+    infos.put(renderer.camera.info(bus.header(frame)))
     pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
-    drawn, picture = None, draw([], camera, config.world)
     while True:
-        header = bus.header(frame)  # the instant of exposure: what is drawn is where the balls are now
-        balls = seen(truth.latest or PoseArray())
-        shown = (balls, config.noise_std, config.brightness)
-        if shown != drawn or config.noise_std:  # without noise, pictures of the same thing are the same
-            picture = draw(
-                balls, camera, config.world, noise_std=config.noise_std, brightness=config.brightness, rng=rng
-            )
-            drawn = shown
-        images.put(array_to_image(picture, "bgr8", header))
+        header = bus.header(frame)  # the instant of exposure: what is drawn is where everything is now
+        picture = renderer.see((truth.latest or WorldObjects()).objects).colour
+        images.put(array_to_image(disturbed(picture, config.noise_std, config.brightness, rng), "bgr8", header))
         await pace.wait()
 
 

@@ -15,7 +15,7 @@ from common.perception.image import array_to_image
 from common.process.pace import Pace
 from common.process.service import main
 from common.robot.model import RobotModel
-from common.sim.depth_view import DepthView, disturbed
+from common.sim.rendering import Renderer, disturbed_depth
 from common.transport.bus import Bus
 
 
@@ -40,7 +40,7 @@ async def run(bus: Bus, config: Config) -> None:
     points, infos = bus.writer(topics.DEPTH_CAMERA_POINTS), bus.writer(topics.DEPTH_CAMERA_INFO)
     frame = config.world.camera.frame
     rng = np.random.default_rng(config.run.seed)
-    view = await asyncio.to_thread(lambda: DepthView(config.world, RobotModel.load(config.robot)))
+    view = await asyncio.to_thread(lambda: Renderer(config.world, RobotModel.load(config.robot)))
     await bus.ready()
     await truth.next()
     await joints.next()
@@ -51,7 +51,7 @@ async def run(bus: Bus, config: Config) -> None:
         objects = (truth.latest or WorldObjects()).objects
         seen = await asyncio.to_thread(view.see, objects, joints.latest)
         depth = seen.depth_within(config.nearest, config.farthest)
-        depth = disturbed(depth, rng, config.depth_noise_std, config.depth_dropout)
+        depth = disturbed_depth(depth, rng, config.depth_noise_std, config.depth_dropout)
         depths.put(array_to_image(depth, "32FC1", header))  # first: who has the picture has its depth
         images.put(array_to_image(seen.colour, "bgr8", header))
         if points.matched:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -67,9 +68,9 @@ def of_scene(message: PlanningScene) -> dict[str, Any]:
 
 
 def of_world(message: WorldObjects) -> dict[str, Any]:
-    """The solids of the simulated world by the edges of their top and base."""
+    """The solids of the simulated world: what stands upright by the edges of its top and base."""
     stamp = message.header.stamp
-    return update(stamp, [entity(solid.id, "world", stamp, lines=_edges(solid)) for solid in message.objects])
+    return update(stamp, [entity(solid.id, "world", stamp, **_of_object(solid)) for solid in message.objects])
 
 
 def of_outline(message: OutlinePoints) -> dict[str, Any]:
@@ -104,6 +105,30 @@ def _solid(solid: CollisionObject) -> dict[str, list[dict[str, Any]]]:
         return _shape("cylinder", solid.pose, Vector3(x=2 * d[0], y=2 * d[0], z=d[1]), solid.color, "")
     edges = [_loop([(x, y, z) for x, y in solid.outline], solid.color) for z in (-d[0] / 2, d[0] / 2)]
     return {"lines": [{**edge, "pose": solid.pose.model_dump()} for edge in edges]}
+
+
+def _of_object(solid: WorldObject) -> dict[str, list[dict[str, Any]]]:
+    if solid.outline:
+        return {"lines": _edges(solid)}
+    if solid.shape in ("sphere", "box", "cylinder"):
+        return _shape(solid.shape, solid.pose, solid.size, solid.color, "")
+    if solid.shape == "mesh":
+        return {"triangles": [{
+            "pose": solid.pose.model_dump(), "color": solid.color.model_dump(), "colors": [],
+            "points": [{"x": x, "y": y, "z": z} for x, y, z in solid.vertices],
+            "indices": [corner for triangle in solid.triangles for corner in triangle],
+        }]}
+    edges = [_loop([(x, y, z) for x, y in loop], solid.color)
+             for loop in _sections(solid) for z in (-solid.size.z / 2, solid.size.z / 2)]
+    return {"lines": [{**edge, "pose": solid.pose.model_dump()} for edge in edges]}
+
+
+def _sections(solid: WorldObject) -> list[list[tuple[float, float]]]:
+    """Edges of the cross-section of a prism or ring, in its own frame."""
+    if solid.shape == "prism":
+        return [solid.polygon]
+    turns = [2 * math.pi * k / 36 for k in range(36)]
+    return [[(r * math.cos(a), r * math.sin(a)) for a in turns] for r in (solid.size.x / 2, solid.inner_radius)]
 
 
 def _edges(solid: WorldObject) -> list[dict[str, Any]]:

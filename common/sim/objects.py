@@ -258,8 +258,9 @@ def solid_of_message(thing: WorldObject) -> Solid:
 def look_of(thing: WorldObject) -> tuple[object, ...]:
     """What tells its shape and colour from others, wherever it is."""
     size, color = thing.size, thing.color
-    return (thing.shape, size.x, size.y, size.z, thing.inner_radius, tuple(thing.polygon), tuple(thing.vertices),
-            tuple(thing.triangles), color.r, color.g, color.b)
+    sizes = tuple(round(value, 7) for value in (size.x, size.y, size.z, thing.inner_radius))
+    polygon = tuple((round(x, 7), round(y, 7)) for x, y in thing.polygon)
+    return (thing.shape, sizes, polygon, tuple(thing.vertices), tuple(thing.triangles), color.r, color.g, color.b)
 
 
 def object_mesh(thing: WorldObject) -> Mesh:

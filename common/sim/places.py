@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import Container, Fixture, World
+from common.config import Container, Fixture, Surroundings, World
 from common.scene.slots import slot_positions
 from common.sim.footprints import distances, heights
 
@@ -125,7 +125,7 @@ class Slots:
         return None
 
 
-def tables(world: World) -> list[Fixture]:
+def tables(world: Surroundings) -> list[Fixture]:
     """Fixtures whose flat top is at the table's height."""
     flat = [f for f in world.fixtures if f.shape == "box" and f.rpy[0] == 0.0 and f.rpy[1] == 0.0]
     return [f for f in flat if abs(f.position[2] + f.dimensions[2] / 2 - world.table_height) < 1e-3]

@@ -13,7 +13,6 @@ from common.applications.pick_place.topics import (
     DETECTION_IMAGE,
     PICK_PLACE_STATUS,
     REJECTED_TARGETS,
-    SCENE_BALLS,
     VALIDATED_TARGETS,
     WORKSPACE_MARKERS,
 )
@@ -35,7 +34,7 @@ ALWAYS: tuple[Topic[Any], ...] = (  # small or seldom
 )
 ON_DEMAND: tuple[Topic[Any], ...] = (  # large, or made only for who listens
     topics.CAMERA_IMAGE, DETECTION_IMAGE, topics.DEPTH_CAMERA_IMAGE, CONTOUR_IMAGE, CONTOURS,
-    SCENE_BALLS, topics.SCENE_OBJECTS, topics.TF, DETECTED_OBJECTS,
+    topics.SCENE_OBJECTS, topics.TF, DETECTED_OBJECTS,
 )
 _OF_NO_SERVICE = ("supervisor", "everyone")
 _LOG_SIZE = 2000  # lines that may wait

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from common import topics
 from common.applications.outlining.messages import Contours
 from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS
-from common.applications.pick_place.topics import DETECTED_OBJECTS, SCENE_BALLS, VALIDATED_TARGETS, WORKSPACE_MARKERS
+from common.applications.pick_place.topics import DETECTED_OBJECTS, VALIDATED_TARGETS, WORKSPACE_MARKERS
 from common.messages import JointState, JointTrajectory, Rejections
 from common.topics import Topic
 from common.viewer.feeds import Feeds
@@ -18,8 +18,6 @@ from common.viewer.pictures import Picture
 
 if TYPE_CHECKING:
     from common.viewer.scene_view import SceneView
-
-TRUTH: tuple[Topic[Any], ...] = (SCENE_BALLS, topics.SCENE_OBJECTS)
 
 
 class SceneFeed:
@@ -65,7 +63,7 @@ class SceneFeed:
         """Topics, of those that are read on demand, that the scene needs to be seen."""
         wanted: list[Topic[Any]] = [CONTOURS]
         if self.layers["truth"] or self.editing:
-            wanted += TRUTH
+            wanted.append(topics.SCENE_OBJECTS)
         if self.layers["frames"]:
             wanted.append(topics.TF)
         if self.layers["rejected"]:
@@ -134,6 +132,5 @@ class SceneFeed:
         for topic, show in shows:
             if (message := self._feeds.fresh(topic)) is not None:
                 show(message)
-        balls, objects = (self._feeds.fresh(topic) for topic in TRUTH)
-        if balls is not None or objects is not None:
-            scene.show_truth(balls, objects)
+        if (objects := self._feeds.fresh(topics.SCENE_OBJECTS)) is not None:
+            scene.show_truth(objects)

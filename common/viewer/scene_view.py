@@ -58,7 +58,6 @@ _LAYERS_OF = {
     "plan": ("plan", "tool_path"),
     "outline": ("outline",),
     "contours": ("contours",),
-    "balls": ("truth",),
     "world": ("truth",),
 }
 
@@ -140,7 +139,7 @@ class SceneView:
         self.plan = Plan(scene, root["plan"], root["tool_path"], rough, robot, self._clock)
         self.outline = Outline(scene, root["outline"])
         self.contours = ContourChoice(scene, root["contours"], around, self._selected)
-        self.truth = Truth(scene, root["truth"], around.ball_radius, self._dragged)
+        self.truth = Truth(scene, root["truth"], self._dragged)
         self.goal = GoalMarker(scene, "/goal", robot, rough, self._goal_moved)
 
     def _selected(self, index: int) -> None:
@@ -243,12 +242,9 @@ class SceneView:
         """Show what may be chosen as lines, each with its label and a pin; clicking the pin calls `on_select`."""
         self._take("contours", m)
 
-    def show_truth(self, balls: PoseArray | None = None, objects: WorldObjects | None = None) -> None:
-        """Show where everything really is, beside what was perceived; what is None stays as it was."""
-        if balls is not None:
-            self._take("balls", balls)
-        if objects is not None:
-            self._take("world", objects)
+    def show_truth(self, objects: WorldObjects) -> None:
+        """Show where everything really is, beside what was perceived."""
+        self._take("world", objects)
 
     # --- what the person moves ---
 
@@ -257,7 +253,7 @@ class SceneView:
         with self._lock:
             self._editing = on
             self._roots["truth"].visible = self._is_shown("truth")
-            self._apply("balls", "world")
+            self._apply("world")
             self.truth.set_editing(on)
 
     def goal_marker(self, on: bool) -> None:
@@ -345,9 +341,6 @@ class SceneView:
         except CameraError:  # a distorted camera: pixels are not where a pinhole would see them
             return
         self.contours.show(m, camera, self._newest.get("scene"))
-
-    def _apply_balls(self, m: PoseArray) -> None:
-        self.truth.balls(m)
 
     def _apply_world(self, m: WorldObjects) -> None:
         self.truth.objects(m)

@@ -8,9 +8,12 @@ from numpy.typing import NDArray
 
 from common.messages import CollisionObject, WorldObject
 from common.planning.prism import convex_hull
-from common.sim.objects import centre_of, object_mesh
+from common.robot.transforms import pose_to_matrix
+from common.sim.objects import solid_of_message
 from common.sim.solids import upright
 from common.viewer.poses import Rgb, position_of, rgb_of, wxyz_of
+
+_LARGER = 1.03  # a sphere is drawn a little outside of what was perceived
 
 Solid = viser.BoxHandle | viser.IcosphereHandle | viser.CylinderHandle | viser.MeshHandle
 
@@ -58,8 +61,25 @@ def add_triangles(
     )
 
 
-def add_world_object(scene: viser.SceneApi, name: str, thing: WorldObject, color: Rgb) -> viser.MeshHandle:
-    """An object of the simulated world as a wireframe, its node at its centre."""
-    centre = centre_of(thing)
-    triangles = object_mesh(thing).corners - np.array(centre)
-    return add_triangles(scene, name, triangles, color, wireframe=True, position=centre)
+def add_world_object(
+    scene: viser.SceneApi, name: str, thing: WorldObject, color: Rgb
+) -> viser.MeshHandle | viser.IcosphereHandle:
+    """An object of the simulated world as a wireframe, its node in the middle of its box."""
+    if thing.shape == "sphere":
+        return scene.add_icosphere(
+            name, _LARGER * thing.size.x / 2, color, subdivisions=2, wireframe=True, position=middle_of(thing),
+            cast_shadow=False, receive_shadow=False,
+        )
+    solid = solid_of_message(thing)
+    triangles = solid.triangles - (solid.low + solid.high) / 2
+    return add_triangles(scene, name, triangles, color, wireframe=True, position=middle_of(thing),
+                         wxyz=wxyz_of(thing.pose))
+
+
+def middle_of(thing: WorldObject) -> tuple[float, float, float]:
+    """Middle [m], world, of the box about an object along the axes of its own frame."""
+    if thing.shape in ("prism", "mesh"):
+        points = np.array(thing.vertices or [(x, y, 0.0) for x, y in thing.polygon])
+        x, y, z = (pose_to_matrix(thing.pose) @ np.array([*(points.min(axis=0) + points.max(axis=0)) / 2, 1.0]))[:3]
+        return float(x), float(y), float(z)
+    return position_of(thing.pose)

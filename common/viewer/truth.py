@@ -8,71 +8,56 @@ from typing import Any
 
 import viser
 
-from common.messages import PoseArray, WorldObject, WorldObjects
-from common.sim.objects import centre_of
+from common.messages import WorldObjects
+from common.sim.objects import centre_of, look_of
 from common.viewer.dragging import Drag
-from common.viewer.poses import position_of
-from common.viewer.solids import add_world_object
+from common.viewer.poses import wxyz_of
+from common.viewer.solids import add_world_object, middle_of
 
 TRUTH = (0, 229, 255)
 EDITED = (255, 255, 0)
-_FREE = ("", "table", "box", "elsewhere")  # what may be pulled: not what the hand holds, nor what falls
-_LARGER = 1.03  # drawn a little outside of what was perceived
+_FREE = ("table", "contained", "elsewhere")  # what may be pulled: not what the hand holds, nor what falls
 
 
 class Truth:
-    """Balls and objects of the simulated world."""
+    """Objects of the simulated world."""
 
     def __init__(
-        self, scene: viser.SceneApi, root: str, radius: float, dragged: Callable[[str, float, float], None]
+        self, scene: viser.SceneApi, root: str, dragged: Callable[[str, float, float], None]
     ) -> None:
         """Start without any.
 
         Args:
             scene: to which nodes are added.
             root: name of the node under which they are put.
-            radius: of a ball [m].
             dragged: called with the id of what was dropped somewhere, and x, y [m].
         """
         self._scene = scene
         self._root = root
-        self._radius = radius
         self._dragged = dragged
         self._numbers = count()
         self._editing = False
         self._nodes: dict[str, tuple[Any, Any]] = {}  # by id: what it looks like, its node
         self._free: dict[str, bool] = {}
         self._drags: dict[str, Drag] = {}
-
-    def balls(self, m: PoseArray) -> None:
-        """Show these balls and no others."""
-        labels = dict(zip(m.ids, m.labels, strict=True)) if m.labels else {}
-        places = {name: position_of(pose) for name, pose in zip(m.ids, m.poses, strict=False)}
-        self._keep([name for name, (look, _) in self._nodes.items() if look != "ball" or name in places])
-        for name, place in places.items():
-            if name not in self._nodes:
-                node = self._scene.add_icosphere(
-                    f"{self._root}/{next(self._numbers)}", _LARGER * self._radius, self._color, subdivisions=2,
-                    wireframe=True, position=place, cast_shadow=False, receive_shadow=False,
-                )
-                self._nodes[name] = ("ball", node)
-            self._free[name] = labels.get(name, "") in _FREE
-            if not (name in self._drags and self._drags[name].held):
-                self._nodes[name][1].position = place
-        self._listen()
+        self._off: dict[str, tuple[float, float]] = {}  # of the middle of what it covers from its node [m]
 
     def objects(self, m: WorldObjects) -> None:
         """Show these objects and no others."""
         things = {thing.id: thing for thing in m.objects}
-        looks = {name: _look(thing) for name, thing in things.items()}
-        self._keep([name for name, (look, _) in self._nodes.items() if look == "ball" or looks.get(name) == look])
+        looks = {name: look_of(thing)[:-3] for name, thing in things.items()}
+        self._keep([name for name, (look, _) in self._nodes.items() if looks.get(name) == look])
         for name, thing in things.items():
             if name not in self._nodes:
                 node = add_world_object(self._scene, f"{self._root}/{next(self._numbers)}", thing, self._color)
                 self._nodes[name] = (looks[name], node)
-                self._free[name] = True
+            place, node = middle_of(thing), self._nodes[name][1]
+            self._free[name] = thing.state in _FREE
+            self._off[name] = (centre_of(thing)[0] - place[0], centre_of(thing)[1] - place[1])
             if not (name in self._drags and self._drags[name].held):
-                self._nodes[name][1].position = centre_of(thing)
+                node.position = place
+                if thing.shape != "sphere":
+                    node.wxyz = wxyz_of(thing.pose)
         self._listen()
 
     def set_editing(self, on: bool) -> None:
@@ -83,7 +68,7 @@ class Truth:
         self._listen()
 
     def node(self, name: str) -> Any:
-        """The node of a ball or object by its id; None when there is none."""
+        """The node of an object by its id; None when there is none."""
         return self._nodes.get(name, (None, None))[1]
 
     @property
@@ -100,16 +85,11 @@ class Truth:
         for name, (_, node) in self._nodes.items():
             wanted = self._editing and self._free[name]
             if wanted and name not in self._drags:
-                self._drags[name] = Drag(node, lambda x, y, name=name: self._dragged(name, x, y))  # type: ignore[misc]
+                self._drags[name] = Drag(node, lambda x, y, name=name: self._drop(name, x, y))  # type: ignore[misc]
             elif not wanted and name in self._drags:
                 self._drags.pop(name).stop()
 
-
-def _look(thing: WorldObject) -> str:
-    """What tells an object from others, wherever it stands."""
-    x, y, _ = centre_of(thing)
-
-    def about(edge: list[tuple[float, float]]) -> list[tuple[float, float]]:
-        return [(round(a - x, 6), round(b - y, 6)) for a, b in edge]
-
-    return thing.model_copy(update={"outline": about(thing.outline), "hole": about(thing.hole)}).model_dump_json()
+    def _drop(self, name: str, x: float, y: float) -> None:
+        """Tell of a node that was dropped where the middle of what it covers is to lie."""
+        off = self._off[name]
+        self._dragged(name, x + off[0], y + off[1])

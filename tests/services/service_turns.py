@@ -17,7 +17,7 @@ from common import topics
 from common.applications.outlining.contours import ContourOptions, find_contours
 from common.applications.outlining.messages import Contours, OutlinePoints
 from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_STATUS
-from common.applications.pick_place.topics import DETECTED_OBJECTS, SCENE_BALLS, VALIDATED_TARGETS
+from common.applications.pick_place.topics import DETECTED_OBJECTS, VALIDATED_TARGETS
 from common.clock import Clock
 from common.config import Parameters, load_cell, service_config
 from common.config.tunables import tunable_sections
@@ -26,10 +26,10 @@ from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
-from common.sim.drawing import draw
 from common.sim.objects import world_object
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
+from tests.common.sim.spheres import draw_spheres
 
 PANDA, UR5 = load_cell("panda"), load_cell("ur5")
 CELLS = {"panda": PANDA, "ur5": UR5}
@@ -80,7 +80,7 @@ def calibrate(bus: Bus, camera: Pinhole, frame: str) -> None:
 
 async def simulate_camera(bus: Bus) -> AsyncIterator[m.Image]:
     images = bus.reader(topics.CAMERA_IMAGE)
-    bus.writer(SCENE_BALLS).put(m.PoseArray())
+    bus.writer(topics.SCENE_OBJECTS).put(m.WorldObjects())
     while True:
         yield await later(bus, images)
 
@@ -89,7 +89,7 @@ async def detect(bus: Bus) -> AsyncIterator[list[m.Marker]]:
     frame = PANDA.world.camera.frame
     images, found = bus.writer(topics.CAMERA_IMAGE), bus.reader(DETECTED_OBJECTS)
     calibrate(bus, CAMERA, frame)
-    pictures = [draw(balls, CAMERA, PANDA.world) for balls in (BALLS, BALLS[:2])]
+    pictures = [draw_spheres(balls, CAMERA, PANDA.world) for balls in (BALLS, BALLS[:2])]
     for turn in itertools.count():
         picture = pictures[turn // 2 % 2]  # the same twice: it would not be looked at again without a change
         images.put(array_to_image(picture, "bgr8", bus.header(frame)))

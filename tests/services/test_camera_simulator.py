@@ -4,25 +4,24 @@ import numpy as np
 import pytest
 
 from common import topics
-from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.config import Run, Surroundings
-from common.messages import Pose, PoseArray, Vector3
-from common.perception.image import image_to_array
+from common.messages import Header
+from common.perception.image import array_to_image, image_to_array
+from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.process.wiring import wiring
+from common.sim.rendering import draw
 from common.transport.local import LocalNetwork
-from services.camera_simulator import Config, run, seen
+from services.camera_simulator import Config, run
+from tests.common.sim.spheres import spheres
 
-config = Config(world=Surroundings(), run=Run(cell="test", seed=4))
+around = Surroundings()
+config = Config(world=around, run=Run(cell="test", seed=4))
 
 
-def balls(*places, labels=()):
-    return PoseArray(
-        poses=[Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in places],
-        ids=[f"ball_{i}" for i in range(len(places))],
-        labels=list(labels) or ["table"] * len(places),
-    )
+def balls(*places, states=()):
+    return spheres(places, states=states)
 
 
 async def next_of(reader):
@@ -38,7 +37,7 @@ async def test_one_layout_in_pictures_and_camera_info_out():
     net = LocalNetwork()
     tester = net.bus()
     images, infos = tester.reader(topics.CAMERA_IMAGE), tester.reader(topics.CAMERA_INFO)
-    truth = tester.writer(SCENE_BALLS)
+    truth = tester.writer(topics.SCENE_OBJECTS)
     async with running_service(net, run, config, name="camera_simulator"):
         truth.put(balls((0.5, -0.2, 0.03)))
         image, info = await next_of(images), await next_of(infos)
@@ -52,7 +51,7 @@ async def test_nothing_is_sent_before_the_world_says_where_its_balls_are():
     net = LocalNetwork()
     tester = net.bus()
     images, infos = tester.reader(topics.CAMERA_IMAGE), tester.reader(topics.CAMERA_INFO)
-    truth = tester.writer(SCENE_BALLS)
+    truth = tester.writer(topics.SCENE_OBJECTS)
     async with running_service(net, run, config.model_copy(update={"rate": 200.0, "max_rate": 200.0})):
         await asyncio.sleep(0.1)
         assert images.latest is None and infos.latest is None
@@ -63,29 +62,29 @@ async def test_nothing_is_sent_before_the_world_says_where_its_balls_are():
 async def test_what_is_drawn_follows_the_world_and_leaves_out_what_can_not_be_seen():
     net = LocalNetwork()
     tester = net.bus()
-    images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(SCENE_BALLS)
+    images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_OBJECTS)
     async with running_service(net, run, config):
         truth.put(balls((0.5, -0.2, 0.03), (0.6, 0.0, 0.03)))
         while not red_at(await next_of(images), 0.6, 0.0):
             pass
-        truth.put(balls((0.5, -0.2, 0.03), (0.6, 0.0, 0.03), labels=("held", "table")))
+        truth.put(balls((0.5, -0.2, 0.03), (0.6, 0.0, 0.03), states=("held", "table")))
         while red_at(image := await next_of(images), 0.5, -0.2):
             pass
         assert red_at(image, 0.6, 0.0)
 
 
-def test_held_and_lost_balls_are_not_seen_but_falling_and_boxed_ones_are():
-    places = [(0.1 * i, 0, 0.03) for i in range(5)]
-    labels = ("table", "held", "falling", "box", "elsewhere")
-    assert seen(balls(*places, labels=labels)) == [places[0], places[2], places[3]]
-    assert seen(PoseArray(poses=[Pose()])) == [(0, 0, 0)]
+@pytest.mark.parametrize(("state", "shown"), [
+    ("table", True), ("held", False), ("falling", True), ("contained", True), ("elsewhere", False)])
+def test_what_is_held_or_lost_is_not_seen_but_what_falls_or_lies_in_a_container_is(state, shown):
+    picture = draw(spheres([(0.5, -0.2, 0.03)], states=[state]).objects, Pinhole.from_config(around.camera), around)
+    assert red_at(array_to_image(picture, "bgr8", Header()), 0.5, -0.2) == shown
 
 
 async def test_stamps_are_cell_time_at_the_rate_in_cell_time():
     net = LocalNetwork()
     clock = Clock(speed=5.0)
     tester = net.bus(clock=clock)
-    images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(SCENE_BALLS)
+    images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_OBJECTS)
     async with running_service(net, run, config, clock=clock):
         truth.put(balls())
         stamps = [(await next_of(images)).header.stamp for _ in range(8)]
@@ -98,7 +97,7 @@ async def test_noise_comes_from_the_seed_of_the_run():
     async def first(seed):
         net = LocalNetwork()
         tester = net.bus()
-        images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(SCENE_BALLS)
+        images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_OBJECTS)
         truth.put(balls())
         noisy = Config(world=Surroundings(), run=Run(cell="test", seed=seed), noise_std=8, brightness=-20)
         async with running_service(net, run, noisy):
@@ -112,6 +111,6 @@ async def test_noise_comes_from_the_seed_of_the_run():
 
 async def test_it_is_the_only_one_here_that_reads_the_truth():
     found = await wiring(run, config)
-    assert found.reads == {SCENE_BALLS}
+    assert found.reads == {topics.SCENE_OBJECTS}
     assert found.writes == {topics.CAMERA_IMAGE, topics.CAMERA_INFO}
     assert not found.serves and not found.calls

@@ -101,7 +101,7 @@ async def test_object_that_was_moved_is_seen_and_outlined_where_it_lies_now():
         cell.say(W5.objects)
         await until(cell.paths, lambda p: bool(p.poses))
         world.edit(WorldEdit(op="move", id="green_box", position=Vector3(x=0.5, y=-0.15)), 0.0)
-        cell.truth.put(world.scene_objects(Header()))
+        cell.truth.put(world.objects(Header()))
         moved = await until(cell.points, lambda p: bool(p.poses) and abs(middle(p)[0] - 0.46) > 0.02)
         np.testing.assert_allclose(middle(moved), (0.5, -0.15, 1.05), atol=1e-3)
         path = await until(cell.paths, lambda p: p.header.stamp >= moved.header.stamp)

@@ -6,26 +6,24 @@ from contextlib import AsyncExitStack
 import numpy as np
 
 from common import topics
-from common.applications.pick_place.topics import REJECTED_TARGETS, SCENE_BALLS, VALIDATED_TARGETS
+from common.applications.pick_place.topics import REJECTED_TARGETS, VALIDATED_TARGETS
 from common.clock import Clock
 from common.config import Run, Surroundings, load_cell, service_config
-from common.messages import Header, Pose, PoseArray, TFMessage, TransformStamped, Vector3
+from common.messages import Header, TFMessage, TransformStamped
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.robot.transforms import matrix_to_pose
 from common.transport.local import LocalNetwork
 from services import camera_simulator, vision_detector, workspace_validator
+from tests.common.sim.spheres import spheres
 
 cell = load_cell("panda")
 around = cell.section(Surroundings)
 camera = Pinhole.from_config(around.camera)
 
 
-def truth(places, labels=None):
-    return PoseArray(
-        poses=[Pose(position=Vector3(x=p[0], y=p[1], z=p[2] if len(p) > 2 else 0.03)) for p in places],
-        labels=labels or ["table"] * len(places),
-    )
+def truth(places, states=()):
+    return spheres([(p[0], p[1], p[2] if len(p) > 2 else 0.03) for p in places], around, states)
 
 
 def tf():
@@ -57,7 +55,7 @@ async def targets_like(reader, places):
 async def test_what_lies_on_the_table_is_offered_and_follows_what_happens_there():
     net, clock = LocalNetwork(), Clock()
     bus = net.bus(clock=clock)
-    world, statics = bus.writer(SCENE_BALLS), bus.writer(topics.TF_STATIC)
+    world, statics = bus.writer(topics.SCENE_OBJECTS), bus.writer(topics.TF_STATIC)
     offered, rejected = bus.reader(VALIDATED_TARGETS), bus.reader(REJECTED_TARGETS)
     statics.put(tf())
     places = list(cell.world.spots[:7])
@@ -69,7 +67,7 @@ async def test_what_lies_on_the_table_is_offered_and_follows_what_happens_there(
         world.put(truth(places, ["held", *["table"] * 6]))
         await targets_like(offered, places[1:])
         c = around.container
-        world.put(truth([(c.x - 0.033, c.y - 0.033, 0.035), *places[1:]], ["box", *["table"] * 6]))
+        world.put(truth([(c.x - 0.033, c.y - 0.033, 0.035), *places[1:]], ["contained", *["table"] * 6]))
         await targets_like(offered, places[1:])
         assert rejected.received == 0
         world.put(truth([(0.2, 0.0), (0.46, 0.0), (0.52, 0.0), (0.49, 0.052)]))
@@ -81,7 +79,7 @@ async def test_what_lies_on_the_table_is_offered_and_follows_what_happens_there(
 async def test_noise_and_a_darker_picture_change_nothing():
     net, clock = LocalNetwork(), Clock()
     bus = net.bus(clock=clock)
-    world, statics = bus.writer(SCENE_BALLS), bus.writer(topics.TF_STATIC)
+    world, statics = bus.writer(topics.SCENE_OBJECTS), bus.writer(topics.TF_STATIC)
     offered = bus.reader(VALIDATED_TARGETS)
     statics.put(tf())
     places = [(0.40, -0.30), (0.46, -0.30), (0.64, -0.25), (0.40, -0.17)]

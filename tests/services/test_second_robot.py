@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from common import topics
-from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import RemoteError
@@ -56,12 +55,11 @@ async def test_it_starts_at_home_with_open_fingers_and_tells_every_joint(robot: 
     async with executor() as bus:
         joints = await see(bus.reader(topics.JOINT_STATES), lambda m: True)
         gripper = await see(bus.reader(topics.GRIPPER_STATE), lambda m: True)
-        balls = await see(bus.reader(SCENE_BALLS), lambda m: True)
         objects = await see(bus.reader(topics.SCENE_OBJECTS), lambda m: True)
     assert joints.name == [*robot.joint_names, *GRIPPER.joints]
     assert joints.position == pytest.approx([*robot.named("home"), *[0.0] * 6], abs=1e-5)
     assert (gripper.width, gripper.source) == (0.085, "gripper_position_controller")
-    assert balls.poses == [] and [o.id for o in objects.objects] == ["cube"]
+    assert [o.id for o in objects.objects] == ["cube"]
 
 
 async def test_fingers_close_together_within_the_speed_of_their_knuckle() -> None:
@@ -99,10 +97,16 @@ async def test_it_follows_a_trajectory_and_signs_with_its_name(robot: RobotModel
     assert (again.state, again.error, again.source) == ("rejected", "start_mismatch", "joint_trajectory_controller")
 
 
-async def test_ball_can_not_be_put_into_a_world_of_objects() -> None:
+async def test_what_is_added_without_a_shape_is_like_the_first_object_of_the_world() -> None:
     async with executor() as bus:
-        with pytest.raises(RemoteError, match="no balls"):
-            await bus.client(topics.WORLD_EDIT).call(WorldEdit(op="add", position=Vector3(x=0.5, y=0.0)))
+        edit = bus.client(topics.WORLD_EDIT)
+        with pytest.raises(RemoteError, match="would reach into cube"):
+            await edit.call(WorldEdit(op="add", position=Vector3(x=0.5, y=0.0)))
+        reply = await edit.call(WorldEdit(op="add", position=Vector3(x=0.5, y=0.2)))
+        assert reply.ids == ["cube", "cube_1"]
+        objects = await see(bus.reader(topics.SCENE_OBJECTS), lambda m: len(m.objects) == 2)
+    first, second = objects.objects
+    assert (second.shape, second.size, second.color, second.base) == ("box", first.size, first.color, 1.0)
 
 
 async def test_object_that_is_moved_stands_there_and_still_does_when_the_process_is_started_again(

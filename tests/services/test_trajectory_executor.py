@@ -360,7 +360,7 @@ def test_speed_scaling_out_of_bounds_is_refused(value: str) -> None:
 
 
 async def test_impossible_layout_stops_it_with_the_place() -> None:
-    with pytest.raises(ConfigError, match=r"world\.balls"):
+    with pytest.raises(ConfigError, match=r"world\.objects: cannot be laid out: ball_1"):
         async with executor("world.balls=[[0.55, 0.17]]"):
             pass
 

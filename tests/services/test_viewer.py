@@ -26,7 +26,7 @@ from common.applications.outlining.messages import (
 )
 from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT, OUTLINE_STATUS
 from common.applications.pick_place.messages import PickPlaceStatus
-from common.applications.pick_place.topics import DETECTION_IMAGE, PICK_PLACE_STATUS, REJECTED_TARGETS, SCENE_BALLS
+from common.applications.pick_place.topics import DETECTION_IMAGE, PICK_PLACE_STATUS, REJECTED_TARGETS
 from common.clock import Clock
 from common.config import Cell, load_cell, service_config
 from common.errors import Refused
@@ -190,17 +190,17 @@ async def test_state_and_counters_are_shown_in_words(panda: Played, page: Browse
 
 async def test_pictures_and_truth_are_read_only_while_a_page_that_shows_them_is_open(panda: Played) -> None:
     writers = {topic: panda.bus.writer(topic) for topic in (topics.CAMERA_IMAGE, DETECTION_IMAGE)}
-    balls = panda.bus.writer(SCENE_BALLS)
-    assert not any(writer.matched for writer in writers.values()) and not balls.matched
+    objects = panda.bus.writer(topics.SCENE_OBJECTS)
+    assert not any(writer.matched for writer in writers.values()) and not objects.matched
     async with opened(panda.port) as page:
         await until(lambda: all(writer.matched for writer in writers.values()))
-        assert not balls.matched
+        assert not objects.matched
         await page.set("Truth (simulated hardware)", True)
-        await until(lambda: balls.matched)
+        await until(lambda: objects.matched)
         await page.set("With what was found", False)
         await until(lambda: not writers[DETECTION_IMAGE].matched)
         assert writers[topics.CAMERA_IMAGE].matched
-    await until(lambda: not writers[topics.CAMERA_IMAGE].matched and not balls.matched)
+    await until(lambda: not writers[topics.CAMERA_IMAGE].matched and not objects.matched)
 
 
 async def test_parameter_changed_on_the_page_is_changed_by_the_page(panda: Played, page: BrowserDouble) -> None:

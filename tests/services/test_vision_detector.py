@@ -14,9 +14,9 @@ from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.process.wiring import wiring
 from common.robot.transforms import matrix_to_pose
-from common.sim.drawing import draw
 from common.transport.local import LocalNetwork
 from services.vision_detector import Config, run
+from tests.common.sim.spheres import draw_spheres
 
 around = Surroundings()
 camera = Pinhole.from_config(around.camera)
@@ -26,7 +26,7 @@ PLACES = np.array([(0.40, -0.30, 0.03), (0.52, -0.30, 0.03), (0.64, -0.25, 0.03)
 
 
 def picture(places=PLACES, stamp=1_000):
-    return array_to_image(draw(places, camera, around), "bgr8", Header(stamp=stamp, frame_id=FRAME))
+    return array_to_image(draw_spheres(places, camera, around), "bgr8", Header(stamp=stamp, frame_id=FRAME))
 
 
 def tf(T=camera.T_world_optical, child=FRAME):
@@ -92,7 +92,7 @@ async def test_intrinsics_come_from_camera_info():
     rig.infos.put(other.info(Header(frame_id=FRAME)))
     rig.statics.put(tf())
     async with running_service(net, run, config):
-        rig.images.put(array_to_image(draw(PLACES[:1], other, around), "bgr8", Header(stamp=1, frame_id=FRAME)))
+        rig.images.put(array_to_image(draw_spheres(PLACES[:1], other, around), "bgr8", Header(stamp=1, frame_id=FRAME)))
         (mark,) = (await rig.next()).markers
     assert (mark.pose.position.x, mark.pose.position.y) == pytest.approx((0.40, -0.30), abs=1e-3)
 
@@ -167,14 +167,14 @@ async def test_annotated_picture_is_drawn_for_whoever_listens():
         rig.images.put(picture(stamp=7))
         image = await asyncio.wait_for(shown.next(), 10)
     assert image.header == Header(stamp=7, frame_id=FRAME)
-    assert (image_to_array(image) != draw(PLACES, camera, around)).any()
+    assert (image_to_array(image) != draw_spheres(PLACES, camera, around)).any()
 
 
 async def test_an_rgb_picture_is_understood():
     net = LocalNetwork()
     rig = Rig(net)
     rig.calibrate()
-    flipped = np.ascontiguousarray(draw(PLACES, camera, around)[..., ::-1])
+    flipped = np.ascontiguousarray(draw_spheres(PLACES, camera, around)[..., ::-1])
     async with running_service(net, run, config):
         rig.images.put(array_to_image(flipped, "rgb8", Header(stamp=5, frame_id=FRAME)))
         assert len((await rig.next()).markers) == 3

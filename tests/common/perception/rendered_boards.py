@@ -9,7 +9,8 @@ import numpy as np
 from common.perception.calibration_board import Board, BoardOptions
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, rpy_to_matrix, transform
-from common.sim.drawing import RIM_WIDTH, draw
+from common.sim.rendering import RIM_WIDTH
+from tests.common.sim.spheres import draw_spheres
 
 FINER = 2  # rays along each side of a pixel
 
@@ -120,7 +121,7 @@ def through(lens: Lens, T_world_camera, surroundings, balls, *, noise=2.0, seed=
     k = finer * lens.k
     pinhole = Pinhole(k[0, 0], k[1, 1], finer * (lens.cx + border + 0.5) - 0.5, finer * (lens.cy + border + 0.5) - 0.5,
                       finer * (lens.width + 2 * border), finer * (lens.height + 2 * border), T_world_camera)
-    straight = draw(balls, pinhole, surroundings, rim_width=finer * RIM_WIDTH)
+    straight = draw_spheres(balls, pinhole, surroundings, rim_width=finer * RIM_WIDTH)
     rays = lens.rays()
     u, v = rays[..., 0] * pinhole.fx + pinhole.cx, rays[..., 1] * pinhole.fy + pinhole.cy
     smeared = cv2.GaussianBlur(straight.astype(np.float32), (0, 0), 0.7)

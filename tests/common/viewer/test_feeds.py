@@ -3,7 +3,7 @@ from __future__ import annotations
 from common import messages as m
 from common import topics
 from common.applications.outlining.topics import CONTOURS
-from common.applications.pick_place.topics import SCENE_BALLS, VALIDATED_TARGETS
+from common.applications.pick_place.topics import VALIDATED_TARGETS
 from common.config import Members, load_cell
 from common.transport.local import LocalNetwork
 from common.viewer.feeds import Feeds, in_cell
@@ -52,9 +52,9 @@ async def test_topic_that_the_cell_does_not_have_is_not_asked_for() -> None:
 async def test_what_is_large_is_listened_to_while_it_is_wanted() -> None:
     net = LocalNetwork()
     feeds = Feeds(net.bus("viewer"), members())
-    balls = net.bus("trajectory_executor").writer(SCENE_BALLS)
-    assert not balls.matched
-    feeds.listen([SCENE_BALLS])
-    assert balls.matched
+    objects = net.bus("trajectory_executor").writer(topics.SCENE_OBJECTS)
+    assert not objects.matched
+    feeds.listen([topics.SCENE_OBJECTS])
+    assert objects.matched
     feeds.listen([])
-    assert not balls.matched
+    assert not objects.matched

@@ -54,11 +54,16 @@ def test_joints_that_the_robot_lacks_are_left_out(panda: Stage) -> None:
     np.testing.assert_allclose(panda.view.figure.poses.pose("panda_hand_tcp")[0], tcp)
 
 
+def a_sphere(name: str, pose: m.Pose) -> m.WorldObjects:
+    size = m.Vector3(x=0.06, y=0.06, z=0.06)
+    return m.WorldObjects(header=WORLD, objects=[m.WorldObject(id=name, shape="sphere", size=size, pose=pose)])
+
+
 def test_nothing_is_sent_when_nothing_changed(panda: Stage) -> None:
     pose = m.JointState(header=WORLD, name=panda.robot.joint_names, position=[0.1] * 3 + [-1.0] + [0.1] * 3)
     scene = scene_of(*fixed_objects(around_of("panda")), ball("a", at(0.4, 0.1, 0.03)))
     targets = m.PoseArray(header=WORLD, poses=[at(0.4, 0.1, 0.03)])
-    truth = m.PoseArray(header=WORLD, poses=[at(0.4, 0.1, 0.03)], ids=["ball_1"])
+    truth = a_sphere("ball_1", at(0.4, 0.1, 0.03))
     panda.view.set_visible("truth", True)
 
     def show_all(stamp: int) -> None:
@@ -66,7 +71,7 @@ def test_nothing_is_sent_when_nothing_changed(panda: Stage) -> None:
         panda.view.show_joints(pose.model_copy(update=later))
         panda.view.show_scene(scene.model_copy(update=later))
         panda.view.show_targets(targets.model_copy(update=later))
-        panda.view.show_truth(balls=truth.model_copy(update=later))
+        panda.view.show_truth(truth.model_copy(update=later))
 
     with panda.sent() as first:
         show_all(1)
@@ -118,7 +123,7 @@ def test_layers_begin_as_wanted_and_unknown_ones_are_refused(server: viser.Viser
 
 
 def test_hidden_layer_shows_the_newest_when_it_comes_back(panda: Stage) -> None:
-    panda.view.show_truth(balls=m.PoseArray(header=WORLD, poses=[at(0.4, 0.1, 0.03)], ids=["ball_1"]))
+    panda.view.show_truth(a_sphere("ball_1", at(0.4, 0.1, 0.03)))
     assert panda.view.truth.node("ball_1") is None
     panda.view.set_visible("truth", True)
     assert is_shown(panda.server, panda.view.truth.node("ball_1"))
@@ -195,7 +200,7 @@ def test_messages_without_content_do_no_harm(ur5: Stage) -> None:
     view.play_plan()
     view.show_outline(OutlinePoints())
     view.show_contours(Contours(header=WORLD, width=64, height=48))
-    view.show_truth(balls=m.PoseArray(), objects=m.WorldObjects())
+    view.show_truth(m.WorldObjects())
     view.show_joints(m.JointState(header=WORLD, name=ur5.robot.joint_names, position=[0.0] * 6))
 
 

@@ -15,9 +15,11 @@ from tests.common.viewer.scene_cell import WORLD, Stage, at, is_shown
 EYE = np.array([1.0, -1.0, 1.0])
 
 
-def balls(**places: tuple[float, float]) -> m.PoseArray:
-    poses = [at(x, y, 0.03) for x, y in places.values()]
-    return m.PoseArray(header=WORLD, poses=poses, ids=list(places), labels=["table"] * len(poses))
+def balls(state: str = "table", **places: tuple[float, float]) -> m.WorldObjects:
+    size = m.Vector3(x=0.06, y=0.06, z=0.06)
+    things = [{"id": name, "shape": "sphere", "size": size, "pose": at(x, y, 0.03), "state": state}
+              for name, (x, y) in places.items()]
+    return m.WorldObjects(header=WORLD, objects=[m.WorldObject.model_validate(thing) for thing in things])
 
 
 def disc(x: float) -> m.WorldObject:
@@ -53,7 +55,7 @@ def moved(panda: Stage) -> list[tuple[str, float, float]]:
 
 
 def test_truth_is_hidden_until_it_is_asked_for(panda: Stage) -> None:
-    panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1)))
+    panda.view.show_truth(balls(ball_1=(0.4, 0.1)))
     panda.view.set_visible("truth", True)
     node = panda.view.truth.node("ball_1")
     assert is_shown(panda.server, node) and node.wireframe
@@ -63,20 +65,20 @@ def test_truth_is_hidden_until_it_is_asked_for(panda: Stage) -> None:
 
 def test_balls_come_move_and_go(panda: Stage) -> None:
     panda.view.set_visible("truth", True)
-    panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1), ball_2=(0.5, 0.1)))
+    panda.view.show_truth(balls(ball_1=(0.4, 0.1), ball_2=(0.5, 0.1)))
     first = panda.view.truth.node("ball_1")
-    panda.view.show_truth(balls=balls(ball_1=(0.3, 0.1)))
+    panda.view.show_truth(balls(ball_1=(0.3, 0.1)))
     assert panda.view.truth.node("ball_1") is first and panda.view.truth.node("ball_2") is None
     np.testing.assert_allclose(first.position, [0.3, 0.1, 0.03])
 
 
 def test_object_of_the_world_is_shown_in_its_size(ur5: Stage) -> None:
     ur5.view.set_visible("truth", True)
-    ur5.view.show_truth(objects=m.WorldObjects(header=WORLD, objects=[disc(0.5)]))
+    ur5.view.show_truth(m.WorldObjects(header=WORLD, objects=[disc(0.5)]))
     node = ur5.view.truth.node("disc")
     np.testing.assert_allclose(node.position, [0.5, 0.0, 1.01], atol=1e-6)
     np.testing.assert_allclose(np.ptp(node.vertices, axis=0), [0.04, 0.04, 0.02], atol=1e-4)
-    ur5.view.show_truth(objects=m.WorldObjects(header=WORLD, objects=[disc(0.6)]))
+    ur5.view.show_truth(m.WorldObjects(header=WORLD, objects=[disc(0.6)]))
     np.testing.assert_allclose(ur5.view.truth.node("disc").position, [0.6, 0.0, 1.01], atol=1e-6)
     assert ur5.view.truth.node("disc") is node  # moved and not sent again
 
@@ -86,7 +88,7 @@ async def test_object_is_dropped_where_it_was_pulled_to_and_can_be_pulled_again(
     ur5.view.on_object_dragged = lambda name, x, y: moved.append((name, round(x, 6), round(y, 6)))
     ur5.view.set_editing(True)
     for x, to in ((0.5, 0.55), (0.55, 0.45)):
-        ur5.view.show_truth(objects=m.WorldObjects(header=WORLD, objects=[disc(x)]))
+        ur5.view.show_truth(m.WorldObjects(header=WORLD, objects=[disc(x)]))
         node = ur5.view.truth.node("disc")
         assert is_shown(ur5.server, node)
         np.testing.assert_allclose(node.position, [x, 0.0, 1.01], atol=1e-6)
@@ -100,7 +102,7 @@ async def test_object_is_dropped_where_it_was_pulled_to_and_can_be_pulled_again(
 
 
 async def test_ball_is_dropped_where_it_was_pulled_to(panda: Stage, moved: list[tuple[str, float, float]]) -> None:
-    panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1)))
+    panda.view.show_truth(balls(ball_1=(0.4, 0.1)))
     panda.view.set_editing(True)
     node = panda.view.truth.node("ball_1")
     assert is_shown(panda.server, node)  # though the truth is not ticked
@@ -110,21 +112,21 @@ async def test_ball_is_dropped_where_it_was_pulled_to(panda: Stage, moved: list[
 
 
 async def test_ball_follows_the_pointer_and_not_the_world_meanwhile(panda: Stage) -> None:
-    panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1)))
+    panda.view.show_truth(balls(ball_1=(0.4, 0.1)))
     panda.view.set_editing(True)
     node = panda.view.truth.node("ball_1")
     seen: list[list[float]] = []
     for entry in node._impl.drag_cb:
         for phase, place in (("start", (0.4, 0.1, 0.03)), ("update", (0.5, 0.2, 0.03))):
             await entry.callback(event(phase, (0.4, 0.1, 0.03), place))
-        panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1)))
+        panda.view.show_truth(balls(ball_1=(0.4, 0.1)))
         seen.append(node.position.tolist())
     np.testing.assert_allclose(seen, [[0.5, 0.2, 0.03]])
 
 
 async def test_nothing_is_pulled_without_editing(panda: Stage, moved: list[tuple[str, float, float]]) -> None:
     panda.view.set_visible("truth", True)
-    panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1)))
+    panda.view.show_truth(balls(ball_1=(0.4, 0.1)))
     node = panda.view.truth.node("ball_1")
     await pull(node, (0.4, 0.1), (0.5, 0.2))
     panda.view.set_editing(True)
@@ -135,9 +137,8 @@ async def test_nothing_is_pulled_without_editing(panda: Stage, moved: list[tuple
 
 async def test_ball_in_the_hand_can_not_be_pulled(panda: Stage, moved: list[tuple[str, float, float]]) -> None:
     panda.view.set_editing(True)
-    for label, count in (("held", 0), ("falling", 0), ("box", 1)):
-        there = balls(ball_1=(0.4, 0.1)).model_copy(update={"labels": [label]})
-        panda.view.show_truth(balls=there)
+    for state, count in (("held", 0), ("falling", 0), ("contained", 1)):
+        panda.view.show_truth(balls(state, ball_1=(0.4, 0.1)))
         await pull(panda.view.truth.node("ball_1"), (0.4, 0.1), (0.5, 0.2))
         assert len(moved) == count
 
@@ -146,11 +147,11 @@ async def test_ball_that_goes_while_it_is_pulled_does_no_harm(
     panda: Stage, moved: list[tuple[str, float, float]]
 ) -> None:
     panda.view.set_editing(True)
-    panda.view.show_truth(balls=balls(ball_1=(0.4, 0.1)))
+    panda.view.show_truth(balls(ball_1=(0.4, 0.1)))
     node = panda.view.truth.node("ball_1")
     callbacks, place = list(node._impl.drag_cb), (0.4, 0.1, 0.03)
     await callbacks[0].callback(event("start", place, place))
-    panda.view.show_truth(balls=balls())
+    panda.view.show_truth(balls())
     for phase in ("update", "end"):
         await callbacks[0].callback(event(phase, place, place))
     assert moved == []

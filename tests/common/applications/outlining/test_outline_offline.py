@@ -21,8 +21,8 @@ from common.perception.depth import DepthError
 from common.perception.pinhole import Pinhole
 from common.planning.pipeline import PlanningPipeline
 from common.robot.model import RobotModel
-from common.sim.depth_view import DepthView
 from common.sim.objects import world_object
+from common.sim.rendering import Renderer
 
 CELL = load_cell("ur5")
 AROUND = CELL.section(Surroundings)
@@ -32,8 +32,8 @@ TALL = ObjectConfig(id="tower", shape="box", x=0.5, y=0.0, z=1.0, size=(0.04, 0.
 
 
 @cache
-def view() -> DepthView:
-    return DepthView(AROUND, RobotModel.load(CELL.robot))
+def view() -> Renderer:
+    return Renderer(AROUND, RobotModel.load(CELL.robot))
 
 
 @cache

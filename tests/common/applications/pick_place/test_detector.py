@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from common.applications.pick_place.annotation import annotate
 from common.applications.pick_place.detector import Detector, DetectorOptions
-from common.config import Surroundings
+from common.config import Container, Surroundings
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouette, wholly_in_view
 from common.robot.transforms import rpy_to_matrix, transform
-from common.sim.drawing import draw
+from tests.common.sim.spheres import draw_spheres
 
-around = Surroundings()
+around = Surroundings(container=Container())
 camera = Pinhole.from_config(around.camera)
 detector = Detector(around)
 TOUCHING = 0.06
@@ -100,7 +100,7 @@ def test_every_ball_of_random_layouts_is_found_within_a_millimetre(noise, bright
     rng = np.random.default_rng(1)
     for _ in range(15):
         balls = random_layout(rng)
-        picture = draw(
+        picture = draw_spheres(
             balls, camera, around, noise_std=noise, brightness=brightness, rng=rng, rim_width=rim
         )
         check(balls, picture, within=0.001)
@@ -115,7 +115,9 @@ def test_balls_that_touch_are_told_apart(name, noise, brightness, rim):
     rng = np.random.default_rng(2)
     for _ in range(5):
         balls = moved_into_view(CLUSTERS[name](rng), rng)
-        check(balls, draw(balls, camera, around, noise_std=noise, brightness=brightness, rng=rng, rim_width=rim))
+        picture = draw_spheres(
+            balls, camera, around, noise_std=noise, brightness=brightness, rng=rng, rim_width=rim)
+        check(balls, picture)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -123,7 +125,7 @@ def test_balls_that_touch_are_told_apart(name, noise, brightness, rim):
 def test_any_layout_without_overlap_is_found(seed):
     rng = np.random.default_rng(seed)
     balls = random_layout(rng)
-    check(balls, draw(balls, camera, around, noise_std=rng.choice([0, 8]), rng=rng))
+    check(balls, draw_spheres(balls, camera, around, noise_std=rng.choice([0, 8]), rng=rng))
 
 
 def test_balls_cut_by_the_border_are_found_and_marked_and_disturb_no_other():
@@ -131,7 +133,7 @@ def test_balls_cut_by_the_border_are_found_and_marked_and_disturb_no_other():
     partial = 0
     for _ in range(25):
         balls = random_layout(rng, (-0.02, -0.55), (0.82, 0.55))
-        found = detector.detect(draw(balls, camera, around, rng=rng), camera)
+        found = detector.detect(draw_spheres(balls, camera, around, rng=rng), camera)
         places = np.array([d.position[:2] for d in found]).reshape(-1, 2)
         for d, place in zip(found, places, strict=True):
             assert np.linalg.norm(balls[:, :2] - place, axis=1).min() < 0.012, "there is a ball wherever one is seen"
@@ -171,7 +173,7 @@ def test_every_ball_in_the_box_that_is_not_covered_is_seen_where_it_is(count, no
     for _ in range(3):
         order = rng.permutation(4)
         balls = boxed(count, order)
-        found = detector.detect(draw(balls, camera, around, noise_std=noise, rng=rng), camera)
+        found = detector.detect(draw_spheres(balls, camera, around, noise_std=noise, rng=rng), camera)
         pixels, truth = np.array([d.pixel for d in found]), camera.project(balls)
         whole = [i for i, ball in enumerate(balls) if shown_whole(ball, balls)]
         assert whole
@@ -184,7 +186,7 @@ def test_every_ball_in_the_box_that_is_not_covered_is_seen_where_it_is(count, no
 
 def test_a_ball_in_the_air_is_not_taken_for_one_on_the_table():
     for z in np.arange(0.16, 0.40, 0.02):
-        assert detector.detect(draw([(0.5, -0.2, z)], camera, around), camera) == []
+        assert detector.detect(draw_spheres([(0.5, -0.2, z)], camera, around), camera) == []
 
 
 @pytest.mark.parametrize("count", [0, 4, 7])
@@ -192,7 +194,7 @@ def test_a_ball_that_falls_into_the_box_is_seen_nowhere_outside_of_it(count):
     c = around.container
     below = boxed(count, range(4)) if count else np.empty((0, 3))
     for z in np.arange(0.10, 0.32, 0.02):
-        picture = draw(np.vstack([below, (c.x, c.y, z)]), camera, around)
+        picture = draw_spheres(np.vstack([below, (c.x, c.y, z)]), camera, around)
         for d in detector.detect(picture, camera):
             assert detector.resting.meets_container(*camera.ray(d.pixel))
 
@@ -201,19 +203,19 @@ def test_a_blurred_picture_still_gives_every_ball():
     rng = np.random.default_rng(5)
     for shape in ("block of five", "triangle"):
         balls = moved_into_view(CLUSTERS[shape](rng), rng)
-        picture = draw(balls, camera, around, noise_std=4, rng=rng, rim_width=0)
+        picture = draw_spheres(balls, camera, around, noise_std=4, rng=rng, rim_width=0)
         check(balls, cv2.GaussianBlur(picture, (0, 0), 1.0))
 
 
 def test_position_lies_on_the_ray_of_the_pixel_at_the_height_of_the_centres():
-    for d in detector.detect(draw(boxed(8, range(4)), camera, around), camera):
+    for d in detector.detect(draw_spheres(boxed(8, range(4)), camera, around), camera):
         assert d.position[2] == 0.03
         np.testing.assert_allclose(camera.on_plane(d.pixel, 0.03), d.position[:2], atol=1e-9)
 
 
 def test_left_of_the_robot_is_left_in_the_picture():
     balls = on_table([(0.4, 0.2), (0.4, -0.2)])
-    left, right = sorted(check(balls, draw(balls, camera, around)), key=lambda d: d.pixel[0])
+    left, right = sorted(check(balls, draw_spheres(balls, camera, around)), key=lambda d: d.pixel[0])
     assert left.pixel[0] < 320 < right.pixel[0] and left.position[1] > 0 > right.position[1]
 
 
@@ -224,11 +226,11 @@ def test_a_tilted_camera_gives_the_same_places():
     x, y = tilted.on_plane((300, 200), 0.03)
     balls = on_table([(x, y), (x + 0.06, y), (x - 0.06, y + 0.1), (x + 0.03, y - UP), (x - 0.1, y - 0.1)])
     assert all(wholly_in_view(tilted, ball, 0.03) for ball in balls)
-    check(balls, draw(balls, tilted, around, noise_std=4, rng=rng), view=tilted)
+    check(balls, draw_spheres(balls, tilted, around, noise_std=4, rng=rng), view=tilted)
 
 
 def test_nothing_red_gives_nothing():
-    assert detector.detect(draw([], camera, around), camera) == []
+    assert detector.detect(draw_spheres([], camera, around), camera) == []
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
     assert detector.detect(noise, camera) == []
 
@@ -239,7 +241,7 @@ def test_a_picture_that_is_all_red_gives_nothing_and_no_error():
 
 
 def test_a_red_square_is_no_ball():
-    picture = draw([], camera, around)
+    picture = draw_spheres([], camera, around)
     picture[100:220, 350:480] = (26, 38, 255)
     assert detector.detect(picture, camera) == []
 
@@ -251,14 +253,14 @@ def test_the_tiniest_picture_is_looked_at_without_an_error():
 
 def test_windows_choose_what_is_a_ball():
     blue = around.model_copy(update={"ball_color": (0.1, 0.2, 1.0)})
-    picture = draw(on_table([(0.4, 0.0)]), camera, blue)
+    picture = draw_spheres(on_table([(0.4, 0.0)]), camera, blue)
     assert detector.detect(picture, camera) == []
     options = DetectorOptions(hsv_red_lo1=(110, 120, 80), hsv_red_hi1=(130, 255, 255))
     assert len(Detector(blue, options).detect(picture, camera)) == 1
 
 
 def test_smaller_blobs_than_the_least_area_are_ignored():
-    picture = draw(on_table([(0.4, 0.0)]), camera, around)
+    picture = draw_spheres(on_table([(0.4, 0.0)]), camera, around)
     (only,) = detector.detect(picture, camera)
     assert 900 < only.area < 1300
     options = DetectorOptions(min_contour_area_px=only.area + 1)
@@ -267,7 +269,7 @@ def test_smaller_blobs_than_the_least_area_are_ignored():
 
 def test_annotation_marks_what_was_found_on_a_copy():
     balls = on_table([(0.5, -0.2), (0.4, 0.465)])
-    picture = draw(balls, camera, around)
+    picture = draw_spheres(balls, camera, around)
     before = picture.copy()
     found = detector.detect(picture, camera)
     assert [d.partial for d in sorted(found, key=lambda d: d.pixel[0])] == [True, False]
@@ -283,7 +285,7 @@ def places(detections):
 
 
 def test_picture_that_comes_again_and_one_that_differs_are_both_looked_at_rightly():
-    one, other = (draw(on_table(spots), camera, around) for spots in ([(0.4, 0.1)], [(0.4, 0.1), (0.6, -0.2)]))
+    one, other = (draw_spheres(on_table(spots), camera, around) for spots in ([(0.4, 0.1)], [(0.4, 0.1), (0.6, -0.2)]))
     remembering = Detector(around)
     fresh = [places(Detector(around).detect(picture, camera)) for picture in (one, one, other, one)]
     assert [places(remembering.detect(picture.copy(), camera)) for picture in (one, one, other, one)] == fresh
@@ -295,14 +297,14 @@ def test_same_picture_of_another_camera_shows_balls_elsewhere():
     moved = camera.T_world_optical.copy()
     moved[0, 3] += 0.1
     elsewhere = Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, moved)
-    picture = draw(on_table([(0.4, 0.1)]), camera, around)
+    picture = draw_spheres(on_table([(0.4, 0.1)]), camera, around)
     (here,), (there,) = (places(remembering.detect(picture, seen_by)) for seen_by in (camera, elsewhere))
     np.testing.assert_allclose(np.subtract(there, here), [0.1, 0.0, 0.0], atol=1e-6)
 
 
 def test_caller_that_draws_into_the_picture_or_the_list_spoils_nothing():
     remembering = Detector(around)
-    picture = draw(on_table([(0.4, 0.1)]), camera, around)
+    picture = draw_spheres(on_table([(0.4, 0.1)]), camera, around)
     mine = picture.copy()
     remembering.detect(mine, camera).clear()
     mine[:] = 0

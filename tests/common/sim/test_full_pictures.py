@@ -5,8 +5,8 @@ import pytest
 from common.config import RobotConfig, Surroundings, check, find_file, read_robot
 from common.messages import Header, JointState
 from common.robot.model import RobotModel
-from common.sim.depth_view import ARM, DepthView, disturbed
 from common.sim.objects import world_object
+from common.sim.rendering import ARM, Renderer, disturbed_depth
 from common.sim.robot_shapes import robot_shapes, triangles
 from tests.common.applications.outlining.outline_scenes import seen_world, world
 
@@ -22,7 +22,7 @@ def robot():
 
 @pytest.fixture
 def view(robot):
-    return DepthView(AROUND, robot)
+    return Renderer(AROUND, robot)
 
 
 def joints(robot, positions):
@@ -86,7 +86,7 @@ def test_shapes_without_triangles_are_refused():
 def test_noise_and_missing_depth_are_as_asked_for():
     depth = np.full((200, 200), 1.5, np.float32)
     depth[0, 0] = np.nan
-    noisy = disturbed(depth, np.random.default_rng(1), 0.002, 0.1)
+    noisy = disturbed_depth(depth, np.random.default_rng(1), 0.002, 0.1)
     assert np.isnan(noisy).mean() == pytest.approx(0.1, abs=0.01) and np.nanstd(noisy) == pytest.approx(0.002, rel=0.05)
     assert noisy.dtype == np.float32 and np.isnan(noisy[0, 0])
-    np.testing.assert_array_equal(disturbed(depth, np.random.default_rng(1), 0, 0), depth)
+    np.testing.assert_array_equal(disturbed_depth(depth, np.random.default_rng(1), 0, 0), depth)

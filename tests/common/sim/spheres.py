@@ -1,0 +1,37 @@
+"""Spheres of the simulated world, as its messages tell them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from common.config import Surroundings
+from common.messages import Color, Pose, Vector3, WorldObject, WorldObjects
+from common.perception.pinhole import Pinhole
+from common.sim.rendering import draw
+
+
+def spheres(centres: npt.ArrayLike, around: Surroundings | None = None, states: Sequence[str] = ()) -> WorldObjects:
+    """Spheres with their centres (n, 3) there [m], of the size and colour of the surroundings, on the table."""
+    usual = around or Surroundings()
+    r, g, b = usual.ball_color
+    size = 2 * usual.ball_radius
+    places = np.asarray(centres, dtype=float).reshape(-1, 3)
+    return WorldObjects(objects=[
+        WorldObject.model_validate({
+            "id": f"ball_{number + 1}", "shape": "sphere", "pose": Pose(position=Vector3(x=x, y=y, z=z)),
+            "size": Vector3(x=size, y=size, z=size), "color": Color(r=r, g=g, b=b),
+            "state": states[number] if states else "table",
+        })
+        for number, (x, y, z) in enumerate(places.tolist())
+    ])
+
+
+def draw_spheres(
+    centres: npt.ArrayLike, camera: Pinhole, around: Surroundings, **options: Any
+) -> npt.NDArray[np.uint8]:
+    """A plain picture of spheres."""
+    return draw(spheres(centres, around).objects, camera, around, **options)
