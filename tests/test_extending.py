@@ -186,6 +186,7 @@ def planners(summary: dict[str, object]) -> set[str]:
     return {plan["planner"] for plan in plans}
 
 
+@pytest.mark.slow
 @pytest.mark.cell
 @pytest.mark.parametrize("line", HERE)
 def test_cell_of_the_clone_runs_with_one_part_of_ours(line: str, folder: Path, tmp_path: Path) -> None:
@@ -193,6 +194,7 @@ def test_cell_of_the_clone_runs_with_one_part_of_ours(line: str, folder: Path, t
     assert ("over_home" in planners(summary)) == ("my_pipeline" in line)
 
 
+@pytest.mark.slow
 @pytest.mark.cell
 def test_cell_of_ours_runs_from_anywhere(folder: Path, tmp_path: Path) -> None:
     variable, line = ANYWHERE[0].replace("~/my_cell", str(folder)).split(" ", 1)
@@ -204,6 +206,7 @@ def test_cell_of_ours_runs_from_anywhere(folder: Path, tmp_path: Path) -> None:
     assert "over_home" in planners(summary)
 
 
+@pytest.mark.slow
 @pytest.mark.cell
 def test_service_of_ours_joins_a_cell_and_its_topic_is_shown(folder: Path) -> None:
     up, join, echo = COMMANDS[COMMANDS.index("zencell up panda"):][:3]

@@ -59,6 +59,7 @@ def test_readme_names_the_two_commands_first() -> None:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
 
 
+@pytest.mark.slow
 @pytest.mark.cell
 @pytest.mark.parametrize("line", RUNS)
 def test_run_of_the_readme_ends_with_everything_done(line: str) -> None:

@@ -24,6 +24,7 @@ def empty(state: GripperState) -> bool:
     return not state.holding
 
 
+@pytest.mark.slow
 async def test_task_and_scene_manager_are_killed_with_a_ball_in_the_hand(tmp_path: Path) -> None:
     with RunningCell(tmp_path, "run", "panda", "--speed", "5", "--set", "world.count=3") as cell:
         async with cell.listen() as bus:
@@ -58,6 +59,7 @@ async def test_the_router_is_killed_in_the_middle_of_a_motion(tmp_path: Path) ->
     assert {name: n for name, n in summary["restarts"].items() if n} == {"router": 1}
 
 
+@pytest.mark.slow
 async def test_balls_that_are_moved_added_and_taken_away_end_up_where_they_should(tmp_path: Path) -> None:
     def placing(status: PickPlaceStatus) -> bool:
         return status.state == "PLACING"
@@ -84,6 +86,7 @@ async def test_balls_that_are_moved_added_and_taken_away_end_up_where_they_shoul
     assert summary["rejected"] == []
 
 
+@pytest.mark.slow
 async def test_what_can_not_be_taken_is_reported_and_the_run_ends_done(tmp_path: Path) -> None:
     places = {  # by how the reason begins
         "": [(0.40, -0.30), (0.52, -0.30), (0.62, -0.25), (0.40, -0.17), (0.52, -0.17), (0.64, -0.13), (0.40, -0.04)],

@@ -14,7 +14,7 @@ from common.chaos.setting import keys_of
 from common.config import load_cell
 from tests.harness import RunningCell, beside
 
-pytestmark = pytest.mark.cell
+pytestmark = [pytest.mark.cell, pytest.mark.slow]
 
 BALLS = 3
 

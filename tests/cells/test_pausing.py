@@ -17,7 +17,7 @@ from common.process.operator_motion import MotionFailed, OperatorMotion
 from common.transport.bus import Bus, Reader
 from tests.harness import RunningCell, until
 
-pytestmark = pytest.mark.cell
+pytestmark = [pytest.mark.cell, pytest.mark.slow]
 
 PATIENT = ("--set", "services.contour_tracer.selection_timeout=40")  # wall time: machines may be busy
 STATUS = {"panda": PICK_PLACE_STATUS, "ur5": OUTLINE_STATUS}

@@ -16,7 +16,7 @@ from tests.cells.losses import Losses
 from tests.cells.subscribers import Subscriber
 from tests.harness import RunningCell, beside, until
 
-pytestmark = pytest.mark.cell
+pytestmark = [pytest.mark.cell, pytest.mark.slow]
 
 
 async def newest_counters(bus: Bus, told: dict[str, ServiceCounters]) -> None:

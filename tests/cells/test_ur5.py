@@ -74,6 +74,7 @@ def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCell]:
         yield cell
 
 
+@pytest.mark.slow
 def test_snapshot_of_a_cell_that_is_up_can_be_planned_from_its_files_alone(up: RunningCell, tmp_path: Path) -> None:
     stored = up.tell("snapshot", "ur5", str(tmp_path), "--select", "green")
     assert stored.returncode == 0, stored.stderr
@@ -92,6 +93,7 @@ def test_snapshot_of_a_cell_that_is_up_can_be_planned_from_its_files_alone(up: R
     assert {path.name for path in tmp_path.iterdir()} == names
 
 
+@pytest.mark.slow
 def test_object_that_is_not_there_is_refused_with_the_choices_and_another_is_outlined(up: RunningCell) -> None:
     refused = up.tell("task", "select", "7")
     assert refused.returncode == 1
@@ -121,6 +123,7 @@ def test_object_that_is_not_there_is_refused_with_the_choices_and_another_is_out
     assert_good(up.summary)
 
 
+@pytest.mark.slow
 def test_coordinates_edited_by_hand_are_traced(tmp_path: Path) -> None:
     smaller = [[0.5 + dx, dy, 1.105] for dx, dy in ((-0.03, -0.03), (0.03, -0.03), (0.03, 0.03), (-0.03, 0.03))]
     stage_files.write_points(tmp_path / stage_files.CLEARED, smaller)
@@ -132,6 +135,7 @@ def test_coordinates_edited_by_hand_are_traced(tmp_path: Path) -> None:
     assert outline["tracking_mm"]["max"] < 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("objects", "said"),
     [
@@ -155,6 +159,7 @@ def test_what_can_not_be_outlined_ends_with_one_line_and_the_arm_at_home(
     assert "Traceback" not in text
 
 
+@pytest.mark.slow
 def test_person_at_the_terminal_is_asked_and_gets_a_picture(tmp_path: Path) -> None:
     domain = str(free_domain())
     command = command_line("run", "ur5", "--ask", "--world", "w5", "--speed", "10", "--no-viewer", "--domain", domain)

@@ -37,6 +37,7 @@ async def freeze(bus: Bus, cell: RunningCell, name: str) -> None:
     await until(supervisor, lambda status: restarted(name, status), 60)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("victim", ["vision_detector", "router"])
 async def test_a_process_that_is_frozen_is_started_again_and_no_other(tmp_path: Path, victim: str) -> None:
     options = ("--speed", "3", "--set", "world.count=2", "--set", "watchdogs.silence=4")
@@ -53,6 +54,7 @@ async def test_a_process_that_is_frozen_is_started_again_and_no_other(tmp_path: 
     assert summary["truth"] == {"in_box": 2, "on_table": 0, "elsewhere": 0, "containers": {"box": 2}}
 
 
+@pytest.mark.slow
 async def test_a_service_whose_loop_is_stuck_tells_where_and_is_started_again(tmp_path: Path) -> None:
     file = tmp_path / "with_stuck.yaml"
     cell_file = yaml.safe_load((ROOT / "config" / "cells" / "panda.yaml").read_text())
@@ -92,6 +94,7 @@ async def test_nothing_is_left_of_a_cell_whose_supervisor_is_killed_not_even_wha
     assert not left
 
 
+@pytest.mark.slow
 async def test_the_arm_is_held_while_the_planner_is_dead_and_the_same_motion_goes_on_when_it_is_back(
     tmp_path: Path,
 ) -> None:

@@ -133,6 +133,7 @@ def descendants(cell: RunningCell) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_interrupted_with_a_ball_in_the_hand_it_is_gone_and_has_written_the_summary(tmp_path: Path) -> None:
     with RunningCell(tmp_path, "run", "panda", "--speed", "5") as cell:
 
@@ -149,6 +150,7 @@ def test_interrupted_with_a_ball_in_the_hand_it_is_gone_and_has_written_the_summ
         assert "Traceback" not in cell.text
 
 
+@pytest.mark.slow
 def test_a_value_that_only_a_service_can_judge_exits_2_with_one_line(tmp_path: Path) -> None:
     with RunningCell(tmp_path, "run", "panda", "--set", "services.camera_simulator.rate=-1") as cell:
         assert asyncio.run(cell.ended(30)) == 2

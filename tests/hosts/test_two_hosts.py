@@ -10,7 +10,7 @@ from tests.hosts.cut_cell import CutCell
 from tests.hosts.two_hosts import two_hosts, why_not
 
 REASON = why_not()
-pytestmark = [pytest.mark.cell, pytest.mark.skipif(bool(REASON), reason=REASON)]
+pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.skipif(bool(REASON), reason=REASON)]
 
 SHORT = ("--speed", "3", "--set", "world.count=3", "--seed", "3")
 

@@ -16,7 +16,7 @@ from common.transport.endpoint import port_of
 from tests.harness import RunningCell
 from tests.security.holders import PATIENCE, Heard, Holder
 
-pytestmark = [pytest.mark.cell, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.timeout(300)]
 
 EYE = ["camera_simulator", "vision_detector", "workspace_validator"]
 ARM = [entry.name for entry in load_cell("panda").services.values() if entry.name not in (*EYE, "viewer")]
