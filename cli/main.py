@@ -31,6 +31,7 @@ from cli import (
     robot,
     router,
     secure,
+    simulate,
     tf,
     top,
     topic,
@@ -116,6 +117,7 @@ app.command()(report.report)
 app.command()(exporting.export)
 app.add_typer(secure.app, name="secure")
 app.add_typer(router.app, name="router")
+app.command()(simulate.simulate)
 app.command()(doctor.doctor)
 
 

@@ -42,6 +42,9 @@ _END_SECONDS = 1.0  # for a cancelled service to end
 class Bus:
     """A service's place in its cell. Made on a running loop and used on it; writers may put from any thread."""
 
+    make_reader: type[Reader[Any]] = Reader  # a simulation has its own, which look on
+    make_client: type[Client[Any, Any]] = Client
+
     def __init__(
         self, session: Session, *, service: str, cell: str, clock: Clock, limit: int = DEFAULT_LIMIT,
         topics: Mapping[str, str] | None = None,
@@ -92,7 +95,7 @@ class Bus:
 
         With `listening=False` nothing comes until `listen` says so.
         """
-        reader = Reader(self._in_cell(topic), self._loop, self.log, size=size, limit=self._limit)
+        reader = self.make_reader(self._in_cell(topic), self._loop, self.log, size=size, limit=self._limit)
         self._readers.append(reader)
         if listening:
             self.listen(reader, True)
@@ -145,7 +148,9 @@ class Bus:
         """A client of the request key."""
         asked = self._in_cell(topic)
         servers = self._watch(serves_key(self.cell, asked.key))
-        return Client(self._session, self.cell, self.service, asked, servers, loop=self._loop, limit=self._limit)
+        return self.make_client(
+            self._session, self.cell, self.service, asked, servers, loop=self._loop, limit=self._limit
+        )
 
     def _in_cell(self, topic: T) -> T:
         """The topic or request under its key in the cell."""

@@ -12,9 +12,11 @@ from common.virtual.network import FAIR, Weather
 
 Kind = Literal["crash", "restart", "cut", "router lost"]
 
-CRASHES = 3  # at least; the first of them soon, so that short runs see them all
-FIRST_GAP, LATER_GAP = 4.0, 12.0  # [s] mean time to each of those, and to each further fault
+CRASHES: tuple[Kind, ...] = ("crash", "crash", "crash")  # at least, and soon: short runs see them all too
+FIRST_GAPS = 0.2, 4.0  # [s] between those
+LATER_GAP = 12.0  # [s] on average to each further fault
 LONGEST = 60.0  # [s] from the cell being ready; what comes after is left to it to finish
+MOST_FAULTS = 20  # of one run
 MOST_TURNS = 40  # of a process, from the time at which it is to crash to where it does
 CUT_SECONDS = 0.3, 3.0
 SKEW = 0.09  # [s] by which clocks are wrong at most; two of them differ by less than their tolerance of 0.2 s
@@ -57,23 +59,24 @@ def make_plan(seed: int, services: Sequence[str]) -> Plan:
         services: names of those that may be hit.
     """
     random = np.random.default_rng([seed, 5])
-    kinds: list[Kind] = ["crash"] * CRASHES + ["cut"]
-    random.shuffle(kinds)  # type: ignore[arg-type]
-    faults, at = [], 0.0
-    while kinds or at < LONGEST:
-        if kinds:
-            kind = kinds.pop()
-            at += float(random.exponential(FIRST_GAP))
-        else:
-            kind = str(random.choice(["crash", "crash", "restart", "cut"]))  # type: ignore[assignment]
-            at += float(random.exponential(LATER_GAP))
-            if at > LONGEST:
-                break
+    first: list[Kind] = [*CRASHES, "cut"]
+    later: tuple[Kind, ...] = ("crash", "crash", "restart", "cut")
+    kinds = [first[i] for i in random.permutation(len(first))]
+    gaps = [float(gap) for gap in random.uniform(*FIRST_GAPS, len(kinds))]
+    while len(kinds) < MOST_FAULTS:
+        kinds.append(later[int(random.integers(len(later)))])
+        gaps.append(float(random.exponential(LATER_GAP)))
+    faults: list[Fault] = []
+    for kind, gap in zip(kinds, gaps, strict=True):
+        at = (faults[-1].at if faults else 0.0) + gap
+        if at > LONGEST:
+            break
         target, seconds = str(random.choice(list(services))), 0.0
         if kind == "cut":
             seconds = float(random.uniform(*CUT_SECONDS))
             if random.random() < ROUTER_SHARE:
-                kind, target = "router lost", ""
+                faults.append(Fault(at, "router lost", seconds=seconds))
+                continue
         faults.append(Fault(at, kind, target, int(random.integers(MOST_TURNS)), seconds))
     weather = Weather(
         delay=float(random.uniform(0.0002, 0.004)), hiccup=float(random.uniform(0.0002, 0.002)),

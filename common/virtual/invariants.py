@@ -15,6 +15,7 @@ from common.hardware.interface import Limits, Vector
 from common.messages import (
     CameraInfo,
     GripperState,
+    HoldRequest,
     Image,
     LogLine,
     Message,
@@ -26,6 +27,7 @@ from common.messages import (
 )
 from common.topics import AnyTopic
 from common.transport.codec import decode
+from common.transport.local import intersects
 from common.transport.session import RawSample
 from common.virtual.process import Requests
 
@@ -39,6 +41,21 @@ BLEND = 0.08  # [rad/s] by which the difference to the start of a trajectory, wh
 SHARP = 1.0  # [rad/s^2] the same for acceleration
 AT_REST = 2.0  # [s] of cell time after which an arm that is held is at rest
 STILL = 1e-9  # [rad]
+UNTOLD = 3  # set-points of a goal that may come before it is told of
+CYCLE = 0.025  # [s] of cell time at most between two cycles of a controller that is not held up
+STALL = 0.3  # [s] of cell time after which a trajectory goes on where it was
+CARRIED, CONTAINED, LOST = ("held", "falling"), "box", "elsewhere"  # what the truth says of an object
+
+OBJECTS = "no object lost or doubled"
+TWO = "never two goals"
+ONCE = "a goal id acts once"
+LIMITS = "every set-point within limits"
+GOAL = "the arm moves for a goal only"
+HELD = "an arm that is held rests"
+TRUTH = "nothing that decides saw the truth"
+OUTCOMES = "every request ends in one of five ways"
+NEWER = "nothing is read twice, or after what is newer"
+BELIEVED = "as many lie there as the task says"
 
 
 @dataclass
@@ -46,11 +63,11 @@ class _Goals:
     """What one controller said of its goals."""
 
     active: str = ""
-    writer: str = ""
+    life: str = ""  # of the process
 
 
 class Invariants:
-    """Looks at every message, set-point and request; `broken` says what did not hold, `checked` how often was looked."""
+    """Looks at all messages, set-points and requests. `broken` says what did not hold, `checked` how many looks."""
 
     def __init__(self, cell: Cell, requests: Requests, now: Callable[[], float]) -> None:
         """Begin without having seen anything; `now` is the virtual time [s]."""
@@ -58,135 +75,155 @@ class Invariants:
         self.checked: Counter[str] = Counter()
         self.truth_readers: set[str] = set()  # processes that hear what only cameras may see
         self._requests, self._now = requests, now
+        requests.on_answer = self._on_answer
         known: dict[str, AnyTopic] = {**topics.platform_topics(), **find_application(cell.application).topics}
         self._truth = {f"{cell.name}/{t.key}": t for t in known.values() if t.doc.startswith("the truth")}
-        self._messages = {name: model for t in known.values() for name, model in [(t.message.__name__, t.message)]}
-        self._motion, self._gripper = f"{cell.name}/{topics.MOTION_STATUS.key}", f"{cell.name}/{topics.GRIPPER_STATE.key}"
+        self._messages = {t.message.__name__: t.message for t in known.values()}
+        self._motion = f"{cell.name}/{topics.MOTION_STATUS.key}"
+        self._gripper = f"{cell.name}/{topics.GRIPPER_STATE.key}"
         self._goals: dict[str, _Goals] = {}
         self._over: dict[tuple[str, str], str] = {}  # by key and goal
         self._ids: dict[str, list[str]] = {}  # by key: what there is
         self._lying: dict[str, tuple[str, Vector]] = {}  # by object: state and place
         self._held_since: float | None = None  # cell time
         self._last: tuple[Vector, Vector, float] | None = None  # newest set-points and when
+        self._stray = 0  # set-points that moved without a goal
         self._strange = 0
 
-    def _require(self, holds: object, what: str, told: Callable[[], str]) -> None:
+    def _broke(self, holds: object, what: str) -> bool:
         self.checked[what] += 1
-        if not holds and len(self.broken) < MOST_BROKEN:
-            self.broken.append(f"{self._now():.3f} s: {what}: {told()}")
+        return not holds
+
+    def _tell(self, what: str, how: str) -> None:
+        if len(self.broken) < MOST_BROKEN:
+            self.broken.append(f"{self._now():.3f} s: {what}: {how}")
 
     # --- messages -----------------------------------------------------------------------------------------------------
 
-    def on_put(self, service: str, writer: str, sample: RawSample) -> None:
+    def on_listen(self, service: str, key: str) -> None:
+        """Take note of who subscribes to what."""
+        if any(intersects(key, truth) for truth in self._truth):
+            self.truth_readers.add(service)
+
+    def on_put(self, service: str, life: str, sample: RawSample) -> None:
         """Look at what a process puts.
 
         Args:
             service: name of the process.
-            writer: id of this life of it.
+            life: name and number of it, another after each start.
             sample: as it travels.
         """
         if service in self.truth_readers:
             model = self._messages.get(sample.encoding.rpartition(";")[2], Message)
-            self._require(issubclass(model, SEEN_BY_CAMERAS), "nothing that decides saw the truth",
-                          lambda: f"{service} hears it and says {sample.key}")
+            if self._broke(issubclass(model, SEEN_BY_CAMERAS), TRUTH):
+                self._tell(TRUTH, f"{service} hears it and says {sample.key}")
         if sample.key == self._motion:
             motion = decode(MotionStatus, sample.payload)
-            self._on_goal(sample.key, writer, motion.id, motion.state)
+            self._on_goal(sample.key, life, motion.id, motion.state)
             held = motion.held and motion.state == "active"
             self._held_since = None if not held else self._held_since or motion.header.stamp * 1e-9
         elif sample.key == self._gripper:
             gripper = decode(GripperState, sample.payload)
-            self._on_goal(sample.key, writer, gripper.id, gripper.state)
+            self._on_goal(sample.key, life, gripper.id, gripper.state)
         elif sample.key in self._truth:
             self._on_truth(sample.key, decode(self._truth[sample.key].message, sample.payload))
 
-    def _on_goal(self, key: str, writer: str, goal: str, state: str) -> None:
+    def _on_goal(self, key: str, life: str, goal: str, state: str) -> None:
         known = self._goals.setdefault(key, _Goals())
-        if writer != known.writer:  # another process, which knows nothing of goals before it
-            known.writer, known.active = writer, ""
+        if life != known.life:  # another process, which knows nothing of goals before it
+            known.life, known.active = life, ""
         before = self._over.get((key, goal), "")
-        self._require(not before or state == before, "a goal id acts once",
-                      lambda: f"{key}: {goal} is {state} after it was {before}")
+        if self._broke(not before or state == before, ONCE):
+            self._tell(ONCE, f"{key}: {goal} is {state} after it was {before}")
         if state in OVER:
             self._over[key, goal] = state
             if goal == known.active:
                 known.active = ""
         elif state == "active":
-            one = not known.active or goal == known.active or key == self._gripper  # whose newer goal ends the older
-            other = known.active
-            self._require(one, "never two goals", lambda: f"{key}: {goal} is active while {other} is")
+            # The fingers' newer goal ends the older one.
+            if self._broke(not known.active or goal == known.active or key == self._gripper, TWO):
+                self._tell(TWO, f"{key}: {goal} is active while {known.active} is")
             known.active = goal
 
     def _on_truth(self, key: str, message: Message) -> None:
+        things: dict[str, tuple[str, Vector]] = {}
         if isinstance(message, PoseArray):
-            things = [(i, label, np.array([p.position.x, p.position.y, p.position.z]))
-                      for i, label, p in zip(message.ids, message.labels, message.poses, strict=True)]
+            for name, state, pose in zip(message.ids, message.labels, message.poses, strict=True):
+                things[name] = state, np.array([pose.position.x, pose.position.y, pose.position.z])
+            ids = sorted(message.ids)
         elif isinstance(message, WorldObjects):
-            things = [(o.id, "", np.array([*np.mean(o.outline, axis=0), o.base])) for o in message.objects]
+            things = {o.id: ("", np.array([*np.mean(o.outline, axis=0), o.base])) for o in message.objects}
+            ids = sorted(o.id for o in message.objects)
         else:
             return
-        what, ids = "no object lost or doubled", sorted(name for name, _, _ in things)
         known = self._ids.setdefault(key, ids)
-        self._require(ids == known and len(set(ids)) == len(ids), what, lambda: f"{key}: {ids} instead of {known}")
-        held = [name for name, state, _ in things if state == "held"]
-        self._require(len(held) <= 1, what, lambda: f"{key}: {held} are held at once")
-        for name, state, place in things:
-            before = self._lying.get(name)
+        if self._broke(ids == known and len(set(ids)) == len(ids), OBJECTS):
+            self._tell(OBJECTS, f"{key}: {ids} instead of {known}")
+        held = [name for name, (state, _) in things.items() if state in CARRIED[:1]]
+        if self._broke(len(held) <= 1, OBJECTS):
+            self._tell(OBJECTS, f"{key}: {held} are held at once")
+        for name, (state, place) in things.items():
+            was, there = self._lying.get(name, (state, place))
             self._lying[name] = state, place
-            self._require(state != "elsewhere", what, lambda name=name: f"{name} lies where nobody sees it")  # type: ignore[misc]
-            if before is not None and state not in ("held", "falling") and before[0] == state:
-                gone = float(np.linalg.norm(place - before[1]))
-                self._require(gone < MOVED, what, lambda name=name, gone=gone: f"{name} went {gone:.3f} m by itself")  # type: ignore[misc]
-            elif before is not None and before[0] != state:
-                legal = state in ("held", "falling") or before[0] in ("held", "falling")
-                self._require(legal, what, lambda name=name, was=before[0], state=state: f"{name} went from {was} to {state}")  # type: ignore[misc]
+            way = 0.0 if state in CARRIED else float(np.linalg.norm(place - there))
+            legal = state in CARRIED or was in CARRIED or (state == was and way < MOVED)
+            if self._broke(legal and state != LOST, OBJECTS):
+                self._tell(OBJECTS, f"{name} went from {was} to {state} by itself, {way:.3f} m")
 
     # --- the arm ------------------------------------------------------------------------------------------------------
 
     def on_set_point(self, limits: Limits, measured: Vector, q: Vector, dq: Vector, now: float) -> None:
         """Look at set-points q (dof,) [rad] and dq [rad/s], given where the arm is, at cell time [s]."""
-        what = "every set-point within limits"
-        fits = bool(np.isfinite(q).all() and np.isfinite(dq).all())
-        fits = fits and bool(((q >= limits.lower - 2e-3) & (q <= limits.upper + 2e-3)).all())
         fastest = 1.03 * limits.velocity + BLEND
-        fits = fits and bool((np.abs(dq) <= fastest).all())
-        self._require(fits, what, lambda: f"q {np.round(q, 4).tolist()}, dq {np.round(dq, 3).tolist()}")
+        fits = np.isfinite(q).all() and np.isfinite(dq).all() and (np.abs(dq) <= fastest).all()
+        if self._broke(fits and ((q >= limits.lower - 2e-3) & (q <= limits.upper + 2e-3)).all(), LIMITS):
+            self._tell(LIMITS, f"q {np.round(q, 4).tolist()}, dq {np.round(dq, 3).tolist()}")
         last, self._last = self._last, (q.copy(), dq.copy(), now)
         if last is None:
             return
-        passed = now - last[2]
-        way = np.abs(q - last[0])
-        if passed <= 0 or passed > 0.3:  # another process of another clock; or one after a stall
-            self._require((way <= JUMP).all(), what, lambda: f"a jump of {way.max():.3f} rad after {passed:.3f} s")
+        passed, way = now - last[2], np.abs(q - last[0])
+        if passed <= 0 or passed > STALL:  # another process, or one that stood still
+            if self._broke((way <= JUMP).all(), LIMITS):
+                self._tell(LIMITS, f"a jump of {way.max():.3f} rad after {passed:.3f} s")
             return
-        self._require((way <= fastest * passed + 1e-3).all(), what,
-                      lambda: f"a step of {way.max():.4f} rad in {passed * 1e3:.1f} ms")
+        if self._broke((way <= fastest * passed + 1e-3).all(), LIMITS):
+            self._tell(LIMITS, f"a step of {way.max():.4f} rad in {passed * 1e3:.1f} ms")
         change = np.abs(dq - last[1])
-        self._require((change <= (1.1 * limits.braking + SHARP) * max(passed, 0.01) + 1e-3).all(), what,
-                      lambda: f"velocity changes by {change.max():.3f} rad/s in {passed * 1e3:.1f} ms")
-        moving = bool((way > STILL).any())
+        if self._broke((change <= (1.1 * limits.braking + SHARP) * max(passed, 0.01) + 1e-3).all(), LIMITS):
+            self._tell(LIMITS, f"velocity changes by {change.max():.3f} rad/s in {passed * 1e3:.1f} ms")
+        if way.max() <= STILL or passed > 2 * CYCLE:
+            return
         goals = self._goals.get(self._motion)
-        self._require(not moving or (goals is not None and bool(goals.active)) or passed > 0.05,
-                      "the arm moves for a goal only", lambda: f"{way.max():.4f} rad without one")
-        at_rest = self._held_since is None or now - self._held_since < AT_REST
-        self._require(not moving or at_rest, "an arm that is held rests", lambda: f"it moves {way.max():.4f} rad")
+        self._stray = 0 if goals is not None and goals.active else self._stray + 1
+        if self._broke(self._stray <= UNTOLD, GOAL):
+            self._tell(GOAL, f"{way.max():.4f} rad without one")
+        if self._broke(self._held_since is None or now - self._held_since < AT_REST, HELD):
+            self._tell(HELD, f"it moves {way.max():.4f} rad")
 
     # --- requests -----------------------------------------------------------------------------------------------------
 
+    def _on_answer(self, service: str, request: Message, answer: Message) -> None:
+        asked = isinstance(request, HoldRequest) and request.hold and isinstance(answer, MotionStatus)
+        if asked and self._broke(getattr(answer, "held", False), HELD):
+            self._tell(HELD, f"it is not held when {service} asks for it")
+
     def look(self) -> None:
-        """Look at the requests that are under way."""
-        what, now = "every request ends in one of five ways", self._now()
+        """Look at the requests that are under way, and at what was read that should not have been."""
+        now = self._now()
         for service, key, end in self._requests.open.values():
-            self._require(now <= end + LATE, what,
-                          lambda service=service, key=key, end=end: f"{key} of {service} should have by {end:.1f} s")  # type: ignore[misc]
+            if self._broke(now <= end + LATE, OUTCOMES):
+                self._tell(OUTCOMES, f"{key} of {service} should have ended by {end:.1f} s")
+        self.checked[OUTCOMES] += self._requests.begun
         for strange in self._requests.strange[self._strange:]:
-            self._require(False, what, lambda strange=strange: strange)  # type: ignore[misc]
+            self._tell(OUTCOMES, strange)
+        for repeated in self._requests.repeated[:1]:
+            self._tell(NEWER, repeated)
+        self.checked[NEWER] = self._requests.read
         self._strange = len(self._requests.strange)
 
     def on_end(self, done: int, state: str) -> None:
         """Compare what the task believes in the end with what there is."""
         if state == "DONE":
-            within = sum(label == "box" for label, _ in self._lying.values())
-            held = [name for name, (label, _) in self._lying.items() if label == "held"]
-            self._require(not held, "nothing is held in the end", lambda: f"{held} is")
-            self._require(done == within, "as many placed as are said to be", lambda: f"{done} are, {within} really")
+            within = sum(label == CONTAINED for label, _ in self._lying.values())
+            if self._broke(done == within, BELIEVED):
+                self._tell(BELIEVED, f"{done} are, {within} really")

@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 
 from common.transport.local import Lane, LocalNetwork, LocalSession, intersects
-from common.transport.session import RawSample
+from common.transport.session import Declared, OnSample, RawSample
 from common.virtual.loop import VirtualLoop
 
 Link = tuple["VirtualSession", "VirtualSession", Lane, str]
@@ -50,9 +50,10 @@ FOUL = Weather(delay=0.001, hiccup=0.001, loss=0.01, doubled=0.005)
 class VirtualSession(LocalSession):
     """A session whose link to the router may be cut, and whose process may end without a word."""
 
-    def __init__(self, network: VirtualNetwork, context: Context) -> None:
-        """Be connected; callbacks run in the context of the process."""
+    def __init__(self, network: VirtualNetwork, context: Context, name: str, number: int) -> None:
+        """Be connected; callbacks run in the context of the process, which has a name and a number of its own."""
         super().__init__(network)
+        self.name, self.life = name, f"{name} {number}"
         self.context = context
         self.cut = False
         self.detached = False
@@ -68,6 +69,11 @@ class VirtualSession(LocalSession):
         """Call back when the link was cut or stands again."""
         self._on_change.append(on_change)
 
+    def subscriber(self, key: str, on_sample: OnSample) -> Declared:
+        """Call back for each value put under a matching key."""
+        _of(self.network).on_listen(self, key)
+        return super().subscriber(key, on_sample)
+
     def tell_connection(self) -> None:
         """Have the process look at its link."""
         for on_change in self._on_change:
@@ -82,16 +88,19 @@ class VirtualNetwork(LocalNetwork):
         super().__init__()
         self.counted: Counter[str] = Counter()  # what the weather did
         self.weather = weather
+        self.router_lost = False
         self.on_put: Callable[[VirtualSession, RawSample], None] = lambda session, sample: None
+        self.on_listen: Callable[[VirtualSession, str], None] = lambda session, key: None
         self._loop = loop
         self._random = np.random.default_rng([seed, 3])
         self._drawn: list[float] = []
         self._arrival: dict[Link, float] = {}
         self._sessions: list[VirtualSession] = []
 
-    def attach(self, context: Context) -> VirtualSession:
+    def attach(self, context: Context, name: str, number: int = 0) -> VirtualSession:
         """A session of a process."""
-        session = VirtualSession(self, context)
+        session = VirtualSession(self, context, name, number)
+        session.cut = self.router_lost
         self._sessions.append(session)
         return session
 
@@ -162,6 +171,16 @@ class VirtualNetwork(LocalNetwork):
                     self._arrive_at(self._loop.time(), session, session, partial(watcher, token, False))
                 session.tell_connection()
 
+    def lose_router(self) -> None:
+        """Cut all links, also of processes that start meanwhile, until it is back."""
+        self.router_lost = True
+        self.cut(list(self._sessions))
+
+    def find_router(self) -> None:
+        """Let all links stand again."""
+        self.router_lost = False
+        self.mend(list(self._sessions))
+
     def mend(self, sessions: Iterable[VirtualSession]) -> None:
         """Let the links stand again."""
         for session in sessions:
@@ -216,6 +235,11 @@ class VirtualNetwork(LocalNetwork):
                 if entry.session is not session and entry.session.connected and intersects(watcher.key, entry.key)
             )
         ]
+
+
+def _of(network: LocalNetwork) -> VirtualNetwork:
+    assert isinstance(network, VirtualNetwork)
+    return network
 
 
 def _ours(session: LocalSession) -> VirtualSession:

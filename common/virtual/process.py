@@ -9,7 +9,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,14 +20,14 @@ from common.messages import Message
 from common.process.log import BusLog
 from common.process.service import serve
 from common.sources import monotonic
-from common.topics import Request
-from common.transport.bus import Bus, Client
-from common.transport.keys import serves_key
+from common.topics import Request, Topic
+from common.transport.bus import Bus, Client, Reader
 from common.virtual.loop import Life, VirtualLoop, context_of
 from common.virtual.network import VirtualNetwork, VirtualSession
 
 Q = TypeVar("Q", bound=Message)
 A = TypeVar("A", bound=Message)
+M = TypeVar("M", bound=Message)
 
 BOOT = 0.4, 1.2  # [s] from the start of a process to its first declaration
 TAIL_LINES = 50
@@ -51,12 +51,15 @@ class SkewedClock(Clock):
 
 @dataclass
 class Requests:
-    """What became of all requests of a cell, and those that are under way."""
+    """What became of all requests of a cell, those that are under way, and what was read that should not have been."""
 
     outcomes: Counter[str] = field(default_factory=Counter)
     open: dict[int, tuple[str, str, float]] = field(default_factory=dict)  # service, key, latest end [s, monotonic]
     strange: list[str] = field(default_factory=list)  # what ended in none of the five ways
+    repeated: list[str] = field(default_factory=list)  # what was read again, or after what is newer
+    read: int = 0  # messages
     begun: int = 0
+    on_answer: Callable[[str, Message, Message], None] = lambda service, request, answer: None
 
 
 class _WatchedClient(Client[Q, A]):
@@ -83,11 +86,29 @@ class _WatchedClient(Client[Q, A]):
         finally:
             noted.open.pop(number, None)
         noted.outcomes["answered"] += 1
+        noted.on_answer(self._service, request, answer)
         return answer
+
+
+class _WatchedReader(Reader[M]):
+    """A reader that notes what it should have left out."""
+
+    noted: Requests
+
+    def _decode(self, arrived: Any) -> bool:
+        known: dict[str, int] = self.__dict__.setdefault("_known", {})
+        self.noted.read += 1
+        if arrived.message is None and (sent := arrived.attachment) is not None:
+            if sent.sequence <= known.get(sent.writer, -1):
+                self.noted.repeated.append(f"{self.topic.key} of {sent.writer} was read again, or after a newer one")
+            known[sent.writer] = sent.sequence
+        return super()._decode(arrived)
 
 
 class VirtualBus(Bus):
     """A bus of whose requests is noted how they end, with a log of its own."""
+
+    make_reader, make_client = _WatchedReader, _WatchedClient
 
     def __init__(
         self, session: VirtualSession, service: str, cell: str, clock: Clock, noted: Requests,
@@ -102,13 +123,17 @@ class VirtualBus(Bus):
 
     def client(self, topic: Request[Q, A]) -> Client[Q, A]:
         """A client of the request key."""
-        asked = self._in_cell(topic)
-        servers = self._watch(serves_key(self.cell, asked.key))
-        client = _WatchedClient(
-            self._session, self.cell, self.service, asked, servers, loop=self._loop, limit=self._limit
-        )
+        client = super().client(topic)
+        assert isinstance(client, _WatchedClient)
         client.noted = self._noted
         return client
+
+    def reader(self, topic: Topic[M], *, size: int = 1000, listening: bool = True) -> Reader[M]:
+        """A reader of the topic."""
+        reader = super().reader(topic, size=size, listening=listening)
+        assert isinstance(reader, _WatchedReader)
+        reader.noted = self._noted
+        return reader
 
 
 @dataclass
@@ -124,6 +149,7 @@ class Host:
     processes: dict[str, VirtualProcess] = field(default_factory=dict)
     ended: list[tuple[Life, asyncio.Task[int]]] = field(default_factory=list)  # cut off, not cleared away yet
     started: int = 0
+    killed: int = 0
     skews: dict[str, float] = field(default_factory=dict)  # by service [s]
     crashes: list[str] = field(default_factory=list)  # of services, by themselves
 
@@ -190,7 +216,7 @@ class VirtualProcess:
         self.life, self._ending = Life(self.name), _Ending()
         self._code, self._gate = host.loop.create_future(), asyncio.Event()
         context = context_of(self.life)
-        session = self._session = host.network.attach(context)
+        session = self._session = host.network.attach(context, self.name, self._pid)
         boot = float(host.random.uniform(*BOOT))
         task = self._task = context.run(lambda: asyncio.create_task(self._run(session, boot), name=self.name))
         task.add_done_callback(self._done)
@@ -257,10 +283,16 @@ class VirtualProcess:
         if self._pid is None or self._task is None:
             return
         host = self._host
+        host.killed += 1
         host.loop.end(self.life)
         host.ended.append((self.life, self._task))
         host.requests.open = {n: r for n, r in host.requests.open.items() if r[0] != self.name}
         self._gone(SIGKILL)
+
+    @property
+    def session(self) -> VirtualSession | None:
+        """Its place on the network while it runs."""
+        return self._session if self._pid is not None else None
 
     def kill_at_turn(self, turns: int) -> None:
         """End it in that many turns of its own, counted from now: in the middle of whatever it does then."""

@@ -32,11 +32,17 @@ from common.supervision.supervisor import Supervisor
 from common.transport.bus import Bus
 from common.transport.codec import decode
 from common.transport.session import RawSample
+from common.virtual.faults import Plan, make_plan
+from common.virtual.invariants import Invariants
 from common.virtual.loop import VirtualLoop
-from common.virtual.network import FAIR, VirtualNetwork, VirtualSession
-from common.virtual.process import Host, VirtualBus, VirtualProcess
+from common.virtual.network import VirtualNetwork, VirtualSession
+from common.virtual.process import Host, Requests, VirtualBus, VirtualProcess
+from common.virtual.trace import Trace
+from common.virtual.watched_arm import shown_to, with_watched_arm
 
 LIMIT = 900.0  # [s] virtual time in which the task has to end
+LOOK = 0.5  # [s] of virtual time between looks at requests
+AGAIN = 0.1  # [s] between looks whether a process is there on which something is to be done
 SETTLE = 2.0  # [s] of virtual time for what still falls when the task has ended
 CLEARING = 30.0  # [s] of virtual time for what was cut off to come to its end
 SUPERVISOR, HOST = "supervisor", "simulated"
@@ -62,6 +68,9 @@ class Outcome:
     restarts: dict[str, int] = field(default_factory=dict)
     crashes: list[str] = field(default_factory=list)  # of services by themselves
     requests: Counter[str] = field(default_factory=Counter)  # by outcome
+    faults: Counter[str] = field(default_factory=Counter)  # that were made
+    checked: Counter[str] = field(default_factory=Counter)  # how often each invariant was
+    broken: list[str] = field(default_factory=list)  # invariants, with when and how
 
     @property
     def ok(self) -> bool:
@@ -72,32 +81,47 @@ class Outcome:
 class Simulation:
     """One run of a cell under one seed."""
 
-    def __init__(self, cell: Cell, seed: int, *, limit: float = LIMIT, digest: bool = False) -> None:
+    def __init__(
+        self, cell: Cell, seed: int, *, faults: bool = False, limit: float = LIMIT, digest: bool = False,
+        trace: Trace | None = None, tell: Callable[[str], None] = lambda line: None,
+    ) -> None:
         """Prepare a run.
 
         Args:
             cell: resolved; its viewer is left out.
             seed: decides everything that is left open.
+            faults: whether things go wrong.
             limit: virtual time in which the task has to end [s].
             digest: whether a digest of the message log is made.
+            trace: takes all messages.
+            tell: is called with each log line and each fault.
+
+        Raises:
+            ConfigError: the cell has a real arm, or is none that can be simulated.
         """
         kept = {key: entry for key, entry in cell.services.items() if entry.name not in LEFT_OUT}
-        self.cell = cell.model_copy(update={"services": kept})
+        self.cell = with_watched_arm(cell.model_copy(update={"services": kept}))
+        names = [entry.name for entry in kept.values()]
+        self.plan = make_plan(seed, names) if faults else Plan()
         self.outcome = Outcome(seed)
-        self._limit = limit
+        self._limit, self._trace, self._tell = limit, trace, tell
         self._hash = hashlib.blake2b(digest_size=16) if digest else None
         self._status = find_application(cell.application).status
         self._status_key = f"{cell.name}/{self._status.key}"
         self._last_status: RawSample | None = None
         self._ended = asyncio.Event()
         self._loop = VirtualLoop(seed)
-        self._network = VirtualNetwork(self._loop, seed, FAIR)
+        self._network = VirtualNetwork(self._loop, seed, self.plan.weather)
         self._network.on_put = self._on_put
+        self._requests = Requests()
+        self.invariants = Invariants(self.cell, self._requests, self._loop.time)
+        self._network.on_listen = lambda session, key: self.invariants.on_listen(session.name, key)
+        self._done: Counter[str] = Counter()  # faults that were made
 
     def run(self) -> Outcome:
         """What became of it."""
         began = time.process_time()
-        with drawn_from(self._loop), _state_folder(), _quiet():
+        with drawn_from(self._loop), shown_to(self.invariants.on_set_point), _state_folder(), _quiet():
             try:
                 self._loop.run_until_complete(self._run())
             finally:
@@ -109,21 +133,24 @@ class Simulation:
 
     async def _run(self) -> None:
         outcome, clock = self.outcome, Clock()
-        host = Host(self._loop, self._network, self.cell, clock, np.random.default_rng([outcome.seed, 4]))
+        host = Host(
+            self._loop, self._network, self.cell, clock, np.random.default_rng([outcome.seed, 4]), self._requests,
+            skews=dict(self.plan.skews),
+        )
+        self._host = host
         entries = {entry.name: entry for entry in self.cell.services.values()}
 
         def make_child(name: str, _command: object, _environment: object, on_line: Callable[[str, str], None]) -> Any:
             return VirtualProcess(host, entries[name], on_line)
 
         launch = Launch(cell=self.cell.name, connect="tcp/127.0.0.1:7447", clock=clock)
-        session = self._network.attach(contextvars.copy_context())
+        session = self._network.attach(contextvars.copy_context(), SUPERVISOR)
         bus = VirtualBus(session, SUPERVISOR, self.cell.name, clock, host.requests)
-        supervisor = Supervisor(self.cell, launch, lambda name, line: None, make_child=make_child)
+        supervisor = Supervisor(self.cell, launch, lambda name, line: self._say(line), make_child=make_child)
         supervisor.begin()
         working = asyncio.create_task(supervise(bus, self.cell, launch, supervisor, self._work, host=HOST))
         try:
-            await asyncio.wait({working, supervisor.failure}, timeout=self._limit,
-                               return_when=asyncio.FIRST_COMPLETED)
+            await self._look_on(working, supervisor)
             if supervisor.failure.done():
                 outcome.state, outcome.message = "NOT STARTED", str(supervisor.failure.exception())
             elif working.done() and not working.cancelled() and (error := working.exception()) is not None:
@@ -132,20 +159,75 @@ class Simulation:
         finally:
             outcome.restarts = {name: count for name, count in supervisor.restarts.items() if count}
             outcome.crashes, outcome.requests = host.crashes, host.requests.outcomes
+            outcome.faults = self._done + self._network.counted + Counter({"crash": host.killed})
+            outcome.broken, outcome.checked = self.invariants.broken, self.invariants.checked
             self._network.on_put = lambda session, sample: None  # what comes now is no part of the run
             await self._clear(working, supervisor, bus, host)
 
+    async def _look_on(self, working: asyncio.Task[None], supervisor: Supervisor) -> None:
+        """Return when the work is done, or cannot be, or something broke that must hold."""
+        deadline = self._loop.time() + self._limit
+        while not working.done() and not supervisor.failure.done() and self._loop.time() < deadline:
+            await asyncio.wait({working, supervisor.failure}, timeout=LOOK, return_when=asyncio.FIRST_COMPLETED)
+            self.invariants.look()
+            if self.invariants.broken:
+                return
+
+    def _say(self, line: str) -> None:
+        self._tell(f"{self._loop.time():9.3f} s  {line}")
+
     async def _work(self, bus: Bus) -> None:
         """Wait for the end of the task, and for what still falls then."""
+        making = asyncio.create_task(self._make_faults())
         await self._ended.wait()
         self.outcome.seconds = self._loop.time()
+        making.cancel()
+        await asyncio.wait({making})
+        self._network.find_router()
         await asyncio.sleep(SETTLE)
+
+    async def _make_faults(self) -> None:
+        """Let go wrong what the plan says."""
+        began = self._loop.time()
+        for fault in self.plan.faults:
+            await asyncio.sleep(max(0.0, began + fault.at - self._loop.time()))
+            self._say(f"FAULT {fault.kind} {fault.target}{f' for {fault.seconds:.1f} s' if fault.seconds else ''}")
+            if fault.kind == "router lost":
+                self._network.lose_router()
+                self._loop.call_later(fault.seconds, self._network.find_router)
+                self._done[fault.kind] += 1
+                continue
+            process = self._host.processes[fault.target]
+            session = await self._when_there(process, connected=fault.kind == "cut")
+            if fault.kind == "crash":
+                process.kill_at_turn(fault.turns)
+                continue
+            self._done[fault.kind] += 1
+            if fault.kind == "cut":
+                self._network.cut([session])
+                self._loop.call_later(fault.seconds, self._mend, session)
+            else:
+                process.terminate()
+
+    async def _when_there(self, process: VirtualProcess, connected: bool) -> VirtualSession:
+        """The place of a process on the network, as soon as it runs."""
+        while (session := process.session) is None or (connected and session.cut):  # noqa: ASYNC110 - time is free here
+            await asyncio.sleep(AGAIN)
+        return session
+
+    def _mend(self, session: VirtualSession) -> None:
+        if not session.detached and not self._network.router_lost:
+            self._network.mend([session])
 
     def _judge(self) -> None:
         """Take down what the task said last."""
         outcome, told = self.outcome, self._last_status
         status = decode(self._status.message, told.payload) if told else TaskStatus()
         outcome.done, outcome.total = status.done, status.total
+        self.invariants.look()
+        self.invariants.on_end(status.done, status.state)
+        if self.invariants.broken:
+            outcome.state, outcome.message = "BROKEN", self.invariants.broken[0]
         if outcome.state:
             return
         outcome.state, outcome.message = status.state, status.message
@@ -161,6 +243,9 @@ class Simulation:
                 + (sample.attachment or b"")
             )
             self._hash.update(sample.payload)
+        if self._trace is not None:
+            self._trace.add(sample, self._loop.wall_ns())
+        self.invariants.on_put(session.name, session.life, sample)
         if sample.key == self._status_key and (self._last_status is None or sample != self._last_status):
             self._last_status = sample
             if decode(self._status.message, sample.payload).state in ENDED:
@@ -200,12 +285,15 @@ def _state_folder() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """No log of this process, and no garbage collection in the middle of anything."""
-    logging.disable(logging.NOTSET)
+    """No log lines of this process, which are those of its processes; and garbage is left for later."""
+    root = logging.getLogger()
+    handlers, root.handlers[:] = list(root.handlers), [logging.NullHandler()]
     collecting = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
+        root.handlers[:] = handlers
         if collecting:
             gc.enable()
+            gc.collect()

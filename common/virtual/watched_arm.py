@@ -19,7 +19,7 @@ class Options(Parameters):
     """The backend below, with its options."""
 
     backend: str
-    options: dict[str, Any] = {}
+    options: dict[str, Any]
 
 
 class _Shown:

@@ -20,7 +20,7 @@ class Net:
         self.loop, self.network, self.sessions = loop, VirtualNetwork(loop, 5, weather), {}
 
     def bus(self, name):
-        session = self.sessions[name] = self.network.attach(contextvars.copy_context())
+        session = self.sessions[name] = self.network.attach(contextvars.copy_context(), name)
         return Bus(session, service=name, cell="test", clock=Clock())
 
 

@@ -1,0 +1,181 @@
+"""`simulate`: whole cells on a virtual clock, one run for each seed."""
+
+from __future__ import annotations
+
+import os
+import re
+import statistics
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli import options
+
+if TYPE_CHECKING:
+    from common.config import Cell
+    from common.virtual.campaign import Tally
+    from common.virtual.simulation import Outcome
+
+MOST_SEEDS = 1_000_000
+SHOWN = 50  # seeds that did not end DONE, in the table
+
+
+def simulate(
+    cell: options.CellArgument,
+    seeds: Annotated[str | None, typer.Option("--seeds", metavar="A-B", help="a run for each of them [1-20]")] = None,
+    seed: Annotated[str | None, typer.Option("--seed", metavar="N", help="just this one, told in full")] = None,
+    faults: Annotated[bool, typer.Option("--faults", help="crashes, cut links, messages that go astray")] = False,
+    trace: Annotated[
+        str | None, typer.Option("--trace", metavar="FILE.mcap", help="of --seed: a recording of all that travelled")
+    ] = None,
+    jobs: Annotated[str | None, typer.Option("--jobs", metavar="N", help="so many at a time [one a core]")] = None,
+    overrides: options.Overrides = None,
+    world: options.WorldName = None,
+) -> None:
+    """Run a whole cell in this process on a virtual clock, once for each seed, and check what must hold at every step.
+
+    Exit code 0 only when nothing broke and 99 % of the seeds ended DONE.
+    """
+    from common.config import load_cell
+    from common.errors import ConfigError
+    from common.virtual.watched_arm import with_watched_arm
+
+    if seeds is not None and seed is not None:
+        raise ConfigError("--seed", seed, "does not go with --seeds")
+    if trace is not None and seed is None:
+        raise ConfigError("--trace", trace, "needs --seed N")
+    one = options.whole("--seed", seed, 0)
+    several = seeds_of(seeds or "1-20")
+    at_a_time = options.whole("--jobs", jobs, 1) or os.cpu_count() or 1
+    loaded = load_cell(cell, overrides or (), world=world)
+    with_watched_arm(loaded)  # says in one line what cannot be simulated
+    if one is None:
+        raise typer.Exit(_campaign(loaded, several, faults, at_a_time))
+    raise typer.Exit(_single(loaded, one, faults, trace))
+
+
+def seeds_of(text: str) -> range:
+    """The seeds of A-B, or of a single number.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    from common.errors import ConfigError
+
+    match = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", text.strip())
+    first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+    if not first <= last < first + MOST_SEEDS:
+        raise ConfigError("--seeds", text, "must be a range such as 1-1000")
+    return range(first, last + 1)
+
+
+def _single(cell: Cell, seed: int, faults: bool, file: str | None) -> int:
+    """Run one seed and tell of all that happened; the exit code."""
+    from cli.recording import about, require_new
+    from common.virtual.simulation import Simulation
+    from common.virtual.trace import Trace
+
+    trace = None
+    if file is not None:
+        require_new(Path(file), "--trace")
+        trace = Trace(Path(file), about(cell.name))
+    simulation = Simulation(cell, seed, faults=faults, digest=True, trace=trace, tell=typer.echo)
+    try:
+        outcome = simulation.run()
+    finally:
+        if trace is not None:
+            trace.close("simulated")
+    for line in told(outcome):
+        typer.echo(line)
+    if trace is not None:
+        typer.echo(f"recorded {trace.messages:,} messages: {file}")
+    return 0 if outcome.ok and not outcome.crashes else 1
+
+
+def told(outcome: Outcome) -> list[str]:
+    """One seed in a few lines for people."""
+    lines = [f"seed {outcome.seed}: {outcome.state}{f', {outcome.message}' if outcome.message else ''}"]
+    lines.append(f"  {outcome.seconds:.1f} s of virtual time in {outcome.cpu_seconds:.1f} CPU seconds, "
+                 f"{outcome.messages:,} messages, digest {outcome.digest}")
+    lines.append(f"  faults: {listed(outcome.faults) or 'none'}")
+    lines.append(f"  requests: {listed(outcome.requests)}")
+    lines.append(f"  checked: {listed(outcome.checked)}")
+    lines += [f"  broken: {what}" for what in outcome.broken]
+    lines += [f"  crashed by itself: {what}" for what in outcome.crashes]
+    return lines
+
+
+def listed(counted: dict[str, int]) -> str:
+    """Counts in one line, the largest first."""
+    order = sorted(counted.items(), key=lambda item: (-item[1], item[0]))
+    return ", ".join(f"{name} {count:,}" for name, count in order)
+
+
+def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int) -> int:
+    """Run all seeds with a bar that tells how far it is, then the table; the exit code."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from common.virtual.campaign import Tally, run_seeds
+
+    tally, interrupted = Tally(), False
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not sys.stderr.isatty(), transient=True) as progress:
+        bar = progress.add_task(cell.name, total=len(seeds))
+        try:
+            for outcome in run_seeds(cell, seeds, faults, jobs):
+                tally.add(outcome)
+                if not outcome.ok or outcome.crashes:
+                    line = f"seed {outcome.seed}: {reason(outcome)}"
+                    console.print(line, markup=False, highlight=False, soft_wrap=True)
+                progress.update(bar, advance=1, description=f"{cell.name} {tally.done} DONE")
+        except KeyboardInterrupt:
+            interrupted = True
+    if tally.outcomes:
+        Console(soft_wrap=True).print(table(cell.name, tally, faults))
+    if interrupted:
+        typer.echo(f"interrupted after {len(tally.outcomes)} of {len(seeds)} seeds", err=True)
+        return 130
+    return 0 if tally.passed else 1
+
+
+def reason(outcome: Outcome) -> str:
+    """Why a seed is no success."""
+    crashes = [f"crashed by itself: {what}" for what in outcome.crashes[:1]]
+    return "; ".join([f"{outcome.state} {outcome.message}".strip(), *outcome.broken[1:], *crashes])
+
+
+def table(name: str, tally: Tally, faults: bool) -> object:
+    """All seeds in one table: how they ended, what went wrong on purpose, what was checked, and who failed."""
+    from rich.table import Table
+
+    outcomes = tally.outcomes
+    ended = [outcome.seconds for outcome in outcomes if outcome.ok] or [0.0]
+    cpu = [outcome.cpu_seconds for outcome in outcomes]
+    made = Table(title=f"{name}, {len(outcomes)} seeds{' with faults' if faults else ''}", show_header=False)
+    made.add_row("DONE", f"{tally.done} of {len(outcomes)} ({tally.done / len(outcomes):.1%})")
+    made.add_row("virtual time", f"{statistics.median(ended):.1f} s (median), {max(ended):.1f} s at most")
+    made.add_row("CPU time", f"{statistics.median(cpu):.1f} s a seed (median), {sum(cpu):.0f} s in all")
+    made.add_row("requests", listed(tally.requests))
+    made.add_section()
+    if faults:
+        for kind, count in sorted(tally.faults.items()):
+            each = [outcome.faults[kind] for outcome in outcomes]
+            made.add_row(f"fault: {kind}", f"{count:,} ({min(each)} to {max(each)} a run)")
+        made.add_section()
+    broken = [what for outcome in outcomes for what in outcome.broken]
+    for what, count in sorted(tally.checked.items()):
+        breaks = sum(what in line for line in broken)
+        made.add_row(f"invariant: {what}", f"{count:,} looks, {f'BROKEN {breaks} times' if breaks else 'held'}")
+    bad = [outcome for outcome in sorted(outcomes, key=lambda o: o.seed) if not outcome.ok or outcome.crashes]
+    if bad:
+        made.add_section()
+    for outcome in bad[:SHOWN]:
+        made.add_row(f"seed {outcome.seed}", reason(outcome))
+    if len(bad) > SHOWN:
+        made.add_row("...", f"{len(bad) - SHOWN} more")
+    return made
