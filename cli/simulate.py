@@ -32,6 +32,9 @@ def simulate(
         str | None, typer.Option("--trace", metavar="FILE.mcap", help="of --seed: a recording of all that travelled")
     ] = None,
     jobs: Annotated[str | None, typer.Option("--jobs", metavar="N", help="so many at a time [one a core]")] = None,
+    limit: Annotated[
+        str, typer.Option("--limit", metavar="S", help="of virtual time, in which the task must end [s]")
+    ] = "300",
     overrides: options.Overrides = None,
     world: options.WorldName = None,
 ) -> None:
@@ -50,11 +53,14 @@ def simulate(
     one = options.whole("--seed", seed, 0)
     several = seeds_of(seeds or "1-20")
     at_a_time = options.whole("--jobs", jobs, 1) or os.cpu_count() or 1
+    longest = options.number("--limit", limit)
+    if longest <= 0:
+        raise ConfigError("--limit", limit, "must be more than 0 [s]")
     loaded = load_cell(cell, overrides or (), world=world)
     with_watched_arm(loaded)  # says in one line what cannot be simulated
     if one is None:
-        raise typer.Exit(_campaign(loaded, several, faults, at_a_time))
-    raise typer.Exit(_single(loaded, one, faults, trace))
+        raise typer.Exit(_campaign(loaded, several, faults, at_a_time, longest))
+    raise typer.Exit(_single(loaded, one, faults, trace, longest))
 
 
 def seeds_of(text: str) -> range:
@@ -72,7 +78,7 @@ def seeds_of(text: str) -> range:
     return range(first, last + 1)
 
 
-def _single(cell: Cell, seed: int, faults: bool, file: str | None) -> int:
+def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float) -> int:
     """Run one seed and tell of all that happened; the exit code."""
     from cli.recording import about, require_new
     from common.virtual.simulation import Simulation
@@ -82,7 +88,7 @@ def _single(cell: Cell, seed: int, faults: bool, file: str | None) -> int:
     if file is not None:
         require_new(Path(file), "--trace")
         trace = Trace(Path(file), about(cell.name))
-    simulation = Simulation(cell, seed, faults=faults, digest=True, trace=trace, tell=typer.echo)
+    simulation = Simulation(cell, seed, faults=faults, limit=limit, digest=True, trace=trace, tell=typer.echo)
     try:
         outcome = simulation.run()
     finally:
@@ -114,7 +120,7 @@ def listed(counted: dict[str, int]) -> str:
     return ", ".join(f"{name} {count:,}" for name, count in order)
 
 
-def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int) -> int:
+def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: float) -> int:
     """Run all seeds with a bar that tells how far it is, then the table; the exit code."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -127,7 +133,7 @@ def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int) -> int:
     with Progress(*columns, console=console, disable=not sys.stderr.isatty(), transient=True) as progress:
         bar = progress.add_task(cell.name, total=len(seeds))
         try:
-            for outcome in run_seeds(cell, seeds, faults, jobs):
+            for outcome in run_seeds(cell, seeds, faults, jobs, limit):
                 tally.add(outcome)
                 if not outcome.ok or outcome.crashes:
                     line = f"seed {outcome.seed}: {reason(outcome)}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import logging
 import multiprocessing
@@ -57,7 +56,7 @@ class Tally:
         return bool(self.outcomes) and self.done >= ENOUGH * len(self.outcomes)
 
 
-def run_seeds(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int) -> Iterator[Outcome]:
+def run_seeds(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: float) -> Iterator[Outcome]:
     """The outcome of each seed as it comes; left early, no process stays behind.
 
     Args:
@@ -65,13 +64,15 @@ def run_seeds(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int) -> Iter
         seeds: are run in this order, and come as they are done.
         faults: whether things go wrong.
         jobs: how many at a time.
+        limit: virtual time in which each has to end [s].
     """
     pool = ProcessPoolExecutor(
-        min(jobs, len(seeds)), multiprocessing.get_context("spawn"), _begin, (cell, faults),
+        min(jobs, len(seeds)), multiprocessing.get_context("spawn"), _begin, (cell, faults, limit),
         max_tasks_per_child=SEEDS_A_PROCESS,
     )
+    running: dict[Future[Outcome], int] = {}
     try:
-        running: dict[Future[Outcome], int] = {pool.submit(_run, seed): seed for seed in seeds}
+        running |= {pool.submit(_run, seed): seed for seed in seeds}
         for future in as_completed(running):
             try:
                 yield future.result()
@@ -79,25 +80,26 @@ def run_seeds(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int) -> Iter
                 yield Outcome(running[future], "NO PROCESS", "a process that ran seeds was killed")
             except Exception as error:  # noqa: BLE001 - a seed that breaks the simulation itself is a finding too
                 yield Outcome(running[future], "FAILED", f"{type(error).__name__}: {error}", broken=[str(error)])
+        running.clear()
     finally:
-        for process in multiprocessing.active_children():
-            process.kill()
-        with contextlib.suppress(Exception):
-            pool.shutdown(wait=False, cancel_futures=True)
+        if running:  # left early: nobody waits for what has begun
+            for process in multiprocessing.active_children():
+                process.kill()
+        pool.shutdown(cancel_futures=True)
 
 
-_work: list[tuple[Cell, bool]] = []
+_work: list[tuple[Cell, bool, float]] = []
 
 
-def _begin(cell: Cell, faults: bool) -> None:
+def _begin(cell: Cell, faults: bool, limit: float) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # who began us ends us
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     logging.disable(logging.CRITICAL)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    _work[:] = [(cell, faults)]
+    _work[:] = [(cell, faults, limit)]
 
 
 def _run(seed: int) -> Outcome:
-    cell, faults = _work[0]
-    return Simulation(cell, seed, faults=faults).run()
+    cell, faults, limit = _work[0]
+    return Simulation(cell, seed, faults=faults, limit=limit).run()

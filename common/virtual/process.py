@@ -284,6 +284,7 @@ class VirtualProcess:
             return
         host = self._host
         host.killed += 1
+        self._ending.reason = "SIGKILL"
         host.loop.end(self.life)
         host.ended.append((self.life, self._task))
         host.requests.open = {n: r for n, r in host.requests.open.items() if r[0] != self.name}
