@@ -1,0 +1,1 @@
+"""The planning scene: what is fixed, and where an arm can take things from."""

@@ -1,0 +1,1 @@
+"""Certificates of a secured cell and who may do what in it."""

@@ -1,0 +1,1 @@
+"""The engine of every task: rows of stages, planning ahead, watching, hold and stop, failure, restart."""
