@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 import yaml
 
+from common import messages as m
+from common.application import find_application
 from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import check, load_cell, service_config
 from common.errors import ConfigError, UnknownName
@@ -26,8 +28,11 @@ from common.messages import CameraInfo, Image, Pose, PoseArray, Vector3
 from common.planning.planners import load_planner
 from common.process.in_process import running_service
 from common.process.wiring import wiring
+from common.recording.reading import Recording
 from common.robot.model import RobotModel
+from common.tasks.stages import View
 from common.topics import CAMERA_IMAGE, CAMERA_INFO
+from common.transport.codec import decode
 from common.transport.local import LocalNetwork
 from tests.harness import free_domain
 
@@ -39,8 +44,10 @@ COMMANDS = [
     line for block in re.findall(r"^```sh\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE) for line in block.splitlines()
 ]
 HERE, ANYWHERE = (
-    [line for line in COMMANDS if re.match(rf"{start}zencell run", line)] for start in ("", r"PYTHONPATH=\S+ ")
+    [line for line in COMMANDS if re.match(rf"{start}zencell run (?!cube)", line)]
+    for start in ("", r"PYTHONPATH=\S+ ")
 )
+CUBE = next(line for line in COMMANDS if line.startswith("zencell run cube.yaml"))
 PATIENCE = 60  # [s]
 DONE = "DONE, 1 of 1 placed (truth: 1 in the box, 0 on the table)"
 
@@ -231,6 +238,49 @@ def test_service_of_ours_joins_a_cell_and_its_topic_is_shown(folder: Path) -> No
     assert "unknown key 'neerest_target'" in slip[1] and "nothing came on panda/neerest_target within 2 s" in slip[1]
     assert [question.returncode for question in asked] == [0, 0, 2]
     assert (service.returncode, cell.returncode) == (0, 0)
+
+
+@pytest.mark.cell
+def test_task_of_one_file_moves_a_cube_and_ends_the_run_with_a_status_and_figures_of_its_own(
+    folder: Path, tmp_path: Path
+) -> None:
+    assert len(FILES["my_pkg/move_cube.py"].splitlines()) < 120
+    file, recording = tmp_path / "summary.json", tmp_path / "run.mcap"
+    ran = tell(f"{CUBE} --speed 5 --no-viewer --summary {file} --record {recording}", folder)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    summary = json.loads(file.read_text(encoding="utf-8"))
+    assert (summary["state"], summary["placed"], summary["targets"], summary["failures"]) == ("DONE", 1, 1, 0)
+    assert set(summary["figures"]) == {"off_mm"} and summary["figures"]["off_mm"] < 5
+    assert "off_mm" in ran.stdout
+    with Recording(recording) as kept:
+        newest = {sample.topic: sample.payload for sample in kept.samples(
+            lambda topic: topic in ("scene_objects", "move_cube_status"))}
+    status = decode(m.TaskStatus, newest["move_cube_status"])
+    assert (status.state, status.figures) == ("DONE", summary["figures"])
+    place = decode(m.WorldObjects, newest["scene_objects"]).objects[0].pose.position
+    assert (place.x, place.y) == pytest.approx((0.52, 0.1), abs=0.005), "where it really is"
+
+
+def test_task_of_one_file_goes_on_with_what_is_in_the_hand(folder: Path) -> None:
+    cell = load_cell(str(folder / "cube.yaml"))
+    module = importlib.import_module("my_pkg.move_cube")
+    config = service_config(cell, "move_cube", module.Config)
+    task = module.MoveCube(config, module.MoveCubeStatus(), "t")
+    held = m.GripperState(holding=True, width=0.05)
+    view = View(1.0, m.PlanningScene(header=m.Header()), held, m.MotionStatus(), [0.0] * 6, m.Pose())
+    (plan,) = task.step(view)
+    assert (plan.stage, plan.release) == ("across", False)
+    assert (plan.goal.pose.position.x, plan.goal.pose.position.y) == config.to
+
+
+def test_application_that_is_no_module_or_has_no_status_is_refused_by_name(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    with pytest.raises(ConfigError, match=r"application: 'my_pkg\.move_ball' cannot be imported"):
+        load_cell("cube.yaml", ["application=my_pkg.move_ball"])
+    with pytest.raises(ConfigError, match="is no application: its topics have no STATUS"):
+        _ = find_application("my_pkg.over_home").status
 
 
 def start(line: str, folder: Path, env: dict[str, str]) -> subprocess.Popen[str]:
