@@ -29,9 +29,9 @@ from tests.harness import ROOT, environment, free_domain
 
 CELL = "transport"
 WRITER = "writer"
-PICTURE = Topic("picture", m.Image, "stream", WRITER, "640 x 480, bgr8")
-SMALL = Topic("small", m.SceneUpdate, "event", WRITER, "about 100 bytes")
-ECHO = Request("echo", m.HoldRequest, m.HoldRequest, WRITER, "answers with what was asked")
+PICTURE = Topic("picture", m.Image, "stream", "640 x 480, bgr8")
+SMALL = Topic("small", m.SceneUpdate, "event", "about 100 bytes")
+ECHO = Request("echo", m.HoldRequest, m.HoldRequest, "answers with what was asked")
 WIDTH, HEIGHT = 640, 480
 PICTURE_RATE, SMALL_RATE = 30.0, 100.0  # [Hz]
 PATIENCE = 90.0  # [s] for a process to be there

@@ -121,7 +121,7 @@ def graph_of(cell: str, services: list[Wired], alive: frozenset[str] | None = No
     keys += [key for service in services for key in service.reads]  # written by nobody in this cell
     kinds: dict[str, str] = {}
     for key in keys:
-        topic = find_topic(key)
+        topic = next((each.topics[key] for each in services if key in each.topics), None) or find_topic(key)
         kinds[key] = topic.kind if topic else "event"
     return Graph(cell, services, kinds, alive, outside)
 

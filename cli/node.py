@@ -11,12 +11,13 @@ from cli import completion, options
 from common.errors import UnknownName
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from cli.inspection import Presence
     from cli.wired import Wired
     from common.config import Cell, ServiceEntry
     from common.messages import Parameter, ParameterReply
+    from common.topics import Request, Topic
     from common.transport.bus import Bus
 
 app = typer.Typer(help="Services: who is ready, and what each has to do with.", no_args_is_help=True)
@@ -76,7 +77,7 @@ def info(
     if as_json:
         typer.echo(json.dumps(described))
         return
-    for line in _lines(described):
+    for line in _lines(described, found.topics):
         typer.echo(line)
 
 
@@ -144,9 +145,7 @@ def _described(
     }
 
 
-def _lines(described: dict[str, Any]) -> Iterator[str]:
-    from common.application import find_topic
-
+def _lines(described: dict[str, Any], topics: Mapping[str, Topic[Any] | Request[Any, Any]]) -> Iterator[str]:
     yield f"{described['cell']}/{described['service']}: {described['doc']}"
     yield f"state: {described['state']}" + (
         f", pid {described['pid']}, {described['restarts']} restarts" if described["pid"] else ""
@@ -154,7 +153,7 @@ def _lines(described: dict[str, Any]) -> Iterator[str]:
     for side in SIDES:
         yield f"{side}:" if described[side] else f"{side}: nothing"
         for key in described[side]:
-            topic = find_topic(key)
+            topic = topics.get(key)
             answer = getattr(topic, "answer", None)
             carries = f"{topic.kind:<8} {topic.message.__name__}" if topic else ""
             yield f"  {key:<28} {carries}{f' -> {answer.__name__}' if answer else ''}".rstrip()

@@ -260,7 +260,7 @@ class Operation:
         from common.messages import TaskCommand
         from common.supervision.operation import beside
 
-        collector = self._came_up(bus)
+        collector = await self._came_up(bus)
         if not self.cell.run.autostart:
             await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"), START_REQUEST_TIMEOUT)
 
@@ -277,7 +277,7 @@ class Operation:
         from common.supervision.operation import beside
         from common.transport.endpoint import endpoint_of
 
-        collector = self._came_up(bus)
+        collector = await self._came_up(bus)
         assert self._screen is not None
         endpoint = endpoint_of(None if self.launch.connect else self.launch.domain, self.launch.connect)
         took = f"{self.summary.ready:.1f} s"
@@ -290,17 +290,18 @@ class Operation:
         if self._chaos is not None:
             await self._chaos.run()
 
-    def _came_up(self, bus: Bus) -> Collector:
+    async def _came_up(self, bus: Bus) -> Collector:
         assert self._collector is not None
         self.summary.ready = time.monotonic() - self.began
         if self._page and self._screen:
             self._screen.note(f"Open {self._page.address}")
         if self._disturbance is not None:
-            from common.chaos.setting import chaos_in
+            from common.chaos.setting import chaos_in, keys_of
 
             assert self._supervisor is not None
             seed, per_minute, until_ended = self._disturbance
-            self._chaos = chaos_in(bus, self.cell, self._supervisor, seed, per_minute, until_ended=until_ended)
+            keys = keys_of(await bus.owners(), [entry.name for entry in self.cell.services.values()])
+            self._chaos = chaos_in(bus, self.cell, self._supervisor, keys, seed, per_minute, until_ended=until_ended)
         return self._collector
 
     def _write_summary(self) -> None:

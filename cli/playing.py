@@ -215,13 +215,9 @@ def _greet(player: Player, recording: Recording, cell: str, endpoint: str, *, ow
 
 async def _warn_of_others(bus: Bus, played: list[str]) -> None:
     """Say which services that are up write what is played too."""
-    from common.application import all_topics
-
-    up = await bus.alive.known()
-    known = all_topics()
+    owners = await bus.owners()
     for topic in played:
-        both = sorted(set(known[topic].writers) & up) if topic in known else []
-        for name in both:
+        for name in [owner.service for owner in owners if owner.key == topic]:
             typer.echo(f"{name} is up and writes {topic} too: whoever reads it hears both", err=True)
 
 

@@ -55,7 +55,7 @@ def pub(
         from cli.inspection import cell_clock
 
         bus.clock = await cell_clock(bus)
-        _warn_of_writers(await _others(bus, topic), key)
+        _warn_of_writers(await _others(bus, key), key)
         await _publish(_putter(bus, topic, key, message), period, most)
         await asyncio.sleep(LINGER)
 
@@ -159,13 +159,9 @@ async def _publish(putter: _Putter, period: float, most: int | None) -> None:
         await asyncio.sleep(max(0.0, began + sent * period - time.monotonic()))
 
 
-async def _others(bus: Bus, topic: Topic[Any] | None) -> list[str]:
-    """Services of the cell that are ready and write the topic."""
-    from cli.inspection import alive
-
-    if topic is None:
-        return []
-    return [service for cell, service in await alive(bus) if cell == bus.cell and service in topic.writers]
+async def _others(bus: Bus, key: str) -> list[str]:
+    """Services of the cell that write the key."""
+    return [owner.service for owner in await bus.owners() if owner.key == key]
 
 
 def _warn_of_writers(services: list[str], key: str) -> None:

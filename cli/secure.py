@@ -155,10 +155,10 @@ def rights_in(cell: Cell, names: Collection[str] | None = None) -> dict[str, Rig
         names: of the services that are looked at; all when not given.
 
     Raises:
-        ConfigError: one of them can not be configured so.
+        ConfigError: one of them can not be configured so, or two of them write or serve one key.
         Unwired: one of them does not get so far.
     """
-    from common.process.wiring import wiring_of
+    from common.process.wiring import Wiring, require_one_owner, wiring_of
     from common.security.access import rights_of, rights_of_recorder, rights_of_supervisor
     from common.supervision.launch import require_modules
     from common.transport.credentials import RECORDER, SUPERVISOR
@@ -170,17 +170,20 @@ def rights_in(cell: Cell, names: Collection[str] | None = None) -> dict[str, Rig
         if entry.kind == VIEWER else entry for key, entry in cell.services.items()
     }})
 
-    async def find() -> dict[str, Rights]:
+    async def find() -> dict[str, Wiring]:
         found = {}
         for entry in apart.services.values():
             if names is not None and entry.name not in names:
                 continue
             try:
-                found[entry.name] = rights_of(entry.name, await wiring_of(apart, entry))
+                found[entry.name] = await wiring_of(apart, entry)
             except ZencellError:
                 raise
             except Exception as error:  # whatever a service does that can not run so
                 raise Unwired(entry.name, error) from error
         return found
 
-    return {**asyncio.run(find()), SUPERVISOR: rights_of_supervisor(), RECORDER: rights_of_recorder()}
+    wirings = asyncio.run(find())
+    require_one_owner(wirings)
+    rights = {name: rights_of(name, declared) for name, declared in wirings.items()}
+    return {**rights, SUPERVISOR: rights_of_supervisor(), RECORDER: rights_of_recorder()}

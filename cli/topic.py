@@ -24,30 +24,46 @@ AnyKey = Annotated[
 
 
 @app.command("list")
-def list_(as_json: options.Json = False) -> None:
-    """List all topics: key, kind, message, who writes or serves it, and what it is."""
-    from common.application import all_topics
+def list_(
+    cell: options.CellName = None, as_json: options.Json = False, domain: options.Domain = None,
+    connect: options.Connect = None,
+) -> None:
+    """List all topics: key, kind, message, who writes or serves it in a cell, and what it is.
 
-    for topic in all_topics().values():
+    Asked are the cells that are up; while there are none, those of the configuration.
+    """
+    from cli.owners import known_keys
+
+    for known in known_keys(cell, domain, connect).values():
+        topic = known.topic
+        kind, message, doc = (topic.kind, topic.message.__name__, topic.doc) if topic else ("", "", "")
         if as_json:
-            typer.echo(json.dumps({
-                "key": topic.key, "kind": topic.kind, "message": topic.message.__name__, "writer": topic.writer,
-                "doc": topic.doc,
-            }))
+            described = {"key": known.key, "kind": kind, "message": message, "writer": known.writer, "doc": doc}
+            typer.echo(json.dumps(described))
         else:
-            typer.echo(f"{topic.key:<20} {topic.kind:<8} {topic.message.__name__:<17} {topic.writer:<22} {topic.doc}")
+            typer.echo(f"{known.key:<20} {kind:<8} {message:<17} {known.writer:<22} {doc}".rstrip())
 
 
 @app.command()
-def info(key: AnyKey, as_json: options.Json = False) -> None:
-    """Show what a topic carries, field by field; for a request also the answer and an example to call it with."""
+def info(
+    key: AnyKey, cell: options.CellName = None, as_json: options.Json = False, domain: options.Domain = None,
+    connect: options.Connect = None,
+) -> None:
+    """Show what a topic carries, field by field; for a request also the answer and an example to call it with.
+
+    Who writes or serves it is asked of the cells that are up; while there are none, of those of the configuration.
+    """
+    from cli.owners import known_keys
     from cli.schema import example_of, fields_of
 
-    topic = topic_of(key)
+    known = known_keys(cell, domain, connect).get(key)
+    topic = known.topic if known and known.topic else topic_of(key)
+    parameters = key.removeprefix("param/") if key.startswith("param/") else ""
+    writer = parameters or (known.writer if known else "")
     answer = getattr(topic, "answer", None)
     if as_json:
         described: dict[str, Any] = {
-            "key": topic.key, "kind": topic.kind, "writer": topic.writer, "doc": topic.doc,
+            "key": topic.key, "kind": topic.kind, "writer": writer, "doc": topic.doc,
             "message": topic.message.__name__, "schema": topic.message.model_json_schema(),
         }
         if answer:
@@ -56,7 +72,7 @@ def info(key: AnyKey, as_json: options.Json = False) -> None:
         typer.echo(json.dumps(described))
         return
     typer.echo(f"{topic.key}: {topic.doc}\nkind: {topic.kind}")
-    typer.echo(f"{'served' if answer else 'written'} by: {topic.writer}")
+    typer.echo(f"{'served' if answer else 'written'} by: {writer or 'nobody here'}")
     typer.echo(f"message: {topic.message.__name__}")
     for line in fields_of(topic.message):
         typer.echo(f"  {line}")
@@ -81,8 +97,12 @@ def echo(
     topic = published_or_foreign(key)
 
     async def visit(bus: Bus) -> None:
+        from cli.owners import topic_in
+        from common.topics import Topic
+
         shown = 0
-        lines = _messages(bus, topic, as_json) if topic else _foreign_messages(bus, key, as_json)
+        found = topic or await topic_in(bus, key)
+        lines = _messages(bus, found, as_json) if isinstance(found, Topic) else _foreign_messages(bus, key, as_json)
         async with aclosing(lines):
             async for line in lines:
                 typer.echo(line)

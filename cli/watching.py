@@ -86,7 +86,7 @@ class Watch:
         self._clock = clock
         self._known = all_topics()
         self._hearing: dict[str, Hearing] = {}
-        self._rates = Rates(self._known)
+        self._rates = Rates()
         self._counted: dict[str, tuple[float, ServiceCounters]] = {}  # by service: when [s], what
         self._received: dict[str, float] = {}  # by service [1/s]
         self._processes = Processes()

@@ -13,6 +13,7 @@ from common.errors import ZencellError
 
 if TYPE_CHECKING:
     from common.config import Cell, Parameters, ServiceEntry
+    from common.topics import Request, Topic
 
 UNWIRED = ("log", "counters")  # of everybody
 
@@ -38,6 +39,7 @@ class Wired:
     writes: list[str] = field(default_factory=list)
     serves: list[str] = field(default_factory=list)
     calls: list[str] = field(default_factory=list)
+    topics: dict[str, Topic[Any] | Request[Any, Any]] = field(default_factory=dict)  # all of these, by key
 
 
 def wired(cell: Cell, entry: ServiceEntry) -> Wired:
@@ -61,7 +63,7 @@ def wired(cell: Cell, entry: ServiceEntry) -> Wired:
     apart = config.model_copy(update={"port": 0}) if "port" in module.Config.model_fields else config
     try:
         with redirect_stdout(sys.stderr):  # stdout is for what was asked
-            found = asyncio.run(wiring(module.run, apart, service=entry.name))
+            found = asyncio.run(wiring(module.run, apart, service=entry.name, topics=entry.topics))
     except ZencellError:
         raise
     except Exception as error:
@@ -69,7 +71,9 @@ def wired(cell: Cell, entry: ServiceEntry) -> Wired:
     doc = (module.__doc__ or "").strip().partition("\n")[0]
     sides = ([topic for topic in side if topic.key not in UNWIRED]
              for side in (found.reads, found.writes, found.serves, found.calls))
-    return Wired(entry.name, doc, config, *(_in_order(side) for side in sides))
+    reads, writes, serves, calls = (_in_order(side) for side in sides)
+    every: set[Topic[Any] | Request[Any, Any]] = {*found.reads, *found.writes, *found.serves, *found.calls}
+    return Wired(entry.name, doc, config, reads, writes, serves, calls, {topic.key: topic for topic in every})
 
 
 def _in_order(side: list[Any]) -> list[str]:

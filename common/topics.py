@@ -1,12 +1,14 @@
-"""Every key that the platform knows, said once: its message, its kind and who writes it. Applications add their own.
+"""Every key that the platform knows, said once: its message and its kind. Applications add their own.
 
-A key on the wire is `<cell>/<topic>`, for example `panda/camera/image_raw`.
+A key on the wire is `<cell>/<topic>`, for example `panda/camera/image_raw`. Who writes it follows from
+the services of the cell: `zencell topic info`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Generic, Literal, TypeVar
+import warnings
+from dataclasses import InitVar, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from common import messages as m
 from common.moved import moved_to_applications
@@ -29,13 +31,11 @@ class Topic(Generic[M]):
     key: str
     message: type[M]
     kind: PublishedKind
-    writer: str
     doc: str
+    former: InitVar[str | None] = None
 
-    @property
-    def writers(self) -> list[str]:
-        """Services that write it, of which a cell has one."""
-        return self.writer.split(", ")
+    def __post_init__(self, former: str | None) -> None:
+        _leave_out_writer(self, former)
 
 
 @dataclass(frozen=True)
@@ -45,56 +45,57 @@ class Request(Generic[Q, A]):
     key: str
     message: type[Q]
     answer: type[A]
-    writer: str
     doc: str
-    kind: Literal["request"] = "request"
+    former: InitVar[str | None] = None
+    kind: Literal["request"] = field(default="request", init=False)
 
-    @property
-    def writers(self) -> list[str]:
-        """Services that answer it, of which a cell has one."""
-        return self.writer.split(", ")
+    def __post_init__(self, former: str | None) -> None:
+        _leave_out_writer(self, former)
 
 
-SCENE_OBJECT_UPDATES = Topic("scene_object_updates", m.SceneUpdate, "event", "trajectory_executor",
+def _leave_out_writer(topic: Topic[Any] | Request[Any, Any], former: str | None) -> None:
+    """Take the form of before, which named a writer ahead of the description: who writes is for the cell to say."""
+    if former is not None:
+        warnings.warn(f"{topic.key}: leave {topic.doc!r} out: a topic names no writer any more, the cell does",
+                      DeprecationWarning, stacklevel=4)
+        object.__setattr__(topic, "doc", former)
+
+
+SCENE_OBJECT_UPDATES = Topic("scene_object_updates", m.SceneUpdate, "event",
                              "remove:ball_3 when grasped, add:ball_3 when it lies still again")
-CAMERA_IMAGE = Topic("camera/image_raw", m.Image, "stream", "camera_simulator", "what the camera sees, 10 Hz")
-CAMERA_INFO = Topic("camera/camera_info", m.CameraInfo, "state", "camera_simulator", "intrinsics of the camera")
-PLANNING_SCENE = Topic("planning_scene", m.PlanningScene, "state", "scene_manager, outline_scene",
+CAMERA_IMAGE = Topic("camera/image_raw", m.Image, "stream", "what the camera sees, 10 Hz")
+CAMERA_INFO = Topic("camera/camera_info", m.CameraInfo, "state", "intrinsics of the camera")
+PLANNING_SCENE = Topic("planning_scene", m.PlanningScene, "state",
                        "fixtures and perceived objects with ids, attached object, allowed collisions")
-JOINT_STATES = Topic("joint_states", m.JointState, "stream", "trajectory_executor", "joint positions, 100 Hz")
-TF = Topic("tf", m.TFMessage, "stream", "robot_state_publisher", "poses of the robot's links")
-TF_STATIC = Topic("tf_static", m.TFMessage, "state", "robot_state_publisher", "poses that never change: base, camera")
-GRIPPER_STATE = Topic("gripper/state", m.GripperState, "state", "trajectory_executor",
-                      "width, whether it holds something, newest command")
-MOTION_STATUS = Topic("motion/status", m.MotionStatus, "state", "trajectory_executor",
-                      "newest goal: state, progress, error, source")
-DISPLAY_TRAJECTORY = Topic("display_trajectory", m.JointTrajectory, "state", "motion_planner", "newest plan")
-SCENE_OBJECTS = Topic("scene_objects", m.WorldObjects, "state", "trajectory_executor",
+JOINT_STATES = Topic("joint_states", m.JointState, "stream", "joint positions, 100 Hz")
+TF = Topic("tf", m.TFMessage, "stream", "poses of the robot's links")
+TF_STATIC = Topic("tf_static", m.TFMessage, "state", "poses that never change: base, camera")
+GRIPPER_STATE = Topic("gripper/state", m.GripperState, "state", "width, whether it holds something, newest command")
+MOTION_STATUS = Topic("motion/status", m.MotionStatus, "state", "newest goal: state, progress, error, source")
+DISPLAY_TRAJECTORY = Topic("display_trajectory", m.JointTrajectory, "state", "newest plan")
+SCENE_OBJECTS = Topic("scene_objects", m.WorldObjects, "state",
                       "the truth: where every object is; simulated hardware only")
-DEPTH_CAMERA_IMAGE = Topic("depth_camera/image_raw", m.Image, "stream", "depth_camera", "colour picture")
-DEPTH_CAMERA_DEPTH = Topic("depth_camera/depth/image_raw", m.Image, "stream", "depth_camera",
+DEPTH_CAMERA_IMAGE = Topic("depth_camera/image_raw", m.Image, "stream", "colour picture")
+DEPTH_CAMERA_DEPTH = Topic("depth_camera/depth/image_raw", m.Image, "stream",
                            "depth along the optical axis [m], 32FC1, NaN where there is none")
-DEPTH_CAMERA_POINTS = Topic("depth_camera/points", m.PointCloud2, "stream", "depth_camera",
+DEPTH_CAMERA_POINTS = Topic("depth_camera/points", m.PointCloud2, "stream",
                             "coloured points, only while somebody listens")
-DEPTH_CAMERA_INFO = Topic("depth_camera/camera_info", m.CameraInfo, "state", "depth_camera", "intrinsics")
-SUPERVISOR_STATUS = Topic("supervisor/status", m.SupervisorStatus, "state", "supervisor", "all processes")
-LOG = Topic("log", m.LogLine, "event", "everyone", "log lines")
-COUNTERS = Topic("counters", m.ServiceCounters, "event", "everyone",
+DEPTH_CAMERA_INFO = Topic("depth_camera/camera_info", m.CameraInfo, "state", "intrinsics")
+SUPERVISOR_STATUS = Topic("supervisor/status", m.SupervisorStatus, "state", "all processes")
+LOG = Topic("log", m.LogLine, "event", "log lines")
+COUNTERS = Topic("counters", m.ServiceCounters, "event",
                  "received, dropped and refused messages of each service, each second")
 
-MOTION_PLAN = Request("motion/plan", m.PlanRequest, m.PlanResponse, "motion_planner", "plan a trajectory")
-MOTION_EXECUTE = Request("motion/execute", m.ExecuteRequest, m.MotionStatus, "trajectory_executor",
+MOTION_PLAN = Request("motion/plan", m.PlanRequest, m.PlanResponse, "plan a trajectory")
+MOTION_EXECUTE = Request("motion/execute", m.ExecuteRequest, m.MotionStatus,
                          "follow a trajectory; the result appears on motion/status")
-MOTION_STOP = Request("motion/stop", m.StopRequest, m.MotionStatus, "trajectory_executor", "bring the robot to rest")
-MOTION_HOLD = Request("motion/hold", m.HoldRequest, m.MotionStatus, "trajectory_executor",
-                      "pause the robot on its path, or let it go on")
-GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState, "trajectory_executor",
+MOTION_STOP = Request("motion/stop", m.StopRequest, m.MotionStatus, "bring the robot to rest")
+MOTION_HOLD = Request("motion/hold", m.HoldRequest, m.MotionStatus, "pause the robot on its path, or let it go on")
+GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState,
                           "move the fingers; the result appears on gripper/state")
-WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "trajectory_executor",
-                     "add, move, remove, reset; simulated hardware only")
-TASK_COMMAND = Request("task/command", m.TaskCommand, m.TaskStatus, "smart_pick_place, contour_tracer",
-                       "start, pause, resume or stop the task")
-PARAMETERS = Request("param/<service>", m.ParameterRequest, m.ParameterReply, "everyone",
+WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "add, move, remove, reset; simulated hardware only")
+TASK_COMMAND = Request("task/command", m.TaskCommand, m.TaskStatus, "start, pause, resume or stop the task")
+PARAMETERS = Request("param/<service>", m.ParameterRequest, m.ParameterReply,
                      "parameters of a service: what there is, and changing it while it runs")
 
 AnyTopic = Topic[m.Message] | Request[m.Message, m.Message]
@@ -102,7 +103,7 @@ AnyTopic = Topic[m.Message] | Request[m.Message, m.Message]
 
 def parameters_of(service: str) -> Request[m.ParameterRequest, m.ParameterReply]:
     """The request that a service answers for its own parameters."""
-    return replace(PARAMETERS, key=f"param/{service}", writer=service)
+    return replace(PARAMETERS, key=f"param/{service}")
 
 
 def platform_topics() -> dict[str, AnyTopic]:

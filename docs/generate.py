@@ -19,7 +19,7 @@ from common import topics
 from common.application import all_topics
 from common.config.tunables import bounds_of, is_tunable
 from common.planning.planners import load_planner
-from common.process.wiring import wiring
+from common.process.wiring import owned_in, wiring, wiring_of
 from docs.seed_parameters import CAMERA, CONTROLLER, VALIDATOR, SeedParameter
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -112,14 +112,28 @@ def parameters() -> str:
     return "\n".join(lines) + "\n"
 
 
+def writers() -> dict[str, str]:
+    """By key, who writes or serves it in the cells that come with the project."""
+    shared = {topic.key: "everyone" for topic in (topics.LOG, topics.COUNTERS, topics.PARAMETERS)}
+    found: dict[str, dict[str, None]] = {}
+    for name in c.names_of("cells"):
+        cell = c.load_cell(name, ["services.viewer.port=0"])  # it listens while it is looked at
+        wirings = {entry.name: asyncio.run(wiring_of(cell, entry)) for entry in cell.services.values()}
+        for key, (_, services) in owned_in(wirings).items():
+            found.setdefault(key, {}).update(dict.fromkeys(services))
+    return {**{key: ", ".join(services) for key, services in found.items()}, **shared,
+            topics.SUPERVISOR_STATUS.key: "supervisor"}
+
+
 def topic_table() -> str:
-    """All topics, of both cells."""
+    """All topics, of all cells."""
+    written_by = writers()
     lines = ["| key, after the cell | message | kind | written or served by | |", "|---|---|---|---|---|"]
     for topic in all_topics().values():
         message = topic.message.__name__
         if isinstance(topic, topics.Request):
             message = f"{message} → {topic.answer.__name__}"
-        lines.append(f"| `{topic.key}` | {message} | {topic.kind} | {topic.writer} | {topic.doc} |")
+        lines.append(f"| `{topic.key}` | {message} | {topic.kind} | {written_by[topic.key]} | {topic.doc} |")
     return "\n".join(lines)
 
 

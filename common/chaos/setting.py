@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from common.application import all_topics
 from common.chaos.agent import Chaos
 from common.chaos.plan import CELL_SECONDS, faults, plan
@@ -10,12 +12,13 @@ from common.hardware.loading import find_backend
 from common.supervision.supervisor import Supervisor
 from common.transport.bus import Bus
 from common.transport.keys import ROUTER
+from common.transport.ownership import Owner
 
 PICKS = "smart_pick_place"
 
 
 def chaos_in(
-    bus: Bus, cell: Cell, supervisor: Supervisor, seed: int, per_minute: float, *, until_ended: bool
+    bus: Bus, cell: Cell, supervisor: Supervisor, keys: list[str], seed: int, per_minute: float, *, until_ended: bool
 ) -> Chaos:
     """Faults for the processes and keys of a cell that is up.
 
@@ -23,18 +26,19 @@ def chaos_in(
         bus: of the supervisor.
         cell: the resolved cell.
         supervisor: knows the processes.
+        keys: of messages that may be damaged.
         seed: of the plan.
         per_minute: faults per minute of wall time, on average.
         until_ended: the faults end while a run of the task has time left to finish; else they go on.
     """
     ours = [entry.name for entry in cell.services.values()]
     processes = [status.name for status in supervisor.statuses if status.name in (ROUTER, *ours)]
-    balls = PICKS in ours and find_backend(cell.robot).simulated
+    balls = PICKS in [entry.kind for entry in cell.services.values()] and find_backend(cell.robot).simulated
     if until_ended:
         seconds = CELL_SECONDS / bus.clock.speed
-        planned = iter(plan(seed, processes, keys_of(ours), balls=balls, seconds=seconds, per_minute=per_minute))
+        planned = iter(plan(seed, processes, keys, balls=balls, seconds=seconds, per_minute=per_minute))
     else:
-        planned = faults(seed, processes, keys_of(ours), balls=balls, per_minute=per_minute)
+        planned = faults(seed, processes, keys, balls=balls, per_minute=per_minute)
 
     def pids() -> dict[str, int]:
         return {status.name: status.pid for status in supervisor.statuses if status.pid is not None}
@@ -42,6 +46,7 @@ def chaos_in(
     return Chaos(bus, planned, pids, cell.world.container if balls else None)
 
 
-def keys_of(services: list[str]) -> list[str]:
-    """Keys that these services write or answer, but for those of all services."""
-    return [key for key, topic in all_topics().items() if set(topic.writer.split(", ")) & set(services)]
+def keys_of(owners: Iterable[Owner], services: Iterable[str]) -> list[str]:
+    """Keys that these services write or answer, but for their parameters; the platform's first."""
+    owned = {owner.key for owner in owners if owner.service in set(services)}
+    return [key for key in all_topics() if key in owned]

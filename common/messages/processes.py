@@ -49,6 +49,7 @@ class ServiceCounters(Message):
 
     header: Header = Header()
     service: str
+    writes: list[str] = Field([], description="keys that it writes")
     received: dict[str, int] = {}
     dropped: dict[str, int] = Field({}, description="newer message came before this one was read")
     invalid: dict[str, int] = Field({}, description="payloads that did not parse or validate")

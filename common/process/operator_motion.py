@@ -144,11 +144,11 @@ class OperatorMotion:
 
     def _require_no_task(self) -> None:
         for reader in self._tasks:
-            task, name = reader.latest, reader.topic.writer
+            task = reader.latest
             if task is not None and task.paused:
-                raise MotionFailed("task_paused", f"{name} is paused, its motion is only held: stop the task first")
+                raise MotionFailed("task_paused", "the task is paused, its motion is only held: stop the task first")
             if task is not None and task.started and task.state not in AT_REST:
-                raise MotionFailed("task_busy", f"{name} is {task.state} and has the robot: stop the task first")
+                raise MotionFailed("task_busy", f"the task is {task.state} and has the robot: stop the task first")
 
     async def _ended(self, accepted: m.MotionStatus, patience: float) -> m.MotionStatus:
         """The status of the goal that was accepted, once it has succeeded."""

@@ -146,7 +146,7 @@ class TaskRunner(Generic[V]):
         """The holds to ask for, because something is missing or is back again; the view has what is missing."""
         if self._watchdog is None:
             return []
-        serving = {client.topic.writer: client.available for client in (self._plan, self._execute)}
+        serving = {client.server: client.available for client in (self._plan, self._execute)}
         holds = self._watchdog.look(monotonic(), serving, view.motion)
         view.trouble = self._watchdog.trouble
         return holds

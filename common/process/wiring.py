@@ -10,10 +10,12 @@ from typing import Any, TypeVar
 
 from common.clock import Clock
 from common.config import Cell, ServiceEntry, service_config
+from common.errors import ConfigError
 from common.messages import Message
 from common.topics import Request, Topic
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
+from common.transport.ownership import SHARED, Owner, refusal
 from common.transport.reader import Reader
 from common.transport.requests import Client
 from common.transport.writer import Writer
@@ -32,6 +34,38 @@ class Wiring:
     writes: set[Topic[Any]] = field(default_factory=set)
     serves: set[Request[Any, Any]] = field(default_factory=set)
     calls: set[Request[Any, Any]] = field(default_factory=set)
+
+
+    @property
+    def owns(self) -> set[Topic[Any] | Request[Any, Any]]:
+        """What it writes or serves, which in a cell nobody else does."""
+        owned: set[Topic[Any] | Request[Any, Any]] = {*self.writes, *self.serves}
+        return {topic for topic in owned if topic.key not in SHARED}
+
+
+def owned_in(wirings: Mapping[str, Wiring]) -> dict[str, tuple[Topic[Any] | Request[Any, Any], list[str]]]:
+    """By key what the services of a cell write or serve, and who does: more than one is one too many.
+
+    Args:
+        wirings: of its services, by their names.
+    """
+    found: dict[str, tuple[Topic[Any] | Request[Any, Any], list[str]]] = {}
+    for service, wired in wirings.items():
+        for topic in wired.owns:
+            found.setdefault(topic.key, (topic, []))[1].append(service)
+    return found
+
+
+def require_one_owner(wirings: Mapping[str, Wiring]) -> None:
+    """Return when no two services of a cell write or serve one key.
+
+    Raises:
+        ConfigError: two do; names both and what helps.
+    """
+    for topic, services in owned_in(wirings).values():
+        if len(services) > 1:
+            first, second, *_ = (Owner(topic.key, topic.key, service, service) for service in services)
+            raise ConfigError(f"services.{second.service}", ..., refusal(second, first))
 
 
 class Recorder(Bus):

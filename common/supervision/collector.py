@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from common import topics
-from common.application import all_topics
 from common.reporting.fold import Fold
 from common.sources import monotonic
 from common.supervision.rates import Rates
@@ -31,7 +30,7 @@ class Collector:
             started_at: when this process began [s, monotonic].
             on_progress: called with a line whenever the task got further.
         """
-        self.rates = Rates(all_topics())
+        self.rates = Rates()
         self.ended = asyncio.Event()
         self._fold = fold
         self._clock = bus.clock

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from common.messages import ServiceCounters
-from common.topics import AnyTopic
 
 
 class Rates:
     """Messages per second of each topic and of the service that writes it."""
 
-    def __init__(self, topics: dict[str, AnyTopic]) -> None:
-        """Start with nothing counted.
-
-        Args:
-            topics: by key, with their writers.
-        """
-        self._topics = topics
+    def __init__(self) -> None:
+        """Start with nothing counted."""
+        self._written: dict[str, list[str]] = {}  # keys by service
         self._last: dict[tuple[str, str], tuple[float, int]] = {}  # by reader and key: wall time [s] and count
         self._rates: dict[tuple[str, str], float] = {}
 
     def update(self, counters: ServiceCounters, now: float) -> None:
         """Take note of what a service has received until a wall time [s]."""
+        self._written[counters.service] = counters.writes
         for key, count in counters.received.items():
             pair = (counters.service, key)
             then, before = self._last.get(pair, (now, count))
@@ -35,10 +31,6 @@ class Rates:
 
     def busiest_of(self, service: str) -> tuple[str, float] | None:
         """The topic that a service writes most often, and its rate [Hz]; None when nobody reads from it."""
-        rates = [
-            (self.of_topic(topic.key), topic.key)
-            for topic in self._topics.values()
-            if topic.kind != "request" and service in topic.writers
-        ]
+        rates = [(self.of_topic(key), key) for key in self._written.get(service, ())]
         rate, key = max(rates, default=(0.0, ""))
         return (key, rate) if rate > 0 else None

@@ -224,7 +224,8 @@ class Bus:
 
     def counters(self) -> ServiceCounters:
         """What was received, dropped and refused so far, by key."""
-        counted = ServiceCounters(header=self.header(), service=self.service)
+        writes = [writer.topic.key for writer in self._writers if writer.topic.key not in SHARED]
+        counted = ServiceCounters(header=self.header(), service=self.service, writes=writes)
         sources: list[Reader[Any] | Server[Any, Any]] = [*self._readers, *self._servers]
         for source in sources:
             key = source.topic.key

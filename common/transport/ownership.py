@@ -53,11 +53,12 @@ async def require_only(mine: Mapping[str, Owner], look: Callable[[], Awaitable[l
             return
         if asyncio.get_running_loop().time() > deadline:
             other = min(others, key=lambda each: (each.service, each.key))
-            raise ConfigError(f"services.{mine[other.key].service}", ..., _refusal(mine[other.key], other))
+            raise ConfigError(f"services.{mine[other.key].service}", ..., refusal(mine[other.key], other))
         await asyncio.sleep(LOOK_PERIOD)
 
 
-def _refusal(mine: Owner, other: Owner) -> str:
+def refusal(mine: Owner, other: Owner) -> str:
+    """Why a key cannot be ours too, and what helps."""
     if mine.service == other.service:
         return f"another {mine.service} is up, which has {mine.key} already: end it first, or start one"
     folder, slash, last = mine.own.rpartition("/")

@@ -150,12 +150,18 @@ class Client(Generic[Q, A]):
         self._key = f"{cell}/{topic.key}"
         self._servers = servers
         self._waiting: dict[asyncio.Future[RawReply | None], None] = {}  # in their order
+        self._server = min(servers.names, default=topic.key)
         servers.on_change(self._on_servers)
 
     @property
     def available(self) -> bool:
         """Whether the router is reached and somebody serves the key."""
         return self._session.connected and bool(self._servers.names)
+
+    @property
+    def server(self) -> str:
+        """The service that serves the key, or did last; the key itself before any was known."""
+        return self._server
 
     async def wait_available(self, timeout: float | None = None) -> None:
         """Return as soon as somebody serves the key.
@@ -168,7 +174,8 @@ class Client(Generic[Q, A]):
         except TimeoutError:
             raise NoResponder(self.topic.key) from None
 
-    def _on_servers(self, _name: str, _there: bool) -> None:
+    def _on_servers(self, name: str, there: bool) -> None:
+        self._server = name if there else self._server
         if not self._servers.names:
             for future in self._waiting:
                 self._loop.call_later(_VANISH_SECONDS, _settle, future, None)

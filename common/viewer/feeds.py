@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from common import topics
-from common.application import all_topics
+from common.application import applications
 from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
 from common.applications.pick_place.topics import (
     DETECTED_OBJECTS,
@@ -18,7 +18,7 @@ from common.applications.pick_place.topics import (
 )
 from common.config import Members
 from common.messages import Message
-from common.topics import Request, Topic
+from common.topics import Request, Topic, platform_topics
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -36,14 +36,13 @@ ON_DEMAND: tuple[Topic[Any], ...] = (  # large, or made only for who listens
     topics.CAMERA_IMAGE, DETECTION_IMAGE, topics.DEPTH_CAMERA_IMAGE, CONTOUR_IMAGE, CONTOURS,
     topics.SCENE_OBJECTS, topics.TF, DETECTED_OBJECTS,
 )
-_OF_NO_SERVICE = ("supervisor", "everyone")
 _LOG_SIZE = 2000  # lines that may wait
 
 
 def in_cell(topic: Topic[Any] | Request[Any, Any], members: Members) -> bool:
-    """Whether a cell may have a topic: a service of it writes it, or one that is not known here might."""
-    known = {writer for other in all_topics().values() for writer in other.writers} | {"viewer"}
-    return bool({*topic.writers} & {*members.services, *_OF_NO_SERVICE}) or not {*members.services} <= known
+    """Whether a cell may have a topic: one of the platform's or its application's; any, with one of a person's own."""
+    own = next((found for found in applications() if found.name == members.application), None)
+    return own is None or topic.key in platform_topics() or topic.key in own.topics
 
 
 class Feeds:

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 import viser
 
-from common.application import all_topics
 from common.messages import ServiceCounters, SupervisorStatus
 from common.supervision.rates import Rates
 from common.viewer import words
@@ -28,7 +27,7 @@ class HealthPanel:
             services: of the cell, in start order.
         """
         self._services = list(services)
-        self._rates = Rates(all_topics())
+        self._rates = Rates()
         self._counters: dict[str, ServiceCounters] = {}
         self._html = gui.add_html("")
 

@@ -10,8 +10,8 @@ import pytest
 from common import topics
 from common.chaos.agent import Chaos
 from common.chaos.plan import Fault, Form
-from common.chaos.setting import keys_of
 from common.config import load_cell
+from common.process.wiring import owned_in, wiring_of
 from tests.harness import RunningCell, beside
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow]
@@ -33,7 +33,8 @@ async def test_a_run_under_a_plan_of_faults_ends_done_with_every_ball_in_the_box
 
 async def test_bad_messages_stop_no_service_and_a_ball_that_slips_is_taken_again(tmp_path: Path) -> None:
     panda = load_cell("panda")
-    keys = keys_of([entry.name for entry in panda.services.values()])
+    apart = load_cell("panda", ["services.viewer.port=0"])
+    keys = list(owned_in({entry.name: await wiring_of(apart, entry) for entry in apart.services.values()}))
     forms = [form for form in get_args(Form) if form not in ("", "huge")]
     bad = [Fault(0.0, "corrupt", key, form=form, count=2, seed=i) for i, key in enumerate(keys) for form in forms]
     bad += [Fault(0.0, "corrupt", key, form="huge") for key in (topics.GRIPPER_STATE.key, topics.JOINT_STATES.key)]

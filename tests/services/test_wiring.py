@@ -7,10 +7,11 @@ import importlib
 import pytest
 
 from common import topics
-from common.application import all_topics, applications
+from common.application import all_topics
 from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import Surroundings, World, load_cell, service_config
-from common.process.wiring import Wiring, wiring
+from common.errors import ConfigError
+from common.process.wiring import Wiring, owned_in, require_one_owner, wiring
 
 CELLS = {name: load_cell(name, ["services.viewer.port=0"]) for name in ("panda", "ur5")}
 SERVICES = [(cell, name) for cell, loaded in CELLS.items() for name in loaded.services]
@@ -44,15 +45,20 @@ async def test_the_camera_knows_the_truth_from_the_topic_alone(camera: str) -> N
     assert World not in [info.annotation for info in config.model_fields.values()]
 
 
-@pytest.mark.parametrize(("cell", "name"), SERVICES)
-async def test_service_writes_and_serves_what_the_topic_table_says(cell: str, name: str) -> None:
-    found = await wired(cell, name)
-    shared = {"log", "counters"}
-    views = {t.key for one in applications() if one.name != CELLS[cell].application for t in one.views}
-    assert {t.key for t in found.writes} - shared == {
-        t.key for t in all_topics().values() if t.kind != "request" and name in t.writers} - views
-    assert {t.key for t in found.serves} == {
-        t.key for t in all_topics().values() if t.kind == "request" and name in t.writers}
+async def test_every_topic_that_is_known_has_an_owner_in_a_cell_and_only_such_are_owned() -> None:
+    owned = {topic for cell, name in SERVICES for topic in (await wired(cell, name)).owns}
+    of_no_service = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.PARAMETERS}
+    assert owned == set(all_topics().values()) - of_no_service
+
+
+@pytest.mark.parametrize("cell", CELLS)
+async def test_no_two_services_of_a_cell_own_one_key(cell: str) -> None:
+    wirings = {name: await wired(cell, name) for name in CELLS[cell].services}
+    require_one_owner(wirings)
+    assert {key: services for key, (_, services) in owned_in(wirings).items() if len(services) != 1} == {}
+    twice = {**wirings, "another": next(found for found in wirings.values() if found.serves)}
+    with pytest.raises(ConfigError, match=r"services\.another: motion_planner has .* already.*as in topics: "):
+        require_one_owner(twice)
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -63,8 +69,9 @@ async def test_every_topic_that_is_read_or_asked_is_written_or_served_by_one_ser
     by_others = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS}  # and by everybody
     parameters = {topics.parameters_of(name) for name in CELLS[cell].services}  # which nobody serves by itself
     assert len(written) == len(set(written)) and len(served) == len(set(served))
-    for found in all_wired:
-        assert found.reads <= set(written) | by_others
+    for name, found in zip(CELLS[cell].services, all_wired, strict=True):
+        if name != SHOWING:  # which shows whatever there is
+            assert found.reads <= set(written) | by_others
         assert found.calls <= set(served) | parameters
 
 

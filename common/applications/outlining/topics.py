@@ -12,15 +12,12 @@ from common.applications.outlining.messages import (
 )
 from common.topics import Request, Topic
 
-CONTOURS = Topic("contours", Contours, "state", "contour_detector", "contours of the picture and the chosen one")
-CONTOUR_IMAGE = Topic("contour_image", m.Image, "state", "contour_detector", "the picture with labelled contours")
-CONTOUR_POINTS = Topic("contour_points", OutlinePoints, "state", "pixel_to_world",
-                       "outline of the chosen object's top face in world")
-CONTOUR_PATH = Topic("contour_path", OutlinePoints, "state", "duplicate_remover",
-                     "the same, cleared of duplicates")
-OUTLINE_STATUS = Topic("outline_status", OutlineStatus, "state", "contour_tracer", "state and figures")
-OUTLINE_SELECT = Request("outline/select", OutlineSelect, OutlineSelection, "contour_detector",
-                         "choose the object to outline")
+CONTOURS = Topic("contours", Contours, "state", "contours of the picture and the chosen one")
+CONTOUR_IMAGE = Topic("contour_image", m.Image, "state", "the picture with labelled contours")
+CONTOUR_POINTS = Topic("contour_points", OutlinePoints, "state", "outline of the chosen object's top face in world")
+CONTOUR_PATH = Topic("contour_path", OutlinePoints, "state", "the same, cleared of duplicates")
+OUTLINE_STATUS = Topic("outline_status", OutlineStatus, "state", "state and figures")
+OUTLINE_SELECT = Request("outline/select", OutlineSelect, OutlineSelection, "choose the object to outline")
 
 STATUS = OUTLINE_STATUS
 DECIDED_BY = CONTOUR_PATH

@@ -6,18 +6,15 @@ from common import messages as m
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.topics import Topic
 
-SCENE_BALLS = Topic("scene_balls", m.PoseArray, "state", "trajectory_executor",
-                    "the truth: where every ball is; simulated hardware only")
-DETECTED_OBJECTS = Topic("detected_objects", m.MarkerArray, "stream", "vision_detector",
-                         "balls found in the picture, in world")
-DETECTION_IMAGE = Topic("detection_image", m.Image, "stream", "vision_detector", "the picture with what was found")
-VALIDATED_TARGETS = Topic("validated_targets", m.PoseArray, "stream", "workspace_validator",
-                          "detections that the arm can take, in world")
-REJECTED_TARGETS = Topic("rejected_targets", m.Rejections, "event", "workspace_validator",
+SCENE_BALLS = Topic("scene_balls", m.PoseArray, "state", "the truth: where every ball is; simulated hardware only")
+DETECTED_OBJECTS = Topic("detected_objects", m.MarkerArray, "stream", "balls found in the picture, in world")
+DETECTION_IMAGE = Topic("detection_image", m.Image, "stream", "the picture with what was found")
+VALIDATED_TARGETS = Topic("validated_targets", m.PoseArray, "stream", "detections that the arm can take, in world")
+REJECTED_TARGETS = Topic("rejected_targets", m.Rejections, "event",
                          "detections that it can not take, with the reason, once for each place")
-WORKSPACE_MARKERS = Topic("workspace_markers", m.MarkerArray, "state", "workspace_validator",
+WORKSPACE_MARKERS = Topic("workspace_markers", m.MarkerArray, "state",
                           "reachable shell and excluded column as cylinders")
-PICK_PLACE_STATUS = Topic("pick_place_status", PickPlaceStatus, "state", "smart_pick_place",
+PICK_PLACE_STATUS = Topic("pick_place_status", PickPlaceStatus, "state",
                           "IDLE, GRASPING, PLACING, HOMING, DONE or ERROR, and counters")
 
 STATUS = PICK_PLACE_STATUS

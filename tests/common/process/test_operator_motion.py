@@ -126,8 +126,8 @@ async def test_way_that_can_not_be_planned_is_told_and_nothing_moves(cell: Cell,
 @pytest.mark.parametrize(
     ("said", "told"),
     [
-        ({"started": True, "state": "GRASPING"}, "smart_pick_place is GRASPING and has the robot: stop the task first"),
-        ({"started": True, "state": "IDLE", "paused": True}, "smart_pick_place is paused"),
+        ({"started": True, "state": "GRASPING"}, "the task is GRASPING and has the robot: stop the task first"),
+        ({"started": True, "state": "IDLE", "paused": True}, "the task is paused"),
     ],
 )
 async def test_robot_that_a_task_has_is_left_to_it(
@@ -183,7 +183,7 @@ async def test_task_that_begins_meanwhile_is_named(cell: Cell, person: OperatorM
 
     server = next(s for s in cell.bus._servers if s.topic is topics.MOTION_PLAN)
     server._handler = begin
-    with pytest.raises(MotionFailed, match="smart_pick_place is GRASPING"):
+    with pytest.raises(MotionFailed, match="the task is GRASPING"):
         await person.move(HOME)
 
 

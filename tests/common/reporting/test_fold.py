@@ -60,7 +60,7 @@ class MoveStatus(TaskStatus):
 @pytest.fixture
 def own() -> Application:
     module = ModuleType("my_pkg.move")
-    module.STATUS = Topic("move_status", MoveStatus, "state", "move", "state")  # type: ignore[attr-defined]
+    module.STATUS = Topic("move_status", MoveStatus, "state", "state")  # type: ignore[attr-defined]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "my_pkg", ModuleType("my_pkg"))
         patch.setitem(sys.modules, "my_pkg.move", module)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 
 import pytest
 
@@ -11,6 +12,7 @@ from common.errors import NoResponder
 from common.messages import Image, LogLine, TaskCommand, TaskStatus
 from common.process.in_process import running_service
 from common.process.wiring import wiring
+from common.topics import Request, Topic
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 
@@ -132,3 +134,13 @@ async def test_buses_of_two_networks_or_cells_do_not_meet() -> None:
     assert net.bus("other", cell="b").reader(PICK_PLACE_STATUS).latest is None
     assert LocalNetwork().bus("other", cell="a").reader(PICK_PLACE_STATUS).latest is None
     assert net.bus("same", cell="a").reader(PICK_PLACE_STATUS).latest == PickPlaceStatus()
+
+
+def test_topic_and_request_of_before_named_a_writer_and_are_still_taken_with_a_warning() -> None:
+    with pytest.warns(DeprecationWarning, match="mine: leave 'my_service' out"):
+        topic = Topic("mine", LogLine, "state", "my_service", "what it is")
+    assert topic == Topic("mine", LogLine, "state", "what it is") and topic.doc == "what it is"
+    with pytest.warns(DeprecationWarning, match="ask: leave 'my_service' out"):
+        request = Request("ask", TaskCommand, TaskStatus, "my_service", "asks for it")
+    assert (request.doc, request.kind) == ("asks for it", "request")
+    assert replace(topic, key="other") == Topic("other", LogLine, "state", "what it is")

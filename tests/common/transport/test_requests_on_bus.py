@@ -195,7 +195,7 @@ async def test_plain_client_is_answered_under_the_exact_key(new_bus) -> None:
 
 
 async def test_answer_of_another_kind_is_a_remote_error(new_bus) -> None:
-    other = Request("task/command", TaskCommand, TaskCommand, "server", "")
+    other = Request("task/command", TaskCommand, TaskCommand, "")
 
     async def echo(request: TaskCommand) -> TaskCommand:
         return request
