@@ -10,7 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from common.config import Cell
-    from common.viewer.listening import FreePort
+    from common.viewer.access import FreePort
 
 VIEWER = "viewer"
 HIGHEST_PORT = 65535
@@ -45,8 +45,15 @@ def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
         ConfigError: there is no page, the port is taken, or one of the options can not be used.
     """
     from common.errors import ConfigError
-    from common.viewer.access import TOKEN_VARIABLE, address_of, is_loopback, make_token
-    from common.viewer.listening import first_free_port, open_socket, refusal
+    from common.viewer.access import (
+        TOKEN_VARIABLE,
+        address_of,
+        first_free_port,
+        is_loopback,
+        make_token,
+        open_socket,
+        refusal,
+    )
 
     entry = next((entry for entry in cell.services.values() if entry.kind == VIEWER), None)
     for option, value in (("--viewer-port", port), ("--viewer-host", host)):

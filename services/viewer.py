@@ -8,23 +8,22 @@ from typing import TYPE_CHECKING
 import viser
 from pydantic import Field
 
-from common.applications.outlining.topics import OUTLINE_STATUS
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from common.application import find_application
 from common.config import Members, Parameters, RobotConfig, Run, Surroundings
 from common.process.operator_motion import OperatorMotion
 from common.process.service import main
 from common.transport.bus import Bus
 from common.viewer.access import address_of
-from common.viewer.feeds import Feeds
+from common.viewer.console import Console
+from common.viewer.feeds import Feeds, Periods
 from common.viewer.guard import close_server, make_server
+from common.viewer.layers import Layers, find_layers
 from common.viewer.layout import load_layout
-from common.viewer.page import Page
-from common.viewer.periods import Periods
+from common.viewer.page import Page, Topics
 from common.viewer.plots import Limits
-from common.viewer.requests import Requests
 
 if TYPE_CHECKING:
-    from common.viewer.scene_view import SceneView
+    from common.viewer.scene import Scene
 
 IDLE_PERIOD = 0.1  # [s] wall: without a browser
 START_PATIENCE = 15.0  # [s] wall: for the other services to be ready
@@ -44,21 +43,25 @@ class Config(Parameters):
         False, description="the port is reached through a loopback only, as compose.yaml has it: no token is needed"
     )
     layout: str = Field("", description="file of the layout; empty: config/viewer.yaml")
+    layers: list[str] = Field([], description="layers of the scene of your own: dotted modules, as my_pkg.my_layer")
     rate: float = Field(30.0, ge=1, le=60, description="of the moving robot, wall time [Hz]")
     picture_rate: float = Field(10.0, gt=0, le=30, description="of each camera picture at most, wall time [Hz]")
 
 
-def load(server: viser.ViserServer, config: Config, layers: dict[str, bool]) -> tuple[SceneView, Limits, list[str]]:
+def load(
+    server: viser.ViserServer, config: Config, layers: Layers, console: Console, feeds: Feeds, shown: dict[str, bool]
+) -> tuple[Scene, Limits, list[str]]:
     """The scene with its meshes, the limits of the joints and the names of the planners; takes seconds."""
     from common.planning.planners import planner_names
     from common.robot.model import RobotModel
-    from common.viewer.client_files import client_files
-    from common.viewer.scene_view import SceneView
+    from common.viewer.scene import Scene
+    from common.viewer.viser_inside import client_files
 
     client_files()  # kept from now on
     robot = RobotModel.load(config.robot)
     limits = Limits(robot.joint_names, robot.lower, robot.upper, robot.velocity)
-    return SceneView(server, robot, config.world, visible=layers), limits, planner_names()
+    scene = Scene(server, robot, config.world, layers, console, feeds.latest, shown=shown)
+    return scene, limits, planner_names()
 
 
 async def quiet(bus: Bus, config: Config, page: Page) -> None:
@@ -83,23 +86,30 @@ async def _visited(page: Page) -> None:
 async def run(bus: Bus, config: Config) -> None:
     """Show the cell to whoever looks, until cancelled."""
     layout = load_layout(config.layout)
-    feeds = Feeds(bus, config.members)
-    requests = Requests(bus, config.members, feeds)
-    tasks = [feeds.reader(topic) for topic in (PICK_PLACE_STATUS, OUTLINE_STATUS)]
-    motions = OperatorMotion(bus, [reader for reader in tasks if reader is not None])
+    application = find_application(config.members.application) if config.members.application else None
+    layers = find_layers(application, config.layers)
+    read = Topics(application, layers)
+    feeds = Feeds(bus, read.always, read.on_demand)
+    console = Console(bus, config.members, feeds, read.requests)
+    status = feeds.reader(read.status) if read.status is not None else None
+    motions = OperatorMotion(bus, [status] if status is not None else [])
     server = make_server(config.host, config.port, config.token, published=config.published)
     try:
         page = Page(
-            server, feeds, requests, motions, config.members, cell=config.run.cell, layout=layout,
+            server, feeds, console, motions, config.members, application, layers, cell=config.run.cell, layout=layout,
             layout_file=config.layout, periods=Periods(picture=1 / config.picture_rate),
         )
         await bus.ready()
         host = "127.0.0.1" if config.published else config.host
         bus.log.info("the page is at %s", address_of(host, server.get_port()))
+
+        async def complete() -> None:
+            await quiet(bus, config, page)
+            page.complete(*await asyncio.to_thread(load, server, config, layers, console, feeds, page.shown))
+
         async with asyncio.TaskGroup() as group:
-            for activity in page.activities(bus.clock.age_ms):
+            for activity in [*page.activities(bus.clock.age_ms), complete()]:
                 group.create_task(activity)
-            group.create_task(_complete(bus, config, server, page))
             loop = asyncio.get_running_loop()
             due = loop.time()
             while True:
@@ -108,11 +118,6 @@ async def run(bus: Bus, config: Config) -> None:
                 await asyncio.sleep(due - loop.time())
     finally:
         close_server(server)
-
-
-async def _complete(bus: Bus, config: Config, server: viser.ViserServer, page: Page) -> None:
-    await quiet(bus, config, page)
-    page.complete(*await asyncio.to_thread(load, server, config, page.layers))
 
 
 if __name__ == "__main__":

@@ -1,24 +1,13 @@
-"""What the page reads, and when: everything that the cell has, pictures and the truth only while somebody looks."""
+"""What the page reads, and when: what its panels are made of always, anything else only while somebody looks at it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from common import topics
-from common.application import applications
-from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
-from common.applications.pick_place.topics import (
-    DETECTED_OBJECTS,
-    DETECTION_IMAGE,
-    PICK_PLACE_STATUS,
-    REJECTED_TARGETS,
-    VALIDATED_TARGETS,
-    WORKSPACE_MARKERS,
-)
-from common.config import Members
 from common.messages import Message
-from common.topics import Request, Topic, platform_topics
+from common.topics import Topic
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -26,47 +15,37 @@ if TYPE_CHECKING:
 
 M = TypeVar("M", bound=Message)
 
-ALWAYS: tuple[Topic[Any], ...] = (  # small or seldom
-    topics.JOINT_STATES, topics.TF_STATIC, topics.PLANNING_SCENE, VALIDATED_TARGETS, REJECTED_TARGETS,
-    WORKSPACE_MARKERS, topics.CAMERA_INFO, topics.DEPTH_CAMERA_INFO, topics.DISPLAY_TRAJECTORY,
-    topics.MOTION_STATUS, topics.GRIPPER_STATE, PICK_PLACE_STATUS, OUTLINE_STATUS,
-    CONTOUR_PATH, topics.SUPERVISOR_STATUS, topics.COUNTERS, topics.LOG,
-)
-ON_DEMAND: tuple[Topic[Any], ...] = (  # large, or made only for who listens
-    topics.CAMERA_IMAGE, DETECTION_IMAGE, topics.DEPTH_CAMERA_IMAGE, CONTOUR_IMAGE, CONTOURS,
-    topics.SCENE_OBJECTS, topics.TF, DETECTED_OBJECTS,
-)
 _LOG_SIZE = 2000  # lines that may wait
 
 
-def in_cell(topic: Topic[Any] | Request[Any, Any], members: Members) -> bool:
-    """Whether a cell may have a topic: one of the platform's or its application's; any, with one of a person's own."""
-    own = next((found for found in applications() if found.name == members.application), None)
-    return own is None or topic.key in platform_topics() or topic.key in own.topics
-
-
 class Feeds:
-    """A reader for each topic that the cell has."""
+    """A reader for each topic that the page has to do with."""
 
-    def __init__(self, bus: Bus, members: Members) -> None:
+    def __init__(
+        self, bus: Bus, always: Iterable[Topic[Any]], on_demand: Iterable[Topic[Any]] = ()
+    ) -> None:
         """Declare the readers.
 
         Args:
             bus: of the service.
-            members: who is in the cell.
+            always: what is read all the time.
+            on_demand: what is read while `listen` says so; events are read all the time, since each counts.
         """
         self._bus = bus
         self._readers: dict[str, Reader[Any]] = {}
         self._seen: dict[str, Message] = {}
-        for topic in (*ALWAYS, *ON_DEMAND):
-            if in_cell(topic, members):
-                self._readers[topic.key] = bus.reader(topic, size=_LOG_SIZE, listening=topic in ALWAYS)
+        self._on_demand: set[str] = set()
+        for topic, listening in [*((t, True) for t in always), *((t, t.kind == "event") for t in on_demand)]:
+            if topic.key not in self._readers:
+                self._readers[topic.key] = bus.reader(topic, size=_LOG_SIZE, listening=listening)
+                if not listening:
+                    self._on_demand.add(topic.key)
 
     def __contains__(self, topic: Topic[Any]) -> bool:
         return topic.key in self._readers
 
     def reader(self, topic: Topic[M]) -> Reader[M] | None:
-        """The reader of a topic, or None when the cell does not have it."""
+        """The reader of a topic, or None when the page does not read it."""
         return self._readers.get(topic.key)
 
     def latest(self, topic: Topic[M]) -> M | None:
@@ -85,6 +64,73 @@ class Feeds:
     def listen(self, wanted: Iterable[Topic[Any]]) -> None:
         """Listen to these of the topics that are read on demand, and to no other of them."""
         keys = {topic.key for topic in wanted}
-        for topic in ON_DEMAND:
-            if topic.key in self._readers:
-                self._bus.listen(self._readers[topic.key], topic.key in keys)
+        for key in self._on_demand:
+            self._bus.listen(self._readers[key], key in keys)
+
+
+class Latest(Protocol):
+    """Where the newest message of a topic comes from: `Feeds.latest`."""
+
+    def __call__(self, topic: Topic[M], /) -> M | None:
+        """The newest message, or None."""
+
+
+class Shows(Protocol):
+    """A part of the page that shows messages."""
+
+    @property
+    def TOPICS(self) -> Sequence[Topic[Any]]:
+        """What it is shown."""
+
+    @property
+    def PERIOD(self) -> float:
+        """Least time between two looks at what is new [s]."""
+
+    def show(self, topic: Topic[Any], message: Any, /) -> None:
+        """Show a message."""
+
+
+class News:
+    """Has a part of the page show the newest message of each of its topics, once, and no more often than it wants.
+
+    Events are not among them: each counts, and is shown when it comes.
+    """
+
+    def __init__(self, part: Shows, latest: Latest) -> None:
+        """Tell a part what is new."""
+        self._part, self._latest = part, latest
+        self._seen: dict[str, Message] = {}
+        self._due = 0.0
+
+    def tell(self, now: float) -> None:
+        """Show what is new at a wall time [s], if it is time."""
+        if now < self._due:
+            return
+        for topic in self._part.TOPICS:
+            message = None if topic.kind == "event" else self._latest(topic)
+            if message is not None and message is not self._seen.get(topic.key):
+                self._seen[topic.key] = message
+                self._due = now + self._part.PERIOD
+                self._part.show(topic, message)
+
+
+@dataclass
+class Periods:
+    """Wall time between two looks at a part of the page [s]."""
+
+    picture: float = 0.1
+    task: float = 0.2
+    health: float = 0.25
+    plots: float = 0.5
+    _due: dict[str, float] = field(default_factory=dict)
+
+    def due(self, part: str, now: float) -> bool:
+        """Whether it is time for a part at a wall time [s]; it is done then."""
+        if now < self._due.get(part, 0.0):
+            return False
+        self._due[part] = now + float(getattr(self, part))
+        return True
+
+    def hurry(self) -> None:
+        """Have it be time for everything: somebody has come who has seen nothing yet."""
+        self._due.clear()

@@ -1,21 +1,121 @@
-"""A robot in the scene: a node for each joint below that of its parent, and in them the links that have a shape."""
+"""Where links and frames are, as joint states and transforms come, and a robot in the scene that is moved there."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import pinocchio as pin
 import viser
+from numpy.typing import NDArray
 
-from common.viewer.link_poses import LinkPoses
-from common.viewer.robot_meshes import Piece
-from common.viewer.urdf_visuals import Rgb
+from common.config import CameraConfig
+from common.messages import TFMessage, TransformStamped
+from common.robot.model import RobotModel
+from common.robot.transforms import pose_to_matrix, rpy_to_matrix, transform
+from common.viewer.robot_meshes import Piece, Rgb
 
+Array = NDArray[np.float64]
+
+_JOINT_STILL = 1e-6  # [rad or m] a joint that moves by less has not moved: 1 micrometre at 1 m
 _STILL = 1e-7  # [m or of a unit quaternion]
 
 
+class LinkPoses:
+    """Forward kinematics of all joints, in world: of any joints, in any order. Has working data of its own."""
+
+    def __init__(self, robot: RobotModel) -> None:
+        """Start with the group at home and other joints where the robot file locks them."""
+        self._model = robot.full_model
+        self._data = self._model.createData()
+        self._q = robot.full_reference.copy()
+        self._index = {name: self._model.joints[i].idx_q for i, name in enumerate(self._model.names) if i}
+        self._frames = {f.name: i for i, f in enumerate(self._model.frames) if f.type == pin.FrameType.BODY}
+        self.moves = 0  # how often any joint has moved
+        self._names: tuple[str, ...] = ()
+        self._picked: list[int] = []
+        self._slots: list[int] = []
+        self.update(robot.joint_names, [float(value) for value in robot.named("home")])
+        self._compute()
+
+    def knows(self, link: str) -> bool:
+        """Whether the robot has that link."""
+        return link in self._frames
+
+    def update(self, names: Sequence[str], positions: Sequence[float]) -> bool:
+        """Take over joint positions [rad or m]; whether any has changed. Joints that the robot lacks are left out."""
+        if tuple(names) != self._names:
+            self._names = tuple(names)
+            self._picked = [i for i, name in enumerate(names) if name in self._index]
+            self._slots = [self._index[names[i]] for i in self._picked]
+        values = np.asarray(positions, dtype=float)[self._picked]
+        if (np.abs(values - self._q[self._slots]) < _JOINT_STILL).all():
+            return False
+        self._q[self._slots] = values
+        self._compute()
+        self.moves += 1
+        return True
+
+    def has_joint(self, name: str) -> bool:
+        """Whether the robot has that joint."""
+        return name in self._index
+
+    def joint_positions(self, names: Sequence[str]) -> Array:
+        """Positions [rad or m] of joints of the robot."""
+        return np.asarray(self._q[[self._index[name] for name in names]])
+
+    def pose(self, link: str) -> tuple[Array, Array]:
+        """Position (3,) [m] and quaternion w, x, y, z (4,) of a link in world."""
+        x = pin.SE3ToXYZQUAT(self._data.oMf[self._frames[link]])
+        return x[:3], x[[6, 3, 4, 5]]
+
+    @property
+    def joints(self) -> list[tuple[str, int, int]]:
+        """Name, index and index of the parent of each joint, parents first; 0 is the world."""
+        return [(str(name), i, int(self._model.parents[i])) for i, name in enumerate(self._model.names) if i]
+
+    def carrier(self, link: str) -> tuple[int, Array, Array]:
+        """The joint that carries a link, and the link's position (3,) [m] and quaternion w, x, y, z (4,) in it."""
+        frame = self._model.frames[self._frames[link]]
+        x = pin.SE3ToXYZQUAT(frame.placement)
+        return int(frame.parentJoint), x[:3], x[[6, 3, 4, 5]]
+
+    def in_parents(self) -> Array:
+        """(n, 7) position [m] and quaternion w, x, y, z of each of `joints` in the frame of its parent."""
+        x = np.array([pin.SE3ToXYZQUAT(self._data.liMi[i]) for i in range(1, self._model.njoints)])
+        return np.asarray(x[:, [0, 1, 2, 6, 3, 4, 5]])
+
+    def _compute(self) -> None:
+        pin.framesForwardKinematics(self._model, self._data, self._q)
+
+
+class Transforms:
+    """The newest transform of each frame, of tf and tf_static together."""
+
+    def __init__(self, camera: CameraConfig) -> None:
+        """Know only what the surroundings say: the pose of the camera, which also stands for unknown frames."""
+        self._T_world_camera = transform(rpy_to_matrix(*camera.rpy), camera.position)
+        self.newest: dict[str, TransformStamped] = {}  # by frame
+
+    def update(self, m: TFMessage) -> None:
+        """Take over transforms."""
+        self.newest.update((each.child_frame_id, each) for each in m.transforms)
+
+    def pose(self, frame: str) -> Array:
+        """(4, 4) T_world_frame, or what the surroundings say when transforms do not lead to world."""
+        T, seen = np.eye(4), set()
+        while frame not in ("", "world"):
+            each = self.newest.get(frame)
+            if each is None or frame in seen:
+                return self._T_world_camera
+            seen.add(frame)
+            T = pose_to_matrix(each.transform) @ T
+            frame = each.header.frame_id
+        return T
+
+
 class Figure:
-    """The robot as it is, or as a ghost of one colour."""
+    """A node for each joint below that of its parent, and in them the links that have a shape."""
 
     def __init__(
         self,
@@ -34,7 +134,7 @@ class Figure:
             scene: to which they are added.
             root: name of the node above all links.
             pieces: meshes of the links.
-            poses: belongs to this figure from now on.
+            poses: where its links are, now and at each `follow`.
             color: replaces the colours of the pieces.
             opacity: 0 to 1; None: opaque.
             visible: whether it is shown.
@@ -69,12 +169,15 @@ class Figure:
             self._draw()
         self.root.visible = on
 
-    def move(self, names: Sequence[str], positions: Sequence[float]) -> bool:
-        """Move to joint positions [rad or m]; whether anything moved."""
-        moved = self.poses.update(names, positions)
-        if moved:
+    def move(self, names: Sequence[str], positions: Sequence[float]) -> None:
+        """Move to joint positions [rad or m]."""
+        self.poses.update(names, positions)
+        self.follow()
+
+    def follow(self) -> None:
+        """Be where `poses` is by now."""
+        if self.poses.moves != self._moves:
             self._place()
-        return moved
 
     def _draw(self) -> None:
         """Send the meshes, once: a browser takes its time over meshes that are hidden, too."""
@@ -87,6 +190,7 @@ class Figure:
 
     def _place(self) -> None:
         """Say only what moved: of a joint that turns just the rotation, which moves everything beyond it."""
+        self._moves = self.poses.moves
         poses = self.poses.in_parents()
         moved = ~(np.abs(poses - self._placed) < _STILL)
         self._placed = poses

@@ -1,8 +1,6 @@
 """A viser server that answers only who may open the page.
 
-viser has no authentication, and takes a WebSocket from any web page. Its server is one call of `websockets`' `serve`,
-which can ask a function about each request before anything else reads it. viser gives its own function there, which
-sends the page; ours is put in front of it, while the server is made, and sends the page itself. Nothing is copied
+The guard is asked about each request before anything else reads it, and sends the page itself. Nothing is copied
 through a second process and nothing else listens, so that no port is left unguarded.
 """
 
@@ -13,27 +11,31 @@ import inspect
 import logging
 import os
 import threading
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import viser
 import websockets.asyncio.server as websocket_server
-from rich import get_console
-from viser._messages import ShareUrlDisconnect, ShareUrlRequest
 from websockets import Headers
 from websockets.http11 import Request, Response
 
 from common.errors import ConfigError
-from common.viewer.access import SHORTEST_TOKEN, TOKEN, TOKEN_VARIABLE, Access, Answer, is_loopback
-from common.viewer.client_files import File, client_files
-from common.viewer.listening import open_socket, refusal
+from common.viewer.access import (
+    SHORTEST_TOKEN,
+    TOKEN,
+    TOKEN_VARIABLE,
+    Access,
+    Answer,
+    is_loopback,
+    open_socket,
+    refusal,
+)
+from common.viewer.viser_inside import File, Process, client_files, made_server, quiet
 
 if TYPE_CHECKING:
     import asyncio
-    import socket
 
 log = logging.getLogger(__name__)
 
@@ -50,10 +52,6 @@ POLICY = (
     "img-src 'self' data: blob:; media-src data: blob:; font-src 'self' data:; worker-src 'self' blob:; "
     "connect-src 'self' {own} data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-
-Process = Callable[[websocket_server.ServerConnection, Request], "Awaitable[Response | None] | Response | None"]
-
-_replacing = threading.Lock()
 
 
 def make_server(host: str, port: int, token: str = "", *, published: bool = False) -> viser.ViserServer:
@@ -77,19 +75,7 @@ def make_server(host: str, port: int, token: str = "", *, published: bool = Fals
     except OSError as error:
         raise refusal(error, host, port) from None
     guard = Guard(Access("127.0.0.1" if published else host, listening.getsockname()[1], token))
-    try:
-        with _serving(listening, guard), _quiet():
-            server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    except BaseException:
-        listening.close()
-        raise
-    if not guard.in_place:
-        server.stop()
-        listening.close()
-        raise RuntimeError(f"viser {viser.__version__} serves in another way than the guard of its page knows")
-    # Whoever has the page open could ask for these, and get it tunnelled to a public server.
-    for message in (ShareUrlRequest, ShareUrlDisconnect):
-        server._websock_server.unregister_handler(message)
+    server = made_server(listening, guard.before, OPTIONS)
     if not (published or is_loopback(host)):
         log.warning(
             "the page is served beyond this machine, without encryption: `ssh -L %d:127.0.0.1:%d HOST` to a page on "
@@ -101,7 +87,7 @@ def make_server(host: str, port: int, token: str = "", *, published: bool = Fals
 def close_server(server: viser.ViserServer) -> None:
     """Close all pages and stop listening; what takes longer than `STOP_TIMEOUT` goes on in the background."""
     stopping = threading.Thread(target=server.stop, daemon=True)
-    with _quiet():
+    with quiet():
         stopping.start()
         stopping.join(STOP_TIMEOUT)
     if stopping.is_alive():
@@ -114,11 +100,9 @@ class Guard:
     def __init__(self, access: Access) -> None:
         """Hold to these rules."""
         self.access = access
-        self.in_place = False
 
-    def before(self, process: Process | None) -> Process:
+    def before(self, process: Process) -> Process:
         """What to ask about a request instead of `process`, which is asked about those that may pass."""
-        self.in_place = process is not None
 
         async def guarded(connection: websocket_server.ServerConnection, request: Request) -> Response | None:
             said = {name: request.headers.get_all(name) for name in ("host", "origin", "cookie")}
@@ -133,7 +117,7 @@ class Guard:
             file = None if upgrade else client_files().get(urlsplit(request.path).path)
             if file is not None:
                 return _protected(_sent(file, request), said["host"], lasts=file.lasts)
-            response = process(connection, request) if process else None
+            response = process(connection, request)
             if inspect.isawaitable(response):
                 response = await response
             return None if response is None else _protected(response, said["host"])
@@ -192,35 +176,6 @@ def _protected(response: Response, hosts: list[str], *, lasts: bool = False) -> 
     response.headers["Cross-Origin-Resource-Policy"] = "same-origin"
     response.headers["Cache-Control"] = "private, max-age=31536000, immutable" if lasts else "no-store"
     return response
-
-
-@contextmanager
-def _serving(listening: socket.socket, guard: Guard) -> Iterator[None]:
-    """A block in which a WebSocket server that is made listens at that socket, behind that guard."""
-
-    def serve(handler: Any, host: Any, port: Any, *, process_request: Process | None = None, **options: Any) -> Any:
-        del host, port  # viser would try the next port, and the next, when one is taken
-        options |= {**OPTIONS, "sock": listening, "process_request": guard.before(process_request)}
-        return original(handler, **options)
-
-    with _replacing:
-        original = websocket_server.serve
-        websocket_server.serve = serve  # type: ignore[assignment,misc]
-        try:
-            yield
-        finally:
-            websocket_server.serve = original  # type: ignore[misc]
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """A block in which viser writes no frames around its address on stdout."""
-    console = get_console()
-    before, console.quiet = console.quiet, True
-    try:
-        yield
-    finally:
-        console.quiet = before
 
 
 def _is_news(record: logging.LogRecord) -> bool:

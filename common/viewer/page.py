@@ -1,99 +1,140 @@
-"""The operator's page: panels around the scene, fed with what the cell says while somebody looks."""
+"""The operator's page: panels around the scene, fed with what the cell says while somebody looks.
+
+An application adds to it in its part `page`: words for its task (words.py), layers of the scene (layers), and
+
+    REQUESTS = (SELECT,)                                   # what its buttons and layers ask by `Console.ask`
+    class Controls:                                        # its own buttons, below those of every task
+        TOPICS, PERIOD = (CHOICES,), 0.5                   # as of a layer
+        def __init__(self, gui: viser.GuiApi, console: Console) -> None:
+        def show(self, topic: Topic[Any], message: Any) -> None:
+"""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import viser
 
 from common import topics
-from common.applications.outlining.messages import OutlineSelect
-from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
-from common.applications.pick_place.topics import (
-    DETECTION_IMAGE,
-    PICK_PLACE_STATUS,
-    REJECTED_TARGETS,
-    VALIDATED_TARGETS,
-)
+from common.application import Application
 from common.config import Members, check
 from common.errors import ZencellError
-from common.messages import Image
+from common.messages import Image, Rejections
 from common.reporting.summary import Rejected
-from common.topics import Topic
-from common.viewer.desk import Desk
-from common.viewer.feeds import Feeds
-from common.viewer.health import HealthPanel
-from common.viewer.layers import layers_shown
+from common.topics import Request, Topic
+from common.viewer.console import Console
+from common.viewer.feeds import Feeds, News, Periods
+from common.viewer.health import HealthPanel, LogPanel
+from common.viewer.layers import Layers, layers_shown
 from common.viewer.layout import TABS, Layout, Tab, Viewpoint, save_layout
-from common.viewer.log_panel import LogPanel
-from common.viewer.move_panel import Motions, MovePanel
-from common.viewer.periods import Periods
+from common.viewer.markup import block, span
+from common.viewer.move import Motions, MovePanel
 from common.viewer.pictures import ANNOTATED, LIVE, PicturePanel
 from common.viewer.plots import Limits, PlotPanel
-from common.viewer.requests import Requests
-from common.viewer.scene_feed import SceneFeed
-from common.viewer.surface import furnish
 from common.viewer.task_panel import TaskPanel
 from common.viewer.tuning import TuningPanel
-from common.viewer.view_panel import ViewPanel
-from common.viewer.words import gripper
+from common.viewer.words import TaskWords, gripper
 
 if TYPE_CHECKING:
-    from common.viewer.scene_view import SceneView
+    from common.viewer.scene import Scene
 
-OUTLINER = "contour_tracer"
-IMAGES: dict[str, tuple[Topic[Image], ...]] = {
-    LIVE: (topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
-    ANNOTATED: (DETECTION_IMAGE, CONTOUR_IMAGE),
-}
-STAMPED: tuple[Topic[Any], ...] = (VALIDATED_TARGETS, CONTOUR_PATH)  # with when the picture was taken
+ALWAYS: tuple[Topic[Any], ...] = (
+    topics.JOINT_STATES, topics.MOTION_STATUS, topics.GRIPPER_STATE, topics.SUPERVISOR_STATUS, topics.COUNTERS,
+    topics.LOG,
+)
+
+
+class Topics:
+    """What the page has to do with: what every cell has, what the application names, and what layers show.
+
+    Attributes:
+        status, rejected, decided_by: of the application, if it has them.
+        images: pictures as the cameras send them, and with what was found in them.
+        requests: what the application asks.
+        on_demand: what is read while somebody looks at it.
+    """
+
+    def __init__(self, application: Application | None, layers: Layers) -> None:
+        """Look at what an application and layers say."""
+
+        def named(part: str, name: str) -> Any:
+            return application.find(part, name) if application is not None else None
+
+        self.status: Topic[Any] | None = named("topics", "STATUS")
+        self.rejected: Topic[Rejections] | None = named("topics", "REJECTED")
+        self.decided_by: Topic[Any] | None = named("topics", "DECIDED_BY")
+        annotated: Topic[Image] | None = named("topics", "ANNOTATED")
+        self.images: dict[str, list[Topic[Image]]] = {
+            LIVE: [topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE], ANNOTATED: [annotated] if annotated else [],
+        }
+        self.requests: Sequence[Request[Any, Any]] = named("page", "REQUESTS") or ()
+        controls = getattr(named("page", "Controls"), "TOPICS", ())
+        shown = [topic for kind in layers.values() for topic in kind.TOPICS]
+        self.on_demand: list[Topic[Any]] = [*self.images[LIVE], *self.images[ANNOTATED], *controls, *shown]
+
+    @property
+    def always(self) -> list[Topic[Any]]:
+        """What is read all the time: small or seldom."""
+        return [*ALWAYS, *(topic for topic in (self.status, self.rejected, self.decided_by) if topic is not None)]
 
 
 class Page:
     """Everything that a browser shows. Used on the loop of the service.
 
     Attributes:
-        desk: carries out what persons do.
         pages: how many browsers look.
         visited: set once one has.
     """
 
     def __init__(
-        self, server: viser.ViserServer, feeds: Feeds, requests: Requests, motions: Motions, members: Members, *,
-        cell: str, layout: Layout, layout_file: str, periods: Periods,
+        self, server: viser.ViserServer, feeds: Feeds, console: Console, motions: Motions, members: Members,
+        application: Application | None, layers: Layers, *, cell: str, layout: Layout, layout_file: str,
+        periods: Periods,
     ) -> None:
         """Lay the page out; on the running loop.
 
         Args:
             server: that serves it.
             feeds: what the cell says.
-            requests: to the cell.
+            console: to the cell.
             motions: for the person.
             members: of the cell.
+            application: what the cell is for.
+            layers: of the scene.
             cell: its name.
             layout: what is on.
             layout_file: where the layout is kept; empty for the project's file.
             periods: of the parts.
+
+        Raises:
+            UnknownName: the layout has a layer that there is not.
         """
-        self._server, self._feeds, self._requests = server, feeds, requests
-        self._motions, self._cell = motions, cell
+        self._server, self._feeds, self.console = server, feeds, console
+        self._motions, self._cell, self._kinds = motions, cell, layers
         self._layout, self._layout_file, self._periods = layout, layout_file, periods
-        self._scene = SceneFeed(feeds, periods, layout.layers, layout.edit_world)
+        self._topics, self._words = Topics(application, layers), TaskWords.of(application)
+        self._shown, self._editing = layers_shown(layout.layers, layers), layout.edit_world
         self._rejected = Rejected()
+        self._happened: list[tuple[Topic[Any], Any]] = []  # before there is a scene: an event does not come again
+        self._scene: Scene | None = None
         self._plots: PlotPanel | None = None
         self._move: MovePanel | None = None
         self.pages = 0
         self.visited = asyncio.Event()
-        self.desk = Desk(asyncio.get_running_loop(), self._tell)
-        furnish(server)
+        _furnish(server)
         gui = server.gui
         gui.configure_theme(dark_mode=layout.dark, show_logo=False, show_share_button=False)
         gui.set_panel_label(f"zencell · {cell}")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(layout.panel_width)
-        self._task = TaskPanel(gui, self.desk, requests, outlines=members.task == OUTLINER, home=self._home)
+        self._task = TaskPanel(gui, console, self._words, self._home)
+        console.tell = self._task.tell
+        make = application.find("page", "Controls") if application is not None else None
+        self._controls = make(gui, console) if make is not None else None
+        self._news = News(self._controls, feeds.latest) if self._controls is not None else None
         panel = gui.add_panel()
         tabs = {name: panel.add_tab(name) for name in layout.tabs}
         panel.dock_below(gui.main_panel)
@@ -102,36 +143,50 @@ class Page:
         self._place = place
         with place["Cameras"]:
             self._pictures = PicturePanel(
-                gui, self.desk, {LIVE: layout.live_image, ANNOTATED: layout.annotated_image}, self._listen)
+                gui, console, {LIVE: layout.live_image, ANNOTATED: layout.annotated_image}, self._listen)
         with place["Health"]:
             self._health = HealthPanel(gui, members.services)
         with place["Log"]:
-            self._log = LogPanel(gui, self.desk, layout.log_level)
-        self._tuning = TuningPanel(gui, place["Tuning"], self.desk, requests)
+            self._log = LogPanel(gui, console, layout.log_level)
+        self._tuning = TuningPanel(gui, place["Tuning"], console)
         with place["View"]:
-            self._view = ViewPanel(gui, self.desk, self._scene.layers, self._scene.editing, on_layer=self._set_layer,
-                                   on_editing=self._set_editing, on_save=self._save)
+            self._lay_out_view(gui)
         viewpoint = layout.viewpoint(cell)
         server.initial_camera.position = viewpoint.position
         server.initial_camera.look_at = viewpoint.look_at
 
         async def count(_client: viser.ClientHandle) -> None:
-            self.desk.put(self._count)
+            console.put(self._count)
 
         server.on_client_connect(count)
         server.on_client_disconnect(count)
 
-    def _tell(self, line: str) -> None:
-        self._task.tell(line)
+    def _lay_out_view(self, gui: viser.GuiApi) -> None:
+        """Ticks for the layers, one for editing the simulated world, and a button that saves the layout."""
+        for name, kind in self._kinds.items():
+            self.console.on_change(gui.add_checkbox(kind.LABEL or name, self._shown[name]),
+                                   partial(self._set_layer, name))
+        gui.add_divider()
+        edit = gui.add_checkbox("Edit the simulated world", self._editing, hint="drag objects to other places")
+        self.console.on_change(edit, self._set_editing)
+        button = gui.add_button("Save layout", icon=viser.Icon.DEVICE_FLOPPY,
+                                hint="what is on now, and this view of the scene, is how the page opens")
+
+        async def clicked(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+            client = event.client
+            self.console.put(lambda: self._save(client))
+
+        button.on_click(clicked)
+        self._note = gui.add_html("")
 
     # --- what is shown --------------------------------------------------------------------------------------------
 
     @property
-    def layers(self) -> dict[str, bool]:
+    def shown(self) -> dict[str, bool]:
         """Whether each layer of the scene is shown."""
-        return dict(self._scene.layers)
+        return dict(self._shown)
 
-    def complete(self, scene: SceneView, limits: Limits, planners: list[str]) -> None:
+    def complete(self, scene: Scene, limits: Limits, planners: list[str]) -> None:
         """Add what takes a while to load, and show what the cell says in the scene from now on.
 
         Args:
@@ -141,14 +196,18 @@ class Page:
         """
         gui = self._server.gui
         with self._place["Plots"]:
-            seen = "Picture to targets" if VALIDATED_TARGETS in self._feeds else "Picture to path"
-            self._plots = PlotPanel(gui, limits, seen)
+            self._plots = PlotPanel(gui, limits, self._words.latency)
         with self._place["Move"]:
-            self._move = MovePanel(gui, self.desk, self._motions, scene, planners, planner=self._layout.planner,
-                                   marker=self._layout.goal_marker, tell=self._task.tell, play=self._scene.play)
-        scene.on_select = lambda index: self.desk.put(lambda: self._select(index))
-        scene.on_object_dragged = lambda name, x, y: self.desk.put(lambda: self._requests.move(name, x, y))
-        self._scene.begin(scene)
+            self._move = MovePanel(gui, self.console, self._motions, scene, planners, planner=self._layout.planner,
+                                   marker=self._layout.goal_marker, tell=self._task.tell, play=scene.play)
+        for name, on in self._shown.items():
+            scene.set_shown(name, on)
+        if self._editing:
+            scene.set_editing(True)
+        for topic, event in self._happened:
+            scene.happened(topic, event)
+        self._happened.clear()
+        self._scene = scene
 
     def refresh(self, now: float, alive: frozenset[str]) -> None:
         """Show what is new at a wall time [s], monotonic; without a browser only what plots need is kept.
@@ -163,7 +222,7 @@ class Page:
         if not self.pages:
             return
         if self._periods.due("task", now):
-            task = self._feeds.latest(OUTLINE_STATUS) or self._feeds.latest(PICK_PLACE_STATUS)
+            task = self._feeds.latest(self._topics.status) if self._topics.status is not None else None
             holding = self._feeds.latest(topics.GRIPPER_STATE)
             self._task.show(task, self._feeds.latest(topics.MOTION_STATUS), gripper(holding),
                             len(self._rejected.places))
@@ -173,19 +232,19 @@ class Page:
         if self._plots is not None and self._periods.due("plots", now):
             self._plots.show(now)
         if self._periods.due("picture", now):
-            self._show_pictures(now)
-        contours = self._feeds.fresh(CONTOURS) if self._periods.due("contours", now) else None
-        if contours is not None:
-            self._task.show_contours(contours)
-        self._scene.show(state, contours, now)
+            self._show_pictures()
+        if self._news is not None:
+            self._news.tell(now)
+        if self._scene is not None:
+            self._scene.refresh(now)
 
-    def _show_pictures(self, now: float) -> None:
-        for name, sources in IMAGES.items():
+    def _show_pictures(self) -> None:
+        for name, sources in self._topics.images.items():
             for topic in sources:
                 image = self._feeds.fresh(topic) if self._pictures.shown[name] else None
                 rgb = self._pictures.show(name, image) if image is not None else None
-                if rgb is not None and name == LIVE:
-                    self._scene.picture(rgb, now)
+                if rgb is not None and name == LIVE and self._scene is not None:
+                    self._scene.picture(topic, rgb)
 
     # --- what goes on beside ------------------------------------------------------------------------------------------
 
@@ -195,35 +254,42 @@ class Page:
         Args:
             age_ms: wall time [ms] since a stamp was taken.
         """
-        return [self.desk.run(), self._follow_log(), self._follow_counters(), self._follow_rejected(),
-                self._follow_parameters(), *(self._follow_latency(topic, age_ms) for topic in STAMPED)]
+        now = asyncio.get_running_loop().time
 
-    async def _follow_log(self) -> None:
-        if (reader := self._feeds.reader(topics.LOG)) is not None:
-            async for line in reader:
-                self._log.add(line)
+        def older(message: Any) -> None:
+            if self._plots is not None:
+                self._plots.latency(age_ms(message.header.stamp), now())
 
-    async def _follow_counters(self) -> None:
-        if (reader := self._feeds.reader(topics.COUNTERS)) is not None:
-            async for counters in reader:
-                self._health.count(counters, asyncio.get_running_loop().time())
+        def reject(rejections: Rejections) -> None:
+            self._rejected.add(rejections.rejected)
 
-    async def _follow_rejected(self) -> None:
-        if (reader := self._feeds.reader(REJECTED_TARGETS)) is not None:
-            async for rejections in reader:
-                self._scene.reject(rejections)
-                self._rejected.add(rejections.rejected)
+        acts: dict[Topic[Any], list[Callable[[Any], None]]] = {
+            topics.LOG: [self._log.add], topics.COUNTERS: [lambda counters: self._health.count(counters, now())],
+        }
+        if self._topics.decided_by is not None:
+            acts.setdefault(self._topics.decided_by, []).append(older)
+        if self._topics.rejected is not None:
+            acts.setdefault(self._topics.rejected, []).append(reject)
+        for topic in {topic for kind in self._kinds.values() for topic in kind.TOPICS if topic.kind == "event"}:
+            acts.setdefault(topic, []).append(partial(self._happen, topic))
+        return [self.console.run(), self._follow_parameters(), *(self._follow(*each) for each in acts.items())]
 
-    async def _follow_latency(self, topic: Topic[Any], age_ms: Callable[[int], float]) -> None:
+    async def _follow(self, topic: Topic[Any], acts: list[Callable[[Any], None]]) -> None:
         if (reader := self._feeds.reader(topic)) is not None:
             async for message in reader:
-                if self._plots is not None:
-                    self._plots.latency(age_ms(message.header.stamp), asyncio.get_running_loop().time())
+                for act in acts:
+                    act(message)
+
+    def _happen(self, topic: Topic[Any], event: Any) -> None:
+        if self._scene is not None:
+            self._scene.happened(topic, event)
+        else:
+            self._happened.append((topic, event))
 
     async def _follow_parameters(self) -> None:
         while True:
             if self.pages:
-                self._tuning.show(await self._requests.parameters())
+                self._tuning.show(await self.console.parameters())
             await asyncio.sleep(1.0)
 
     # --- what persons do ------------------------------------------------------------------------------------------
@@ -236,10 +302,13 @@ class Page:
         self._listen()
 
     def _listen(self) -> None:
+        """Read what somebody sees, and nothing else of what is read on demand."""
         wanted: list[Topic[Any]] = []
         if self.pages:
-            wanted += self._scene.wanted()
-            for name, sources in IMAGES.items():
+            wanted += self._controls.TOPICS if self._controls is not None else ()
+            for name, kind in self._kinds.items():
+                wanted += kind.TOPICS if self._shown[name] or (kind.EDITS and self._editing) else ()
+            for name, sources in self._topics.images.items():
                 wanted += sources if self._pictures.shown[name] else ()
         self._feeds.listen(wanted)
 
@@ -249,39 +318,55 @@ class Page:
         else:
             await self._move.go_home()
 
-    async def _select(self, index: int) -> None:
-        await self._task.choose(OutlineSelect(rule="index", index=index))
-
     def _set_layer(self, name: str, on: bool) -> None:
-        self._scene.set_layer(name, on)
+        self._shown[name] = on
+        if self._scene is not None:
+            self._scene.set_shown(name, on)
         self._listen()
 
     def _set_editing(self, on: bool) -> None:
-        self._scene.set_editing(on)
+        self._editing = on
+        if self._scene is not None:
+            self._scene.set_editing(on)
         self._listen()
 
-    def _chosen_motion(self) -> dict[str, object]:
-        return {"goal_marker": self._move.marker, "planner": self._move.planner} if self._move else {}
-
     def _save(self, client: viser.ClientHandle | None) -> None:
-        usual = layers_shown({})
+        usual = layers_shown({}, self._kinds)
+        elsewhere = {name: on for name, on in self._layout.layers.items() if name not in usual}
         viewpoints = dict(self._layout.viewpoints)
+        motion = {"goal_marker": self._move.marker, "planner": self._move.planner} if self._move else {}
         try:
             if client is not None:
                 seen = {"position": client.camera.position, "look_at": client.camera.look_at}
                 viewpoints[self._cell] = check(Viewpoint, {name: [round(float(v), 3) for v in point]
                                                            for name, point in seen.items()}, "viewpoint")
             layout = self._layout.model_copy(update={
-                "layers": {name: on for name, on in self._scene.layers.items() if on != usual[name]},
+                "layers": elsewhere | {name: on for name, on in self._shown.items() if on != usual[name]},
                 "viewpoints": viewpoints, "live_image": self._pictures.shown[LIVE],
                 "annotated_image": self._pictures.shown[ANNOTATED], "log_level": self._log.level,
-                "edit_world": self._scene.editing, **self._chosen_motion(),
+                "edit_world": self._editing, **motion,
             })
             path = save_layout(self._layout_file, layout)
         except OSError as error:
-            self._view.tell(f"{error.filename or 'the layout'} can not be written: {error.strerror}", "bad")
+            self._say(f"{error.filename or 'the layout'} can not be written: {error.strerror}", "bad")
         except ZencellError as error:
-            self._view.tell(str(error), "bad")
+            self._say(str(error), "bad")
         else:
             self._layout = layout
-            self._view.tell(f"Saved in {path}", "good")
+            self._say(f"Saved in {path}", "good")
+
+    def _say(self, line: str, kind: str) -> None:
+        """How saving went."""
+        self._note.content = block(span(line, kind), "layout", kind=kind)
+
+
+def _furnish(server: viser.ViserServer) -> None:
+    """Set light and lens. Before anything else is sent: what was drawn in another light has to get new shaders."""
+    scene, view = server.scene, server.initial_camera
+    scene.set_up_direction("+z")
+    scene.configure_default_lights(cast_shadow=False)
+    scene.configure_environment_map(hdri=None)  # a browser without a graphics card needs seconds to prepare one
+    scene.add_light_hemisphere("/sky", sky_color=(255, 255, 255), ground_color=(120, 115, 110), intensity=2.0)
+    scene.world_axes.visible = False
+    view.up = (0.0, 0.0, 1.0)
+    view.fov = 0.9

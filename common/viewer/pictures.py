@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from common.messages import Image
 from common.perception.image import ImageError, image_to_array
-from common.viewer.desk import Desk
+from common.viewer.console import Desk
 from common.viewer.markup import block, span
 
 WIDEST = 640  # [px] that are sent: more than the panel shows

@@ -113,7 +113,7 @@ class PlotPanel:
 
 
 def _short(joints: Sequence[str]) -> list[str]:
-    """Names without what all of them begin with, as joint1 of panda_joint1, or end with, as elbow of elbow_joint."""
+    """Names without what all of them begin with, as joint1 of arm_joint1, or end with, as elbow of elbow_joint."""
     first = joints[0].partition("_")[0] + "_"
     shared = first if len(joints) > 1 and all(name.startswith(first) for name in joints) else ""
     return [name.removeprefix(shared).removesuffix("_joint").replace("_", " ") for name in joints]

@@ -1,26 +1,22 @@
-"""What states and codes are called on the page."""
+"""What states and codes are called on the page. An application brings words of its own in its part `page`:
+
+    STATES = {"SORTING": "Sorting"}                   # of its task, beside IDLE, HOMING, DONE and ERROR
+    LATENCY = "Picture to targets"                    # what the age of DECIDED_BY is called
+    def counters(status: TaskStatus, rejected: int) -> dict[str, object]:            # the figures below the state
+    def progress(status: TaskStatus, motion: MotionStatus | None) -> float:          # 0 to 1, of the bar
+"""
 
 from __future__ import annotations
 
-from common.applications.outlining.messages import OutlineStatus
-from common.applications.pick_place.messages import PickPlaceStatus
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from common.application import Application
 from common.errors import NoResponder, RemoteError, ZencellError
 from common.messages import GripperState, MotionStatus, PlanResponse, TaskStatus
 from common.viewer.markup import BAD, BUSY, GOOD, OFF
 
-TASK_STATES = {
-    "IDLE": "Waiting",
-    "GRASPING": "Taking",
-    "PLACING": "Placing",
-    "HOMING": "Going home",
-    "SELECTING": "Waiting for a choice",
-    "PLANNING": "Planning",
-    "APPROACHING": "Approaching",
-    "TRACING": "Tracing",
-    "RETREATING": "Retreating",
-    "DONE": "Done",
-    "ERROR": "Failed",
-}
+STATES = {"IDLE": "Waiting", "HOMING": "Going home", "DONE": "Done", "ERROR": "Failed"}
 SERVICE_STATES = {
     "waiting": ("waits for others", OFF),
     "starting": ("starting", BUSY),
@@ -42,21 +38,59 @@ GOAL_STATES = {
 }
 
 
-def task_state(status: TaskStatus | None) -> tuple[str, str]:
-    """What the task does, in words, and how that is."""
-    if status is None:
-        return "Not known yet", OFF
-    word = TASK_STATES.get(status.state, status.state.capitalize())
-    if status.state == "ERROR":
-        return word, BAD
-    if status.paused:
-        return "Paused", BUSY
-    if status.state == "DONE":
-        return word, GOOD
-    if not status.started:
-        return "Stopped" if status.state != "IDLE" else "Waiting for start", OFF
-    thing = status.object if isinstance(status, OutlineStatus) else status.subject
-    return f"{word} {thing}".rstrip(), GOOD
+def counters(status: TaskStatus, rejected: int) -> dict[str, object]:
+    """The figures of any task by their names."""
+    figures = {name.replace("_", " "): value for name, value in status.figures.items() if value is not None}
+    seen = {"rejected": rejected} if rejected else {}
+    return {"done": status.done, "of": status.total, **figures, **seen, "retries": status.retries,
+            "failures": status.failures}
+
+
+def progress(status: TaskStatus, motion: MotionStatus | None) -> float:
+    """How far any task is, 0 to 1: what is done of what there is, or without a number the motion under way."""
+    if status.total:
+        return min(1.0, status.done / status.total)
+    return motion.progress if motion is not None and motion.state == "active" else 0.0
+
+
+@dataclass(frozen=True)
+class TaskWords:
+    """How the task is told of: in words that fit every task, or in those of its application."""
+
+    states: Mapping[str, str] = field(default_factory=lambda: STATES)
+    counters: Callable[[TaskStatus, int], Mapping[str, object]] = counters
+    progress: Callable[[TaskStatus, MotionStatus | None], float] = progress
+    latency: str = "Picture to decision"
+
+    @classmethod
+    def of(cls, application: Application | None) -> TaskWords:
+        """The words of an application."""
+        page = application.part("page") if application is not None else None
+        return cls(
+            {**STATES, **getattr(page, "STATES", {})}, getattr(page, "counters", counters),
+            getattr(page, "progress", progress), getattr(page, "LATENCY", cls.latency),
+        )
+
+    def state(self, status: TaskStatus | None) -> tuple[str, str]:
+        """What the task does, in words, and how that is."""
+        if status is None:
+            return "Not known yet", OFF
+        word = self.states.get(status.state, status.state.replace("_", " ").capitalize())
+        if status.state == "ERROR":
+            return word, BAD
+        if status.paused:
+            return "Paused", BUSY
+        if status.state == "DONE":
+            return word, GOOD
+        if not status.started:
+            return "Stopped" if status.state != "IDLE" else "Waiting for start", OFF
+        return f"{word} {status.subject}".rstrip(), GOOD
+
+    def done(self, status: TaskStatus | None, motion: MotionStatus | None) -> float:
+        """How far the task is, 0 to 1."""
+        if status is None:
+            return motion.progress if motion is not None and motion.state == "active" else 0.0
+        return 1.0 if status.state == "DONE" else self.progress(status, motion)
 
 
 def service_state(state: str, restarts: int) -> tuple[str, str]:
@@ -64,19 +98,6 @@ def service_state(state: str, restarts: int) -> tuple[str, str]:
     if state == "starting" and restarts:
         return "starts again", BAD
     return SERVICE_STATES[state]
-
-
-def counters(status: TaskStatus | None, rejected: int) -> dict[str, object]:
-    """The figures of the task by their names."""
-    if isinstance(status, OutlineStatus):
-        return {
-            "points": status.points, "outline [mm]": f"{1e3 * status.length_m:.0f}",
-            "planned": f"{100 * status.fraction:.0f} %", "failures": status.failures,
-        }
-    if isinstance(status, PickPlaceStatus):
-        return {"placed": status.done, "targets": status.total, "rejected": rejected, "retries": status.retries,
-                "failures": status.failures}
-    return {}
 
 
 def motion(status: MotionStatus | None) -> str:

@@ -10,8 +10,7 @@ import pytest
 from cli.viewing import page_of
 from common.config import Cell, load_cell
 from common.errors import ConfigError
-from common.viewer.access import TOKEN_VARIABLE
-from common.viewer.listening import FIRST_PORT
+from common.viewer.access import FIRST_PORT, TOKEN_VARIABLE
 from tests.harness import Zencell, ask
 
 OPTIONS = (("--viewer-port", "9000"), ("--viewer-host", "0.0.0.0"))
@@ -61,8 +60,8 @@ def test_page_is_on_this_machine_alone_unless_asked_for_more(cell: Cell) -> None
 
 
 def test_next_free_port_is_taken_when_none_was_named(cell: Cell, monkeypatch: pytest.MonkeyPatch, taken: int) -> None:
-    monkeypatch.setattr("common.viewer.listening.FIRST_PORT", taken)
-    monkeypatch.setattr("common.viewer.listening.LAST_PORT", taken + 50)
+    monkeypatch.setattr("common.viewer.access.FIRST_PORT", taken)
+    monkeypatch.setattr("common.viewer.access.LAST_PORT", taken + 50)
     page = page_of(cell, None, None)
     assert page is not None and taken < int(page.address.rpartition(":")[2]) <= taken + 50
 
@@ -77,8 +76,8 @@ def test_two_cells_that_come_up_at_the_same_time_have_pages_of_their_own(cell: C
 
 
 def test_no_free_port_is_said(cell: Cell, monkeypatch: pytest.MonkeyPatch, taken: int) -> None:
-    monkeypatch.setattr("common.viewer.listening.FIRST_PORT", taken)
-    monkeypatch.setattr("common.viewer.listening.LAST_PORT", taken)
+    monkeypatch.setattr("common.viewer.access.FIRST_PORT", taken)
+    monkeypatch.setattr("common.viewer.access.LAST_PORT", taken)
     with pytest.raises(ConfigError, match=f"--viewer-port: ports {taken} to {taken} are all in use"):
         page_of(cell, None, None)
 

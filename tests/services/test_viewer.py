@@ -16,6 +16,7 @@ import yaml
 
 from common import messages as m
 from common import topics
+from common.application import find_application
 from common.applications.outlining.messages import (
     Contour,
     Contours,
@@ -24,11 +25,12 @@ from common.applications.outlining.messages import (
     OutlineSelection,
     OutlineStatus,
 )
+from common.applications.outlining.page import choose
 from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT, OUTLINE_STATUS
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.topics import DETECTION_IMAGE, PICK_PLACE_STATUS, REJECTED_TARGETS
 from common.clock import Clock
-from common.config import Cell, load_cell, service_config
+from common.config import Cell, Members, load_cell, service_config
 from common.errors import Refused
 from common.process.in_process import running_service
 from common.transport.bus import Bus
@@ -51,29 +53,28 @@ class SceneDouble:
 
     made: ClassVar[list[SceneDouble]] = []
 
-    def __init__(self, *_: object, visible: Mapping[str, bool]) -> None:
-        self.on_select: Callable[[int], None] = lambda _: None
-        self.on_object_dragged: Callable[[str, float, float], None] = lambda *_: None
+    def __init__(self, *arguments: Any, shown: Mapping[str, bool]) -> None:
+        self.layers, self.console, self.latest = arguments[3:6]
         self.goal_pose = m.Pose(position=m.Vector3(x=0.4, z=0.5))
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
-        self.visible = dict(visible)
+        self.visible = dict(shown)
         self.begun = False  # is fed, and heard
         SceneDouble.made.append(self)
 
     def __getattr__(self, name: str) -> Callable[..., None]:
         return lambda *arguments: self.calls.append((name, arguments))
 
-    def set_visible(self, layer: str, on: bool) -> None:
+    def set_shown(self, layer: str, on: bool) -> None:
         self.visible[layer] = on
         self.begun = True
 
-    def shown(self, name: str) -> list[tuple[Any, ...]]:
+    def told(self, name: str) -> list[tuple[Any, ...]]:
         return [arguments for called, arguments in self.calls if called == name]
 
 
 @pytest.fixture(autouse=True)
 def scenes(monkeypatch: pytest.MonkeyPatch) -> list[SceneDouble]:
-    monkeypatch.setattr("common.viewer.scene_view.SceneView", SceneDouble)
+    monkeypatch.setattr("common.viewer.scene.Scene", SceneDouble)
     monkeypatch.setattr(viewer, "START_PATIENCE", 0.0)
     monkeypatch.setattr(SceneDouble, "made", [])
     return SceneDouble.made
@@ -317,7 +318,8 @@ async def test_chosen_object_is_traced_once_its_path_is_known() -> None:
 async def test_contour_that_is_clicked_in_the_scene_is_chosen(scenes: list[SceneDouble]) -> None:
     async with page_of("ur5") as played:
         await until(lambda: scenes and scenes[0].begun)
-        await asyncio.to_thread(lambda: scenes[0].on_select(1))  # as viser does
+        console, wanted = scenes[0].console, OutlineSelect(rule="index", index=1)
+        await asyncio.to_thread(lambda: console.put(lambda: choose(console, wanted)))  # as viser does
         await until(lambda: played.selects)
         assert played.selects == [OutlineSelect(rule="index", index=1)]
 
@@ -333,8 +335,9 @@ async def test_object_that_is_dragged_is_moved_in_the_world_and_a_refusal_is_tol
 
     panda.bus.serve(topics.WORLD_EDIT, edit)
     await page.set("Edit the simulated world", True)
-    await until(lambda: scenes and scenes[0].shown("set_editing"))
-    await asyncio.to_thread(lambda: scenes[0].on_object_dragged("ball_2", 0.5, 0.1))
+    await until(lambda: scenes and scenes[0].told("set_editing"))
+    console = scenes[0].console
+    await asyncio.to_thread(lambda: console.put(lambda: console.move("ball_2", 0.5, 0.1)))
     await page.until(lambda: "ball_1 lies there" in page.text)
     assert moved == [m.WorldEdit(op="move", id="ball_2", position=m.Vector3(x=0.5, y=0.1))]
 
@@ -352,9 +355,9 @@ async def test_scene_is_told_what_the_cell_says_while_somebody_looks(panda: Play
     scene = m.PlanningScene(header=m.Header())
     panda.bus.writer(topics.PLANNING_SCENE).put(scene)
     await until(lambda: scenes)
-    assert not scenes[0].shown("show_scene")
+    assert not scenes[0].told("refresh") and scenes[0].latest(topics.PLANNING_SCENE) is None
     async with opened(panda.port):
-        await until(lambda: scenes[0].shown("show_scene") == [(scene,)])
+        await until(lambda: scenes[0].told("refresh") and scenes[0].latest(topics.PLANNING_SCENE) == scene)
 
 
 async def test_plan_to_the_marker_tells_what_is_in_the_way(
@@ -371,7 +374,7 @@ async def test_plan_to_the_marker_tells_what_is_in_the_way(
     await until(lambda: scenes)
     await page.click("Plan here")
     await page.until(lambda: "Drag the goal marker" in page.text)
-    await until(lambda: scenes[0].shown("goal_marker") == [(True,)])
+    await until(lambda: scenes[0].told("goal_marker") == [(True,)])
     await page.set("Planner", "chomp")
     await page.click("Plan here")
     await page.until(lambda: "the goal collides; panda_hand would touch table" in page.text)
@@ -387,14 +390,14 @@ async def test_rejection_that_came_before_the_scene_is_shown_in_it(
         assert go.wait(PATIENCE)
         return SceneDouble(*arguments, **options)
 
-    monkeypatch.setattr("common.viewer.scene_view.SceneView", slow)
+    monkeypatch.setattr("common.viewer.scene.Scene", slow)
     async with page_of("panda") as played, opened(played.port) as page:
         rejected = m.Rejections(header=m.Header(), rejected=[m.Rejection(position=m.Vector3(x=1.0), reason="too far")])
         played.bus.writer(REJECTED_TARGETS).put(rejected)
         await page.click("Pause")  # the page is there before the scene is
         await until(lambda: played.commands)
         go.set()
-        await until(lambda: scenes and scenes[0].shown("show_rejected") == [(rejected,)])
+        await until(lambda: scenes and scenes[0].told("happened") == [(REJECTED_TARGETS, rejected)])
 
 
 async def test_meshes_are_read_when_the_cell_is_up_or_somebody_looks(
@@ -415,25 +418,60 @@ async def test_meshes_are_read_when_the_cell_is_up_or_somebody_looks(
         await until(lambda: scenes)
 
 
-async def test_plan_that_was_found_is_played_and_not_begun_anew(
+async def test_plan_that_was_found_is_played(
     panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
 ) -> None:
-    found, other = (m.JointTrajectory(header=m.Header(stamp=stamp), joint_names=["a"], points=[]) for stamp in (5, 6))
+    found = m.JointTrajectory(header=m.Header(stamp=5), joint_names=["a"], points=[])
 
     async def plan(request: m.PlanRequest) -> m.PlanResponse:
-        display.put(found)
         return m.PlanResponse(id=request.id, ok=True, planner="ompl", trajectory=found)
 
-    display = panda.bus.writer(topics.DISPLAY_TRAJECTORY)
     panda.bus.serve(topics.MOTION_PLAN, plan)
     await page.set("Goal marker", True)
-    await until(lambda: scenes and scenes[0].shown("goal_marker"))
+    await until(lambda: scenes and scenes[0].told("goal_marker"))
     await page.click("Plan here")
     await page.until(lambda: "Planned by ompl" in page.text)
-    display.put(other)
-    await until(lambda: (other,) in scenes[0].shown("show_plan"))
-    told = [name for name, _ in scenes[0].calls if name in ("show_plan", "play_plan")]
-    assert told in (["show_plan", "play_plan", "show_plan"], ["show_plan", "show_plan", "play_plan", "show_plan"])
+    await until(lambda: scenes[0].told("play") == [(found,)])
+
+
+async def test_layer_of_a_persons_own_has_a_tick_and_reads_its_topics_while_it_is_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "viewer_pkg").mkdir()
+    (tmp_path / "viewer_pkg" / "noise.py").write_text("""
+from common import topics
+LABEL, ON, TOPICS = "My noise", False, (topics.DEPTH_CAMERA_DEPTH,)
+def show(layer, topic, message): ...
+""")
+    monkeypatch.syspath_prepend(tmp_path)
+    async with page_of("ur5", layers=["viewer_pkg.noise"]) as played, opened(played.port) as page:
+        depth = played.bus.writer(topics.DEPTH_CAMERA_DEPTH)
+        await page.until(lambda: page.values[page.label("My noise")] is False)
+        assert not depth.matched
+        await page.set("My noise", True)
+        await until(lambda: depth.matched)
+
+
+async def test_application_without_a_page_gets_the_buttons_and_words_of_every_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "apps").mkdir()
+    (tmp_path / "apps" / "moving.py").write_text("""
+from common.messages import TaskStatus
+from common.topics import Topic
+class MovingStatus(TaskStatus):
+    pass
+STATUS = Topic("moving_status", MovingStatus, "state", "how far the moving is")
+""")
+    monkeypatch.syspath_prepend(tmp_path)
+    members = Members(services=["trajectory_executor", "viewer", "mover"], task="mover", application="apps.moving")
+    async with page_of("panda", members=members) as played, opened(played.port) as page:
+        application = find_application("apps.moving")
+        status = application.status.message(state="CARRYING", started=True, subject="cube", done=1, total=2)
+        played.bus.writer(application.status).put(status)
+        await page.until(lambda: "Carrying cube" in page.text and '<div data-field="done"><b>1</b>' in page.text)
+        with pytest.raises(LookupError):
+            page.label("Targets")
 
 
 async def test_rejected_places_are_counted_once(panda: Played, page: BrowserDouble) -> None:

@@ -24,8 +24,8 @@ from common.config.tunables import describe
 from common.errors import ConfigError
 from common.viewer import guard
 from common.viewer.access import TOKEN_VARIABLE
-from common.viewer.client_files import client_files
 from common.viewer.guard import close_server, make_server
+from common.viewer.viser_inside import client_files
 from services.viewer import Config
 
 SECRET = "correct-horse-battery"

@@ -13,11 +13,15 @@ import viser
 from numpy.typing import NDArray
 
 from common import messages as m
+from common import topics
+from common.application import find_application
 from common.config import Cell, Surroundings, load_cell
 from common.robot.model import RobotModel
 from common.robot.transforms import quaternion_to_matrix
+from common.topics import Topic
+from common.viewer.layers import find_layers
 from common.viewer.robot_meshes import Piece, coarse, visual_pieces
-from common.viewer.scene_view import SceneView
+from common.viewer.scene import Scene
 
 WORLD = m.Header(stamp=1, frame_id="world")
 RED = m.Color(r=1.0, g=0.1, b=0.1)
@@ -59,24 +63,74 @@ class Clock:
         return self.now
 
 
+class ConsoleDouble:
+    """Does at once what would be brought to the cell, and keeps it."""
+
+    def __init__(self) -> None:
+        self.moved: list[tuple[str, float, float]] = []
+        self.put_acts: list[Any] = []
+
+    def put(self, act: Any) -> None:
+        self.put_acts.append(act)
+        act()
+
+    def move(self, name: str, x: float, y: float) -> None:
+        self.moved.append((name, round(x, 6), round(y, 6)))
+
+
 class Stage:
-    """A view of a cell on a server of its own, watched or not."""
+    """The scene of a cell on a server of its own, watched or not: `say` is what the cell says."""
 
     def __init__(self, server: viser.ViserServer, cell: str, **options: Any) -> None:
         self.server = server
         self.robot = robot_of(cell)
         self.clock = Clock()
         self.watched = True
+        self.console: Any = ConsoleDouble()
+        self.said: dict[str, m.Message] = {}
         server.scene.reset()
         few = {  # reading meshes takes a second; here few triangles do
             "visual_pieces": lambda _robot: rough_of(cell), "coarse": lambda pieces, _kept: pieces,
         }
-        with patch.multiple("common.viewer.scene_view", **few):
-            self.view = SceneView(
-                server, self.robot, around_of(cell), watched=lambda: self.watched, clock=self.clock, **options
+        layers = find_layers(find_application(cell_of(cell).application))
+        with patch.multiple("common.viewer.scene", **few):
+            self.view = Scene(
+                server, self.robot, around_of(cell), layers, self.console, lambda topic: self.said.get(topic.key),
+                clock=self.clock, **options,
             )
 
-    def joints(self, q: Any, others: dict[str, float] | None = None) -> m.JointState:
+    def layer(self, name: str) -> Any:
+        return self.view.layers[name]
+
+    def say(self, topic: Topic[Any], message: Any, wait: float = 1.0) -> None:
+        """Have the cell say something after a while [s]; it is shown if somebody looks."""
+        self.clock.now += wait
+        if topic.kind == "event":
+            self.view.happened(topic, message)
+            return
+        self.said[topic.key] = message
+        self.look()
+
+    def show(self, layer: str, on: bool) -> None:
+        """Show or hide a layer."""
+        self.view.set_shown(layer, on)
+        self.look()
+
+    def edit(self, on: bool) -> None:
+        """Let the simulated world be edited, or not."""
+        self.view.set_editing(on)
+        self.look()
+
+    def look(self) -> None:
+        """Let what is due be shown."""
+        if self.watched:
+            self.view.refresh(self.clock.now)
+
+    def joints(self, q: Any, others: dict[str, float] | None = None) -> None:
+        """Have the robot say where its joints are."""
+        self.say(topics.JOINT_STATES, self.joint_state(q, others), 0.0)
+
+    def joint_state(self, q: Any, others: dict[str, float] | None = None) -> m.JointState:
         names = [*self.robot.joint_names, *(others or {})]
         return m.JointState(header=WORLD, name=names, position=[*map(float, q), *(others or {}).values()])
 

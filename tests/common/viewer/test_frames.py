@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from common import messages as m
+from common import topics
 from common.config import CameraConfig
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import matrix_to_pose, pose_to_matrix, rpy_to_matrix, transform
-from common.viewer.camera_pose import Transforms
+from common.viewer.figure import Transforms
 from tests.common.viewer.scene_cell import Stage, around_of, at, in_world
 
 TURNED = matrix_to_pose(transform(rpy_to_matrix(0.3, -0.2, 1.0), (0.1, 0.2, 0.3)))
@@ -22,65 +23,61 @@ def tf(parent: str, child: str, pose: m.Pose) -> m.TFMessage:
 
 @pytest.fixture
 def stage(panda: Stage) -> Stage:
-    panda.view.set_visible("frames", True)
+    panda.show("frames", True)
     return panda
 
 
 def test_frame_moves_with_the_one_that_it_hangs_on(stage: Stage) -> None:
-    stage.view.show_transforms(tf("world", "base", TURNED))
-    stage.view.show_transforms(tf("base", "tool", TURNED))
-    node = stage.view.frames.node("tool")
+    stage.say(topics.TF, tf("world", "base", TURNED))
+    stage.say(topics.TF, tf("base", "tool", TURNED))
+    node = stage.layer("frames").node("tool")
     T = pose_to_matrix(TURNED)
     np.testing.assert_allclose(in_world(stage.server, node), T @ T, atol=1e-9)
-    stage.clock.now += 1
-    stage.view.show_transforms(tf("world", "base", at(1, 0, 0)))
+    stage.say(topics.TF, tf("world", "base", at(1, 0, 0)))
     np.testing.assert_allclose(in_world(stage.server, node), pose_to_matrix(at(1, 0, 0)) @ T, atol=1e-9)
 
 
 def test_frame_waits_for_the_one_that_it_hangs_on(stage: Stage) -> None:
-    stage.view.show_transforms(tf("hand", "finger", TURNED))
-    stage.view.show_transforms(tf("base", "hand", TURNED))
-    assert stage.view.frames.node("finger") is None
-    stage.view.show_transforms(tf("world", "base", TURNED))
+    stage.say(topics.TF, tf("hand", "finger", TURNED))
+    stage.say(topics.TF, tf("base", "hand", TURNED))
+    assert stage.layer("frames").node("finger") is None
+    stage.say(topics.TF, tf("world", "base", TURNED))
     T = pose_to_matrix(TURNED)
-    np.testing.assert_allclose(in_world(stage.server, stage.view.frames.node("finger")), T @ T @ T, atol=1e-9)
+    np.testing.assert_allclose(in_world(stage.server, stage.layer("frames").node("finger")), T @ T @ T, atol=1e-9)
 
 
 def test_frame_that_hangs_elsewhere_now_takes_its_children_along(stage: Stage) -> None:
     for parent, child in (("world", "a"), ("world", "b"), ("a", "tool"), ("tool", "tip")):
-        stage.view.show_transforms(tf(parent, child, at(1, 0, 0)))
-    stage.view.show_transforms(tf("b", "tool", at(0, 2, 0)))
-    stage.clock.now += 1
-    stage.view.show_transforms(tf("world", "b", at(0, 0, 3)))
-    tip = stage.view.frames.node("tip")
+        stage.say(topics.TF, tf(parent, child, at(1, 0, 0)))
+    stage.say(topics.TF, tf("b", "tool", at(0, 2, 0)))
+    stage.say(topics.TF, tf("world", "b", at(0, 0, 3)))
+    tip = stage.layer("frames").node("tip")
     np.testing.assert_allclose(in_world(stage.server, tip)[:3, 3], [1, 2, 3])
 
 
 def test_frames_that_hang_on_each_other_in_a_circle_are_left_out(stage: Stage) -> None:
     for parent, child in (("a", "b"), ("b", "a"), ("world", "c")):
-        stage.view.show_transforms(tf(parent, child, TURNED))
-    assert stage.view.frames.node("a") is None and stage.view.frames.node("c") is not None
-    assert np.isfinite(stage.view.transforms.pose("a")).all()
+        stage.say(topics.TF, tf(parent, child, TURNED))
+    assert stage.layer("frames").node("a") is None and stage.layer("frames").node("c") is not None
+    assert np.isfinite(stage.view.stage.transforms.pose("a")).all()
 
 
 def test_frames_are_moved_ten_times_a_second_at_most(stage: Stage) -> None:
-    stage.view.show_transforms(tf("world", "base", at(0, 0, 0)))
+    stage.say(topics.TF, tf("world", "base", at(0, 0, 0)))
     with stage.sent() as sent:
-        stage.clock.now += 0.05
-        stage.view.show_transforms(tf("world", "base", at(0, 0, 1)))
+        stage.say(topics.TF, tf("world", "base", at(0, 0, 1)), 0.05)
         assert not sent
-        stage.clock.now += 0.06
-        stage.view.show_transforms(tf("world", "base", at(0, 0, 2)))
+        stage.say(topics.TF, tf("world", "base", at(0, 0, 2)), 0.06)
     assert len(sent) == 1
 
 
 def test_camera_is_where_its_frame_is_on_a_moving_hand(panda: Stage) -> None:
     camera = Pinhole.from_config(around_of("panda").camera)
-    panda.view.show_camera(camera.info(m.Header(frame_id="eye")))
+    panda.say(topics.CAMERA_INFO, camera.info(m.Header(frame_id="eye")))
     for parent, child, pose in (("world", "hand", at(0.5, 0, 0.5)), ("hand", "eye", TURNED)):
-        panda.view.show_transforms(tf(parent, child, pose))
+        panda.say(topics.TF_STATIC, tf(parent, child, pose))
     wanted = pose_to_matrix(at(0.5, 0, 0.5)) @ pose_to_matrix(TURNED)
-    node = panda.view.camera._node
+    node = panda.layer("camera").nodes["camera"]
     np.testing.assert_allclose(in_world(panda.server, node), wanted, atol=1e-9)
 
 
@@ -91,20 +88,18 @@ def test_camera_without_transforms_is_where_the_surroundings_say() -> None:
 
 def test_camera_looks_as_far_to_the_sides_as_its_picture(panda: Stage) -> None:
     camera = Pinhole.from_config(around_of("panda").camera)
-    panda.view.show_camera(camera.info(m.Header(frame_id="camera_optical_frame")))
-    node = panda.view.camera._node
-    assert node is not None
+    panda.say(topics.CAMERA_INFO, camera.info(m.Header(frame_id="camera_optical_frame")))
+    node = panda.layer("camera").nodes["camera"]
     assert np.tan(node.fov / 2) == pytest.approx(camera.height / 2 / camera.fy)
     assert np.tan(node.fov / 2) * node.aspect == pytest.approx(camera.width / 2 / camera.fx)
 
 
 def test_picture_of_the_frustum_is_small_and_comes_twice_a_second(panda: Stage) -> None:
     camera = Pinhole.from_config(around_of("panda").camera)
-    panda.view.show_camera(camera.info(m.Header(frame_id="camera_optical_frame")))
-    node = panda.view.camera._node
-    assert node is not None
+    panda.say(topics.CAMERA_INFO, camera.info(m.Header(frame_id="camera_optical_frame")))
+    node = panda.layer("camera").nodes["camera"]
     for seconds, grey in ((0.0, 10), (0.4, 20), (0.2, 30)):
         panda.clock.now += seconds
-        panda.view.show_picture(np.full((480, 640, 3), grey, np.uint8))
-        assert node.image is not None and node.image.shape == (240, 320, 3)
+        panda.view.picture(topics.CAMERA_IMAGE, np.full((480, 640, 3), grey, np.uint8))
+        assert node.image.shape == (240, 320, 3)
         assert node.image[0, 0, 0] == (10 if grey < 30 else 30)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 
-from common import messages as m
 from common.robot.transforms import matrix_to_pose, pose_to_matrix, rpy_to_matrix, transform
 from tests.common.viewer.scene_cell import Stage, in_world
 
@@ -15,7 +12,7 @@ GOAL = matrix_to_pose(transform(rpy_to_matrix(3.0, 0.2, 0.5), (0.5, 0.1, 0.4)))
 
 def test_marker_appears_where_the_tool_is(panda: Stage) -> None:
     q = panda.robot.named("home") + 0.2
-    panda.view.show_joints(panda.joints(q))
+    panda.joints(q)
     assert not panda.view.goal.visible
     panda.view.goal_marker(True)
     assert panda.view.goal.visible
@@ -24,26 +21,14 @@ def test_marker_appears_where_the_tool_is(panda: Stage) -> None:
 
 def test_marker_stays_where_it_was_put(panda: Stage) -> None:
     panda.view.goal_marker(True)
-    panda.view.goal_pose = GOAL
+    panda.view.goal.pose = GOAL
     panda.view.goal_marker(True)
     np.testing.assert_allclose(pose_to_matrix(panda.view.goal_pose), pose_to_matrix(GOAL), atol=1e-9)
 
 
-async def test_pose_is_told_when_it_is_let_go(panda: Stage) -> None:
-    told: list[m.Pose] = []
-    panda.view.on_goal_moved = told.append
-    panda.view.goal_marker(True)
-    panda.view.goal_pose = GOAL
-    for phase in ("start", "update", "end"):
-        for callback in panda.view.goal._node._impl_aux.update_cb:
-            await callback(SimpleNamespace(phase=phase))  # type: ignore[arg-type, misc]
-    assert len(told) == 1
-    np.testing.assert_allclose(pose_to_matrix(told[0]), pose_to_matrix(GOAL), atol=1e-9)
-
-
 def test_gripper_in_the_marker_is_where_it_would_be(panda: Stage) -> None:
     panda.view.goal_marker(True)
-    panda.view.goal_pose = matrix_to_pose(panda.robot.fk(panda.robot.named("home")))
+    panda.view.goal.pose = matrix_to_pose(panda.robot.fk(panda.robot.named("home")))
     links = panda.robot.link_poses(panda.robot.named("home"))
     shown = [node for name, node in panda.server.scene._handle_from_node_name.items() if name.startswith("/goal/")]
     poses = [in_world(panda.server, node) for node in shown]

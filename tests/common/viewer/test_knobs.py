@@ -11,7 +11,7 @@ from common.config.tunables import describe
 from common.errors import ConfigError
 from common.messages import Parameter
 from common.viewer.guard import close_server, make_server
-from common.viewer.knobs import Knob, group_of, label_of, step_of
+from common.viewer.tuning import Knob, group_of, label_of, step_of
 from services import vision_detector
 
 

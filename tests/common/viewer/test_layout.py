@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from common.application import find_application
 from common.config import config_root
 from common.errors import ConfigError
-from common.viewer.layers import layers_shown
+from common.viewer.layers import find_layers, layers_shown
 from common.viewer.layout import TABS, Layout, Viewpoint, load_layout, save_layout
 
 
@@ -14,7 +15,7 @@ def test_layout_of_the_project_can_be_read_and_has_every_panel() -> None:
     layout = load_layout("")
     assert set(layout.tabs) == set(TABS)
     assert set(layout.viewpoints) == {"panda", "ur5"}
-    assert layers_shown(layout.layers)["robot"]
+    assert layers_shown(layout.layers, find_layers(find_application("outlining")))["robot"]
 
 
 def test_saved_layout_reads_back(tmp_path: Path) -> None:

@@ -5,6 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from common import messages as m
+from common.applications.pick_place.topics import (
+    DETECTED_OBJECTS,
+    REJECTED_TARGETS,
+    VALIDATED_TARGETS,
+    WORKSPACE_MARKERS,
+)
 from tests.common.viewer.scene_cell import WORLD, Stage, at
 
 TOO_FAR = "too far: 0.873 m from the base axis, more than 0.820 m"
@@ -25,49 +31,47 @@ def detection(stamp: int, *places: tuple[float, float]) -> m.MarkerArray:
 
 def test_each_target_has_a_ring(panda: Stage) -> None:
     for places in ([(0.4, 0.1)], [(0.4, 0.1), (0.5, -0.1)], [(0.3, 0.2), (0.5, -0.1)]):
-        panda.view.show_targets(m.PoseArray(header=WORLD, poses=[at(x, y, 0.03) for x, y in places]))
-        np.testing.assert_allclose([node.position[:2] for node in panda.view.targets._nodes], places, atol=1e-6)
-    panda.view.show_targets(m.PoseArray(header=WORLD))
-    assert panda.view.targets._nodes == []
+        panda.say(VALIDATED_TARGETS, m.PoseArray(header=WORLD, poses=[at(x, y, 0.03) for x, y in places]))
+        np.testing.assert_allclose([node.position[:2] for node in panda.layer("targets").nodes], places, atol=1e-6)
+    panda.say(VALIDATED_TARGETS, m.PoseArray(header=WORLD))
+    assert panda.layer("targets").nodes == []
     assert not [name for name in panda.server.scene._handle_from_node_name if name.startswith("/targets/")]
 
 
 def test_rejected_place_is_labelled_with_the_reason(panda: Stage) -> None:
-    panda.view.show_rejected(rejection(0.82, 0.3, TOO_FAR))
-    ring, label = panda.view.rejected._known[0].nodes
+    panda.say(REJECTED_TARGETS, rejection(0.82, 0.3, TOO_FAR))
+    ring, label = panda.layer("rejected").known[0].nodes
     assert getattr(label, "text", "") == TOO_FAR
     np.testing.assert_allclose(ring.position, [0.82, 0.3, 0.03])
 
 
 def test_newer_reason_replaces_the_old_one_of_the_place(panda: Stage) -> None:
-    panda.view.show_rejected(rejection(0.82, 0.3, TOO_FAR))
-    panda.view.show_rejected(rejection(0.1, 0.0, "too close"))
-    panda.view.show_rejected(rejection(0.825, 0.3, "partly out of view"))
-    assert panda.view.rejected.reasons == ["too close", "partly out of view"]
+    panda.say(REJECTED_TARGETS, rejection(0.82, 0.3, TOO_FAR))
+    panda.say(REJECTED_TARGETS, rejection(0.1, 0.0, "too close"))
+    panda.say(REJECTED_TARGETS, rejection(0.825, 0.3, "partly out of view"))
+    assert panda.layer("rejected").reasons == ["too close", "partly out of view"]
 
 
 def test_place_that_is_a_target_now_is_no_longer_rejected(panda: Stage) -> None:
-    panda.view.show_rejected(rejection(0.5, 0.1, "partly out of view"))
-    panda.view.show_targets(m.PoseArray(header=WORLD, poses=[at(0.5, 0.11, 0.03)]))
-    assert panda.view.rejected.reasons == []
+    panda.say(REJECTED_TARGETS, rejection(0.5, 0.1, "partly out of view"))
+    panda.say(VALIDATED_TARGETS, m.PoseArray(header=WORLD, poses=[at(0.5, 0.11, 0.03)]))
+    assert panda.layer("rejected").reasons == []
 
 
 def test_rejection_is_forgotten_when_nothing_is_there_for_a_while(panda: Stage) -> None:
     second = 1_000_000_000
-    panda.view.show_rejected(rejection(0.82, 0.3, TOO_FAR, stamp=10 * second))
-    panda.view.show_detected(detection(12 * second, (0.821, 0.3), (0.4, 0.1)))
-    panda.view.show_detected(detection(14 * second, (0.4, 0.1)))  # hidden by the arm
-    assert panda.view.rejected.reasons == [TOO_FAR]
-    panda.view.show_detected(detection(16 * second, (0.4, 0.1)))
-    assert panda.view.rejected.reasons == []
+    panda.say(REJECTED_TARGETS, rejection(0.82, 0.3, TOO_FAR, stamp=10 * second))
+    panda.say(DETECTED_OBJECTS, detection(12 * second, (0.821, 0.3), (0.4, 0.1)))
+    panda.say(DETECTED_OBJECTS, detection(14 * second, (0.4, 0.1)))  # hidden by the arm
+    assert panda.layer("rejected").reasons == [TOO_FAR]
+    panda.say(DETECTED_OBJECTS, detection(16 * second, (0.4, 0.1)))
+    assert panda.layer("rejected").reasons == []
 
 
 def test_rejections_without_end_do_not_fill_the_scene(panda: Stage) -> None:
     for index in range(100):
-        panda.view.show_rejected(rejection(0.1 * index, 0.0, f"reason {index}"))
-    assert len(panda.view.rejected.reasons) == 60 and panda.view.rejected.reasons[-1] == "reason 99"
-    panda.view.clear_rejected()
-    assert panda.view.rejected.reasons == []
+        panda.say(REJECTED_TARGETS, rejection(0.1 * index, 0.0, f"reason {index}"))
+    assert len(panda.layer("rejected").reasons) == 60 and panda.layer("rejected").reasons[-1] == "reason 99"
 
 
 def test_workspace_is_shown_as_translucent_cylinders_of_its_size(panda: Stage) -> None:
@@ -75,19 +79,19 @@ def test_workspace_is_shown_as_translucent_cylinders_of_its_size(panda: Stage) -
         ns="workspace", id=0, type="cylinder", pose=at(0, 0, 0.4), scale=m.Vector3(x=1.6, y=1.6, z=1.0),
         color=m.Color(r=0.2, g=0.8, b=0.3, a=0.15),
     )
-    panda.view.show_workspace(m.MarkerArray(header=WORLD, markers=[shell]))
-    _, wall = panda.view.workspace._nodes
+    panda.say(WORKSPACE_MARKERS, m.MarkerArray(header=WORLD, markers=[shell]))
+    _, wall = panda.layer("workspace").markers.nodes
     np.testing.assert_allclose(np.linalg.norm(wall.vertices[:, :2], axis=1), 0.8, atol=1e-6)
     assert np.ptp(wall.vertices[:, 2]) == 1.0 and wall.opacity == 0.15 and wall.position[2] == 0.4
     with panda.sent() as sent:
-        panda.view.show_workspace(m.MarkerArray(header=WORLD, markers=[shell]))
+        panda.say(WORKSPACE_MARKERS, m.MarkerArray(header=WORLD, markers=[shell]))
     assert not sent
 
 
 def test_shapes_of_every_kind_are_shown(panda: Stage) -> None:
     kinds = ("sphere", "box", "text", "cylinder")
-    panda.view.show_workspace(m.MarkerArray(header=WORLD, markers=[
+    panda.say(WORKSPACE_MARKERS, m.MarkerArray(header=WORLD, markers=[
         m.Marker(ns="x", id=i, type=kind, pose=at(0, 0, i), scale=m.Vector3(x=1, y=1, z=1), text="a wall")
         for i, kind in enumerate(kinds)
     ]))
-    assert len(panda.view.workspace._nodes) == len(kinds) + 1  # a cylinder has rims
+    assert len(panda.layer("workspace").markers.nodes) == len(kinds) + 1  # a cylinder has rims

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from common import messages as m
-from common.applications.outlining.messages import Contour, Contours, OutlinePoints
+from common import topics
+from common.applications.outlining.messages import Contour, Contours, OutlinePoints, OutlineSelect
+from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS
 from common.perception.pinhole import Pinhole
 from tests.common.viewer.scene_cell import WORLD, Stage, around_of, at, scene_of
 
@@ -23,7 +25,7 @@ def square(x: float, y: float, z: float, half: float = 0.03) -> np.ndarray[Any, 
 @pytest.fixture
 def stage(ur5: Stage) -> Stage:
     camera = Pinhole.from_config(around_of("ur5").camera)
-    ur5.view.show_camera(camera.info(m.Header(frame_id=around_of("ur5").camera.frame)))
+    ur5.say(topics.DEPTH_CAMERA_INFO, camera.info(m.Header(frame_id=around_of("ur5").camera.frame)))
     return ur5
 
 
@@ -43,13 +45,13 @@ def prism(label: str, x: float) -> m.CollisionObject:
 
 
 def nodes(stage: Stage) -> dict[str, Any]:
-    return {node.name.rsplit("/", 1)[1]: node for node in stage.view.contours._nodes}
+    return {node.name.rsplit("/", 1)[1]: node for node in stage.layer("contours").nodes}
 
 
 def test_contour_lies_on_the_top_of_its_object(stage: Stage) -> None:
-    stage.view.show_scene(scene_of(prism("yellow_1", 0.5)))
+    stage.say(topics.PLANNING_SCENE, scene_of(prism("yellow_1", 0.5)))
     points = square(0.5, 0.0, TOP)
-    stage.view.show_contours(contours(("yellow_1", points)))
+    stage.say(CONTOURS, contours(("yellow_1", points)))
     line = nodes(stage)["0_line"].points
     np.testing.assert_allclose(line[:, 0], points, atol=0.003)
     np.testing.assert_allclose(line[:, 1], np.roll(points, -1, axis=0), atol=0.003)
@@ -57,20 +59,20 @@ def test_contour_lies_on_the_top_of_its_object(stage: Stage) -> None:
 
 def test_contour_without_an_object_lies_on_the_fixture_below_it(stage: Stage) -> None:
     points = square(0.5, 0.1, 1.0)
-    stage.view.show_contours(contours(("green_1", points)))
+    stage.say(CONTOURS, contours(("green_1", points)))
     np.testing.assert_allclose(nodes(stage)["0_line"].points[:, 0], points, atol=0.003)
 
 
 def test_contour_moves_when_its_object_becomes_known(stage: Stage) -> None:
     points = square(0.5, 0.0, TOP)
-    stage.view.show_contours(contours(("yellow_1", points)))
+    stage.say(CONTOURS, contours(("yellow_1", points)))
     assert nodes(stage)["0_line"].points[0, 0, 2] == pytest.approx(1.0, abs=0.003)
-    stage.view.show_scene(scene_of(prism("yellow_1", 0.5)))
+    stage.say(topics.PLANNING_SCENE, scene_of(prism("yellow_1", 0.5)))
     assert nodes(stage)["0_line"].points[0, 0, 2] == pytest.approx(TOP, abs=0.003)
 
 
 def test_each_contour_has_a_pin_and_a_label_and_the_chosen_one_is_white(stage: Stage) -> None:
-    stage.view.show_contours(
+    stage.say(CONTOURS,
         contours(("red_1", square(0.45, 0, 1.0)), ("blue_1", square(0.55, 0, 1.0)), selected=1)
     )
     shown = nodes(stage)
@@ -79,38 +81,38 @@ def test_each_contour_has_a_pin_and_a_label_and_the_chosen_one_is_white(stage: S
     np.testing.assert_allclose(shown["0_pin"].position[:2], [0.45, 0.0], atol=0.002)
 
 
-async def test_click_on_a_pin_chooses_its_contour(stage: Stage) -> None:
-    chosen: list[int] = []
-    stage.view.on_select = chosen.append
-    stage.view.show_contours(contours(("red_1", square(0.45, 0, 1.0)), ("blue_1", square(0.55, 0, 1.0))))
+async def test_click_on_a_pin_chooses_its_contour(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[OutlineSelect] = []
+    monkeypatch.setattr("common.applications.outlining.page.choose", lambda _console, choice: chosen.append(choice))
+    stage.say(CONTOURS, contours(("red_1", square(0.45, 0, 1.0)), ("blue_1", square(0.55, 0, 1.0))))
     for entry in nodes(stage)["1_pin"]._impl.click_cb:
-        entry.callback(None)
-    assert chosen == [1]
+        await entry.callback(None)
+    assert chosen == [OutlineSelect(rule="index", index=1)]
 
 
 def test_same_contours_are_not_sent_again(stage: Stage) -> None:
     found = contours(("red_1", square(0.45, 0, 1.0)))
-    stage.view.show_contours(found)
+    stage.say(CONTOURS, found)
     with stage.sent() as sent:
-        stage.view.show_contours(found.model_copy(update={"header": m.Header(stamp=5, frame_id="camera")}))
+        stage.say(CONTOURS, found.model_copy(update={"header": m.Header(stamp=5, frame_id="camera")}))
     assert not sent
 
 
 def test_contours_of_a_camera_that_is_not_known_or_distorted_are_left_out(ur5: Stage) -> None:
     found = contours(("red_1", square(0.45, 0, 1.0)))
-    ur5.view.show_contours(found)
+    ur5.say(CONTOURS, found)
     assert nodes(ur5) == {}
     info = Pinhole.from_config(around_of("ur5").camera).info(m.Header(frame_id="camera"))
-    ur5.view.show_camera(info.model_copy(update={"d": [0.1, 0.0, 0.0, 0.0, 0.0]}))
-    ur5.view.show_contours(found)
+    ur5.say(topics.DEPTH_CAMERA_INFO, info.model_copy(update={"d": [0.1, 0.0, 0.0, 0.0, 0.0]}))
+    ur5.say(CONTOURS, found)
     assert nodes(ur5) == {}
 
 
 def test_outline_is_closed_and_goes_when_there_is_none(stage: Stage) -> None:
     poses = [at(*point) for point in square(0.5, 0, TOP).tolist()]
-    stage.view.show_outline(OutlinePoints(header=WORLD, poses=poses, object="yellow_1"))
-    node = stage.view.outline._node
+    stage.say(CONTOUR_PATH, OutlinePoints(header=WORLD, poses=poses, object="yellow_1"))
+    node = stage.layer("outline").node
     assert node is not None and len(node.points) == 4
     np.testing.assert_allclose(node.points[-1, 1], node.points[0, 0])
-    stage.view.show_outline(OutlinePoints(header=WORLD, message="nothing is chosen"))
-    assert stage.view.outline._node is None
+    stage.say(CONTOUR_PATH, OutlinePoints(header=WORLD, message="nothing is chosen"))
+    assert stage.layer("outline").node is None

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from common import messages as m
+from common import topics
 from tests.common.viewer.scene_cell import Stage, in_world
 
 
@@ -23,18 +24,18 @@ def plan(stage: Stage, q: NDArray[np.float64], seconds: float = 2.0, count: int 
 
 @pytest.fixture
 def there(panda: Stage) -> NDArray[np.float64]:
-    panda.view.show_joints(panda.joints(panda.robot.named("home")))
+    panda.joints(panda.robot.named("home"))
     return panda.robot.named("home") + np.array([0.5, 0.2, 0, 0.1, 0, 0.1, 0])
 
 
 def tool_of_ghost(stage: Stage) -> NDArray[np.float64]:
-    return in_world(stage.server, stage.view.plan.ghost.links["panda_hand"])
+    return in_world(stage.server, stage.layer("plan").ghost.links["panda_hand"])
 
 
 def test_ghost_stands_where_the_plan_ends(panda: Stage, there: NDArray[np.float64]) -> None:
-    assert not panda.view.plan.ghost.visible
-    panda.view.show_plan(plan(panda, there))
-    assert panda.view.plan.ghost.visible
+    assert not panda.layer("plan").ghost.visible
+    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, there))
+    assert panda.layer("plan").ghost.visible
     np.testing.assert_allclose(tool_of_ghost(panda), panda.robot.link_poses(there)["panda_hand"], atol=1e-6)
 
 
@@ -45,69 +46,77 @@ def test_meshes_of_the_ghost_are_sent_with_the_first_plan_and_once(
     add = panda.server.scene.add_mesh_simple
     monkeypatch.setattr(panda.server.scene, "add_mesh_simple",
                         lambda name, *args, **options: (sent.append(name), add(name, *args, **options))[1])
-    panda.view.show_joints(panda.joints(there - 0.05))
+    panda.joints(there - 0.05)
     assert not [name for name in sent if name.startswith("/plan/")]
     for _ in range(2):
-        panda.view.show_plan(plan(panda, there))
+        panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, there))
     links = {name.split("/")[-2] for name in sent}
-    assert len(sent) == len(links) == len(panda.view.plan.ghost.links)
+    assert len(sent) == len(links) == len(panda.layer("plan").ghost.links)
 
 
 def test_line_is_the_path_of_the_tool(panda: Stage, there: NDArray[np.float64]) -> None:
     trajectory = plan(panda, there)
-    panda.view.show_plan(trajectory)
-    line = panda.view.plan._line
+    panda.say(topics.DISPLAY_TRAJECTORY, trajectory)
+    line = panda.layer("tool_path").line
     assert line is not None
     wanted = [panda.robot.fk(point.positions)[:3, 3] for point in trajectory.points]
     np.testing.assert_allclose([line.points[0, 0], *line.points[:, 1]], wanted, atol=1e-5)
 
 
 def test_ghost_goes_when_the_robot_has_come(panda: Stage, there: NDArray[np.float64]) -> None:
-    panda.view.show_plan(plan(panda, there))
-    panda.view.show_joints(panda.joints(there - 0.05))
-    assert panda.view.plan.ghost.visible
-    panda.view.show_joints(panda.joints(there))
-    assert not panda.view.plan.ghost.visible
+    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, there))
+    panda.joints(there - 0.05)
+    assert panda.layer("plan").ghost.visible
+    panda.joints(there)
+    assert not panda.layer("plan").ghost.visible
 
 
 def test_links_of_the_ghost_that_lie_in_the_robot_are_not_drawn(panda: Stage, there: NDArray[np.float64]) -> None:
-    panda.view.show_plan(plan(panda, there))
-    panda.view.show_joints(panda.joints(panda.robot.named("home")))
-    ghost = panda.view.plan.ghost.links
+    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, there))
+    panda.joints(panda.robot.named("home"))
+    ghost = panda.layer("plan").ghost.links
     assert not ghost["panda_link0"].visible and ghost["panda_hand"].visible
 
 
 def test_ghost_plays_the_plan_over_and_over(panda: Stage, there: NDArray[np.float64]) -> None:
     home = panda.robot.named("home")
-    panda.view.show_plan(plan(panda, there, seconds=2.0))
-    panda.view.play_plan()
-    panda.view.show_joints(panda.joints(home))
+    panda.view.play(plan(panda, there, seconds=2.0))
+    panda.joints(home)
     for seconds, share in ((1.0, 0.5), (1.5, 1.0), (1.0, 0.25)):  # 3.5 s: it began again after 2 s and a rest of 1 s
         panda.clock.now += seconds
-        panda.view.show_joints(panda.joints(home))
+        panda.joints(home)
         wanted = panda.robot.link_poses(home + share * (there - home))["panda_hand"]
         np.testing.assert_allclose(tool_of_ghost(panda), wanted, atol=1e-3)
 
 
 def test_ghost_stops_playing_when_the_robot_moves(panda: Stage, there: NDArray[np.float64]) -> None:
     home = panda.robot.named("home")
-    panda.view.show_plan(plan(panda, there))
-    panda.view.play_plan()
-    panda.view.show_joints(panda.joints(home))
+    panda.view.play(plan(panda, there))
+    panda.joints(home)
     panda.clock.now += 0.5
-    panda.view.show_joints(panda.joints(home + 0.02 * (there - home) / 0.5))
-    assert not panda.view.plan.playing
+    panda.joints(home + 0.02 * (there - home) / 0.5)
+    assert not panda.layer("plan").playing
     np.testing.assert_allclose(tool_of_ghost(panda), panda.robot.link_poses(there)["panda_hand"], atol=1e-6)
 
 
+def test_plan_that_is_played_is_not_begun_anew_when_the_planner_says_it(
+    panda: Stage, there: NDArray[np.float64]
+) -> None:
+    found = plan(panda, there).model_copy(update={"header": m.Header(stamp=5)})
+    panda.view.play(found)
+    panda.say(topics.DISPLAY_TRAJECTORY, found)
+    assert panda.layer("plan").playing
+    panda.say(topics.DISPLAY_TRAJECTORY, found.model_copy(update={"header": m.Header(stamp=6)}))
+    assert not panda.layer("plan").playing
+
+
 def test_plan_without_points_clears_the_last(panda: Stage, there: NDArray[np.float64]) -> None:
-    panda.view.show_plan(plan(panda, there))
-    panda.view.show_plan(m.JointTrajectory(joint_names=panda.robot.joint_names, points=[]))
-    assert not panda.view.plan.ghost.visible and panda.view.plan._line is None
+    panda.say(topics.DISPLAY_TRAJECTORY, plan(panda, there))
+    panda.say(topics.DISPLAY_TRAJECTORY, m.JointTrajectory(joint_names=panda.robot.joint_names, points=[]))
+    assert not panda.layer("plan").ghost.visible and panda.layer("tool_path").line is None
 
 
 def test_plan_of_other_joints_does_no_harm(panda: Stage, there: NDArray[np.float64]) -> None:
     odd = plan(panda, there).model_copy(update={"joint_names": [f"other_{i}" for i in range(7)]})
-    panda.view.show_plan(odd)
-    panda.view.play_plan()
-    panda.view.show_joints(panda.joints(there))
+    panda.view.play(odd)
+    panda.joints(there)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from common import messages as m
-from common.viewer.dragging import on_plane
+from common import topics
+from common.viewer.layers.truth import on_plane
 from tests.common.viewer.scene_cell import WORLD, Stage, at, is_shown
 
 EYE = np.array([1.0, -1.0, 1.0])
@@ -49,47 +50,44 @@ async def pull(node: Any, start: tuple[float, float], *way: tuple[float, float],
 
 @pytest.fixture
 def moved(panda: Stage) -> list[tuple[str, float, float]]:
-    found: list[tuple[str, float, float]] = []
-    panda.view.on_object_dragged = lambda name, x, y: found.append((name, round(x, 6), round(y, 6)))
+    found: list[tuple[str, float, float]] = panda.console.moved
     return found
 
 
 def test_truth_is_hidden_until_it_is_asked_for(panda: Stage) -> None:
-    panda.view.show_truth(balls(ball_1=(0.4, 0.1)))
-    panda.view.set_visible("truth", True)
-    node = panda.view.truth.node("ball_1")
+    panda.say(topics.SCENE_OBJECTS, balls(ball_1=(0.4, 0.1)))
+    panda.show("truth", True)
+    node = panda.layer("truth").node("ball_1")
     assert is_shown(panda.server, node) and node.wireframe
-    panda.view.set_visible("truth", False)
+    panda.show("truth", False)
     assert not is_shown(panda.server, node)
 
 
 def test_balls_come_move_and_go(panda: Stage) -> None:
-    panda.view.set_visible("truth", True)
-    panda.view.show_truth(balls(ball_1=(0.4, 0.1), ball_2=(0.5, 0.1)))
-    first = panda.view.truth.node("ball_1")
-    panda.view.show_truth(balls(ball_1=(0.3, 0.1)))
-    assert panda.view.truth.node("ball_1") is first and panda.view.truth.node("ball_2") is None
+    panda.show("truth", True)
+    panda.say(topics.SCENE_OBJECTS, balls(ball_1=(0.4, 0.1), ball_2=(0.5, 0.1)))
+    first = panda.layer("truth").node("ball_1")
+    panda.say(topics.SCENE_OBJECTS, balls(ball_1=(0.3, 0.1)))
+    assert panda.layer("truth").node("ball_1") is first and panda.layer("truth").node("ball_2") is None
     np.testing.assert_allclose(first.position, [0.3, 0.1, 0.03])
 
 
 def test_object_of_the_world_is_shown_in_its_size(ur5: Stage) -> None:
-    ur5.view.set_visible("truth", True)
-    ur5.view.show_truth(m.WorldObjects(header=WORLD, objects=[disc(0.5)]))
-    node = ur5.view.truth.node("disc")
+    ur5.show("truth", True)
+    ur5.say(topics.SCENE_OBJECTS, m.WorldObjects(header=WORLD, objects=[disc(0.5)]))
+    node = ur5.layer("truth").node("disc")
     np.testing.assert_allclose(node.position, [0.5, 0.0, 1.01], atol=1e-6)
     np.testing.assert_allclose(np.ptp(node.vertices, axis=0), [0.04, 0.04, 0.02], atol=1e-4)
-    ur5.view.show_truth(m.WorldObjects(header=WORLD, objects=[disc(0.6)]))
-    np.testing.assert_allclose(ur5.view.truth.node("disc").position, [0.6, 0.0, 1.01], atol=1e-6)
-    assert ur5.view.truth.node("disc") is node  # moved and not sent again
+    ur5.say(topics.SCENE_OBJECTS, m.WorldObjects(header=WORLD, objects=[disc(0.6)]))
+    np.testing.assert_allclose(ur5.layer("truth").node("disc").position, [0.6, 0.0, 1.01], atol=1e-6)
+    assert ur5.layer("truth").node("disc") is node  # moved and not sent again
 
 
 async def test_object_is_dropped_where_it_was_pulled_to_and_can_be_pulled_again(ur5: Stage) -> None:
-    moved: list[tuple[str, float, float]] = []
-    ur5.view.on_object_dragged = lambda name, x, y: moved.append((name, round(x, 6), round(y, 6)))
-    ur5.view.set_editing(True)
+    ur5.edit(True)
     for x, to in ((0.5, 0.55), (0.55, 0.45)):
-        ur5.view.show_truth(m.WorldObjects(header=WORLD, objects=[disc(x)]))
-        node = ur5.view.truth.node("disc")
+        ur5.say(topics.SCENE_OBJECTS, m.WorldObjects(header=WORLD, objects=[disc(x)]))
+        node = ur5.layer("truth").node("disc")
         assert is_shown(ur5.server, node)
         np.testing.assert_allclose(node.position, [x, 0.0, 1.01], atol=1e-6)
         eye = EYE + np.array([0, 0, 1])
@@ -98,13 +96,13 @@ async def test_object_is_dropped_where_it_was_pulled_to_and_can_be_pulled_again(
                 drag = event(phase, (x, 0.0, 1.01), (place, 0.1, 1.01) if phase != "start" else (x, 0.0, 1.01))
                 drag.client.camera.position = eye
                 await entry.callback(drag)
-    assert moved == [("disc", 0.55, 0.1), ("disc", 0.45, 0.1)]
+    assert ur5.console.moved == [("disc", 0.55, 0.1), ("disc", 0.45, 0.1)]
 
 
 async def test_ball_is_dropped_where_it_was_pulled_to(panda: Stage, moved: list[tuple[str, float, float]]) -> None:
-    panda.view.show_truth(balls(ball_1=(0.4, 0.1)))
-    panda.view.set_editing(True)
-    node = panda.view.truth.node("ball_1")
+    panda.say(topics.SCENE_OBJECTS, balls(ball_1=(0.4, 0.1)))
+    panda.edit(True)
+    node = panda.layer("truth").node("ball_1")
     assert is_shown(panda.server, node)  # though the truth is not ticked
     await pull(node, (0.41, 0.1), (0.45, 0.1), (0.51, 0.2))  # taken 1 cm beside its middle
     assert moved == [("ball_1", 0.5, 0.2)]
@@ -112,46 +110,46 @@ async def test_ball_is_dropped_where_it_was_pulled_to(panda: Stage, moved: list[
 
 
 async def test_ball_follows_the_pointer_and_not_the_world_meanwhile(panda: Stage) -> None:
-    panda.view.show_truth(balls(ball_1=(0.4, 0.1)))
-    panda.view.set_editing(True)
-    node = panda.view.truth.node("ball_1")
+    panda.say(topics.SCENE_OBJECTS, balls(ball_1=(0.4, 0.1)))
+    panda.edit(True)
+    node = panda.layer("truth").node("ball_1")
     seen: list[list[float]] = []
     for entry in node._impl.drag_cb:
         for phase, place in (("start", (0.4, 0.1, 0.03)), ("update", (0.5, 0.2, 0.03))):
             await entry.callback(event(phase, (0.4, 0.1, 0.03), place))
-        panda.view.show_truth(balls(ball_1=(0.4, 0.1)))
+        panda.say(topics.SCENE_OBJECTS, balls(ball_1=(0.4, 0.1)))
         seen.append(node.position.tolist())
     np.testing.assert_allclose(seen, [[0.5, 0.2, 0.03]])
 
 
 async def test_nothing_is_pulled_without_editing(panda: Stage, moved: list[tuple[str, float, float]]) -> None:
-    panda.view.set_visible("truth", True)
-    panda.view.show_truth(balls(ball_1=(0.4, 0.1)))
-    node = panda.view.truth.node("ball_1")
+    panda.show("truth", True)
+    panda.say(topics.SCENE_OBJECTS, balls(ball_1=(0.4, 0.1)))
+    node = panda.layer("truth").node("ball_1")
     await pull(node, (0.4, 0.1), (0.5, 0.2))
-    panda.view.set_editing(True)
-    panda.view.set_editing(False)
+    panda.edit(True)
+    panda.edit(False)
     await pull(node, (0.4, 0.1), (0.5, 0.2))
     assert moved == [] and is_shown(panda.server, node)
 
 
 async def test_ball_in_the_hand_can_not_be_pulled(panda: Stage, moved: list[tuple[str, float, float]]) -> None:
-    panda.view.set_editing(True)
+    panda.edit(True)
     for state, count in (("held", 0), ("falling", 0), ("contained", 1)):
-        panda.view.show_truth(balls(state, ball_1=(0.4, 0.1)))
-        await pull(panda.view.truth.node("ball_1"), (0.4, 0.1), (0.5, 0.2))
+        panda.say(topics.SCENE_OBJECTS, balls(state, ball_1=(0.4, 0.1)))
+        await pull(panda.layer("truth").node("ball_1"), (0.4, 0.1), (0.5, 0.2))
         assert len(moved) == count
 
 
 async def test_ball_that_goes_while_it_is_pulled_does_no_harm(
     panda: Stage, moved: list[tuple[str, float, float]]
 ) -> None:
-    panda.view.set_editing(True)
-    panda.view.show_truth(balls(ball_1=(0.4, 0.1)))
-    node = panda.view.truth.node("ball_1")
+    panda.edit(True)
+    panda.say(topics.SCENE_OBJECTS, balls(ball_1=(0.4, 0.1)))
+    node = panda.layer("truth").node("ball_1")
     callbacks, place = list(node._impl.drag_cb), (0.4, 0.1, 0.03)
     await callbacks[0].callback(event("start", place, place))
-    panda.view.show_truth(balls())
+    panda.say(topics.SCENE_OBJECTS, balls())
     for phase in ("update", "end"):
         await callbacks[0].callback(event(phase, place, place))
     assert moved == []

@@ -4,6 +4,7 @@ from typing import get_args
 
 import pytest
 
+from common.application import find_application
 from common.applications.outlining.messages import OutlineState, OutlineStatus
 from common.applications.pick_place.messages import PickPlaceStatus, TaskState
 from common.errors import ConfigError, NoResponder, RemoteError, ZencellError
@@ -15,13 +16,16 @@ from common.messages import (
     MotionStatus,
     PlanResponse,
     ServiceStatus,
+    TaskStatus,
 )
 from common.viewer import words
 from common.viewer.markup import block, row, span
+from common.viewer.words import TaskWords
 
 
 def test_every_state_has_a_word() -> None:
-    assert set(words.TASK_STATES) == {*get_args(TaskState), *get_args(OutlineState)}
+    for application, states in (("pick_place", TaskState), ("outlining", OutlineState)):
+        assert set(get_args(states)) <= set(TaskWords.of(find_application(application)).states)
     assert set(words.GOAL_STATES) == set(get_args(GoalState))
     states = get_args(ServiceStatus.model_fields["state"].annotation)
     assert set(words.SERVICE_STATES) == {*states, "gone"}
@@ -43,7 +47,15 @@ def test_every_state_has_a_word() -> None:
     ],
 )
 def test_task_is_told_in_words(status: PickPlaceStatus | OutlineStatus | None, said: str) -> None:
-    assert words.task_state(status)[0] == said
+    application = "outlining" if isinstance(status, OutlineStatus) else "pick_place"
+    assert TaskWords.of(find_application(application)).state(status)[0] == said
+
+
+def test_task_of_an_application_without_a_page_is_told_in_words_that_fit_any() -> None:
+    status = TaskStatus(state="MOVING_IT", started=True, subject="cube", done=1, total=4, figures={"mean_mm": 0.2})
+    told = TaskWords.of(None)
+    assert told.state(status)[0] == "Moving it cube" and told.done(status, None) == 0.25
+    assert told.counters(status, 0) == {"done": 1, "of": 4, "mean mm": 0.2, "retries": 0, "failures": 0}
 
 
 def test_arm_and_fingers_are_told_in_words() -> None:

@@ -6,13 +6,13 @@ import threading
 import pytest
 
 from common.errors import NoResponder, ZencellError
-from common.viewer.desk import Desk
+from common.viewer.console import Desk
 
 
 async def test_orders_of_any_thread_are_done_in_order_on_the_loop() -> None:
     done: list[tuple[int, int]] = []
     ended = asyncio.Event()
-    desk = Desk(asyncio.get_running_loop(), lambda _: None)
+    desk = Desk()
     running = asyncio.create_task(desk.run())
 
     def order() -> None:
@@ -30,7 +30,8 @@ async def test_orders_of_any_thread_are_done_in_order_on_the_loop() -> None:
 async def test_what_a_person_can_understand_is_told_and_the_rest_goes_on() -> None:
     told: list[str] = []
     ended = asyncio.Event()
-    desk = Desk(asyncio.get_running_loop(), told.append)
+    desk = Desk()
+    desk.tell = lambda line, _kind="bad": told.append(line)
     running = asyncio.create_task(desk.run())
 
     def refuse() -> None:
@@ -52,7 +53,7 @@ async def test_what_a_person_can_understand_is_told_and_the_rest_goes_on() -> No
 
 async def test_long_request_holds_nothing_up() -> None:
     never, ended = asyncio.Event(), asyncio.Event()
-    desk = Desk(asyncio.get_running_loop(), lambda _: None)
+    desk = Desk()
     running = asyncio.create_task(desk.run())
 
     async def wait() -> None:
@@ -66,7 +67,7 @@ async def test_long_request_holds_nothing_up() -> None:
 
 
 async def test_bug_ends_the_service() -> None:
-    desk = Desk(asyncio.get_running_loop(), lambda _: None)
+    desk = Desk()
 
     async def broken() -> None:
         raise KeyError("a bug")

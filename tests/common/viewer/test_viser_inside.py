@@ -11,7 +11,7 @@ import viser
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.viewer.client_files import ALPHABET, client_files, decoded, files_of
+from common.viewer.viser_inside import ALPHABET, client_files, decoded, files_of
 
 PAGE = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text(encoding="utf-8")
 

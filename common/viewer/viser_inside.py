@@ -1,8 +1,21 @@
-"""The files of the page: viser's client, taken out of the single packed file in which it comes.
+"""Everything of the page that reaches inside viser, and what viser would have to offer in its place.
 
-A browser that is sent that file unpacks and compiles all of it at each opening, before anything else. Sent as a script,
-a style sheet and the decoder of messages, each under a name that has its contents in it, it compiles while it loads,
-and keeps what it has compiled for the next opening.
+Three things have no public call in viser 1.1; whoever updates viser reads this file, and nothing else of the page.
+
+- **Who may open the page, and at which socket.** viser has no authentication, takes a WebSocket from any web page, and
+  tries the next port when one is taken. Its server is one call of `websockets`' `serve`, which can ask a function about
+  each request before anything else reads it: `made_server` puts ours in front of viser's while the server is made.
+  Upstream request: `ViserServer(..., sock=, process_request=, websocket_options=)`, handed on to `serve`.
+- **No tunnel to a public server.** Whoever has the page open may ask for a share URL. The handlers are taken away.
+  Upstream request: `ViserServer(..., allow_share_url=False)`.
+- **A client that starts soon.** viser's client is one packed file that a browser unpacks and compiles at each opening,
+  before anything else. Sent as a script, a style sheet and the decoder of messages, each under a name that has its
+  contents in it, it compiles while it loads, and a browser keeps what it has compiled for the next opening.
+  Upstream requests: a client build in separate files; `configure_environment_map(hdri=None)` and the antialiasing of
+  edges as options that are known before the client begins.
+
+The style sheets in markup.py and task_panel.py name two of the client's CSS classes; without them the page only looks
+different. Upstream requests: a large and sticky button, and a checkbox whose label stands behind it.
 """
 
 from __future__ import annotations
@@ -11,14 +24,86 @@ import gzip
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+import threading
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
+import websockets.asyncio.server as websocket_server
 import zstandard
+from rich import get_console
+from viser._messages import ShareUrlDisconnect, ShareUrlRequest
+from websockets.http11 import Request, Response
+
+if TYPE_CHECKING:
+    import socket
+
+Process = Callable[[websocket_server.ServerConnection, Request], "Awaitable[Response | None] | Response | None"]
+
+_replacing = threading.Lock()
+
+# --- the server ---
+
+
+def made_server(
+    listening: socket.socket, before: Callable[[Process], Process], options: Mapping[str, Any]
+) -> viser.ViserServer:
+    """A viser server that listens at a socket, and nowhere else.
+
+    Args:
+        listening: the socket; closed if that fails.
+        before: makes of the function that viser asks about each request the one that is asked instead.
+        options: of the WebSocket server, in place of viser's.
+
+    Raises:
+        RuntimeError: viser serves in another way than this file knows.
+    """
+    in_place = []
+
+    def serve(handler: Any, host: Any, port: Any, *, process_request: Process | None = None, **theirs: Any) -> Any:
+        del host, port  # viser would try the next port, and the next, when one is taken
+        if process_request is not None:
+            in_place.append(process_request)
+            theirs["process_request"] = before(process_request)
+        return original(handler, **theirs | {**options, "sock": listening})
+
+    try:
+        with _replacing, quiet():
+            original = websocket_server.serve
+            websocket_server.serve = serve  # type: ignore[assignment,misc]
+            try:
+                server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+            finally:
+                websocket_server.serve = original  # type: ignore[misc]
+    except BaseException:
+        listening.close()
+        raise
+    if not in_place:
+        server.stop()
+        listening.close()
+        raise RuntimeError(f"viser {viser.__version__} serves in another way than the guard of its page knows")
+    for message in (ShareUrlRequest, ShareUrlDisconnect):
+        server._websock_server.unregister_handler(message)
+    return server
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """A block in which viser writes no frames around its address on stdout."""
+    console = get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
+
+
+# --- the client ---
 
 PACKED = re.compile(r'<script data-p="([^"]*)" data-ss="(\d+)" data-cs="(\d+)">(.*?)</script>', re.DOTALL)
 DECODER = re.compile(r'const gzWasm=("[^"]*")')

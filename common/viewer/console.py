@@ -1,0 +1,208 @@
+"""From a person to the cell: what is done on the page is brought from viser's threads to the loop, and asked there."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections.abc import Callable, Coroutine, Iterable
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+import viser
+from pydantic import JsonValue
+
+from common import topics
+from common.config import Members
+from common.errors import RequestFailed, ZencellError
+from common.messages import Message, Parameter, ParameterRequest, StopRequest, TaskCommand, Vector3, WorldEdit
+from common.topics import Request, Topic
+from common.viewer.feeds import Feeds
+from common.viewer.words import problem
+
+if TYPE_CHECKING:
+    from common.transport.bus import Bus
+    from common.transport.requests import Client
+
+Act = Callable[[], Coroutine[Any, Any, None] | None]
+M = TypeVar("M", bound=Message)
+Q = TypeVar("Q", bound=Message)
+A = TypeVar("A", bound=Message)
+V = TypeVar("V")
+V_co = TypeVar("V_co", covariant=True)
+
+BY = "page"
+EXECUTOR = "trajectory_executor"
+SPEED = f"services.{EXECUTOR}.speed_scaling"
+SLIDING = 0.15  # [s] after a slider came to rest, what it says is sent
+_SOON = 2.0  # [s] wall: for what every service has at hand, and for stopping
+_PATIENCE = 5.0  # [s] wall: for anything else
+
+
+class Field(Protocol[V_co]):
+    """Something on the page that has a value, as mypy sees it."""
+
+    @property
+    def value(self) -> V_co:
+        """What it shows."""
+
+
+def assign(handle: Field[V], value: V) -> None:
+    """Show a value in a field of the page, in every browser."""
+    handle.value = value  # type: ignore[misc]  # it has a setter, behind a decorator
+
+
+def can_be_given(handle: object, value: object) -> bool:
+    """Whether a browser can give that value: whoever has the page open may send what no field of it takes."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return False
+    return not isinstance(handle, viser.GuiDropdownHandle) or value in handle.options
+
+
+class Tell(Protocol):
+    """Shows a person a line about what they asked for."""
+
+    def __call__(self, line: str, kind: str = "bad", /) -> None:
+        """Show a line that is good, busy or bad; an empty one takes it away. On the loop of the service."""
+
+
+class Desk:
+    """Takes orders on any thread and carries them out on the loop: plain calls in order, coroutines side by side.
+
+    What goes wrong in a way that a person can understand is told; anything else is a bug and ends `run`.
+    """
+
+    def __init__(self) -> None:
+        """Make a desk, on the running loop. `tell` is to be replaced by whoever can show a line to the person."""
+        self.tell: Tell = lambda _line, _kind="bad": None
+        self._loop = asyncio.get_running_loop()
+        self._orders: asyncio.Queue[Act] = asyncio.Queue()
+
+    def put(self, act: Act) -> None:
+        """Have something done; from any thread. A loop that has ended does nothing more."""
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._orders.put_nowait, act)
+
+    async def run(self) -> None:
+        """Carry out orders until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            while True:
+                act = await self._orders.get()
+                try:
+                    doing = act()
+                except ZencellError as error:
+                    self.tell(problem(error))
+                    continue
+                if doing is not None:
+                    group.create_task(self._see_through(doing))
+
+    async def _see_through(self, doing: Coroutine[Any, Any, None]) -> None:
+        try:
+            await doing
+        except ZencellError as error:
+            self.tell(problem(error))
+
+    # Callbacks of viser that are coroutines run on its loop at once; others would wait for a thread.
+
+    def on_click(self, button: viser.GuiButtonHandle, act: Act) -> None:
+        """Do something whenever a button is clicked."""
+
+        async def clicked(_event: object) -> None:
+            self.put(act)
+
+        button.on_click(clicked)
+
+    def on_choice(
+        self, buttons: viser.GuiButtonGroupHandle, act: Callable[[str], Coroutine[Any, Any, None] | None]
+    ) -> None:
+        """Do something with the text of the button that was clicked in a group."""
+
+        async def clicked(event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
+            chosen = event.target.value
+            if chosen in event.target.options:
+                self.put(lambda: act(chosen))
+
+        buttons.on_click(clicked)
+
+    def on_change(
+        self, handle: viser.GuiInputHandle[V], act: Callable[[V], Coroutine[Any, Any, None] | None]
+    ) -> None:
+        """Do something with the value that a person gave; not with one that the service sets itself."""
+
+        async def changed(event: viser.GuiEvent[viser.GuiInputHandle[V]]) -> None:
+            value = event.target.value
+            if event.client_id is not None and can_be_given(event.target, value):
+                self.put(lambda: act(value))
+
+        handle.on_update(changed)
+
+
+class Console(Desk):
+    """A desk that knows whom to ask. Each request ends in an answer or raises a `RequestFailed`."""
+
+    def __init__(self, bus: Bus, members: Members, feeds: Feeds, more: Iterable[Request[Any, Any]] = ()) -> None:
+        """Declare the clients.
+
+        Args:
+            bus: of the service.
+            members: who is in the cell.
+            feeds: what the cell says.
+            more: what else may be asked.
+        """
+        super().__init__()
+        self._feeds = feeds
+        asked: list[Request[Any, Any]] = [topics.TASK_COMMAND, topics.MOTION_STOP, topics.WORLD_EDIT]
+        self._clients: dict[str, Client[Any, Any]] = {request.key: bus.client(request) for request in [*asked, *more]}
+        self._parameters = {name: bus.client(topics.parameters_of(name)) for name in members.services}
+
+    def latest(self, topic: Topic[M]) -> M | None:
+        """The newest message of a topic that the page reads, or None."""
+        return self._feeds.latest(topic)
+
+    async def ask(self, request: Request[Q, A], message: Q, timeout: float = _PATIENCE) -> A:
+        """The answer to a request of the page, or of those that an application named as its `REQUESTS`."""
+        client: Client[Q, A] = self._clients[request.key]
+        return await client.call(message, timeout)
+
+    async def command(self, command: str) -> None:
+        """Tell the task to start, pause, resume or stop."""
+        await self.ask(topics.TASK_COMMAND, TaskCommand.model_validate({"command": command}))
+
+    async def stop(self) -> None:
+        """Bring the arm to rest and end the task, at the same time: one that fails does not hold the other back.
+
+        Raises:
+            RequestFailed: the arm could not be told; or it could, but the task could not.
+        """
+        told = await asyncio.gather(
+            self.ask(topics.MOTION_STOP, StopRequest(reason="stopped on the page"), _SOON),
+            self.ask(topics.TASK_COMMAND, TaskCommand(command="stop"), _SOON),
+            return_exceptions=True,
+        )
+        for answer in told:
+            if isinstance(answer, BaseException):
+                raise answer
+
+    async def move(self, object_id: str, x: float, y: float) -> None:
+        """Put an object of the simulated world somewhere [m]."""
+        await self.ask(topics.WORLD_EDIT, WorldEdit(op="move", id=object_id, position=Vector3(x=x, y=y)))
+
+    async def parameters(self) -> dict[str, list[Parameter]]:
+        """The parameters of each service that answers."""
+        names = [name for name, client in self._parameters.items() if client.available]
+        replies = await asyncio.gather(*map(self._parameters_of, names))
+        return {name: reply for name, reply in zip(names, replies, strict=True) if reply is not None}
+
+    async def _parameters_of(self, service: str) -> list[Parameter] | None:
+        try:
+            return (await self._parameters[service].call(ParameterRequest(), _SOON)).parameters
+        except RequestFailed:
+            return None  # it is shown as gone, or asked again soon
+
+    async def set_parameter(self, services: list[str], path: str, value: JsonValue) -> None:
+        """Change a parameter in every service that has it."""
+        request = ParameterRequest(set={path: value}, by=BY)
+        await asyncio.gather(*(self._parameters[name].call(request, _SOON) for name in services))
+
+    async def set_speed(self, scaling: float) -> None:
+        """Have trajectories followed at a share of their speed."""
+        await self.set_parameter([EXECUTOR], SPEED, scaling)
