@@ -14,8 +14,7 @@ from typing import Any, TypeVar
 
 from common import messages as m
 from common import topics
-from common.applications.outlining.topics import OUTLINE_STATUS
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from common.application import applications
 from common.errors import RequestFailed, ZencellError
 from common.sources import new_id
 from common.transport.bus import Bus
@@ -61,7 +60,7 @@ class OperatorMotion:
         self._stop, self._hold = bus.client(topics.MOTION_STOP), bus.client(topics.MOTION_HOLD)
         self._motion = bus.reader(topics.MOTION_STATUS)
         if tasks is None:
-            tasks = [bus.reader(PICK_PLACE_STATUS), bus.reader(OUTLINE_STATUS)]
+            tasks = [bus.reader(found.status) for found in applications()]
         self._tasks = tasks
 
     async def plan(self, goal: Goal, *, planner: str = "", straight: bool = False) -> m.PlanResponse:
