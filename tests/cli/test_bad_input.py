@@ -93,7 +93,8 @@ def test_the_process_ends_with_the_exit_code_and_without_a_traceback(tmp_path: P
 @pytest.mark.parametrize(
     ("override", "wanted"),
     [
-        ("robot.urdf=package://example-robot-data/robots/nobody/nobody.urdf", "nobody.urdf"),
+        pytest.param("robot.urdf=package://example-robot-data/robots/nobody/nobody.urdf", "nobody.urdf",
+                     marks=pytest.mark.slow, id="a file"),
         ("services.vision_detector.min_aera=3", "services.vision_detector.min_aera"),
     ],
 )

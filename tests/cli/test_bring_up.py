@@ -65,7 +65,10 @@ def test_what_turns_out_wrong_only_in_use_ends_everything_too(zencell: Start) ->
     assert not command.children()
 
 
-@pytest.mark.parametrize("phase", ["hello from first", "first: hello", "hello from last", UP])
+@pytest.mark.parametrize("phase", [
+    pytest.param("hello from first", marks=pytest.mark.slow), "first: hello",
+    pytest.param("hello from last", marks=pytest.mark.slow), UP,
+])
 def test_interrupted_at_any_time_no_process_is_left(zencell: Start, phase: str) -> None:
     command = zencell("up", "tiny.yaml")
     command.until(phase)
@@ -76,6 +79,7 @@ def test_interrupted_at_any_time_no_process_is_left(zencell: Start, phase: str) 
     assert not any("Traceback" in line for line in command.lines)
 
 
+@pytest.mark.slow
 def test_interrupted_before_anything_is_up_no_process_is_left(zencell: Start) -> None:
     command = zencell("run", "tiny.yaml", "--set", "services.first.behave=never ready", "--summary", "out.json")
     command.until("waiting for the moon")
@@ -143,6 +147,7 @@ def test_a_port_in_use_names_domain_and_process(zencell: Start, folder: Path) ->
     assert "services.router" in line
 
 
+@pytest.mark.slow
 def test_log_lines_as_json(zencell: Start) -> None:
     command = zencell("up", "tiny.yaml", "--log-json")
     command.until(UP)

@@ -33,7 +33,7 @@ from common.transport.endpoint import MOST_BYTES, MOST_BYTES_BESIDES, client_con
 from tests.harness import RunningCell, command_line, environment, until
 from tests.security.holders import REFUSED, Heard, Holder
 
-pytestmark = [pytest.mark.cell, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.timeout(300)]
 
 TOKEN = "the-token-of-this-page-0123456789"
 TRUTH = {"panda/scene_balls", "panda/scene_objects"}

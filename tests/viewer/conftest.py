@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from playwright.async_api import Browser, BrowserContext, Page, ViewportSize
 
 IN_BROWSER = [
-    pytest.mark.browser, pytest.mark.cell, pytest.mark.timeout(240), pytest.mark.asyncio(loop_scope="session"),
+    pytest.mark.browser, pytest.mark.cell, pytest.mark.slow, pytest.mark.timeout(240),
+    pytest.mark.asyncio(loop_scope="session"),
 ]
 PATIENCE = 60.0  # [s] until a test gives up waiting for an event; a busy machine without a GPU is slow
 NAMES = ("chromium", "chromium-browser", "google-chrome-stable", "google-chrome")
