@@ -42,8 +42,7 @@ class KnownShort(Section):
             return {**given, "containers": {_id_of(container): container}}
         if not isinstance(containers, Mapping) or not containers:
             return given
-        containers = {name: {**value, "id": name} if isinstance(value, Mapping) else value
-                      for name, value in containers.items()}
+        containers = {name: _named(name, value) for name, value in containers.items()}
         return {"container": next(iter(containers.values())), **given, "containers": containers}
 
     @model_validator(mode="before")
@@ -147,6 +146,13 @@ class WorldShort(KnownShort):
 
 def _has_balls(given: Mapping[str, Any]) -> bool:
     return any(given.get(field) for field in ("spots", "balls", "count")) or given.get("layout") == "random"
+
+
+def _named(name: str, container: Any) -> Any:
+    """A container whose id is the name under which it stands."""
+    if isinstance(container, Container):
+        return container.model_copy(update={"id": name})
+    return {**container, "id": name} if isinstance(container, Mapping) else container
 
 
 def _id_of(container: Any) -> str:

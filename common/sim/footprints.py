@@ -51,29 +51,27 @@ def overlap(a: Array, b: Array) -> bool:
     """Whether two outlines (N, 2) and (K, 2), anticlockwise, have an area in common; touching does not count."""
     if (a.max(axis=0) < b.min(axis=0) + TOUCH).any() or (b.max(axis=0) < a.min(axis=0) + TOUCH).any():
         return False
-    return _cross(a, b) or _covers(a, b) or _covers(b, a)
+    return any(_meet(p, q) for p in _convex_parts(a) for q in _convex_parts(b))
 
 
-def _cross(a: Array, b: Array) -> bool:
-    """Whether any side of one crosses a side of the other."""
-    p, q = a[:, None], b[None]
-    r, s = np.roll(a, -1, axis=0)[:, None], np.roll(b, -1, axis=0)[None]
-    one = _side(p, r, q) * _side(p, r, s)
-    other = _side(q, s, p) * _side(q, s, r)
-    return bool(((one < 0) & (other < 0)).any())
+def _convex_parts(outline: Array) -> list[Array]:
+    """The outline itself if it is convex, else triangles, all anticlockwise."""
+    side = np.roll(outline, -1, axis=0) - outline
+    following = np.roll(side, -1, axis=0)
+    if (side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0] >= -1e-12).all():
+        return [outline]
+    return list(triangulate(outline))
 
 
-def _side(start: Array, end: Array, point: Array) -> Array:
-    """On which side of a line a point lies: 1 or -1, 0 for one that is on it to within `TOUCH`."""
-    way, to = end - start, point - start
-    length = np.maximum(np.hypot(way[..., 0], way[..., 1]), 1e-12)
-    distance = (way[..., 0] * to[..., 1] - way[..., 1] * to[..., 0]) / length
-    return np.asarray(np.where(np.abs(distance) < TOUCH, 0.0, np.sign(distance)))
-
-
-def _covers(a: Array, b: Array) -> bool:
-    """Whether a covers a point that is well within b: of outlines that do not cross, one may lie in the other."""
-    return bool(_inside(a, triangulate(b).mean(axis=1)).any())
+def _meet(a: Array, b: Array) -> bool:
+    """Whether two convex outlines have an area in common: no side of either parts them."""
+    for one, other in ((a, b), (b, a)):
+        side = np.roll(one, -1, axis=0) - one
+        length = np.hypot(side[:, 0], side[:, 1])
+        outward = np.column_stack([side[:, 1], -side[:, 0]])[length > 1e-9] / length[length > 1e-9, None]
+        if ((other @ outward.T).min(axis=0) > (one @ outward.T).max(axis=0) - TOUCH).any():
+            return False
+    return True
 
 
 def covers_point(outline: Array, x: float, y: float) -> bool:

@@ -48,7 +48,7 @@ class SimulatedWorld(Protocol):
     version: int
 
     def obstruction(self, T_world_tcp: Array, width: float) -> float:
-        """The width [m] that the fingers can not close below: what is between them now, or 0.
+        """The width [m] that the fingers cannot close below: what is between them now, or 0.
 
         Args:
             T_world_tcp: (4, 4) pose of the hand; its y axis is the direction in which the fingers open.

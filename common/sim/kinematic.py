@@ -24,6 +24,7 @@ from common.sim.resting import Body, Ground, Rest
 Array = NDArray[np.float64]
 
 GRAVITY = 9.81  # [m/s^2]
+TOUCH = 1e-6  # [m]
 LINES = 5  # across a finger pad, along which it is felt what is between the fingers
 
 
@@ -45,7 +46,7 @@ class KinematicWorld:
         """Put every object where it lies at first; a sphere above a container lies in it.
 
         Raises:
-            ConfigError: an object can not lie where it is to.
+            ConfigError: an object cannot lie where it is to.
         """
         self.version = 0
         self._config = world
@@ -113,7 +114,7 @@ class KinematicWorld:
     # --- the hand ---
 
     def obstruction(self, T_world_tcp: Array, width: float) -> float:
-        """The width [m] that the fingers can not close below: see `common.sim.interface`."""
+        """The width [m] that the fingers cannot close below: see `common.sim.interface`."""
         if held := self.held:
             return self._bodies[held].width
         found: dict[str, tuple[float, float]] = {}
@@ -143,7 +144,9 @@ class KinematicWorld:
             ends = _pressed(solid, invert(T_world_tcp) @ body.T, width, allowed)
             if ends is None:
                 return None
-            (low, high), half = ends, (ends[1] - ends[0]) / 2
+            before = self._between.get(body.name, ends)  # the closing finger may hide an end by pushing it
+            low, high = ends if ends[1] - ends[0] >= before[1] - before[0] else before
+            half = (high - low) / 2
             fits = low >= -width / 2 - allowed.sideways and high <= width / 2 + allowed.sideways
             near = abs(low + high) / 2 < max(width / 2, half)
         enters = width / 2 >= half and fits
@@ -358,7 +361,7 @@ def _pressed(
     x, z = (np.linspace(-half, half, LINES) for half in (allowed.across, allowed.along))
     lines = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
     spans = solid.spans(T_tcp_object, lines)
-    middle = spans[len(spans) // 2]
+    middle = spans[len(lines) // 2]
     if not (np.abs(middle).min(axis=1) < width / 2).any() and not ((middle[:, 0] < 0) & (middle[:, 1] > 0)).any():
         return None
     parts = sorted(tuple(span) for found in spans for span in found.tolist())
@@ -368,7 +371,7 @@ def _pressed(
             merged[-1][1] = max(merged[-1][1], high)
         else:
             merged.append([low, high])
-    inside = [part for part in merged if part[0] < width / 2 and part[1] > -width / 2]
+    inside = [part for part in merged if part[0] <= width / 2 + TOUCH and part[1] >= -width / 2 - TOUCH]
     return (inside[0][0], inside[-1][1]) if inside else None
 
 

@@ -109,10 +109,11 @@ class Solid:
     def spans(self, T_tool_object: Array, lines: Array) -> list[Array]:
         """Where lines along the tool's y axis, through (k, 2) places x, z [m], run within it: (n, 2) y [m] of each.
 
-        Of a mesh, which need not be closed, from the first to the last point.
+        Of a mesh, which need not be closed, from the first to the last point. What is last in the list are the ends
+        of what of its edges lies among the lines.
         """
-        corners = placed(self.triangles, T_tool_object)
-        flat = corners[..., [0, 2]]
+        surface = placed(self.triangles, T_tool_object)
+        corners, flat = surface, surface[..., [0, 2]]
         wanted = lines + _OFF
         near = ((flat.max(axis=1) >= wanted.min(axis=0)) & (flat.min(axis=1) <= wanted.max(axis=0))).all(axis=1)
         corners, flat = corners[near], flat[near]
@@ -130,7 +131,27 @@ class Solid:
             if self.shape == "mesh" or len(crossed) % 2:
                 crossed = crossed[[0, -1]] if len(crossed) else crossed
             found.append(crossed.reshape(-1, 2))
-        return found
+        start = surface[near].reshape(-1, 3)
+        y = _clipped(start, np.roll(surface[near], -1, axis=1).reshape(-1, 3), lines.min(axis=0), lines.max(axis=0))
+        return [*found, np.repeat(y[:, None], 2, axis=1)]
+
+
+def _clipped(start: Array, end: Array, low: Array, high: Array) -> Array:
+    """y (n,) [m] of the ends of what of the edges between points (m, 3) lies between two corners (x, z) [m].
+
+    Liang and Barsky, "A new concept and method for line clipping" (1984).
+    """
+    way = end - start
+    enter, leave = np.zeros(len(start)), np.ones(len(start))
+    for axis, bottom, top in ((0, low[0], high[0]), (2, low[1], high[1])):
+        flat = np.abs(way[:, axis]) < 1e-12
+        slope = np.where(flat, 1.0, way[:, axis])
+        s, t = (bottom - start[:, axis]) / slope, (top - start[:, axis]) / slope
+        within = (start[:, axis] >= bottom) & (start[:, axis] <= top)
+        enter = np.maximum(enter, np.where(flat, np.where(within, 0.0, 2.0), np.minimum(s, t)))
+        leave = np.minimum(leave, np.where(flat, 1.0, np.maximum(s, t)))
+    some = enter <= leave
+    return np.concatenate([(start[:, 1] + share * way[:, 1])[some] for share in (enter, leave)])
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -141,7 +162,7 @@ def solid_of(thing: ObjectConfig) -> Solid:
     """The shape that the configuration describes.
 
     Raises:
-        ConfigError: the file of a mesh can not be read.
+        ConfigError: the file of a mesh cannot be read.
     """
     height = thing.height or 0.0
     if thing.shape == "sphere":
@@ -186,14 +207,14 @@ def load_mesh(name: str, path: Path, scale: float) -> Array:
     """Triangles (n, 3, 3) [m] of a file, scaled.
 
     Raises:
-        ConfigError: it can not be read, has no triangles, or too many.
+        ConfigError: it cannot be read, has no triangles, or too many.
     """
     import trimesh  # takes a third of a second, and few worlds have meshes
 
     try:
         triangles = scale * np.array(trimesh.load_mesh(str(path), process=False).triangles, dtype=np.float64)
     except (OSError, ValueError, AttributeError, IndexError, KeyError, NotImplementedError) as error:
-        raise ConfigError(f"world.objects.{name}.mesh", str(path), f"can not be read: {error}") from None
+        raise ConfigError(f"world.objects.{name}.mesh", str(path), f"cannot be read: {error}") from None
     if not 0 < len(triangles) <= MOST_TRIANGLES:
         raise ConfigError(f"world.objects.{name}.mesh", str(path),
                           f"has {len(triangles)} triangles; 1 to {MOST_TRIANGLES} can be simulated: simplify it")

@@ -195,6 +195,8 @@ class Ground:
     ) -> tuple[float, float, float] | None:
         """The nearest place (x, y, height) where an outline about its own origin rests, within a container if given."""
         inner = box.half_side - box.wall_thickness if box else 0.0
+        carried = [b.high for b in blocks if b.flat and b.low < bottom and covers_point(b.outline, *at)]
+        level = max(carried, default=self._world.table_height)  # it slides off to below its middle, never up
         for ring in range(int(FARTHEST / STEP)):
             for angle in np.linspace(0.0, 2 * math.pi, max(1, min(36, 8 * ring)), endpoint=False):
                 x, y = at[0] + ring * STEP * math.cos(angle), at[1] + ring * STEP * math.sin(angle)
@@ -204,7 +206,7 @@ class Ground:
                 if not box and any(is_over(c, x, y) for c in self._containers):
                     continue
                 height = self._height(there, x, y, bottom, blocks)
-                if height is not None:
+                if height is not None and (not ring or height < level + LEVEL):
                     return x, y, height
             if box and ring * STEP > 2 * box.half_side:
                 break
