@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import msgpack
 import numpy as np
 
 from common import topics
@@ -21,9 +23,7 @@ from common.messages import (
     Message,
     MotionStatus,
     PointCloud2,
-    PoseArray,
     ServiceCounters,
-    WorldObjects,
 )
 from common.topics import AnyTopic
 from common.transport.codec import decode
@@ -44,7 +44,7 @@ STILL = 1e-9  # [rad]
 UNTOLD = 3  # set-points of a goal that may come before it is told of
 CYCLE = 0.025  # [s] of cell time at most between two cycles of a controller that is not held up
 STALL = 0.3  # [s] of cell time after which a trajectory goes on where it was
-CARRIED, CONTAINED, LOST = ("held", "falling"), "box", "elsewhere"  # what the truth says of an object
+CARRIED, CONTAINED, LOST = ("held", "falling"), "contained", "elsewhere"  # what the truth says of an object
 
 OBJECTS = "no object lost or doubled"
 TWO = "never two goals"
@@ -76,14 +76,16 @@ class Invariants:
         self.truth_readers: set[str] = set()  # processes that hear what only cameras may see
         self._requests, self._now = requests, now
         requests.on_answer = self._on_answer
-        known: dict[str, AnyTopic] = {**topics.platform_topics(), **find_application(cell.application).topics}
-        self._truth = {f"{cell.name}/{t.key}": t for t in known.values() if t.doc.startswith("the truth")}
+        application = find_application(cell.application)
+        known: dict[str, AnyTopic] = {**topics.platform_topics(), **application.topics}
+        self._objects = f"{cell.name}/{topics.SCENE_OBJECTS.key}"
+        self._truth = [self._objects, *(f"{cell.name}/{view.key}" for view in application.views)]
         self._messages = {t.message.__name__: t.message for t in known.values()}
         self._motion = f"{cell.name}/{topics.MOTION_STATUS.key}"
         self._gripper = f"{cell.name}/{topics.GRIPPER_STATE.key}"
         self._goals: dict[str, _Goals] = {}
         self._over: dict[tuple[str, str], str] = {}  # by key and goal
-        self._ids: dict[str, list[str]] = {}  # by key: what there is
+        self._ids: list[str] = []  # what there is
         self._lying: dict[str, tuple[str, Vector]] = {}  # by object: state and place
         self._held_since: float | None = None  # cell time
         self._last: tuple[Vector, Vector, float] | None = None  # newest set-points and when
@@ -125,8 +127,8 @@ class Invariants:
         elif sample.key == self._gripper:
             gripper = decode(GripperState, sample.payload)
             self._on_goal(sample.key, life, gripper.id, gripper.state)
-        elif sample.key in self._truth:
-            self._on_truth(sample.key, decode(self._truth[sample.key].message, sample.payload))
+        elif sample.key == self._objects:
+            self._on_truth(msgpack.unpackb(sample.payload)["objects"])
 
     def _on_goal(self, key: str, life: str, goal: str, state: str) -> None:
         known = self._goals.setdefault(key, _Goals())
@@ -145,23 +147,18 @@ class Invariants:
                 self._tell(TWO, f"{key}: {goal} is active while {known.active} is")
             known.active = goal
 
-    def _on_truth(self, key: str, message: Message) -> None:
+    def _on_truth(self, objects: list[dict[str, Any]]) -> None:
+        ids = sorted(str(thing["id"]) for thing in objects)
+        self._ids = self._ids or ids
+        if self._broke(ids == self._ids and len(set(ids)) == len(ids), OBJECTS):
+            self._tell(OBJECTS, f"{ids} instead of {self._ids}")
         things: dict[str, tuple[str, Vector]] = {}
-        if isinstance(message, PoseArray):
-            for name, state, pose in zip(message.ids, message.labels, message.poses, strict=True):
-                things[name] = state, np.array([pose.position.x, pose.position.y, pose.position.z])
-            ids = sorted(message.ids)
-        elif isinstance(message, WorldObjects):
-            things = {o.id: ("", np.array([*np.mean(o.outline, axis=0), o.base])) for o in message.objects}
-            ids = sorted(o.id for o in message.objects)
-        else:
-            return
-        known = self._ids.setdefault(key, ids)
-        if self._broke(ids == known and len(set(ids)) == len(ids), OBJECTS):
-            self._tell(OBJECTS, f"{key}: {ids} instead of {known}")
+        for thing in objects:
+            place = thing["pose"]["position"]
+            things[thing["id"]] = thing["state"], np.array([place["x"], place["y"], place["z"]])
         held = [name for name, (state, _) in things.items() if state in CARRIED[:1]]
         if self._broke(len(held) <= 1, OBJECTS):
-            self._tell(OBJECTS, f"{key}: {held} are held at once")
+            self._tell(OBJECTS, f"{held} are held at once")
         for name, (state, place) in things.items():
             was, there = self._lying.get(name, (state, place))
             self._lying[name] = state, place
