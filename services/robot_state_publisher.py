@@ -8,10 +8,10 @@ from pydantic import Field
 
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
-from common.messages import Header, JointState, TFMessage, TransformStamped
+from common.messages import JointState, TFMessage, TransformStamped
 from common.process.service import main
 from common.robot.model import RobotModel
-from common.robot.transforms import invert, matrix_to_pose, rpy_to_matrix, transform
+from common.robot.transforms import invert, pose_fields, rpy_to_matrix, transform
 from common.transport.bus import Bus
 
 MOST_MESSAGES = 250.0  # per second of wall time
@@ -28,8 +28,9 @@ class Config(Parameters):
 
 def stamped(parent: str, child: str, T_parent_child: NDArray[np.float64], stamp: int) -> TransformStamped:
     """The pose of child in parent as a message."""
-    header = Header(stamp=stamp, frame_id=parent)
-    return TransformStamped(header=header, child_frame_id=child, transform=matrix_to_pose(T_parent_child))
+    header = {"stamp": stamp, "frame_id": parent}
+    fields = {"header": header, "child_frame_id": child, "transform": pose_fields(T_parent_child)}
+    return TransformStamped.model_validate(fields)
 
 
 class LinkFrames:

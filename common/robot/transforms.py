@@ -7,10 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from common.messages import Pose, Quaternion, Vector3
+from common.messages import Pose
 
 Array = NDArray[np.float64]
 
+_IDENTITY = np.eye(4)
 
 def quaternion_to_matrix(x: float, y: float, z: float, w: float) -> Array:
     """(3, 3) rotation of a quaternion x, y, z, w, which is normalised first."""
@@ -30,25 +31,25 @@ def matrix_to_quaternion(rotation: Array) -> tuple[float, float, float, float]:
 
     Shepperd's method: divides by the largest of the four components, so it is exact near half turns too.
     """
-    m = rotation
-    trace = float(m[0, 0] + m[1, 1] + m[2, 2])
-    squares = (float(m[0, 0]), float(m[1, 1]), float(m[2, 2]), trace)
-    largest = max(range(4), key=squares.__getitem__)
+    m = rotation.tolist()  # many times as fast as looking into an array
+    trace = m[0][0] + m[1][1] + m[2][2]
+    squares = (m[0][0], m[1][1], m[2][2], trace)
+    largest = squares.index(max(squares))
     if largest == 3:
-        q = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], 1 + trace]
+        q = [m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1], 1 + trace]
     else:
         i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
-        q = [0.0, 0.0, 0.0, m[k, j] - m[j, k]]
-        q[i] = 1 + m[i, i] - m[j, j] - m[k, k]
-        q[j] = m[i, j] + m[j, i]
-        q[k] = m[k, i] + m[i, k]
-    norm = math.copysign(math.sqrt(sum(float(v) ** 2 for v in q)), q[3])
-    return float(q[0] / norm), float(q[1] / norm), float(q[2] / norm), float(q[3] / norm)
+        q = [0.0, 0.0, 0.0, m[k][j] - m[j][k]]
+        q[i] = 1 + m[i][i] - m[j][j] - m[k][k]
+        q[j] = m[i][j] + m[j][i]
+        q[k] = m[k][i] + m[i][k]
+    norm = math.copysign(math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2), q[3])
+    return q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm
 
 
 def pose_to_matrix(pose: Pose) -> Array:
     """(4, 4) matrix of a pose message."""
-    T = np.eye(4)
+    T = _IDENTITY.copy()
     o, p = pose.orientation, pose.position
     T[:3, :3] = quaternion_to_matrix(o.x, o.y, o.z, o.w)
     T[:3, 3] = p.x, p.y, p.z
@@ -57,11 +58,14 @@ def pose_to_matrix(pose: Pose) -> Array:
 
 def matrix_to_pose(T: Array) -> Pose:
     """The pose message of a (4, 4) matrix."""
+    return Pose.model_validate(pose_fields(T))
+
+
+def pose_fields(T: Array) -> dict[str, dict[str, float]]:
+    """The same as the fields of a pose message: what is made of many of them is checked as a whole, and once."""
     x, y, z, w = matrix_to_quaternion(T[:3, :3])
-    return Pose(
-        position=Vector3(x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3])),
-        orientation=Quaternion(x=x, y=y, z=z, w=w),
-    )
+    px, py, pz = T[:3, 3].tolist()
+    return {"position": {"x": px, "y": py, "z": pz}, "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
 
 def rpy_to_matrix(roll: float, pitch: float, yaw: float) -> Array:
@@ -90,7 +94,7 @@ def matrix_to_rpy(rotation: Array) -> tuple[float, float, float]:
 
 def transform(rotation: Array, translation: Array | tuple[float, float, float]) -> Array:
     """(4, 4) matrix of a (3, 3) rotation and a translation [m]."""
-    T = np.eye(4)
+    T = _IDENTITY.copy()
     T[:3, :3] = rotation
     T[:3, 3] = translation
     return T
@@ -98,7 +102,7 @@ def transform(rotation: Array, translation: Array | tuple[float, float, float]) 
 
 def invert(T: Array) -> Array:
     """Inverse of a rigid (4, 4) transform: T_b_a for T_a_b."""
-    inverse = np.eye(4)
+    inverse = _IDENTITY.copy()
     inverse[:3, :3] = T[:3, :3].T
     inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
     return inverse

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -57,6 +58,7 @@ class KinematicWorld:
         self._bodies: dict[str, Body] = {}
         self._between: dict[str, tuple[float, float]] = {}  # what the fingers would press on: its ends along tool y [m]
         self._events: list[SceneUpdate] = []
+        self._kept: tuple[int, dict[str, StandingObject]] | None = None  # as of a version
         try:
             self._lay_out()
         except Refused as refusal:
@@ -65,13 +67,18 @@ class KinematicWorld:
 
     # --- over a restart ---
 
-    @property
+    @cached_property
     def layout(self) -> dict[str, tuple[float, ...]]:
         """Where everything was at first, (x, y, z) [m] by id."""
         return {name: tuple(pose_of(thing, self._solids[name])[:3, 3].tolist()) for name, thing in self._first.items()}
 
     def standing(self) -> dict[str, StandingObject]:
         """Everything as it is, for `restore`."""
+        if self._kept is None or self._kept[0] != self.version:
+            self._kept = self.version, self._standing()
+        return self._kept[1]
+
+    def _standing(self) -> dict[str, StandingObject]:
         return {
             name: StandingObject(
                 pose=_numbers(b.T), like=b.like, made=b.message() if b.added and not b.like else None,

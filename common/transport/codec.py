@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import msgpack
@@ -121,6 +122,7 @@ def encode_attachment(attachment: Attachment) -> bytes:
     return packed
 
 
+@lru_cache(maxsize=256)  # several readers of a process, and states that are put again
 def decode_attachment(data: bytes | None) -> Attachment | None:
     """The attachment, or None for a sender that sends none, such as a plain zenoh-cli put.
 

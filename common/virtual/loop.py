@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from contextvars import Context, ContextVar
 from itertools import count
+from random import Random
 from typing import Any
 
 import numpy as np
@@ -89,7 +90,7 @@ class VirtualLoop(base_events.BaseEventLoop):
         self._now = 0.0
         self._work_ns = 0  # done by the call that computes now
         self._computing = False
-        self._ids = np.random.default_rng([seed, 1])
+        self._ids = Random(f"ids of {seed}")  # a text: the same in every process
         self._calls = np.random.default_rng([seed, 2])
         self._numbers = count()
         self.set_task_factory(self._make_task)
@@ -112,7 +113,7 @@ class VirtualLoop(base_events.BaseEventLoop):
 
     def token_hex(self, count: int) -> str:
         """An id that the seed decides, of so many bytes."""
-        return self._ids.bytes(count).hex()
+        return f"{self._ids.getrandbits(8 * count):0{2 * count}x}"
 
     # --- turns --------------------------------------------------------------------------------------------------------
 
