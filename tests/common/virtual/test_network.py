@@ -29,8 +29,14 @@ def run(main, weather=FAIR):
 
     async def whole():
         net = Net(loop, weather)
-        async with asyncio.timeout(1000.0):
-            return await main(net)
+        try:
+            async with asyncio.timeout(1000.0):
+                return await main(net)
+        finally:
+            left = asyncio.all_tasks() - {asyncio.current_task()}
+            for task in left:
+                task.cancel()
+            await asyncio.gather(*left, return_exceptions=True)
 
     with drawn_from(loop):
         try:
