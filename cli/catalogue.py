@@ -45,7 +45,7 @@ def service(
     ],
     cell: Annotated[
         str, typer.Option("--cell", metavar="CELL", help="the cell that it belongs to", autocompletion=completion.cells)
-    ] = "panda",
+    ] = completion.default_cell(),
     overrides: options.Overrides = None,
     world: options.WorldName = None,
     seed: options.Seed = None,

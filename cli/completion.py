@@ -81,6 +81,11 @@ def cells(incomplete: str) -> list[Offer]:
     return _starting(incomplete, ((path.stem, _first_comment(path)) for path in _config_files("cells")))
 
 
+def default_cell() -> str:
+    """The first cell that there is by name."""
+    return min((path.stem for path in _config_files("cells")), default="")
+
+
 def worlds(incomplete: str) -> list[Offer]:
     """Worlds by name."""
     return _starting(incomplete, ((path.stem, _first_comment(path)) for path in _config_files("worlds")))

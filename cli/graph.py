@@ -41,7 +41,7 @@ class Graph:
 def graph(
     cell: Annotated[
         str, typer.Argument(metavar="[CELL]", help="name or path of the cell file", autocompletion=completion.cells)
-    ] = "panda",
+    ] = completion.default_cell(),
     output: Annotated[
         str, typer.Option("-o", "--output", metavar="FILE", help="*.svg, *.dot or *.mmd; without it Mermaid on stdout")
     ] = "",

@@ -26,8 +26,10 @@ class NothingUp(RequestFailed):
     """There is no cell to look at."""
 
     def __init__(self, endpoint: str, what: str) -> None:
+        from cli.completion import default_cell
+
         super().__init__(
-            f"{what} at {endpoint}; is a cell up (`zencell up panda`), and on this --domain or --connect?"
+            f"{what} at {endpoint}; is a cell up (`zencell up {default_cell()}`), and on this --domain or --connect?"
         )
         self.endpoint = endpoint
 

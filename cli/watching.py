@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from cli.measuring import Hearing
-from common.application import all_topics
+from common.application import all_topics, applications
 
 if TYPE_CHECKING:
     import psutil
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from common.transport.bus import Bus
 
 SUPERVISOR, ROUTER = "supervisor", "router"
-# Made only while somebody listens: if we did, the cell would work more. Their rates are those of their readers.
-ON_DEMAND = ("detection_image", "depth_camera/points")
 ASK_TIMEOUT = 1.0  # [s]
 
 
@@ -85,6 +83,7 @@ class Watch:
         self._bus = bus
         self._clock = clock
         self._known = all_topics()
+        self._on_demand = on_demand()
         self._hearing: dict[str, Hearing] = {}
         self._rates = Rates()
         self._counted: dict[str, tuple[float, ServiceCounters]] = {}  # by service: when [s], what
@@ -100,7 +99,7 @@ class Watch:
         latched = await asyncio.gather(*(self._bus.raw_get(f"{self._bus.cell}/{key}", ASK_TIMEOUT) for key in states))
         said = dict(zip(states, latched, strict=True))
         for key, topic in self._known.items():
-            if topic.kind != "request" and key not in ON_DEMAND:
+            if topic.kind != "request" and key not in self._on_demand:
                 self._listen(key)
                 for sample in said.get(key, ()):
                     self._hearing[key].know(sample)
@@ -166,9 +165,20 @@ class Watch:
                     key, float(arrived["hz"] or 0), float(arrived["bytes_per_second"] or 0), int(arrived["messages"]),
                     aged["p50"], aged["p99"],
                 )
-        for key in ON_DEMAND:
+        for key in self._on_demand:
             if rate := self._rates.of_topic(key):
                 yield TopicRow(key, round(rate, 3), None, None, None, None)
+
+
+def on_demand() -> list[str]:
+    """Keys of what is made only while somebody listens: if we did, the cell would work more.
+
+    Those are clouds of points, and pictures into which what was found is drawn. Their rates are those of their readers.
+    """
+    from common.topics import DEPTH_CAMERA_POINTS
+
+    drawn = [found.find("topics", "ANNOTATED") for found in applications()]
+    return [topic.key for topic in (*drawn, DEPTH_CAMERA_POINTS) if topic is not None and topic.kind == "stream"]
 
 
 def statuses(status: SupervisorStatus | None, alive: frozenset[str], connected: bool) -> list[ServiceStatus]:

@@ -12,9 +12,11 @@ What it brings lies in modules of these names within the package, or else in the
                            published by whoever simulates the world
     figures   (optional) what the summary, the report and the recheck say of a run
     page      (optional) labels and layers of the operator's page
+    recording (optional) how its messages are written for other tools, as common/recording/foxglove.py says
     verbs     (optional) verbs of the command line, as common/verbs.py says
 
-`TASK` in the package itself names the service that decides; without it the cell's `task` does.
+`TASK` in the package itself names the service that decides; without it the cell's `task` does. `GRASPS = True` says
+that the task takes objects in the hand.
 """
 
 from __future__ import annotations
@@ -28,13 +30,13 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-from common import messages, topics
 from common.errors import ConfigError, UnknownName
-from common.messages import Message, TaskStatus, WorldObjects
-from common.remapping import SERVICE_NAME
-from common.topics import AnyTopic, Request, Topic
+
+if TYPE_CHECKING:  # they take longer to load than a person at the command line wants to wait
+    from common.messages import Message, TaskStatus, WorldObjects
+    from common.topics import AnyTopic, Request, Topic
 
 PACKAGE = "common.applications"
 
@@ -68,12 +70,20 @@ class Application:
         return str(getattr(self.module, "TASK", ""))
 
     @property
+    def grasps(self) -> bool:
+        """Whether its task takes objects in the hand, which then may slip."""
+        return bool(getattr(self.module, "GRASPS", False))
+
+    @property
     def status(self) -> Topic[TaskStatus]:
         """Where the task says how far it is.
 
         Raises:
             ConfigError: the module is no application.
         """
+        from common.messages import TaskStatus
+        from common.topics import Topic
+
         found = self.find("topics", "STATUS")
         if not isinstance(found, Topic) or not issubclass(found.message, TaskStatus):
             raise ConfigError("application", self.name, "is no application: its topics have no STATUS")
@@ -109,8 +119,6 @@ def find_application(name: str) -> Application:
     """
     if "." not in name and name not in application_names():
         raise UnknownName("application", name, application_names())
-    if "." in name and (here := str(Path.cwd())) not in sys.path:
-        sys.path.append(here)  # a person's own is also found where they stand
     found = Application(name)
     look_where_one_stands()
     try:
@@ -138,7 +146,9 @@ def application_of_task(task: str) -> str:
 @cache
 def all_topics() -> dict[str, AnyTopic]:
     """Every topic of the platform and of the applications that come with it, by key."""
-    known = dict(topics.platform_topics())
+    from common.topics import platform_topics
+
+    known = dict(platform_topics())
     for found in applications():
         known |= found.topics
     return known
@@ -146,24 +156,31 @@ def all_topics() -> dict[str, AnyTopic]:
 
 def find_topic(key: str) -> Topic[Any] | Request[Any, Any] | None:
     """The topic or request of a key, also of the parameters of a service; None for one that is not known."""
+    from common.remapping import SERVICE_NAME
+    from common.topics import parameters_of
+
     prefix, _, service = key.partition("/")
     if prefix == "param" and SERVICE_NAME.fullmatch(service):
-        return topics.parameters_of(service)
+        return parameters_of(service)
     return all_topics().get(key)
 
 
 @cache
 def message_class(name: str) -> type[Message] | None:
     """The message class of that name, of the platform or of an application that comes with it; None for no such."""
+    from common import messages
+
     modules = [messages, *(part for found in applications() if (part := found.part("messages")) is not None)]
     for module in modules:
         found = vars(module).get(name)
-        if isinstance(found, type) and issubclass(found, Message):
+        if isinstance(found, type) and issubclass(found, messages.Message):
             return found
     return None
 
 
 def _topics_in(module: ModuleType | None) -> dict[str, AnyTopic]:
+    from common.topics import Request, Topic, platform_topics
+
     found = vars(module).values() if module is not None else ()
-    shared = topics.platform_topics()
+    shared = platform_topics()
     return {t.key: t for t in found if isinstance(t, Topic | Request) and t.key not in shared}

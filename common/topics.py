@@ -1,6 +1,6 @@
 """Every key that the platform knows, said once: its message and its kind. Applications add their own.
 
-A key on the wire is `<cell>/<topic>`, for example `panda/camera/image_raw`. Who writes it follows from
+A key on the wire is `<cell>/<topic>`, for example `cell/camera/image_raw`. Who writes it follows from
 the services of the cell: `zencell topic info`.
 """
 
@@ -62,7 +62,7 @@ def _leave_out_writer(topic: Topic[Any] | Request[Any, Any], former: str | None)
 
 
 SCENE_OBJECT_UPDATES = Topic("scene_object_updates", m.SceneUpdate, "event",
-                             "remove:ball_3 when grasped, add:ball_3 when it lies still again")
+                             "remove:ID when grasped, add:ID when it lies still again")
 CAMERA_IMAGE = Topic("camera/image_raw", m.Image, "stream", "what the camera sees, 10 Hz")
 CAMERA_INFO = Topic("camera/camera_info", m.CameraInfo, "state", "intrinsics of the camera")
 PLANNING_SCENE = Topic("planning_scene", m.PlanningScene, "state",

@@ -109,52 +109,18 @@ SHORT_FORMS = ("common/config/short_forms.py",)  # where the fields of older wor
 # Files that still do: the lists may only get shorter.
 STILL_IMPORT = (
     "common/chaos/agent.py",
-    "common/recording/foxglove.py",
-    "common/recording/foxglove_scene.py",
-    "services/camera_simulator.py",
-    "services/trajectory_executor.py",
 )
 STILL_NAME = (
-    "cli/catalogue.py",
-    "cli/graph.py",
-    "cli/inspection.py",
-    "cli/watching.py",
     "common/chaos/agent.py",
-    "common/chaos/plan.py",
-    "common/chaos/setting.py",
-    "common/control/cycle.py",
-    "common/messages/geometry.py",
-    "common/messages/processes.py",
-    "common/recording/foxglove.py",
-    "common/recording/foxglove_scene.py",
-    "common/robot/transforms.py",
-    "common/sim/world.py",
-    "common/topics.py",
-    "common/transport/bus.py",
-    "common/transport/writer.py",
-    "services/camera_simulator.py",
-    "services/trajectory_executor.py",
 )
 STILL_BALLS = (
     "common/chaos/agent.py",
-    "common/chaos/plan.py",
-    "common/chaos/setting.py",
-    "common/config/world.py",
-    "common/control/cycle.py",
-    "common/messages/geometry.py",
     "common/messages/world.py",
     "common/perception/resting.py",
     "common/scene/slots.py",
     "common/sim/drawing.py",
-    "common/sim/layout.py",
     "common/sim/places.py",
     "common/sim/robot_shapes.py",
-    "common/sim/standing.py",
-    "common/sim/standing_objects.py",
-    "common/sim/world.py",
-    "common/topics.py",
-    "services/camera_simulator.py",
-    "services/trajectory_executor.py",
 )
 
 

@@ -18,12 +18,12 @@ MOST_PER_MINUTE = 600.0
 CELL_SECONDS = 80.0  # of cell time in which a run sees faults; what comes after is left to it to finish
 LEAST_GAP = 0.05  # [s] between two faults
 LEFT_STOPPED = 0.25  # share of what is stopped that stays so until a watchdog takes notice
-HOLDING = 0.4  # share of the faults of processes that wait for a ball in the hand
+HOLDING = 0.4  # share of the faults of processes that wait for an object in the hand
 STATELESS_FORMS: tuple[Form, ...] = ("noise", "wrong type", "huge")  # for which no real message is needed
 
 LABELS: dict[Kind, str] = {
     "kill": "kill -9", "restart": "SIGTERM", "freeze": "SIGSTOP", "delay": "short SIGSTOPs",
-    "corrupt": "damaged messages on", "replay": "old messages on", "drop": "the held ball slips",
+    "corrupt": "damaged messages on", "replay": "old messages on", "drop": "what is held slips",
 }
 
 _WEIGHTS: dict[Kind, float] = {
@@ -37,14 +37,14 @@ class Fault:
 
     Attributes:
         at: when [s, wall time] from the cell being up.
-        kind: kill -9, SIGTERM, SIGSTOP for a time, short stops in a row, damaged messages, old messages, a ball that
-            slips out of the fingers.
-        target: name of the process, or key without the cell; empty for a ball.
+        kind: kill -9, SIGTERM, SIGSTOP for a time, short stops in a row, damaged messages, old messages, an object
+            that slips out of the fingers.
+        target: name of the process, or key without the cell; empty for an object.
         seconds: how long it lasts, where it lasts; infinite for what stays stopped.
         form: of damaged messages.
         count: messages, or stops in a row.
         seed: of everything else that is random about it.
-        holding: whether it waits for a ball in the hand.
+        holding: whether it waits for an object in the hand.
     """
 
     at: float
@@ -70,7 +70,7 @@ class Fault:
                 text = f"{self.count}, {self.seconds:.1f} s late"
             case _:
                 text = ""
-        return ", ".join(part for part in (text, "a ball in the hand" if self.holding else "") if part)
+        return ", ".join(part for part in (text, "something in the hand" if self.holding else "") if part)
 
     @property
     def what(self) -> str:
@@ -78,13 +78,13 @@ class Fault:
         return ": ".join(part for part in (LABELS[self.kind], self.detail) if part)
 
     def __str__(self) -> str:
-        """As "SIGSTOP vision_detector: 2.1 s"."""
+        """As "SIGSTOP camera_simulator: 2.1 s"."""
         action = f"{LABELS[self.kind]} {self.target}".rstrip()
         return ": ".join(part for part in (action, self.detail) if part)
 
 
 def faults(
-    seed: int, processes: Sequence[str], keys: Sequence[str], *, balls: bool, per_minute: float = PER_MINUTE
+    seed: int, processes: Sequence[str], keys: Sequence[str], *, objects: bool, per_minute: float = PER_MINUTE
 ) -> Iterator[Fault]:
     """Faults without end, in order.
 
@@ -92,35 +92,35 @@ def faults(
         seed: of the plan.
         processes: that can be killed and stopped.
         keys: of topics and requests under which bad messages are put.
-        balls: whether there is something that can slip out of a hand.
+        objects: whether there is something that can slip out of a hand.
         per_minute: of wall time, on average.
     """
     rng = np.random.default_rng(seed)
-    kinds = [kind for kind in get_args(Kind) if balls or kind != "drop"]
+    kinds = [kind for kind in get_args(Kind) if objects or kind != "drop"]
     weights = np.array([_WEIGHTS[kind] for kind in kinds])
     mean = max(60.0 / per_minute - LEAST_GAP, 0.01)
     at = 0.0
     while True:
         at += LEAST_GAP + min(float(rng.exponential(mean)), 3 * mean)
         kind: Kind = rng.choice(kinds, p=weights / weights.sum())
-        yield _fault(at, kind, rng, processes, keys, balls)
+        yield _fault(at, kind, rng, processes, keys, objects)
 
 
 def plan(
-    seed: int, processes: Sequence[str], keys: Sequence[str], *, balls: bool, seconds: float,
+    seed: int, processes: Sequence[str], keys: Sequence[str], *, objects: bool, seconds: float,
     per_minute: float = PER_MINUTE,
 ) -> list[Fault]:
     """The faults of the first `seconds` [s, wall time]; see `faults`."""
-    endless = faults(seed, processes, keys, balls=balls, per_minute=per_minute)
+    endless = faults(seed, processes, keys, objects=objects, per_minute=per_minute)
     return list(takewhile(lambda fault: fault.at <= seconds, endless))
 
 
 def _fault(
-    at: float, kind: Kind, rng: np.random.Generator, processes: Sequence[str], keys: Sequence[str], balls: bool
+    at: float, kind: Kind, rng: np.random.Generator, processes: Sequence[str], keys: Sequence[str], objects: bool
 ) -> Fault:
     seed, at = int(rng.integers(2**31)), round(at, 3)
     process, key = str(rng.choice(processes)), str(rng.choice(keys))
-    holding = balls and bool(rng.random() < HOLDING)
+    holding = objects and bool(rng.random() < HOLDING)
     if kind in ("kill", "restart"):
         return Fault(at, kind, process, seed=seed, holding=holding)
     if kind == "freeze":

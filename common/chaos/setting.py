@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from common.application import all_topics
+from common.application import all_topics, find_application
 from common.chaos.agent import Chaos
 from common.chaos.plan import CELL_SECONDS, faults, plan
 from common.config import Cell
@@ -13,8 +13,6 @@ from common.supervision.supervisor import Supervisor
 from common.transport.bus import Bus
 from common.transport.keys import ROUTER
 from common.transport.ownership import Owner
-
-PICKS = "smart_pick_place"
 
 
 def chaos_in(
@@ -33,17 +31,18 @@ def chaos_in(
     """
     ours = [entry.name for entry in cell.services.values()]
     processes = [status.name for status in supervisor.statuses if status.name in (ROUTER, *ours)]
-    balls = PICKS in [entry.kind for entry in cell.services.values()] and find_backend(cell.robot).simulated
+    grasps = find_application(cell.application).grasps and cell.task in ours
+    objects = grasps and find_backend(cell.robot).simulated
     if until_ended:
         seconds = CELL_SECONDS / bus.clock.speed
-        planned = iter(plan(seed, processes, keys, balls=balls, seconds=seconds, per_minute=per_minute))
+        planned = iter(plan(seed, processes, keys, objects=objects, seconds=seconds, per_minute=per_minute))
     else:
-        planned = faults(seed, processes, keys, balls=balls, per_minute=per_minute)
+        planned = faults(seed, processes, keys, objects=objects, per_minute=per_minute)
 
     def pids() -> dict[str, int]:
         return {status.name: status.pid for status in supervisor.statuses if status.pid is not None}
 
-    return Chaos(bus, planned, pids, cell.world.container if balls else None)
+    return Chaos(bus, planned, pids, cell.world.container if objects else None)
 
 
 def keys_of(owners: Iterable[Owner], services: Iterable[str]) -> list[str]:

@@ -46,7 +46,7 @@ class PoseArray(Message):
     header: Header = Header()
     poses: list[Pose] = []
     ids: list[str] = []
-    labels: list[str] = Field([], description="scene_balls: table, held, falling, box, or elsewhere (out of sight)")
+    labels: list[str] = Field([], description="of truth: table, held, falling, box, or elsewhere (out of sight)")
 
     @model_validator(mode="after")
     def _same_length(self) -> PoseArray:

@@ -59,7 +59,7 @@ class ServiceCounters(Message):
 class Parameter(Message):
     """One parameter as it is now. `path` is what `--set` and a cell file call it."""
 
-    path: Name = Field(description="such as services.vision_detector.min_saturation or motion.velocity_scaling")
+    path: Name = Field(description="such as services.camera_simulator.rate or motion.velocity_scaling")
     value: JsonValue
     default: JsonValue = None
     type: Literal["number", "integer", "boolean", "string", "list", "mapping"]

@@ -1,10 +1,14 @@
-"""Recordings for Foxglove: MCAP with JSON messages of its own schemas, where it has one for what was recorded."""
+"""Recordings for Foxglove: MCAP with JSON messages of its own schemas, where it has one for what was recorded.
+
+An application says in its part `recording` which of its own messages are one of these: `FOXGLOVE`, a list as KINDS is.
+"""
 
 from __future__ import annotations
 
 import base64
 import json
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +16,7 @@ import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from common.applications.outlining.messages import OutlinePoints
+from common.application import applications
 from common.messages import (
     CameraInfo,
     Image,
@@ -30,7 +34,7 @@ from common.messages import (
 from common.perception.image import image_to_array
 from common.recording.appending import AppendedFile
 from common.recording.decoding import Decoder
-from common.recording.foxglove_scene import of_markers, of_outline, of_scene, of_world, time_of
+from common.recording.foxglove_scene import of_markers, of_scene, of_world, time_of
 from common.recording.foxglove_schemas import SCHEMAS
 from common.recording.reading import Recording, Wanted
 from common.recording.schemas import schema_of
@@ -79,10 +83,17 @@ def convert(message: Message) -> tuple[str, dict[str, Any]]:
     """Name of the schema, and the message as a JSON object of it."""
     if isinstance(message, Image):
         return image(message)
-    for kind, name, make in _KINDS:
+    for kind, name, make in _kinds():
         if isinstance(message, kind):
             return name, make(message)
     return type(message).__name__, message.model_dump(mode="json")
+
+
+@cache
+def _kinds() -> list[Kind]:
+    """Those of applications first: their messages derive from what any message may be."""
+    own = [kind for found in applications() for kind in found.find("recording", "FOXGLOVE") or ()]
+    return [*own, *KINDS]
 
 
 def image(message: Image) -> tuple[str, dict[str, Any]]:
@@ -157,11 +168,10 @@ def _cloud(message: PointCloud2) -> dict[str, Any]:
     }
 
 
-# The first that fits: an outline is a PoseArray too.
-_KINDS: list[tuple[type[Message], str, Callable[[Any], dict[str, Any]]]] = [
+Kind = tuple[type[Message], str, Callable[[Any], dict[str, Any]]]  # message, schema, how it is made one
+KINDS: list[Kind] = [
     (CameraInfo, "foxglove.CameraCalibration", _calibration),
     (TFMessage, "foxglove.FrameTransforms", _transforms),
-    (OutlinePoints, "foxglove.SceneUpdate", of_outline),
     (PoseArray, "foxglove.PosesInFrame", _poses),
     (MarkerArray, "foxglove.SceneUpdate", of_markers),
     (PlanningScene, "foxglove.SceneUpdate", of_scene),

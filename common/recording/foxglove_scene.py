@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from common.applications.outlining.messages import OutlinePoints
 from common.messages import (
     CollisionObject,
     Color,
@@ -22,7 +21,6 @@ LINE_LOOP = 1
 DELETE_ALL = 1
 PRIMITIVES = ("arrows", "cubes", "spheres", "cylinders", "lines", "triangles", "texts", "models")  # all are required
 THICKNESS = 0.004  # of lines [m]
-OUTLINE_COLOR = Color(r=0.1, g=0.9, b=0.3)
 
 Entity = dict[str, Any]
 
@@ -73,14 +71,6 @@ def of_world(message: WorldObjects) -> dict[str, Any]:
     return update(stamp, [entity(solid.id, "world", stamp, **_of_object(solid)) for solid in message.objects])
 
 
-def of_outline(message: OutlinePoints) -> dict[str, Any]:
-    """An outline as a closed line."""
-    points = [pose.position for pose in message.poses]
-    lines = [_loop([(p.x, p.y, p.z) for p in points], OUTLINE_COLOR)] if points else []
-    stamp = message.header.stamp
-    return update(stamp, [entity(message.object or "outline", message.header.frame_id, stamp, lines=lines)])
-
-
 def _shape(kind: str, pose: Pose, size: Vector3, color: Color, text: str) -> dict[str, list[dict[str, Any]]]:
     shape = {"pose": pose.model_dump(), "size": size.model_dump(), "color": color.model_dump()}
     if kind == "box":
@@ -103,7 +93,7 @@ def _solid(solid: CollisionObject) -> dict[str, list[dict[str, Any]]]:
         return _shape("sphere", solid.pose, Vector3(x=2 * d[0], y=2 * d[0], z=2 * d[0]), solid.color, "")
     if solid.shape == "cylinder":
         return _shape("cylinder", solid.pose, Vector3(x=2 * d[0], y=2 * d[0], z=d[1]), solid.color, "")
-    edges = [_loop([(x, y, z) for x, y in solid.outline], solid.color) for z in (-d[0] / 2, d[0] / 2)]
+    edges = [closed_line([(x, y, z) for x, y in solid.outline], solid.color) for z in (-d[0] / 2, d[0] / 2)]
     return {"lines": [{**edge, "pose": solid.pose.model_dump()} for edge in edges]}
 
 
@@ -118,7 +108,7 @@ def _of_object(solid: WorldObject) -> dict[str, list[dict[str, Any]]]:
             "points": [{"x": x, "y": y, "z": z} for x, y, z in solid.vertices],
             "indices": [corner for triangle in solid.triangles for corner in triangle],
         }]}
-    edges = [_loop([(x, y, z) for x, y in loop], solid.color)
+    edges = [closed_line([(x, y, z) for x, y in loop], solid.color)
              for loop in _sections(solid) for z in (-solid.size.z / 2, solid.size.z / 2)]
     return {"lines": [{**edge, "pose": solid.pose.model_dump()} for edge in edges]}
 
@@ -134,10 +124,11 @@ def _sections(solid: WorldObject) -> list[list[tuple[float, float]]]:
 def _edges(solid: WorldObject) -> list[dict[str, Any]]:
     loops = [solid.outline, *([solid.hole] if solid.hole else [])]
     heights = (solid.base, solid.base + solid.height)
-    return [_loop([(x, y, z) for x, y in loop], solid.color) for loop in loops for z in heights]
+    return [closed_line([(x, y, z) for x, y in loop], solid.color) for loop in loops for z in heights]
 
 
-def _loop(points: Sequence[tuple[float, float, float]], color: Color) -> dict[str, Any]:
+def closed_line(points: Sequence[tuple[float, float, float]], color: Color) -> dict[str, Any]:
+    """A closed line through points [m]."""
     return {
         "type": LINE_LOOP, "pose": Pose().model_dump(), "thickness": THICKNESS, "scale_invariant": False,
         "points": [{"x": x, "y": y, "z": z} for x, y, z in points], "color": color.model_dump(),

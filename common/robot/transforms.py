@@ -111,6 +111,6 @@ def invert(T: Array) -> Array:
 def tool_down(x: float, y: float, z: float, yaw: float = 0.0) -> Array:
     """(4, 4) T_world_tcp at a point [m] with the tool's z axis pointing to -z of world, turned by yaw [rad] about +z.
 
-    At yaw 0 the tool's x axis is that of world and its y axis (the Panda's finger axis) is -y of world.
+    At yaw 0 the tool's x axis is that of world and its y axis (along which fingers close) is -y of world.
     """
     return transform(rpy_to_matrix(math.pi, 0.0, yaw), (x, y, z))

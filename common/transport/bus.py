@@ -243,7 +243,7 @@ class Bus:
     # --- anything on the network, for tools -----------------------------------------------------------------------
 
     async def raw_reader(self, key: str) -> AsyncIterator[RawSample]:
-        """Everything that is put under a full key expression, such as `panda/**`, from now on; the oldest give way."""
+        """Everything that is put under a full key expression, such as `cell/**`, from now on; the oldest give way."""
         waiting: deque[RawSample] = deque(maxlen=_MOST_RAW)
         came = asyncio.Event()
         bell = Doorbell(self._loop, came.set)

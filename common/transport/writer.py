@@ -50,7 +50,7 @@ class RawWriter:
 
         Args:
             session: connection to the network.
-            key: full key, such as `panda/camera/image_raw`.
+            key: full key, such as `cell/camera/image_raw`.
             encoding: what the payloads are, as `encoding_of` says it.
             kind: stream, event or state.
             service: who writes, the first part of the writer id.

@@ -98,6 +98,15 @@ def make_folder(path: Path) -> Path:
     return path
 
 
+@pytest.fixture(autouse=True)
+def _forget_services_of_other_folders(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Modules of one test's folder are not found by another's, which may run in the same process."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield
+    for name in [name for name in sys.modules if name.partition(".")[0] == "fakes"]:
+        del sys.modules[name]
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A folder of its own for each test."""

@@ -5,7 +5,7 @@ import pytest
 from rich.console import Console
 
 from cli.top import render
-from cli.watching import ON_DEMAND, Processes, ServiceRow, TopicRow, View, Watch, statuses
+from cli.watching import Processes, ServiceRow, TopicRow, View, Watch, on_demand, statuses
 from common import topics
 from common.application import all_topics
 from common.clock import Clock
@@ -63,7 +63,7 @@ async def test_what_is_made_only_for_listeners_is_not_listened_to() -> None:
     bus = network.bus("camera")
     made = {key: bus.writer(topic) for key, topic in all_topics().items() if isinstance(topic, Topic)}
     async with Watch(network.bus("top"), CLOCK) as watch:
-        assert {key for key, writer in made.items() if not writer.matched} == set(ON_DEMAND)
+        assert {key for key, writer in made.items() if not writer.matched} == set(on_demand())
         watch.count(counted("viewer", {"detection_image": 0}), 1.0)
         watch.count(counted("viewer", {"detection_image": 10}), 2.0)
         rows = {row.topic: row for row in watch.view().topics}

@@ -23,8 +23,8 @@ PROCESSES = ["router", "motion_planner", "trajectory_executor", "smart_pick_plac
 KEYS = ["camera/image_raw", "gripper/state", "motion/plan"]
 
 
-def planned(seed: int, *, balls: bool = True, seconds: float = 60.0, per_minute: float = 30.0) -> list[Fault]:
-    return plan(seed, PROCESSES, KEYS, balls=balls, seconds=seconds, per_minute=per_minute)
+def planned(seed: int, *, objects: bool = True, seconds: float = 60.0, per_minute: float = 30.0) -> list[Fault]:
+    return plan(seed, PROCESSES, KEYS, objects=objects, seconds=seconds, per_minute=per_minute)
 
 
 def test_the_same_seed_plans_the_same_faults_and_another_one_others() -> None:
@@ -45,13 +45,13 @@ def test_every_kind_form_process_and_key_occurs_over_seeds() -> None:
 
 
 def test_no_ball_slips_and_nothing_waits_for_one_where_there_are_none() -> None:
-    every = [fault for seed in range(20) for fault in planned(seed, balls=False)]
+    every = [fault for seed in range(20) for fault in planned(seed, objects=False)]
     assert not any(fault.kind == "drop" or fault.holding for fault in every)
 
 
 @pytest.mark.parametrize("per_minute", [6.0, 30.0, 120.0])
 def test_faults_come_in_order_and_about_as_often_as_asked(per_minute: float) -> None:
-    many = list(islice(faults(1, PROCESSES, KEYS, balls=True, per_minute=per_minute), 2000))
+    many = list(islice(faults(1, PROCESSES, KEYS, objects=True, per_minute=per_minute), 2000))
     times = [fault.at for fault in many]
     assert times == sorted(times)
     assert 0.8 * per_minute < 60 * len(many) / times[-1] < 1.3 * per_minute
@@ -64,11 +64,11 @@ def test_a_run_at_speed_5_sees_five_to_ten_faults_as_a_rule() -> None:
 
 def test_faults_are_told_in_a_line() -> None:
     assert str(Fault(1.0, "kill", "vision_detector")) == "kill -9 vision_detector"
-    assert str(Fault(1.0, "freeze", "router", 2.14, holding=True)) == "SIGSTOP router: 2.1 s, a ball in the hand"
+    assert str(Fault(1.0, "freeze", "router", 2.14, holding=True)) == "SIGSTOP router: 2.1 s, something in the hand"
     assert str(Fault(1.0, "freeze", "tf", math.inf)) == "SIGSTOP tf: until it is noticed"
     corrupt = Fault(1.0, "corrupt", "tf", form="truncated", count=12)
     assert (str(corrupt), corrupt.what) == ("damaged messages on tf: 12 truncated", "damaged messages on: 12 truncated")
-    assert str(Fault(1.0, "drop")) == "the held ball slips"
+    assert str(Fault(1.0, "drop")) == "what is held slips"
 
 
 def test_keys_are_those_that_the_services_write_or_answer() -> None:
