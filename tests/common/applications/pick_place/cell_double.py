@@ -119,11 +119,7 @@ class CellDouble:
 
     def _grip(self, request: m.GripperCommand, header: m.Header) -> None:
         if request.width > 0.06 and self.held:
-            if math.dist(self.tcp[:2], (0.55, 0.25)) < 0.03:
-                self.contained += 1
-            else:
-                self.balls[self.held] = (*self.tcp[:2], 0.03)
-            self.held = ""
+            self._fall()
         elif request.width < 0.06 and not self.slips:
             for name, p in self.balls.items():
                 if math.dist(p, self.tcp) < 0.01:
@@ -135,10 +131,16 @@ class CellDouble:
                                       width=0.06 if self.held else request.width)
         self.task.on_goal(self.gripper, self.view())
 
-    def drop(self) -> None:
-        """The held ball falls on the table below."""
-        self.balls[self.held] = (*self.tcp[:2], 0.03)
+    def _fall(self) -> None:
+        if math.dist(self.tcp[:2], (0.55, 0.25)) < 0.03:
+            self.contained += 1
+        else:
+            self.balls[self.held] = (*self.tcp[:2], 0.03)
         self.held = ""
+
+    def drop(self) -> None:
+        """The held ball falls on the table below, or into the container."""
+        self._fall()
         self.gripper = self.gripper.model_copy(update={"holding": False, "width": 0.0})
 
     def until(self, condition: str, most: int = 2000) -> None:
