@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 
+from pydantic import Field
+
 from common import topics
 from common.applications.pick_place.perceived import PerceivedScene
-from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.applications.pick_place.tracks import SceneParameters
+from common.applications.pick_place.views import Seen, ViewName, Views
 from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError
-from common.perception.intake import Cameras, LeftOut, Unusable
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
@@ -21,13 +22,13 @@ class Config(SceneParameters):
 
     robot: RobotConfig
     world: Surroundings
+    views: list[ViewName] = Field([], description="names of several detectors' views, as left: left/detected_objects, "
+                                                  "left/camera/camera_info")
 
 
 async def run(bus: Bus, config: Config) -> None:
     """Publish the planning scene whenever a frame was looked at or the hand closed or opened."""
-    detected = bus.reader(DETECTED_OBJECTS)
-    infos = bus.reader(topics.CAMERA_INFO)
-    statics = bus.reader(topics.TF_STATIC)
+    views = Views(bus, config.views, bus.log)
     joints = bus.reader(topics.JOINT_STATES)
     gripper = bus.reader(topics.GRIPPER_STATE)
     out = bus.writer(topics.PLANNING_SCENE)
@@ -35,9 +36,7 @@ async def run(bus: Bus, config: Config) -> None:
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: scene_manager needs a robot with one")
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
-    left_out = LeftOut(bus.log, "a frame of detections")
     out.put(scene.scene())
-    cameras = Cameras()
     await bus.ready()
 
     def hand() -> None:
@@ -55,22 +54,16 @@ async def run(bus: Bus, config: Config) -> None:
                 hand()
                 out.put(scene.scene())
 
-    async def watch_table() -> None:
-        async for markers in detected:
-            try:
-                camera = cameras.of(infos.latest, statics.latest, config.world.camera.frame)
-            except Unusable as error:
-                left_out.note(error)
-                continue
-            hand()
-            measured = joints.latest
-            q = robot.order(measured.name, measured.position) if measured else None
-            scene.see(markers, camera, robot.fk(q) if q is not None else None)
-            out.put(scene.scene())
+    async def look(view: int, seen: Seen) -> None:
+        hand()
+        measured = joints.latest
+        q = robot.order(measured.name, measured.position) if measured else None
+        scene.see(seen.frame, seen.camera, robot.fk(q) if q is not None else None, view)
+        out.put(scene.scene())
 
     async with asyncio.TaskGroup() as group:
         group.create_task(watch_hand())
-        group.create_task(watch_table())
+        group.create_task(views.watch(look))
 
 
 if __name__ == "__main__":

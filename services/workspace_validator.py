@@ -7,18 +7,15 @@ from contextlib import suppress
 
 from pydantic import Field
 
-from common import topics
 from common.applications.pick_place.topics import (
-    DETECTED_OBJECTS,
     REJECTED_TARGETS,
     VALIDATED_TARGETS,
     WORKSPACE_MARKERS,
 )
 from common.applications.pick_place.validation import Validation
+from common.applications.pick_place.views import Seen, ViewName, Views
 from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
-from common.perception.intake import Cameras, LeftOut, Unusable
-from common.perception.pinhole import Pinhole
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.workspace import ReachCache, WorkspaceBounds
@@ -34,6 +31,8 @@ class Config(WorkspaceBounds):
     world: Surroundings
     robot: RobotConfig
     grasp: Grasp
+    views: list[ViewName] = Field([], description="names of several detectors' views, as left: left/detected_objects, "
+                                                  "left/camera/camera_info")
     forget_after: Tunable[float] = Field(
         2.0, ge=0, le=3600, description="a rejection is told again once its place was empty for so long [s, cell time]"
     )
@@ -59,8 +58,7 @@ def shells(config: Config, header: Header) -> MarkerArray:
 
 async def run(bus: Bus, config: Config) -> None:
     """Judge every frame with what is known; the inverse kinematics of new places is worked out beside that."""
-    detected = bus.reader(DETECTED_OBJECTS)
-    infos, statics = bus.reader(topics.CAMERA_INFO), bus.reader(topics.TF_STATIC)
+    views = Views(bus, config.views, bus.log)
     validated, rejected = bus.writer(VALIDATED_TARGETS), bus.writer(REJECTED_TARGETS)
     markers = bus.writer(WORKSPACE_MARKERS)
     reach = ReachCache(RobotModel.load(config.robot), config.grasp, config)
@@ -73,17 +71,15 @@ async def run(bus: Bus, config: Config) -> None:
     bus.on_parameters(show)
     places: list[tuple[float, float, float]] = []
     work, idle = asyncio.Event(), asyncio.Event()
-    unfinished: tuple[MarkerArray, Pinhole] | None = None  # sent without the places that were still worked on
-    left_out = LeftOut(bus.log, "a frame of detections")
-    cameras = Cameras()
+    unfinished: list[Seen] = []  # sent without the places that were still worked on
     await bus.ready()
 
-    def send(frame: MarkerArray, camera: Pinhole) -> None:
+    def send(seen: list[Seen]) -> None:
         nonlocal unfinished
         validation.forget_after = config.forget_after
-        verdict = validation.judge(frame, camera)
-        unfinished = (frame, camera) if verdict.unknown else None
-        header = Header(stamp=frame.header.stamp, frame_id=WORLD)
+        verdict = validation.judge_all([(one.frame, one.camera) for one in seen])
+        unfinished = seen if verdict.unknown else []
+        header = Header(stamp=min(one.frame.header.stamp for one in seen), frame_id=WORLD)
         poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in verdict.targets]
         validated.put(PoseArray(header=header, poses=poses))
         if verdict.rejections:
@@ -91,21 +87,16 @@ async def run(bus: Bus, config: Config) -> None:
         for one in verdict.rejections:
             bus.log.info("rejected (%s, %s): %s", f"{one.position.x:z.3f}", f"{one.position.y:z.3f}", one.reason)
 
-    async def watch() -> None:
-        async for frame in detected:
-            try:
-                camera = cameras.of(infos.latest, statics.latest)
-            except Unusable as error:
-                left_out.note(error)
-                continue
-            places[:] = validation.unknown(frame, camera)
-            if places:
-                idle.clear()
-                work.set()
-                with suppress(TimeoutError):  # what is not known by then goes out with a later frame
-                    async with asyncio.timeout(PATIENCE):  # wait_for of Python 3.11 can lose a cancellation
-                        await idle.wait()
-            send(frame, camera)
+    async def look(_view: int, _seen: Seen) -> None:
+        seen = views.newest()
+        places[:] = [place for one in seen for place in validation.unknown(one.frame, one.camera)]
+        if places:
+            idle.clear()
+            work.set()
+            with suppress(TimeoutError):  # what is not known by then goes out with a later frame
+                async with asyncio.timeout(PATIENCE):  # wait_for of Python 3.11 can lose a cancellation
+                    await idle.wait()
+        send(seen)
 
     async def work_out() -> None:
         while True:
@@ -114,11 +105,11 @@ async def run(bus: Bus, config: Config) -> None:
             while places:
                 await asyncio.to_thread(reach.reason, places.pop(0))
             idle.set()
-            if unfinished is not None:
-                send(*unfinished)
+            if unfinished:
+                send(unfinished)
 
     async with asyncio.TaskGroup() as group:
-        group.create_task(watch())
+        group.create_task(views.watch(look))
         group.create_task(work_out())
 
 

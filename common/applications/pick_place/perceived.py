@@ -37,13 +37,13 @@ class PerceivedScene:
         self.p, self._tracks = parameters, Tracks(parameters)
         self._fixed = fixed_objects(around)
         self._slots = slot_positions(around.container, around.ball_radius, around.table_height).reshape(-1, 3)
-        self._occupied: set[int] = set()
+        self._occupied: dict[int, tuple[int, set[int]]] = {}  # stamp and slots by view
         self._held: m.AttachedObject | None = None
         self._changed_hands_at = 0
         self._stamp = 0
 
-    def see(self, detections: m.MarkerArray, camera: Pinhole, T_world_tcp: Array | None) -> None:
-        """Take in the detections of one frame.
+    def see(self, detections: m.MarkerArray, camera: Pinhole, T_world_tcp: Array | None, view: int = 0) -> None:
+        """Take in the detections of one frame, of one of several views.
 
         A frame that was taken before the hand last closed or opened still shows what is in the hand now on the table:
         it is left out. So is anything seen where the hand holds a ball.
@@ -51,7 +51,7 @@ class PerceivedScene:
         stamp = detections.header.stamp
         if stamp <= self._changed_hands_at:
             return
-        self._stamp = stamp
+        self._stamp = max(self._stamp, stamp)
         hand = None
         if self._held is not None and T_world_tcp is not None:
             hand = tuple(T_world_tcp[:3, 3])
@@ -65,7 +65,7 @@ class PerceivedScene:
             elif hand is None or math.dist(hand, (p.x, p.y, p.z)) > self.around.ball_radius:
                 on_table.append((p.x, p.y, p.z))
         self._tracks.update(on_table, stamp * 1e-9)
-        self._occupied = occupied_slots(in_container, camera, self.around)
+        self._occupied[view] = stamp, occupied_slots(in_container, camera, self.around)
 
     def feel(self, gripper: m.GripperState, T_world_tcp: Array | None) -> None:
         """Take in whether the hand holds something: the nearest ball moves into it with its id, or leaves it."""
@@ -97,7 +97,7 @@ class PerceivedScene:
         contained = [
             self._ball(f"slot_{k + 1}", "contained", m.Pose(position=m.Vector3(
                 x=float(self._slots[k, 0]), y=float(self._slots[k, 1]), z=float(self._slots[k, 2]))))
-            for k in sorted(self._occupied)
+            for k in sorted(self._occupied_slots())
         ]
         held = [self._held] if self._held is not None else []
         return m.PlanningScene(
@@ -106,6 +106,11 @@ class PerceivedScene:
             attached=held,
             allowed_collisions=[(link, h.object.id) for h in held for link in self.gripper.links],
         )
+
+    def _occupied_slots(self) -> set[int]:
+        """Slots in which any view shows something now."""
+        return {slot for stamp, slots in self._occupied.values() for slot in slots
+                if (self._stamp - stamp) * 1e-9 <= self.p.forget_after}
 
     def _ball(self, name: str, role: str, pose: m.Pose) -> m.CollisionObject:
         return m.CollisionObject.model_validate({

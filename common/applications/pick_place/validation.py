@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from common.config import Surroundings
@@ -55,6 +56,18 @@ class Validation:
         self.forget_after = forget_after
         self._same_place = same_place
         self._told: list[_Told] = []
+
+    def judge_all(self, views: Sequence[tuple[MarkerArray, Pinhole]]) -> Verdict:
+        """What becomes of what several views show, of which each place counts once."""
+        joined = Verdict()
+        for frame, camera in views:
+            verdict = self.judge(frame, camera)
+            known = list(joined.targets)
+            joined.targets += [p for p in verdict.targets if all(math.dist(p, q) >= self._same_place for q in known)]
+            joined.rejections += verdict.rejections
+            joined.inside += verdict.inside
+            joined.unknown += verdict.unknown
+        return joined
 
     def judge(self, frame: MarkerArray, camera: Pinhole) -> Verdict:
         """What becomes of the detections of a frame. The same frame may be judged again when more is known."""

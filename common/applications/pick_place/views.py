@@ -1,0 +1,90 @@
+"""What one or several detectors found, each with the camera that it looked through."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+from pydantic import Field
+
+from common import topics
+from common.applications.pick_place.topics import DETECTED_OBJECTS
+from common.messages import Marker, MarkerArray
+from common.perception.intake import Cameras, LeftOut, Unusable
+from common.perception.pinhole import Pinhole
+from common.transport.bus import Bus
+
+OLDEST = 0.5  # [s, cell time] behind the newest: a camera that is so late says nothing of how things are now
+
+ViewName = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*$")]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A frame of detections and the camera that took the picture."""
+
+    frame: MarkerArray
+    camera: Pinhole
+
+
+class Views:
+    """Readers for each view: what was detected, and the camera. A view called left has its keys under `left/`."""
+
+    def __init__(self, bus: Bus, names: Sequence[str], log: logging.Logger) -> None:
+        """Declare the readers.
+
+        Args:
+            bus: of the service.
+            names: of the views; none stands for a single one, whose keys begin with nothing.
+            log: is told once for each reason why a frame is left out.
+        """
+        keys = [f"{name}/" for name in names] or [""]
+        self._statics = bus.reader(topics.TF_STATIC)
+        self._frames = [bus.reader(replace(DETECTED_OBJECTS, key=f"{at}{DETECTED_OBJECTS.key}")) for at in keys]
+        self._infos = [bus.reader(replace(topics.CAMERA_INFO, key=f"{at}{topics.CAMERA_INFO.key}")) for at in keys]
+        self._cameras = [Cameras() for _ in keys]
+        self._newest: list[Seen | None] = [None for _ in keys]
+        self._left_out = LeftOut(log, "a frame of detections")
+
+    async def watch(self, look: Callable[[int, Seen], Awaitable[None]]) -> None:
+        """Have every frame looked at as it comes, one after the other, with the number of its view; never returns."""
+        turn = asyncio.Lock()
+
+        async def follow(number: int) -> None:
+            async for frame in self._frames[number]:
+                try:
+                    camera = self._cameras[number].of(self._infos[number].latest, self._statics.latest)
+                except Unusable as error:
+                    self._left_out.note(error)
+                    continue
+                seen = self._newest[number] = Seen(self._without_cut_off(number, frame), camera)
+                async with turn:
+                    await look(number, seen)
+
+        async with asyncio.TaskGroup() as group:
+            for number in range(len(self._frames)):
+                group.create_task(follow(number))
+
+    def newest(self) -> list[Seen]:
+        """The newest frame of each view that tells of now."""
+        found = [seen for seen in self._newest if seen is not None]
+        latest = max((seen.frame.header.stamp for seen in found), default=0)
+        return [seen for seen in found if latest - seen.frame.header.stamp <= OLDEST * 1e9]
+
+    def _without_cut_off(self, number: int, frame: MarkerArray) -> MarkerArray:
+        """The frame without what is cut off by the border of its picture and whole in another one."""
+        others = [seen for index, seen in enumerate(self._newest) if seen is not None and index != number]
+        whole = [marker for seen in others for marker in seen.frame.markers if not marker.partial]
+        kept = [
+            marker for marker in frame.markers
+            if not (marker.partial and any(math.dist(_place(marker), _place(one)) < marker.scale.x for one in whole))
+        ]
+        return frame if len(kept) == len(frame.markers) else frame.model_copy(update={"markers": kept})
+
+
+def _place(marker: Marker) -> tuple[float, float, float]:
+    return marker.pose.position.x, marker.pose.position.y, marker.pose.position.z

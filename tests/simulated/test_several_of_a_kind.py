@@ -1,0 +1,68 @@
+"""A cell with two cameras and two detectors under names of their own, and one scene that both of them feed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from common import messages as m
+from common import topics
+from common.config import load_cell, service_config
+from common.errors import ConfigError
+from common.process.in_process import running_service
+from common.process.wiring import owned_in, require_one_owner, wiring_of
+from common.transport import ownership
+from common.transport.local import LocalNetwork
+from common.virtual.simulation import Simulation
+from services import camera_simulator
+
+CELL = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")
+
+
+def test_two_cameras_two_detectors_and_one_scene_clear_a_table_that_neither_camera_sees_wholly() -> None:
+    outcome = Simulation(load_cell(CELL), 1).run()
+    assert (outcome.state, outcome.done, outcome.total) == ("DONE", 3, 3), outcome
+    assert outcome.crashes == [] and outcome.restarts == {}
+
+
+def test_one_camera_alone_leaves_what_it_does_not_see() -> None:
+    blind = [f"services.{name}.views=[left]" for name in ("scene_manager", "workspace_validator")]
+    outcome = Simulation(load_cell(CELL, blind), 1).run()
+    assert (outcome.state, outcome.done) == ("DONE", 2), outcome  # the third lies where only the right one looks
+
+
+async def test_keys_and_owners_follow_from_the_cell() -> None:
+    cell = load_cell(CELL)
+    wirings = {entry.name: await wiring_of(cell, entry) for entry in cell.services.values()}
+    require_one_owner(wirings)
+    owned = {key: services for key, (_, services) in owned_in(wirings).items()}
+    for side in ("left", "right"):
+        assert owned[f"{side}/camera/image_raw"] == owned[f"{side}/camera/camera_info"] == [f"{side}_camera"]
+        assert owned[f"{side}/detected_objects"] == owned[f"{side}/detection_image"] == [f"{side}_detector"]
+    assert "camera/image_raw" not in owned and "detected_objects" not in owned
+    read = {topic.key for topic in wirings["scene_manager"].reads}
+    assert {"left/detected_objects", "right/detected_objects", "left/camera/camera_info"} < read
+
+
+async def test_each_camera_says_its_own_frame_and_tf_has_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ownership, "GIVE_UP", 0.0)
+    cell, net = load_cell(CELL), LocalNetwork()
+    bus = net.bus("tester")
+    infos = {side: bus.reader(replace(topics.CAMERA_INFO, key=f"{side}/camera/camera_info"))
+             for side in ("left", "right")}
+    entries = [cell.services[f"{side}_camera"] for side in infos]
+    left, right = (service_config(cell, entry.name, camera_simulator.Config) for entry in entries)
+    async with (
+        running_service(net, camera_simulator.run, left, name="left_camera", topics=entries[0].topics),
+        running_service(net, camera_simulator.run, right, name="right_camera", topics=entries[1].topics),
+    ):
+        bus.writer(topics.SCENE_OBJECTS).put(m.WorldObjects())
+        frames = {side: (await reader.next()).header.frame_id for side, reader in infos.items()}
+        assert frames == {"left": "left_optical_frame", "right": "right_optical_frame"}
+        with pytest.raises(ConfigError, match=r"services\.third: left_camera has left/camera/\w+ already"):
+            async with running_service(net, camera_simulator.run, left, name="third", topics=entries[0].topics):
+                pytest.fail("it was let in")
+
+
