@@ -1,0 +1,56 @@
+"""Services under names of their own as processes: what the supervisor, the tokens and the parameters call them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from common.transport.connect import connect
+from tests.harness import RunningCell, command_line, environment, free_domain
+
+pytestmark = [pytest.mark.cell, pytest.mark.slow]
+
+CELL = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")
+SERVICES = ["motion_planner", "robot_state_publisher", "trajectory_executor", "left_camera", "right_camera",
+            "left_detector", "right_detector", "workspace_validator", "scene_manager", "smart_pick_place"]
+
+
+async def test_two_cameras_two_detectors_and_one_scene_clear_the_table(tmp_path: Path) -> None:
+    with RunningCell(tmp_path, "run", CELL, "--speed", "3") as cell:
+        assert await cell.ended(150) == 0, cell.tail(80)
+        assert cell.summary["restarts"] == dict.fromkeys(["router", *SERVICES], 0)
+        assert cell.summary["truth"]["in_box"] == 3 and not cell.processes()
+
+
+async def test_a_cell_that_is_up_knows_them_by_their_names(tmp_path: Path) -> None:
+    with RunningCell(tmp_path, "up", CELL, "--set", "autostart=false") as cell:
+        async with connect(cell="two_cameras", service="watcher", endpoint=cell.endpoint, timeout=60.0) as bus:
+            await bus.alive.wait(SERVICES[-1], 60.0)
+        listed = cell.tell("node", "list").stdout.split()
+        assert {f"two_cameras/{name}" for name in SERVICES} <= set(listed)
+        told = json.loads(cell.tell("topic", "info", "left/camera/image_raw", "--json").stdout)
+        assert (told["writer"], told["message"], told["kind"]) == ("left_camera", "Image", "stream")
+        assert cell.tell("param", "set", "services.right_camera.rate=5").returncode == 0
+        rates = [cell.tell("param", "get", f"services.{name}.rate").stdout.strip() for name in
+                 ("left_camera", "right_camera")]
+        assert [float(rate) for rate in rates] == [10.0, 5.0]
+        info = json.loads(cell.tell("topic", "echo", "left/camera/camera_info", "-n", "1", "--json").stdout)
+        assert info["header"]["frame_id"] == "left_optical_frame"
+        # One more of what is there is refused, also when a person starts it.
+        twice = cell.tell("service", "left_camera", "--cell", CELL)
+        assert twice.returncode == 2
+        assert "another left_camera is up, which has left/camera/camera_info already" in twice.stderr.splitlines()[-1]
+
+
+def test_two_cameras_on_one_key_end_the_start_with_one_line() -> None:
+    line = command_line("run", CELL, "--no-viewer", "--domain", str(free_domain()), "--set",
+                        "services.right_camera.topics={camera/*: left/camera/*}")
+    done = subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1] == (
+        "zencell: services.right_camera: left_camera has left/camera/camera_info already, and a key is written or "
+        "served by one service: give right_camera or left_camera keys of its own, as in topics: "
+        "{camera/*: right_camera/*}")
