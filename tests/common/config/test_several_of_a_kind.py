@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import yaml
 
 from common.config import Surroundings, load_cell, service_config
 from common.errors import ConfigError, UnknownName
@@ -107,3 +108,13 @@ def test_entry_that_renames_nothing_is_told_with_the_keys_that_there_are() -> No
     assert remapping.key("camera/image_raw") == "camera/image_raw"
     with pytest.raises(ConfigError, match=r"services\.left\.topics: 'camra/\*' .* choices: camera/image_raw"):
         remapping.require_used("left")
+
+
+def test_page_on_extending_shows_the_cell_that_the_tests_run() -> None:
+    root = Path(__file__).resolve().parents[3]
+    page = (root / "docs" / "extending.md").read_text(encoding="utf-8")
+    chapter = page[page.index("### Several of a kind"):]
+    shown = yaml.safe_load(chapter.split("```yaml\n")[1].split("```")[0])
+    run = yaml.safe_load((root / "tests" / "data" / "two_cameras.yaml").read_text(encoding="utf-8"))
+    assert shown["world"]["cameras"] == run["world"]["cameras"]
+    assert shown["services"].items() <= run["services"].items()
