@@ -14,7 +14,8 @@ from common.process.persist import persist
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.sources import monotonic, new_id
-from common.tasks.engine import Task, TaskConfig
+from common.tasks.deciding import TaskConfig
+from common.tasks.engine import Task
 from common.tasks.stages import Command, View
 from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
 from common.topics import Topic

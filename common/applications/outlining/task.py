@@ -12,7 +12,8 @@ from common import messages as m
 from common.applications.outlining.legs import Legs, OutlineView, TracingParameters, closed, length
 from common.applications.outlining.messages import OutlinePoints, OutlineStatus
 from common.config import Tunable
-from common.tasks.engine import Task, TaskConfig
+from common.tasks.deciding import TaskConfig
+from common.tasks.engine import Task
 from common.tasks.stages import Cycle, Grip, Look, Move, Stage
 
 AT_HOME = 0.01  # [rad] from it

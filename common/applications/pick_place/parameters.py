@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from common.config import Grasp, Parameters, Surroundings, Tunable
-from common.tasks.engine import TaskConfig
+from common.tasks.deciding import TaskConfig
 
 
 class HandShape(Parameters):
@@ -41,7 +41,7 @@ class Config(TaskConfig):
         60.0, gt=0, le=3600, description="a motion that takes longer is stopped [s]"
     )
     grace: Tunable[float] = Field(
-        8.0, ge=0, le=600, description="wait while only objects are left that can not be taken [s]"
+        8.0, ge=0, le=600, description="wait while only objects are left that cannot be taken [s]"
     )
     empty: Tunable[float] = Field(
         1.0, ge=0.1, le=600, description="wait with an empty table before the task is done [s]"

@@ -82,7 +82,7 @@ class PickPlace(Task[PickPlaceView]):
             seen = max(self.look_after, min(view.stamps))
             done = self.patience.lasts(bool(left), seen) >= (self.p.grace if left else self.p.empty)
             done = done and len(view.objects("contained")) <= self.status.done  # else it is about to be counted
-            self.status.message = f"{left} objects are left that can not be taken" if left else "the table looks empty"
+            self.status.message = f"{left} objects are left that cannot be taken" if left else "the table looks empty"
         self.status.state, self.status.stage, self.status.subject = "DONE" if done else "IDLE", "", ""
 
     # --- what happened ---------------------------------------------------------------------------------------
