@@ -93,8 +93,10 @@ def find_layers(application: Application | None, own: Iterable[str] = ()) -> Lay
     parts = [application.part("page")] if application is not None else []
     found: dict[str, type[Layer]] = {}
     for module in [*map(_import, FIRST), *(part for part in parts if part is not None), *map(_import_own, own)]:
-        found |= layers_in(module)  # one of a name that was there before takes its place
-    return {name: kind for module in map(_import, LAST) for name, kind in layers_in(module).items()} | found
+        found |= layers_in(module)  # one of a name that is there already takes its place
+    for module in map(_import, LAST):
+        found = found | {name: kind for name, kind in layers_in(module).items() if name not in found}
+    return found
 
 
 def layers_in(module: ModuleType) -> dict[str, type[Layer]]:

@@ -48,6 +48,7 @@ def test_cell_has_the_layers_of_the_platform_and_of_its_application() -> None:
     assert {*panda} & {*ur5} == everywhere
     assert {*panda} - {*ur5} == {"targets", "rejected", "workspace"}
     assert {*ur5} - {*panda} == {"outline", "contours"}
+    assert (next(iter(panda)), list(panda)[-1]) == ("robot", "grid")  # in the order of their ticks
     assert all(kind.LABEL for kind in (*panda.values(), *ur5.values()))
 
 
