@@ -87,8 +87,8 @@ async def run(bus: Bus, config: Config) -> None:
     """Show the cell to whoever looks, until cancelled."""
     layout = load_layout(config.layout)
     application = find_application(config.members.application) if config.members.application else None
-    layers = find_layers(application, config.layers)
-    read = Topics(application, layers)
+    layers = find_layers(application, config.layers, config.members.keys)
+    read = Topics(application, layers, config.members.keys)
     feeds = Feeds(bus, read.always, read.on_demand)
     console = Console(bus, config.members, feeds, read.requests)
     status = feeds.reader(read.status) if read.status is not None else None

@@ -38,6 +38,7 @@ class Members(Section):
     services: list[str] = Field(description="in start order")
     task: str = Field(description="the service that runs the task")
     application: str = Field("", description="what the cell is for: a name, or a dotted module")
+    keys: list[dict[str, str]] = Field([], description="of services with keys of their own: the cell's by theirs")
 
 
 class Reach(Section):
@@ -80,7 +81,8 @@ class Cell(Section):
             return Surroundings.model_validate(around | {"camera": self.world.camera_of(camera)})
         if kind is Members:
             names = [entry.name for entry in self.services.values()]
-            return Members(services=names, task=self.task, application=self.application)
+            keys = [entry.topics for entry in self.services.values() if entry.topics]
+            return Members(services=names, task=self.task, application=self.application, keys=keys)
         if kind is Reach:
             return Reach(told={name: entry.parameters for name, entry in self.services.items()})
         for value in (self.run, self.robot, self.world, self.motion, self.grasp, self.pipeline, self.watchdogs):

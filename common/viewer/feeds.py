@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from common.messages import Message
+from common.remapping import Remapping
 from common.topics import Topic
 
 if TYPE_CHECKING:
@@ -66,6 +67,17 @@ class Feeds:
         keys = {topic.key for topic in wanted}
         for key in self._on_demand:
             self._bus.listen(self._readers[key], key in keys)
+
+
+def under_all_keys(topic: Topic[M], tables: Iterable[Mapping[str, str]]) -> list[Topic[M]]:
+    """A topic under each key that it has in a cell: two cameras say the same under different ones.
+
+    Args:
+        topic: in the words of the services.
+        tables: the cell's keys by a service's own, of each service that has some.
+    """
+    keys = dict.fromkeys([topic.key, *(Remapping(table).key(topic.key) for table in tables)])
+    return [replace(topic, key=key) for key in keys]
 
 
 class Latest(Protocol):

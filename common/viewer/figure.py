@@ -92,9 +92,9 @@ class LinkPoses:
 class Transforms:
     """The newest transform of each frame, of tf and tf_static together."""
 
-    def __init__(self, camera: CameraConfig) -> None:
-        """Know only what the surroundings say: the pose of the camera, which also stands for unknown frames."""
-        self._T_world_camera = transform(rpy_to_matrix(*camera.rpy), camera.position)
+    def __init__(self, cameras: Iterable[CameraConfig]) -> None:
+        """Know only what the surroundings say: the poses of cameras, of which the first stands for unknown frames."""
+        self._fixed = {camera.frame: transform(rpy_to_matrix(*camera.rpy), camera.position) for camera in cameras}
         self.newest: dict[str, TransformStamped] = {}  # by frame
 
     def update(self, m: TFMessage) -> None:
@@ -107,7 +107,7 @@ class Transforms:
         while frame not in ("", "world"):
             each = self.newest.get(frame)
             if each is None or frame in seen:
-                return self._T_world_camera
+                return self._fixed.get(frame, next(iter(self._fixed.values())))
             seen.add(frame)
             T = pose_to_matrix(each.transform) @ T
             frame = each.header.frame_id

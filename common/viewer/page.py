@@ -12,7 +12,7 @@ An application adds to it in its part `page`: words for its task (words.py), lay
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,7 @@ from common.messages import Image, Rejections
 from common.reporting.summary import Rejected
 from common.topics import Request, Topic
 from common.viewer.console import Console
-from common.viewer.feeds import Feeds, News, Periods
+from common.viewer.feeds import Feeds, News, Periods, under_all_keys
 from common.viewer.health import HealthPanel, LogPanel
 from common.viewer.layers import Layers, layers_shown
 from common.viewer.layout import TABS, Layout, Tab, Viewpoint, save_layout
@@ -57,18 +57,24 @@ class Topics:
         on_demand: what is read while somebody looks at it.
     """
 
-    def __init__(self, application: Application | None, layers: Layers) -> None:
-        """Look at what an application and layers say."""
+    def __init__(
+        self, application: Application | None, layers: Layers, keys: Sequence[Mapping[str, str]] = ()
+    ) -> None:
+        """Look at what an application and layers say, and what services call otherwise by their `keys`."""
 
         def named(part: str, name: str) -> Any:
             return application.find(part, name) if application is not None else None
 
         self.status: Topic[Any] | None = named("topics", "STATUS")
-        self.rejected: Topic[Rejections] | None = named("topics", "REJECTED")
-        self.decided_by: Topic[Any] | None = named("topics", "DECIDED_BY")
-        annotated: Topic[Image] | None = named("topics", "ANNOTATED")
+
+        def everywhere(*found: Topic[Any] | None) -> list[Topic[Any]]:
+            return [each for topic in found if topic is not None for each in under_all_keys(topic, keys)]
+
+        self.rejected: list[Topic[Rejections]] = everywhere(named("topics", "REJECTED"))
+        self.decided_by: list[Topic[Any]] = everywhere(named("topics", "DECIDED_BY"))
         self.images: dict[str, list[Topic[Image]]] = {
-            LIVE: [topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE], ANNOTATED: [annotated] if annotated else [],
+            LIVE: everywhere(topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
+            ANNOTATED: everywhere(named("topics", "ANNOTATED")),
         }
         self.requests: Sequence[Request[Any, Any]] = named("page", "REQUESTS") or ()
         controls = getattr(named("page", "Controls"), "TOPICS", ())
@@ -78,7 +84,7 @@ class Topics:
     @property
     def always(self) -> list[Topic[Any]]:
         """What is read all the time: small or seldom."""
-        return [*ALWAYS, *(topic for topic in (self.status, self.rejected, self.decided_by) if topic is not None)]
+        return [*ALWAYS, *([self.status] if self.status is not None else []), *self.rejected, *self.decided_by]
 
 
 class Page:
@@ -115,7 +121,7 @@ class Page:
         self._server, self._feeds, self.console = server, feeds, console
         self._motions, self._cell, self._kinds = motions, cell, layers
         self._layout, self._layout_file, self._periods = layout, layout_file, periods
-        self._topics, self._words = Topics(application, layers), TaskWords.of(application)
+        self._topics, self._words = Topics(application, layers, members.keys), TaskWords.of(application)
         self._shown, self._editing = layers_shown(layout.layers, layers), layout.edit_world
         self._rejected = Rejected()
         self._happened: list[tuple[Topic[Any], Any]] = []  # before there is a scene: an event does not come again
@@ -242,7 +248,7 @@ class Page:
         for name, sources in self._topics.images.items():
             for topic in sources:
                 image = self._feeds.fresh(topic) if self._pictures.shown[name] else None
-                rgb = self._pictures.show(name, image) if image is not None else None
+                rgb = self._pictures.show(name, image, topic.key) if image is not None else None
                 if rgb is not None and name == LIVE and self._scene is not None:
                     self._scene.picture(topic, rgb)
 
@@ -266,10 +272,10 @@ class Page:
         acts: dict[Topic[Any], list[Callable[[Any], None]]] = {
             topics.LOG: [self._log.add], topics.COUNTERS: [lambda counters: self._health.count(counters, now())],
         }
-        if self._topics.decided_by is not None:
-            acts.setdefault(self._topics.decided_by, []).append(older)
-        if self._topics.rejected is not None:
-            acts.setdefault(self._topics.rejected, []).append(reject)
+        for topic in self._topics.decided_by:
+            acts.setdefault(topic, []).append(older)
+        for topic in self._topics.rejected:
+            acts.setdefault(topic, []).append(reject)
         for topic in {topic for kind in self._kinds.values() for topic in kind.TOPICS if topic.kind == "event"}:
             acts.setdefault(topic, []).append(partial(self._happen, topic))
         return [self.console.run(), self._follow_parameters(), *(self._follow(*each) for each in acts.items())]

@@ -61,7 +61,7 @@ class PicturePanel:
         self._on_shown = on_shown
         self._ticks = {name: gui.add_checkbox(label, shown[name]) for name, label in LABELS.items()}
         self._folders = {name: gui.add_folder(None) for name in LABELS}
-        self._images: dict[str, viser.GuiImageHandle] = {}
+        self._images: dict[str, dict[str, viser.GuiImageHandle]] = {name: {} for name in LABELS}  # each by its source
         self._notes: dict[str, viser.GuiHtmlHandle] = {}
         for name, tick in self._ticks.items():
             desk.on_change(tick, partial(self._set_shown, name))
@@ -69,26 +69,35 @@ class PicturePanel:
                 self._notes[name] = gui.add_html(block(span("No picture yet", "dim"), f"{name} picture", pictures=0))
         self._count = dict.fromkeys(LABELS, 0)
 
-    def show(self, name: str, image: Image) -> Picture | None:
-        """Show a message as the live or the annotated picture; the picture, or None when it is none."""
+    def show(self, name: str, image: Image, source: str) -> Picture | None:
+        """Show a message as a live or an annotated picture; the picture, or None when it is none.
+
+        Args:
+            name: live or annotated.
+            image: the message.
+            source: the key under which it came; several stand below one another, with their keys.
+        """
         try:
             rgb = rgb_picture(image)
         except ImageError as error:
             self._notes[name].content = block(span(error, "bad"), f"{name} picture", pictures=self._count[name])
             return None
         self._count[name] += 1
-        if name in self._images:
-            self._images[name].image = rgb
+        images = self._images[name]
+        if source in images:
+            images[source].image = rgb
             return rgb
         self._notes[name].content = ""
         with self._folders[name]:
-            self._images[name] = self._gui.add_image(rgb, format="jpeg", jpeg_quality=QUALITY,
-                                                     visible=self.shown[name])
+            images[source] = self._gui.add_image(rgb, format="jpeg", jpeg_quality=QUALITY, visible=self.shown[name])
+        if len(images) > 1:
+            for key, handle in images.items():
+                handle.label = key
         return rgb
 
     def _set_shown(self, name: str, on: bool) -> None:
         self.shown[name] = on
         self._folders[name].visible = on
-        if name in self._images:
-            self._images[name].visible = on
+        for handle in self._images[name].values():
+            handle.visible = on
         self._on_shown()

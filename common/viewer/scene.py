@@ -69,7 +69,7 @@ class Scene:
         self._server, self._editing = server, False
         pieces = visual_pieces(robot)
         self.stage = Stage(server.scene, robot, around, console, latest, clock, LinkPoses(robot),
-                           Transforms(around.camera), pieces, coarse(pieces, GHOST))
+                           Transforms(around.cameras.values()), pieces, coarse(pieces, GHOST))
         self._roots = {name: server.scene.add_frame(f"/{name}", show_axes=False, visible=self._shown[name])
                        for name in layers}
         self.layers = {name: kind(self.stage, f"/{name}") for name, kind in layers.items()}

@@ -7,7 +7,7 @@ import re
 import threading
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -450,6 +450,18 @@ def show(layer, topic, message): ...
         assert not depth.matched
         await page.set("My noise", True)
         await until(lambda: depth.matched)
+
+
+async def test_pictures_of_two_cameras_are_shown_beside_each_other() -> None:
+    members = Members(services=["left_camera", "right_camera"], task="", application="pick_place",
+                      keys=[{"camera/*": "left_camera/*"}, {"camera/*": "right_camera/*"}])
+    async with page_of("panda", members=members) as played, opened(played.port) as page:
+        keys = [f"{side}_camera/image_raw" for side in ("left", "right")]
+        writers = [played.bus.writer(replace(topics.CAMERA_IMAGE, key=key)) for key in keys]
+        await until(lambda: all(writer.matched for writer in writers))
+        for writer, grey in zip(writers, (10, 200), strict=True):
+            writer.put(m.Image(header=m.Header(), height=4, width=4, encoding="mono8", data=bytes([grey] * 16)))
+        await page.until(lambda: all(page.label(key) for key in keys))
 
 
 async def test_application_without_a_page_gets_the_buttons_and_words_of_every_task(

@@ -25,6 +25,7 @@ from common.application import Application, applications
 from common.errors import ConfigError, UnknownName
 from common.messages import JointTrajectory
 from common.topics import Topic
+from common.viewer.feeds import under_all_keys
 
 if TYPE_CHECKING:
     import viser
@@ -80,12 +81,15 @@ class Layer:
 Layers = Mapping[str, type[Layer]]
 
 
-def find_layers(application: Application | None, own: Iterable[str] = ()) -> Layers:
+def find_layers(
+    application: Application | None, own: Iterable[str] = (), keys: Sequence[Mapping[str, str]] = ()
+) -> Layers:
     """The layers of a cell by name, in the order of their ticks.
 
     Args:
         application: what the cell is for.
         own: dotted modules of a person.
+        keys: of services that call topics otherwise: a layer shows these topics, too.
 
     Raises:
         ConfigError: a module can not be imported, or has no layer.
@@ -96,6 +100,10 @@ def find_layers(application: Application | None, own: Iterable[str] = ()) -> Lay
         found |= layers_in(module)  # one of a name that is there already takes its place
     for module in map(_import, LAST):
         found = found | {name: kind for name, kind in layers_in(module).items() if name not in found}
+    if keys:
+        found = {name: type(kind.__name__, (kind,), {"TOPICS": [t for topic in kind.TOPICS
+                                                               for t in under_all_keys(topic, keys)]})
+                 for name, kind in found.items()}
     return found
 
 

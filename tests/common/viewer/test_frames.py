@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import viser
 
 from common import messages as m
 from common import topics
@@ -81,9 +84,22 @@ def test_camera_is_where_its_frame_is_on_a_moving_hand(panda: Stage) -> None:
     np.testing.assert_allclose(in_world(panda.server, node), wanted, atol=1e-9)
 
 
+def test_each_of_two_cameras_has_a_frustum_where_it_is(server: viser.ViserServer) -> None:
+    keys = [{"camera/*": "left_camera/*"}, {"camera/*": "right_camera/*"}]
+    stage = Stage(server, "panda", keys=keys)
+    camera = Pinhole.from_config(around_of("panda").camera)
+    for side, x in (("left", 0.3), ("right", 0.7)):
+        stage.say(replace(topics.CAMERA_INFO, key=f"{side}_camera/camera_info"),
+                  camera.info(m.Header(frame_id=f"{side}_eye")))
+        stage.say(topics.TF_STATIC, tf("world", f"{side}_eye", at(x, 0, 0.5)))
+    nodes = stage.layer("camera").nodes
+    assert {name: round(float(in_world(server, node)[0, 3]), 6) for name, node in nodes.items()} == {
+        "left_camera": 0.3, "right_camera": 0.7}
+
+
 def test_camera_without_transforms_is_where_the_surroundings_say() -> None:
     config = CameraConfig(position=(0.4, 0.0, 0.8))
-    np.testing.assert_allclose(Transforms(config).pose(config.frame)[:3, 3], [0.4, 0.0, 0.8])
+    np.testing.assert_allclose(Transforms([config]).pose(config.frame)[:3, 3], [0.4, 0.0, 0.8])
 
 
 def test_camera_looks_as_far_to_the_sides_as_its_picture(panda: Stage) -> None:
