@@ -83,7 +83,7 @@ class Operation:
             loaded = loaded.model_copy(update={"services": kept})
         self.cell: Cell = loaded
         self.fold = Fold(loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
-                         speed=self.launch.clock.speed)
+                         speed=self.launch.clock.speed, containers=list(loaded.world.containers))
         self.summary = self.fold.summary
         require_modules(loaded)
         if endpoint is None:

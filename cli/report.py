@@ -72,6 +72,7 @@ def page_of(recording: Recording, cell: str | None = None) -> str:
     fold = Fold(
         recording.cell, _application_of(recording, resolved), robot=resolved.robot if resolved and robot else None,
         seed=int(run.get("seed") or 0), speed=speed, gathering=gathered,
+        containers=list(resolved.world.containers) if resolved else (),
     )
     wanted = {topic.key: topic for topic in fold.topics}
     decoder = Decoder(topic.message for topic in fold.topics)

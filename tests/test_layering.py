@@ -105,22 +105,8 @@ PLATFORM_SERVICES = (
 )
 APPLICATIONS = [path.parent.name for path in sorted((ROOT / "common" / "applications").glob("*/__init__.py"))]
 PARTS_ALL_LOOK_FOR = ("STATUS", "DECIDED_BY", "REJECTED", "ANNOTATED", "VIEWS")
-SHORT_FORMS = ("common/config/short_forms.py",)  # where the fields of older world files are read
-# Files that still do: the lists may only get shorter.
-STILL_IMPORT = (
-    "common/chaos/agent.py",
-)
-STILL_NAME = (
-    "common/chaos/agent.py",
-)
-STILL_BALLS = (
-    "common/chaos/agent.py",
-    "common/messages/world.py",
-    "common/perception/resting.py",
-    "common/scene/slots.py",
-    "common/sim/drawing.py",
-    "common/sim/places.py",
-    "common/sim/robot_shapes.py",
+SHORT_FORMS = (  # where the fields of older world files are read, and the arguments of an older function
+    "common/config/short_forms.py", "common/sim/drawing.py",
 )
 
 
@@ -163,11 +149,6 @@ def lines_with(pattern: re.Pattern[str], paths: list[Path]) -> list[str]:
     ]
 
 
-def beyond(known: tuple[str, ...], found: list[str]) -> list[str]:
-    """What was found outside of the files that are known for it."""
-    return [line for line in found if line.partition(":")[0] not in known]
-
-
 def test_every_service_is_the_platforms_or_belongs_to_one_application() -> None:
     for path in sources("services"):
         if path.stem != "__init__" and path.stem not in PLATFORM_SERVICES:
@@ -175,7 +156,7 @@ def test_every_service_is_the_platforms_or_belongs_to_one_application() -> None:
 
 
 def test_the_platform_never_imports_an_application() -> None:
-    assert beyond(STILL_IMPORT, offences(of_platform(), tuple(f"common.applications.{n}" for n in APPLICATIONS))) == []
+    assert offences(of_platform(), tuple(f"common.applications.{name}" for name in APPLICATIONS)) == []
 
 
 def test_an_application_never_imports_another() -> None:
@@ -188,18 +169,18 @@ def test_the_platform_names_no_application_and_none_of_its_words() -> None:
     words = application_words()
     assert {"smart_pick_place", "contour_tracer", "vision_detector", "PickPlaceStatus", "scene_balls"} <= words
     either = "|".join(re.escape(word) for word in sorted(words, key=len, reverse=True))
-    assert beyond(STILL_NAME, lines_with(re.compile(rf"(?<![\w/])(?:{either})(?![\w/])"), of_platform())) == []
+    assert lines_with(re.compile(rf"(?<![\w/])(?:{either})(?![\w/])"), of_platform()) == []
 
 
 def test_the_platform_names_no_robot_that_comes_with_the_project() -> None:
     robots = "|".join(path.stem for path in (ROOT / "config" / "robots").glob("*.yaml"))
     assert "panda" in robots
-    assert beyond(STILL_NAME, lines_with(re.compile(robots, re.IGNORECASE), of_platform())) == []
+    assert lines_with(re.compile(robots, re.IGNORECASE), of_platform()) == []
 
 
 def test_the_platform_says_ball_only_where_the_short_form_is_read() -> None:
-    found = lines_with(re.compile("ball", re.IGNORECASE), of_platform())
-    assert beyond((*STILL_BALLS, *SHORT_FORMS), found) == []
+    others = [path for path in of_platform() if name_of(path) not in SHORT_FORMS]
+    assert lines_with(re.compile("ball", re.IGNORECASE), others) == []
 
 
 # --- no cycles ----------------------------------------------------------------------------------------------------

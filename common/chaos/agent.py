@@ -9,7 +9,7 @@ import math
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,6 @@ import numpy as np
 
 from common import topics
 from common.application import find_topic
-from common.applications.pick_place.topics import SCENE_BALLS
 from common.chaos.plan import STATELESS_FORMS, Fault, Form
 from common.config import Container
 from common.errors import DecodeError, RequestFailed
@@ -37,8 +36,8 @@ if TYPE_CHECKING:
     from common.transport.bus import Bus, Reader
     from common.transport.session import RawSample
 
-PATIENCE = 4.0  # [s] that a fault of a process waits for a ball in the hand
-SLIP_PATIENCE = 20.0  # [s] that a ball has to be taken before it slips
+PATIENCE = 4.0  # [s] that a fault of a process waits for something in the hand
+SLIP_PATIENCE = 20.0  # [s] that an object has to be taken before it slips
 SAMPLE_SECONDS = 1.5  # within which a state is repeated
 DROP_TIMEOUT = 1.0  # [s]
 SPACING = 0.02  # [s] between bad messages in a row
@@ -60,8 +59,8 @@ class Chaos:
     """Faults, carried out one after the other; `happened` lists them."""
 
     def __init__(
-        self, bus: Bus, plan: Iterable[Fault], pids: Callable[[], dict[str, int]], container: Container | None,
-        patience: float = SLIP_PATIENCE,
+        self, bus: Bus, plan: Iterable[Fault], pids: Callable[[], dict[str, int]],
+        containers: Sequence[Container] | None, patience: float = SLIP_PATIENCE,
     ) -> None:
         """Declare what is listened to.
 
@@ -69,15 +68,16 @@ class Chaos:
             bus: of the cell.
             plan: faults in order of time.
             pids: the processes that run now, by name.
-            container: balls are let slip clear of its edge; None when there are no balls.
-            patience: that there has to be a ball in the hand before it slips [s, wall time].
+            containers: objects are let slip clear of their edges; None where no object is taken.
+            patience: that there has to be something in the hand before it slips [s, wall time].
         """
         self.happened: list[Happened] = []
-        self._bus, self._plan, self._pids, self._container = bus, plan, pids, container
+        self._bus, self._plan, self._pids, self._containers = bus, plan, pids, containers
         self._patience = patience
-        self._gripper = bus.reader(topics.GRIPPER_STATE) if container else None
-        self._balls = bus.reader(SCENE_BALLS) if container else None
-        self._edit = bus.client(topics.WORLD_EDIT) if container else None
+        taken = containers is not None
+        self._gripper = bus.reader(topics.GRIPPER_STATE) if taken else None
+        self._objects = bus.reader(topics.SCENE_OBJECTS) if taken else None
+        self._edit = bus.client(topics.WORLD_EDIT) if taken else None
         self._began = 0.0
         self._stopped: set[int] = set()
 
@@ -104,7 +104,7 @@ class Chaos:
     async def _begin(self, fault: Fault, lasting: asyncio.TaskGroup) -> None:
         """Carry out a fault; one that lasts goes on beside those that follow."""
         if fault.kind == "drop":
-            lasting.create_task(self._drop(fault))  # others need not wait until a ball is in the hand
+            lasting.create_task(self._drop(fault))  # others need not wait until something is in the hand
         elif fault.kind in ("corrupt", "replay"):
             lasting.create_task(self._disturb(fault))
         elif (pid := self._pids().get(fault.target)) is None:
@@ -134,34 +134,35 @@ class Chaos:
             _signal(pid, signal.SIGCONT)
             await asyncio.sleep(fault.seconds / 2)
 
-    # --- balls ----------------------------------------------------------------------------------------------------
+    # --- objects --------------------------------------------------------------------------------------------------
 
     def _is_holding(self) -> bool:
         latest = self._gripper.latest if self._gripper else None
         return latest is not None and latest.holding
 
     def _may_slip(self) -> bool:
-        """Whether a ball is in the hand that would fall to where it can be seen and taken again, or into the box."""
-        balls, box = self._balls.latest if self._balls else None, self._container
-        if balls is None or box is None or "held" not in balls.labels:
+        """Whether what is in the hand would fall to where it can be seen and taken again, or into a container."""
+        latest = self._objects.latest if self._objects else None
+        held = next((thing for thing in latest.objects if thing.state == "held"), None) if latest else None
+        if held is None:
             return False
-        place = balls.poses[balls.labels.index("held")].position
-        off = max(abs(place.x - box.x), abs(place.y - box.y)) - box.half_side
-        return off > CLEARANCE or off < -box.wall_thickness
+        p = held.pose.position
+        off = [(max(abs(p.x - c.x), abs(p.y - c.y)) - c.half_side, c.wall_thickness) for c in self._containers or ()]
+        return all(far > CLEARANCE or far < -wall for far, wall in off)
 
     async def _drop(self, fault: Fault) -> None:
         rng = np.random.default_rng(fault.seed)
         if self._edit is None:
             return
         for wait in (float(rng.uniform(0, 0.3)), 0.0):
-            if not await _until(self._balls, self._may_slip, self._patience):
-                log.info("there is no ball in the hand to be let slip")
+            if not await _until(self._objects, self._may_slip, self._patience):
+                log.info("there is nothing in the hand to be let slip")
                 return
             await asyncio.sleep(wait)  # not always as soon as it may
         try:
             await self._edit.call(WorldEdit(op="drop"), DROP_TIMEOUT)
         except RequestFailed as error:
-            log.info("no ball slips: %s", error)
+            log.info("nothing slips: %s", error)
             return
         self._note(fault)
 

@@ -42,7 +42,7 @@ def chaos_in(
     def pids() -> dict[str, int]:
         return {status.name: status.pid for status in supervisor.statuses if status.pid is not None}
 
-    return Chaos(bus, planned, pids, cell.world.container if objects else None)
+    return Chaos(bus, planned, pids, list(cell.world.containers.values()) if objects else None)
 
 
 def keys_of(owners: Iterable[Owner], services: Iterable[str]) -> list[str]:

@@ -15,7 +15,7 @@ Corner = tuple[Finite, Finite]
 
 
 class SceneUpdate(Message):
-    """What happened to an object of the simulated world, as in the seed: "remove:ball_3", "add:ball_3"."""
+    """What happened to an object of the simulated world, as in the seed: "remove:ID", "add:ID"."""
 
     header: Header = Header()
     data: str

@@ -31,7 +31,11 @@ class Truth:
     def on_objects(self, message: WorldObjects) -> None:
         """Take note of all objects; in old recordings they do not tell what becomes of them."""
         if all("state" in thing.model_fields_set for thing in message.objects):
-            self._objects = [_thing(thing) for thing in message.objects]
+            self._objects = [
+                Thing((thing.pose.position.x, thing.pose.position.y, thing.pose.position.z), thing.state,
+                      thing.container)
+                for thing in message.objects
+            ]
 
     def on_labels(self, message: PoseArray) -> None:
         """Take note of what is told as poses with labels."""
@@ -62,11 +66,6 @@ class Truth:
         in_box, on_table = sum(contained.values()), sum(thing.state == "table" for thing in self.things)
         elsewhere = len(self.things) - in_box - on_table
         return {"in_box": in_box, "on_table": on_table, "elsewhere": elsewhere, "containers": contained}
-
-
-def _thing(thing: Any) -> Thing:
-    p = thing.pose.position
-    return Thing((p.x, p.y, p.z), thing.state, thing.container)
 
 
 def _counts(known: Iterable[str], found: Iterable[str]) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""The places of balls in the container, and which of them are taken as seen in the picture."""
+"""The places of equal spheres in a container, and which of them are taken as seen in the picture."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import Container, Surroundings
+from common.config import Container
 from common.perception.pinhole import Pinhole
 
 Array = NDArray[np.float64]
 
 
 def slot_positions(box: Container, radius: float, table_height: float) -> Array:
-    """Centres (layers, 4, 3) of the balls that fill the container [m], world: 2 x 2 in each layer.
+    """Centres (layers, 4, 3) of the spheres that fill the container [m], world: 2 x 2 in each layer.
 
     A layer stands straight on the one below it.
     """
@@ -26,21 +26,23 @@ def slot_positions(box: Container, radius: float, table_height: float) -> Array:
     ])
 
 
-def occupied_slots(pixels: Iterable[tuple[float, float]], camera: Pinhole, around: Surroundings) -> set[int]:
-    """Which slots hold a ball, as indices into the flattened slots.
+def occupied_slots(
+    pixels: Iterable[tuple[float, float]], camera: Pinhole, slots: Array, radius: float
+) -> set[int]:
+    """Which slots hold a sphere, as indices.
 
-    Each seen ball belongs to the slot whose centre is imaged nearest to it, the nearest pairs first, one to one. Below
-    a ball that is seen stand the balls that carry it, though they are hidden.
+    Each seen sphere belongs to the slot whose centre is imaged nearest to it, the nearest pairs first, one to one.
+    Below one that is seen stand those that carry it, though they are hidden.
 
     Args:
-        pixels: (u, v) of the balls that are seen inside the container.
+        pixels: (u, v) of the spheres that are seen inside the container.
         camera: with its pose in world.
-        around: the container and the size of a ball.
+        slots: (n, 3) [m], world, as `slot_positions` has them, in its order.
+        radius: of a sphere [m].
     """
-    slots = slot_positions(around.container, around.ball_radius, around.table_height).reshape(-1, 3)
     images = camera.project(slots)
     seen = list(pixels)
-    reach = camera.fx * around.ball_radius / float(np.min(camera.to_camera(slots)[:, 2]))
+    reach = camera.fx * radius / float(np.min(camera.to_camera(slots)[:, 2]))
     pairs = sorted(
         (float(np.hypot(*(images[slot] - pixel))), slot, number)
         for number, pixel in enumerate(seen)

@@ -12,9 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from common.config import Grasp, Parameters, Surroundings, Tunable, check
-from common.perception.pinhole import Pinhole
-from common.perception.resting import Resting
+from common.config import Grasp, Parameters, Tunable, check
 from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
@@ -88,11 +86,6 @@ def outside_reason(bounds: WorkspaceBounds, position: Sequence[float]) -> str:
     if radius > bounds.max_radius:
         return f"too far: {radius:.3f} m from the base axis, more than {bounds.max_radius:.3f} m"
     return ""
-
-
-def inside_container(camera: Pinhole, pixel: npt.ArrayLike, around: Surroundings) -> bool:
-    """Whether the ray through a pixel (u, v) meets the volume of the container up to the height of a full stack."""
-    return Resting.of(around).meets_container(*camera.ray(pixel))
 
 
 def chain_reason(robot: RobotModel, position: Sequence[float], grasp: Grasp, bounds: WorkspaceBounds) -> str:

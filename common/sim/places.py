@@ -43,7 +43,7 @@ class Table:
         )
 
     def blocked(self, x: float, y: float) -> str:
-        """The thing into which a ball resting at (x, y) [m] would reach, or an empty string."""
+        """The thing into which a sphere resting at (x, y) [m] would reach, or an empty string."""
         point = np.array([[x, y]])
         reach = self.radius - 1e-9
         for c in self._containers:

@@ -46,6 +46,6 @@ def triangles(shape: coal.CollisionGeometry) -> Array:
         tube = primitive("cylinder", [radius, 2 * half])
         if isinstance(shape, coal.Cylinder):
             return tube
-        ball, up = primitive("sphere", [radius]), np.array([0.0, 0.0, half])
-        return np.concatenate([tube, ball + up, ball - up])
+        end, up = primitive("sphere", [radius]), np.array([0.0, 0.0, half])
+        return np.concatenate([tube, end + up, end - up])
     raise ValueError(f"no triangles for a {type(shape).__name__}")

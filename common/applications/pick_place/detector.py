@@ -12,10 +12,10 @@ from pydantic import Field, model_validator
 
 from common.applications.pick_place.blobs import Blob, Mask, find_blobs
 from common.applications.pick_place.fit import fit_each, fit_spheres
+from common.applications.pick_place.resting import Resting
 from common.applications.pick_place.separation import separate
 from common.config import Parameters, Surroundings, Tunable
 from common.perception.pinhole import Pinhole
-from common.perception.resting import Resting
 from common.perception.sphere import ray_distances, silhouettes
 
 Array = npt.NDArray[np.float64]

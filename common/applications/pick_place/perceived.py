@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common import messages as m
+from common.applications.pick_place.resting import inside_container
 from common.applications.pick_place.tracks import Place, SceneParameters, Tracks
 from common.config import GripperConfig, Surroundings
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, matrix_to_pose
 from common.scene.fixtures import color_of, fixed_objects
 from common.scene.slots import occupied_slots, slot_positions
-from common.scene.workspace import inside_container
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,8 @@ class PerceivedScene:
             elif hand is None or math.dist(hand, (p.x, p.y, p.z)) > self.around.ball_radius:
                 on_table.append((p.x, p.y, p.z))
         self._tracks.update(on_table, stamp * 1e-9)
-        self._occupied[view] = stamp, occupied_slots(in_container, camera, self.around)
+        seen = occupied_slots(in_container, camera, self._slots, self.around.ball_radius)
+        self._occupied[view] = stamp, seen
 
     def feel(self, gripper: m.GripperState, T_world_tcp: Array | None) -> None:
         """Take in whether the hand holds something: the nearest ball moves into it with its id, or leaves it."""

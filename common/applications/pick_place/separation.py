@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from common.applications.pick_place.blobs import Mask, Outline
 from common.applications.pick_place.fit import fit_each, near_points
+from common.applications.pick_place.resting import Resting
 from common.perception.pinhole import Pinhole
-from common.perception.resting import Resting
 from common.perception.sphere import ray_distances, silhouettes
 
 Array = npt.NDArray[np.float64]

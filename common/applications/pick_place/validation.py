@@ -6,10 +6,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from common.applications.pick_place.resting import inside_container
 from common.config import Surroundings
 from common.messages import Marker, MarkerArray, Rejection, Vector3
 from common.perception.pinhole import Pinhole
-from common.scene.workspace import INSIDE_CONTAINER, PARTLY_OUT_OF_VIEW, ReachCache, inside_container
+from common.scene.workspace import INSIDE_CONTAINER, PARTLY_OUT_OF_VIEW, ReachCache
 
 Place = tuple[float, float, float]
 

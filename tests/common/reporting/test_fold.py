@@ -8,7 +8,7 @@ import pytest
 from common import topics
 from common.application import Application
 from common.applications.pick_place.messages import PickPlaceStatus
-from common.messages import Header, MotionStatus, Pose, PoseArray, TaskStatus, WorldObjects
+from common.messages import Header, MotionStatus, Pose, PoseArray, TaskStatus, WorldObject, WorldObjects
 from common.reporting.application import Figures, figures_of, truth_in_words
 from common.reporting.fold import Fold, application_in
 from common.reporting.gathering import Gathering
@@ -91,5 +91,11 @@ def test_objects_tell_the_truth_where_they_say_what_becomes_of_them() -> None:
     fold = Fold("panda", Application("pick_place"))
     fold.on("scene_objects", WorldObjects(), 0.0, 0)
     assert fold.summary.as_dict()["truth"] == {"in_box": 0, "on_table": 0, "elsewhere": 0, "containers": {}}
-    fold.on("scene_balls", PoseArray(poses=[Pose()], labels=["box"]), 0.0, 0)
+    fold.on("scene_balls", PoseArray(poses=[Pose()], labels=["box"]), 0.0, 0)  # all that older recordings tell
     assert fold.summary.as_dict()["truth"] == {"in_box": 1, "on_table": 0, "elsewhere": 0, "containers": {"box": 1}}
+    states = [("contained", "tray"), ("contained", "tray"), ("table", ""), ("held", "")]
+    things = [WorldObject(id=f"cube_{k}", shape="box", state=state, container=into)
+              for k, (state, into) in enumerate(states)]
+    fold.on("scene_objects", WorldObjects(objects=things), 0.0, 0)
+    assert fold.summary.as_dict()["truth"] == {"in_box": 2, "on_table": 1, "elsewhere": 1, "containers": {"tray": 2}}
+    assert not fold.summary.truth.settled

@@ -31,4 +31,4 @@ def test_slots_are_told_from_the_pixels_of_the_balls_on_top(filled: int) -> None
     visible = [k for k in taken if k + 4 not in taken]
     jitter = np.random.default_rng(filled).uniform(-5, 5, (len(visible), 2))
     pixels = [tuple(p) for p in CAMERA.project(SLOTS[visible]).reshape(-1, 2) + jitter]
-    assert occupied_slots(pixels, CAMERA, AROUND) == taken
+    assert occupied_slots(pixels, CAMERA, SLOTS, AROUND.ball_radius) == taken

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from common.applications.pick_place.resting import inside_container
 from common.config import Grasp, Surroundings, check, load_cell
 from common.errors import ConfigError
 from common.perception.pinhole import Pinhole
@@ -16,7 +17,6 @@ from common.scene.workspace import (
     ReachCache,
     WorkspaceBounds,
     chain_reason,
-    inside_container,
     outside_reason,
     reach_reason,
 )

@@ -82,3 +82,8 @@ class Resting:
             return True
         room = self.container.half_side - self.container.wall_thickness - 0.7 * self.radius
         return bool(abs(x - self.container.x) <= room and abs(y - self.container.y) <= room)
+
+
+def inside_container(camera: Pinhole, pixel: npt.ArrayLike, around: Surroundings) -> bool:
+    """Whether the ray through a pixel (u, v) meets the volume of the container up to the height of a full stack."""
+    return Resting.of(around).meets_container(*camera.ray(pixel))

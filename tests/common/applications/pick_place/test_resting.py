@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from common.applications.pick_place.resting import Resting
 from common.config import Container, Surroundings
 from common.perception.pinhole import Pinhole
-from common.perception.resting import Resting
 
 resting = Resting.of(Surroundings())
 camera = Pinhole.from_config(Surroundings().camera)
