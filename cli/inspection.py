@@ -19,6 +19,7 @@ T = TypeVar("T")
 
 TOOL = "zencell"
 CONNECT_TIMEOUT = 2.0  # [s] to reach the router
+PRESENCE_TIMEOUT = 1.0  # [s] the same, where only one of many is looked at
 LOOK_TIMEOUT = 1.0  # [s] to hear who is there
 
 
@@ -97,7 +98,6 @@ def _only(cells: set[str], endpoint: str) -> str:
 
 ASK_TIMEOUT = 1.0  # [s]
 PROBE_TIMEOUT = 0.5  # [s] to see whether anything listens where a router would
-CONNECT_TIMEOUT = 1.0  # [s]
 
 
 async def supervisor_status(bus: Bus) -> SupervisorStatus | None:
@@ -151,7 +151,7 @@ async def _look(domain: str | None, connect: str | None) -> dict[str, Presence]:
 
     ready: dict[str, set[str]] = {}
     try:
-        async with connect_to(cell="_", service=TOOL, endpoint=endpoint, timeout=CONNECT_TIMEOUT) as bus:
+        async with connect_to(cell="_", service=TOOL, endpoint=endpoint, timeout=PRESENCE_TIMEOUT) as bus:
             for cell, service in await alive(bus):
                 ready.setdefault(cell, set()).add(service)
             return {cell: Presence(frozenset(names), await _status(bus, cell)) for cell, names in ready.items()}

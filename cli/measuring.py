@@ -88,7 +88,6 @@ def describe(figures: Figures, *, in_bytes: bool) -> str:
 
 
 HEAD = 256  # [bytes] in which the header of our messages lies; what follows may be a picture
-COVERED = 5.0  # [s] before now that the figures cover, at most
 
 DelayFigures = dict[str, float | int | None]
 

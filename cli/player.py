@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from common.recording.playhead import Playhead
 from common.recording.sample import encoding_of
+from common.recording.selection import Playhead
 from common.recording.stamps import restamp
 
 if TYPE_CHECKING:

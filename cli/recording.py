@@ -129,8 +129,8 @@ async def _gated(
 
 async def _record(bus: Bus, selection: Selection, asked: _Asked) -> None:
     from cli.capturing import Capture
+    from common.recording.files import SplitWriter
     from common.recording.sink import Sink
-    from common.recording.splitting import SplitWriter
     from common.supervision.interrupts import Interrupts
     from common.transport.handoff import call_on_loop
 

@@ -11,9 +11,8 @@ from common import topics
 from common.config import Parameters, Surroundings, Tunable
 from common.errors import ConfigError
 from common.messages import CameraInfo
-from common.perception.calibration_file import CameraFile
+from common.perception.calibration_file import CameraFile, Rectifier, require_size
 from common.perception.image import array_to_image
-from common.perception.rectification import Rectifier, require_size
 from common.perception.sources import Source, open_source
 from common.process.pace import Pace
 from common.process.service import main

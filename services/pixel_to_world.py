@@ -12,8 +12,7 @@ from common.applications.outlining.top_face import TopFace, TopFaceOptions, top_
 from common.applications.outlining.topics import CONTOUR_POINTS, CONTOURS
 from common.errors import ZencellError
 from common.messages import Header, Image, Pose, Vector3
-from common.perception.depth import check_depth
-from common.perception.depth_intake import depth_of
+from common.perception.depth import check_depth, depth_of
 from common.perception.intake import camera_of
 from common.perception.pinhole import Pinhole
 from common.process.service import main

@@ -7,9 +7,8 @@ from typing import Any
 from pydantic import Field
 
 from common.config.basics import Section
-from common.config.motion import Grasp, Motion, Pipeline, Run
+from common.config.motion import Grasp, Motion, Pipeline, Run, Watchdogs
 from common.config.robot import RobotConfig
-from common.config.watchdogs import Watchdogs
 from common.config.world import Surroundings, World
 
 

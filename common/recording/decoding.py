@@ -1,9 +1,11 @@
-"""Recorded payloads as messages; what is none is counted."""
+"""Recorded payloads as messages, what is none is counted; and the JSON schema of each message class."""
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterable
+from functools import cache
 
 import msgpack
 from pydantic import ValidationError
@@ -37,3 +39,10 @@ class Decoder:
                 pass
         self.skipped[sample.topic] += 1
         return None
+
+
+@cache
+def schema_of(name: str) -> bytes:
+    """The JSON schema of a message class as UTF-8; empty for one of somebody else's."""
+    found = message_class(name)
+    return json.dumps(found.model_json_schema(mode="serialization")).encode() if found else b""

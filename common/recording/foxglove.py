@@ -32,12 +32,11 @@ from common.messages import (
     WorldObjects,
 )
 from common.perception.image import image_to_array
-from common.recording.appending import AppendedFile
-from common.recording.decoding import Decoder
+from common.recording.decoding import Decoder, schema_of
 from common.recording.foxglove_scene import of_markers, of_scene, of_world, time_of
 from common.recording.foxglove_schemas import SCHEMAS
 from common.recording.reading import Recording, Wanted
-from common.recording.schemas import schema_of
+from common.recording.writing import AppendedFile
 
 JPEG_QUALITY = 90
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "critical": 5}

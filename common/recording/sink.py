@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from common.recording.files import SplitWriter
 from common.recording.sample import RecordingError, Sample
-from common.recording.splitting import SplitWriter
 
 MOST_BYTES = 256 * 1024 * 1024  # that wait while the disk stalls: ten seconds of the most that cameras send
 MOST_SAMPLES = 200_000

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,9 +12,8 @@ from typing import Any
 import msgpack
 from mcap.writer import CompressionType, Writer
 
-from common.recording.appending import AppendedFile
-from common.recording.sample import Sample
-from common.recording.schemas import schema_of
+from common.recording.decoding import schema_of
+from common.recording.sample import RecordingError, Sample
 from common.recording.stamps import stamp_of
 
 CHUNK_BYTES = 512 * 1024  # before compression; a picture has a chunk of its own
@@ -25,6 +26,66 @@ _TRACES = {
     "description": "Trace ids of the messages of this chunk: [channel id, sequence number, trace id].",
     "properties": {"traces": {"type": "array", "items": {"type": "array"}}},
 }
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk takes no more
+
+
+class WritingFailed(RecordingError):
+    """The disk takes no more; what was written before is kept."""
+
+    exit_code = 1
+
+    def __init__(self, path: Path, error: OSError) -> None:
+        why = "the disk is full" if error.errno in FULL else (error.strerror or str(error))
+        super().__init__(f"{path}: recording stopped, {why}; what was written is kept: zencell recover {path}")
+        self.path = path
+        self.errno = error.errno
+
+
+class AppendedFile:
+    """What an MCAP writer needs of a stream."""
+
+    def __init__(self, path: Path) -> None:
+        """Create the file.
+
+        Raises:
+            RecordingError: it is there already, or can not be made.
+        """
+        self.path = path
+        try:
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        except FileExistsError:
+            raise RecordingError(f"{path}: is there already; choose another name") from None
+        except OSError as error:
+            raise RecordingError(f"{path}: can not be written: {error.strerror}") from None
+        self._size = 0
+
+    def write(self, data: bytes) -> int:
+        """Append all of the data, which are whole records.
+
+        Raises:
+            WritingFailed: the disk takes no more; none of the data are in the file then.
+        """
+        view = memoryview(data)
+        while view:
+            try:
+                written = os.write(self._file, view)
+            except OSError as error:
+                os.ftruncate(self._file, self._size)
+                raise WritingFailed(self.path, error) from None
+            view = view[written:]
+        self._size += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Bytes written so far."""
+        return self._size
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._file)
 
 
 class RecordingWriter:

@@ -1,4 +1,4 @@
-"""Who of the processes is alive and yet frozen: judged by what is heard of them, without a clock of its own."""
+"""Who is heard of: processes that fell silent, and what other hosts' supervisors say of their part of the cell."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from common.config import Watchdogs
-from common.messages import ServiceStatus
+from common.messages import ServiceStatus, SupervisorStatus
 from common.transport.keys import ROUTER
 from common.waking import Waking
 
@@ -100,3 +100,40 @@ class LivenessWatchdog:
         if any(process.name == ROUTER and process.state == "ready" for process in processes):
             return [Verdict(ROUTER, "lets none of the services be heard")]
         return []
+
+
+class Elsewhere:
+    """The services of a cell that other supervisors keep."""
+
+    def __init__(self, host: str, own: Collection[str]) -> None:
+        """Know of none yet.
+
+        Args:
+            host: name of this host.
+            own: names of the services that run here.
+        """
+        self.host, self._own = host, frozenset(own)
+        self._heard: dict[str, ServiceStatus] = {}
+
+    def hear(self, status: SupervisorStatus) -> None:
+        """Take note of what a supervisor says of its own part; what it passes on is not news."""
+        for service in status.services:
+            if service.name not in self._own and service.host == status.host:
+                self._heard[service.name] = service
+
+    def statuses(self, alive: Collection[str]) -> list[ServiceStatus]:
+        """All of them as they are now: a host that can not be reached does not tell any more.
+
+        Args:
+            alive: names of the services whose readiness tokens are there.
+        """
+        return [
+            service if service.name in alive or service.state != "ready" else service.model_copy(update={
+                "state": "waiting", "message": f"on {service.host}, which is not reached",
+            })
+            for service in self._heard.values()
+        ]
+
+    def ours(self, services: Collection[ServiceStatus]) -> list[ServiceStatus]:
+        """Those of this host, with its name."""
+        return [service.model_copy(update={"host": self.host}) for service in services]

@@ -14,10 +14,9 @@ from common.config import Cell
 from common.errors import ConfigError, DecodeError, ZencellError
 from common.messages import ServiceStatus, SupervisorStatus
 from common.sources import monotonic
-from common.supervision.elsewhere import Elsewhere
 from common.supervision.interrupts import Interrupts
 from common.supervision.launch import Launch
-from common.supervision.liveness_watchdog import PERIOD, LivenessWatchdog
+from common.supervision.liveness_watchdog import PERIOD, Elsewhere, LivenessWatchdog
 from common.supervision.supervisor import Supervisor
 from common.transport.credentials import SUPERVISOR
 

@@ -13,7 +13,7 @@ from common.applications.outlining.contours_choice import NoSuchContour, describ
 from common.applications.outlining.messages import Contours, OutlinePoints, OutlineSelect
 from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
 from common.errors import ConfigError, RemoteError, ZencellError
-from common.perception.depth_intake import depth_of
+from common.perception.depth import depth_of
 from common.perception.image import image_to_array
 from common.perception.intake import colour_picture
 

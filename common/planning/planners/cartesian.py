@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common.config import Parameters
+from common.planning.path import smoothed
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result, ToolPath, ToolWay
-from common.planning.smoothing import smoothed
 from common.robot.ik import converge
 from common.robot.model import RobotModel
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -9,8 +12,8 @@ from pydantic import Field
 from common.config import Parameters
 from common.planning.joint_goals import blocked_edge, first_success, joint_goals
 from common.planning.problem import Cancel, Problem, Result
+from common.planning.retiming import TimedPath
 from common.planning.timing import LIMIT_SHARE
-from common.planning.trapezoid import synchronised
 
 Array = NDArray[np.float64]
 
@@ -38,3 +41,68 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
         return Result(trajectory=timed, fraction=1.0)
 
     return first_success(goals, attempt, cancel, problem)
+
+
+_SHORTEST = 1e-6  # [s] between two states
+
+
+@dataclass(frozen=True)
+class Trapezoid:
+    """Durations [s] of the three phases and the speed [1/s] in the middle one, in units of the way per second."""
+
+    speeding: float
+    cruising: float
+    braking: float
+    speed: float
+
+    @property
+    def duration(self) -> float:
+        """Seconds from rest to rest."""
+        return self.speeding + self.cruising + self.braking
+
+    def at(self, time: float) -> tuple[float, float, float]:
+        """Way, speed and acceleration at a time [s]; at the end of a phase the acceleration is that of the next."""
+        up, down = self.speed / self.speeding, self.speed / self.braking
+        if time < self.speeding:
+            return 0.5 * up * time**2, up * time, up
+        if time < self.speeding + self.cruising:
+            return self.speed * (time - 0.5 * self.speeding), self.speed, 0.0
+        left = self.duration - time
+        whole = self.speed * (0.5 * self.speeding + self.cruising + 0.5 * self.braking)
+        return whole - 0.5 * down * left**2, down * left, -down
+
+
+def trapezoid(length: float, speed: float, acceleration: float, deceleration: float) -> Trapezoid:
+    """The fastest profile over a length > 0 within a speed, an acceleration and a deceleration, all positive.
+
+    A way too short to reach the speed has no middle phase: v^2 / 2a + v^2 / 2d = length.
+    """
+    top = min(speed, math.sqrt(2 * length / (1 / acceleration + 1 / deceleration)))
+    speeding, braking = top / acceleration, top / deceleration
+    cruising = max(0.0, (length - 0.5 * top * (speeding + braking)) / top)
+    return Trapezoid(speeding, cruising, braking, top)
+
+
+def synchronised(start: Array, goal: Array, velocity: Array, acceleration: Array, deceleration: Array) -> TimedPath:
+    """The fastest trajectory between two positions (dof,) [rad] in which all joints share the phases of one profile.
+
+    So the joint that needs longest sets the times, no limit (dof,) is exceeded and the way is a straight edge.
+    """
+    span = goal - start
+    moving = np.abs(span) > 1e-9
+    if not moving.any():
+        still = np.zeros((2, len(start)))
+        return TimedPath(np.array([0.0, 0.01]), np.array([start, start]), still, still)
+    way = np.abs(span[moving])
+    v, a, d = (float((limit[moving] / way).min()) for limit in (velocity, acceleration, deceleration))
+    profile = trapezoid(1.0, v, a, d)
+    times = [0.0]
+    for time in (profile.speeding, profile.speeding + profile.cruising, profile.duration):
+        if time > times[-1] + _SHORTEST:
+            times.append(time)
+    states = np.array([profile.at(time) for time in times])
+    states[-1, :2] = 1.0, 0.0
+    s, ds, dds = (column[:, None] for column in states.T)
+    positions = start + s * span
+    positions[-1] = goal
+    return TimedPath(np.array(times), positions, ds * span, dds * span)

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from common.messages import Header
-from common.perception.depth import DepthError, Rays, check_depth, point_cloud
-from common.perception.depth_intake import depth_of
+from common.perception.depth import DepthError, Rays, check_depth, depth_of, point_cloud
 from common.perception.image import array_to_image
 from common.perception.intake import Unusable, colour_picture
 from tests.common.applications.outlining.outline_scenes import seen_world

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.planning.smoothing import smoothed
+from common.planning.path import smoothed
 
 
 def bending(points):

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from common.planning.planners.ptp import synchronised, trapezoid
 from common.planning.retiming import end_accelerations
-from common.planning.trapezoid import synchronised, trapezoid
 
 values = st.floats(0.01, 10)
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from common.messages import JointState
+from common.recording.files import SplitWriter
 from common.recording.reading import Recording
 from common.recording.sample import RecordingError, Sample, encoding_of, message_of
-from common.recording.splitting import SplitWriter
 from common.recording.stamps import Sequences
 from common.recording.summary import summarise
 from common.recording.writing import RecordingWriter

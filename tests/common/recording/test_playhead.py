@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.recording.playhead import Playhead
+from common.recording.selection import Playhead
 
 SECOND = 1_000_000_000
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from common.recording import appending
-from common.recording.appending import WritingFailed
+from common.recording.files import SplitWriter
 from common.recording.reading import Recording
 from common.recording.sink import Sink
-from common.recording.splitting import SplitWriter
+from common.recording.writing import WritingFailed
 from tests.common.recording.samples import joints, status
 
 

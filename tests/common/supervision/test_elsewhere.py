@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from common.messages import ServiceStatus, SupervisorStatus
-from common.supervision.elsewhere import Elsewhere
+from common.supervision.liveness_watchdog import Elsewhere
 
 
 def said(host: str, *services: tuple[str, str, str]) -> SupervisorStatus:

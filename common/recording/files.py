@@ -1,4 +1,4 @@
-"""A recording in one file or several, each of which is complete from its start."""
+"""The files of a recording: only appended to, so that what was written is on its way to the disk, and split by size."""
 
 from __future__ import annotations
 
@@ -100,3 +100,5 @@ class SplitWriter:
     def abandon(self) -> None:
         """Close as it is, after a failure."""
         self._file.abandon()
+
+
