@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from common.recording import appending
+from common.recording import writing
 from common.recording.files import SplitWriter
 from common.recording.reading import Recording
 from common.recording.sink import Sink
@@ -70,7 +70,7 @@ def test_full_disk_ends_it_with_one_line_and_keeps_whole_chunks(
         room -= taken
         return real(file, data[:taken])  # a disk that fills takes the part that still fits
 
-    monkeypatch.setattr(appending.os, "write", write)
+    monkeypatch.setattr(writing.os, "write", write)
     offered = 0
     while not failed.wait(0.001):
         for _ in range(10):
@@ -92,7 +92,7 @@ def test_failure_while_closing_is_told_too(tmp_path: Path, monkeypatch: pytest.M
     def write(file: int, data: memoryview) -> int:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(appending.os, "write", write)
+    monkeypatch.setattr(writing.os, "write", write)
     with pytest.raises(WritingFailed, match="Input/output error"):
         sink.close({})
 
