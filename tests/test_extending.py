@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import viser
 import yaml
 
 from common import messages as m
@@ -31,9 +32,11 @@ from common.process.wiring import wiring
 from common.recording.reading import Recording
 from common.robot.model import RobotModel
 from common.tasks.stages import View
-from common.topics import CAMERA_IMAGE, CAMERA_INFO
+from common.topics import CAMERA_IMAGE, CAMERA_INFO, GRIPPER_STATE
 from common.transport.codec import decode
 from common.transport.local import LocalNetwork
+from common.viewer.guard import close_server, make_server
+from tests.common.viewer.scene_cell import Stage
 from tests.harness import free_domain
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -286,6 +289,19 @@ def test_application_that_is_no_module_or_has_no_status_is_refused_by_name(
 def start(line: str, folder: Path, env: dict[str, str]) -> subprocess.Popen[str]:
     return subprocess.Popen(shlex.split(line), cwd=folder, env=env, text=True, stdout=subprocess.PIPE,
                             stderr=subprocess.PIPE)
+
+
+def test_layer_of_ours_is_drawn_on_the_page(folder: Path) -> None:
+    server = make_server("127.0.0.1", 0)
+    try:
+        stage = Stage(server, "panda", own=["my_pkg.hand_width"])
+        stage.say(GRIPPER_STATE, m.GripperState(width=0.04))
+        label = server.scene.get_handle_by_name("/my_pkg.hand_width/words")
+        assert isinstance(label, viser.LabelHandle) and label.text == "40 mm"
+        tool = stage.robot.fk(stage.robot.named("home"))
+        np.testing.assert_allclose(label.position, tool[:3, 3], atol=1e-6)
+    finally:
+        close_server(server)
 
 
 def test_service_that_is_no_module_is_refused_by_name(folder: Path) -> None:

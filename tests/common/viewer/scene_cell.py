@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
@@ -81,7 +81,9 @@ class ConsoleDouble:
 class Stage:
     """The scene of a cell on a server of its own, watched or not: `say` is what the cell says."""
 
-    def __init__(self, server: viser.ViserServer, cell: str, keys: Any = (), **options: Any) -> None:
+    def __init__(
+        self, server: viser.ViserServer, cell: str, own: Sequence[str] = (), keys: Any = (), **options: Any
+    ) -> None:
         self.server = server
         self.robot = robot_of(cell)
         self.clock = Clock()
@@ -92,7 +94,7 @@ class Stage:
         few = {  # reading meshes takes a second; here few triangles do
             "visual_pieces": lambda _robot: rough_of(cell), "coarse": lambda pieces, _kept: pieces,
         }
-        layers = find_layers(find_application(cell_of(cell).application), keys=keys)
+        layers = find_layers(find_application(cell_of(cell).application), own, keys)
         with patch.multiple("common.viewer.scene", **few):
             self.view = Scene(
                 server, self.robot, around_of(cell), layers, self.console, lambda topic: self.said.get(topic.key),
