@@ -73,6 +73,7 @@ def test_run_of_the_readme_ends_with_everything_done(line: str) -> None:
     assert wanted in ran.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.cell
 @pytest.mark.parametrize("line", BESIDE)
 def test_command_of_the_readme_answers_beside_a_running_cell(line: str, cell: dict[str, str]) -> None:
@@ -91,6 +92,7 @@ def test_command_of_the_readme_answers_beside_a_running_cell(line: str, cell: di
     assert next(text for word, text in wanted.items() if word in line) in first
 
 
+@pytest.mark.slow
 @pytest.mark.cell
 def test_up_prints_the_line_of_the_readme(cell: dict[str, str]) -> None:
     line = next(line for line in LINES if "/zenoh " in line).removeprefix(".venv/bin/")

@@ -212,15 +212,15 @@ def test_a_detector_can_not_read_the_truth(secured: Secured) -> None:
     with secured.holder("panda.vision_detector") as detector, secured.holder("panda.camera_simulator") as camera:
         stolen = detector.hear(*TRUTH, "panda/scene_$*", "panda/*", "panda/**", "**")
         pictures = detector.hear("panda/camera/image_raw")
-        seen = camera.hear("panda/scene_balls")
+        seen = camera.hear("panda/scene_objects")
         seen.wait(lambda samples: len(samples) > 1)  # it is told again each second
         pictures.wait_for("panda/camera/image_raw")
         for key in ("panda/scene_balls", "panda/scene_objects", "panda/scene_$*", "panda/**", "**"):
             answers = detector.ask(key, timeout=1.0)
             assert not any(b"ball_" in answer for answer in answers)
             assert key in {"panda/**", "**"} or answers == []
-        (truth,) = camera.ask("panda/scene_balls")
-        assert len(decode(m.PoseArray, truth).poses) == 7
+        (truth,) = camera.ask("panda/scene_objects")
+        assert len(decode(m.WorldObjects, truth).objects) == 7
         assert stolen.keys.isdisjoint(TRUTH)
         assert detector.ask("panda/camera/camera_info")
 
