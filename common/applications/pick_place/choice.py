@@ -13,6 +13,7 @@ from typing import Any
 from common import messages as m
 from common.applications.pick_place.parameters import Config, HandShape
 from common.config import Container
+from common.robot.transforms import matrix_to_rpy, pose_to_matrix
 from common.tasks.engine import appeared
 from common.tasks.stages import Cycle, Place, View, place_of
 
@@ -23,10 +24,25 @@ SETTLING = 1.5  # [s] from letting go until the ball lies in the container and w
 
 @dataclass
 class Target:
-    """An object that was seen: its place [m] in world, and its track id in the planning scene."""
+    """An object that was seen: its place [m] in world, and its track id in the planning scene.
+
+    `size` (x, y) [m] and `yaw` [rad] are those of a box seen from above; what is round has none.
+    """
 
     id: str
     position: Place
+    radius: float = 0.0  # of the circle about it seen from above [m]
+    size: tuple[float, float] | None = None
+    yaw: float = 0.0
+
+    @classmethod
+    def of(cls, thing: m.CollisionObject) -> Target:
+        """An object of the planning scene."""
+        d = thing.dimensions
+        if thing.shape != "box":
+            return cls(thing.id, place_of(thing.pose), d[0])
+        yaw = matrix_to_rpy(pose_to_matrix(thing.pose)[:3, :3])[2]
+        return cls(thing.id, place_of(thing.pose), math.hypot(d[0], d[1]) / 2, (d[0], d[1]), yaw)
 
 
 @dataclass(eq=False)
@@ -35,6 +51,7 @@ class Pick(Cycle):
 
     target: Target = field(kw_only=True)
     yaws: list[float] = field(default_factory=list, kw_only=True)
+    yaw: float = field(default=0.0, kw_only=True)  # of the hand, of those the one that is tried
     first_error: str = ""
 
     def __post_init__(self) -> None:
@@ -60,11 +77,15 @@ class PickPlaceView(View):
 
     def balls(self) -> list[Target]:
         """Balls on the table according to the planning scene, reachable or not."""
-        return [Target(o.id, place_of(o.pose)) for o in self.objects("target")]
+        return [Target.of(thing) for thing in self.objects("target")]
 
     def spots(self, but: Target | None, radius: float) -> Spots:
         """(x, y) of the balls on the table, without the one in work."""
-        return [b.position[:2] for b in self.balls() if but is None or not same_place(b.position, but.position, radius)]
+        return [b.position[:2] for b in self.others(but, radius)]
+
+    def others(self, but: Target | None, radius: float) -> list[Target]:
+        """Balls on the table, without the one in work."""
+        return [b for b in self.balls() if but is None or not same_place(b.position, but.position, radius)]
 
 
 class Choice:
@@ -100,8 +121,9 @@ class Choice:
         candidates = [ball for ball in view.balls() if self._is_open(ball, view, under_way)]
         candidates.sort(key=lambda ball: math.dist(ball.position[:2], origin[:2]))
         for ball in candidates:
-            others = view.spots(ball, self.radius)
-            yaws = grasp_yaws(self.p.hand, ball.position, others, self.radius, self.container)
+            others = [(*b.position[:2], b.radius) for b in view.others(ball, self.radius)]
+            yaws = grasp_yaws(self.p.hand, ball.position, others, self.radius, self.container,
+                              yaws_of(ball, self.p.hand))
             if full:
                 self.give_up(ball, FULL, view)
             elif not yaws:
@@ -178,7 +200,7 @@ def finger_clearance(
         shape: the fingers.
         center: (x, y) of the object to take [m], world.
         yaw: of the tool about world z [rad].
-        neighbours: (x, y) of other balls [m], world.
+        neighbours: (x, y) of other balls [m], world, and the radius of each if it is not that of the others.
         radius: of the balls [m].
         container: an open box whose walls must be cleared as well.
     """
@@ -186,12 +208,12 @@ def finger_clearance(
     half_length = (shape.finger_outer - shape.finger_inner) / 2
     middle = (shape.finger_outer + shape.finger_inner) / 2
     best = math.inf
-    for x, y in neighbours:
+    for x, y, *own in neighbours:
         dx, dy = x - center[0], y - center[1]
         lateral, along = c * dx + s * dy, -s * dx + c * dy
         gap_lateral = max(abs(lateral) - shape.finger_half_width, 0.0)
         gap_along = max(abs(abs(along) - middle) - half_length, 0.0)
-        best = min(best, math.hypot(gap_lateral, gap_along) - radius)
+        best = min(best, math.hypot(gap_lateral, gap_along) - (own[0] if own else radius))
     if container is not None:
         best = min(best, _container_gap(shape, center, c, s, container))
     return best
@@ -212,13 +234,29 @@ def _container_gap(shape: HandShape, center: Sequence[float], c: float, s: float
 
 def grasp_yaws(
     shape: HandShape, center: Sequence[float], neighbours: Sequence[Sequence[float]], radius: float,
-    container: Container | None = None,
+    container: Container | None = None, yaws: Sequence[float] | None = None,
 ) -> list[float]:
-    """Yaws [rad] with clear fingers, the least turn first; empty when the neighbours leave no room."""
+    """Yaws [rad] with clear fingers, the least turn first; empty when the neighbours leave no room.
+
+    `yaws` are those that the object itself allows; any without them.
+    """
     near = [n for n in neighbours if math.dist(n[:2], center[:2]) < shape.finger_outer + 2 * radius + 0.05]
-    near_xy = [(n[0], n[1]) for n in near]
     return [
         yaw
-        for yaw in yaw_candidates(shape.yaw_count)
-        if finger_clearance(shape, center, yaw, near_xy, radius, container) >= shape.min_clearance
+        for yaw in (yaw_candidates(shape.yaw_count) if yaws is None else yaws)
+        if finger_clearance(shape, center, yaw, near, radius, container) >= shape.min_clearance
     ]
+
+
+def yaws_of(target: Target, shape: HandShape) -> list[float] | None:
+    """Yaws [rad] of the hand at which its pads lie flat on two sides of a box that fits between them.
+
+    None for what is round, which is taken at any.
+    """
+    if target.size is None:
+        return None
+    # At the yaw of the box the fingers close along its y axis, a quarter turn from there along its x axis.
+    fitting = [target.yaw + turn for width, turn in ((target.size[1], 0.0), (target.size[0], math.pi / 2))
+               if width <= 2 * (shape.finger_inner - shape.min_clearance)]
+    turned = [math.remainder(yaw, math.pi) for yaw in fitting]  # a parallel gripper repeats after half a turn
+    return sorted(turned, key=lambda yaw: (abs(yaw), -yaw))

@@ -1,4 +1,4 @@
-"""The planning scene as it is believed to be: fixtures, tracked balls, the ball in the hand, balls in the container."""
+"""The planning scene as it is believed to be: fixtures, tracked objects, and those in the hand and the container."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from common import messages as m
 from common.applications.pick_place.resting import inside_container
-from common.applications.pick_place.tracks import Place, SceneParameters, Tracks
+from common.applications.pick_place.tracks import SceneParameters, Sighting, Track, Tracks
 from common.config import GripperConfig, Surroundings
 from common.perception.pinhole import Pinhole
-from common.robot.transforms import invert, matrix_to_pose
+from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix
 from common.scene.fixtures import color_of, fixed_objects
 from common.scene.slots import occupied_slots, slot_positions
 
@@ -29,7 +29,7 @@ class PerceivedScene:
 
         Args:
             parameters: of the tracking; they may change meanwhile.
-            around: fixtures, container, size and colour of a ball.
+            around: fixtures, container, and how large balls are, of which the container has slots.
             gripper: its links may touch what is held.
             tcp_link: what is held moves with this link.
         """
@@ -38,6 +38,7 @@ class PerceivedScene:
         self._fixed = fixed_objects(around)
         self._slots = slot_positions(around.container, around.ball_radius, around.table_height).reshape(-1, 3)
         self._occupied: dict[int, tuple[int, set[int]]] = {}  # stamp and slots by view
+        self._beside_slots: dict[int, list[Sighting]] = {}  # what else lies in the container, by view
         self._held: m.AttachedObject | None = None
         self._changed_hands_at = 0
         self._stamp = 0
@@ -55,15 +56,22 @@ class PerceivedScene:
         hand = None
         if self._held is not None and T_world_tcp is not None:
             hand = tuple(T_world_tcp[:3, 3])
-        on_table: list[Place] = []
+        on_table: list[Sighting] = []
+        beside_slots: list[Sighting] = []
         in_container: list[tuple[float, float]] = []
         for marker in detections.markers:
-            p = marker.pose.position
-            pixel = marker.pixel or tuple(camera.project([p.x, p.y, p.z]))
+            thing = Sighting.of(marker)
+            if thing is None:
+                continue
+            pixel = marker.pixel or tuple(camera.project(list(thing.position)))
             if inside_container(camera, pixel, self.around):
-                in_container.append((pixel[0], pixel[1]))
-            elif hand is None or math.dist(hand, (p.x, p.y, p.z)) > self.around.ball_radius:
-                on_table.append((p.x, p.y, p.z))
+                if thing.shape == "sphere":
+                    in_container.append((pixel[0], pixel[1]))
+                else:
+                    beside_slots.append(thing)
+            elif hand is None or math.dist(hand, thing.position) > max(thing.size) / 2:
+                on_table.append(thing)
+        self._beside_slots[view] = beside_slots
         self._tracks.update(on_table, stamp * 1e-9)
         seen = occupied_slots(in_container, camera, self._slots, self.around.ball_radius)
         self._occupied[view] = stamp, seen
@@ -77,28 +85,33 @@ class PerceivedScene:
             self._held = None
             return
         x, y, z = (float(v) for v in T_world_tcp[:3, 3])
-        track = self._tracks.take((x, y, z), self.p.match_radius)
+        track = self._tracks.take((x, y, z), self.p.match_radius, gripper.width)
         # The fingers have centred it between them; along them and along the tool it lies where it was seen.
         offset = np.zeros(3)
         if track is not None:
             offset = (invert(T_world_tcp) @ np.array([*track.position, 1.0]))[:3]
             offset[1] = 0.0
             offset = np.clip(offset, -0.015, 0.015)
-        T_tcp_ball = np.eye(4)
-        T_tcp_ball[:3, 3] = offset
-        ball = self._ball(track.id if track else self._tracks.new_id(), "attached", matrix_to_pose(T_tcp_ball))
-        self._held = m.AttachedObject(link=self.tcp_link, object=ball)
+        T_tcp_object = np.eye(4)
+        T_tcp_object[:3, 3] = offset
+        if track is not None and track.sighting.shape != "sphere":
+            T_tcp_object[:3, :3] = T_world_tcp[:3, :3].T @ pose_to_matrix(_pose(track))[:3, :3]
+        pose = matrix_to_pose(T_tcp_object)
+        thing = _object(track.id, "attached", track.sighting, pose) if track else self._ball(
+            self._tracks.new_id(), "attached", pose)
+        self._held = m.AttachedObject(link=self.tcp_link, object=thing)
 
     def scene(self) -> m.PlanningScene:
         """What is believed now; its stamp is that of the newest frame in it."""
-        table = [
-            self._ball(t.id, "target", m.Pose(position=m.Vector3(x=t.position[0], y=t.position[1], z=t.position[2])))
-            for t in self._tracks.confirmed()
-        ]
+        table = [_object(t.id, "target", t.sighting, _pose(t)) for t in self._tracks.confirmed()]
         contained = [
             self._ball(f"slot_{k + 1}", "contained", m.Pose(position=m.Vector3(
                 x=float(self._slots[k, 0]), y=float(self._slots[k, 1]), z=float(self._slots[k, 2]))))
             for k in sorted(self._occupied_slots())
+        ]
+        contained += [
+            _object(f"contained_{k + 1}", "contained", thing, _pose(Track("", thing.position, 0, 0.0, thing)))
+            for k, thing in enumerate(max(self._beside_slots.values(), key=len, default=[]))  # as the best view has it
         ]
         held = [self._held] if self._held is not None else []
         return m.PlanningScene(
@@ -118,3 +131,16 @@ class PerceivedScene:
             "id": name, "role": role, "shape": "sphere", "dimensions": [self.around.ball_radius], "pose": pose,
             "color": color_of(self.around.ball_color),
         })
+
+
+def _pose(track: Track) -> m.Pose:
+    x, y, z = track.position
+    return m.Pose(position=m.Vector3(x=x, y=y, z=z), orientation=track.sighting.orientation)
+
+
+def _object(name: str, role: str, thing: Sighting, pose: m.Pose) -> m.CollisionObject:
+    """A solid of the planning scene, with shape, size and colour as they were seen."""
+    return m.CollisionObject.model_validate({
+        "id": name, "role": role, "shape": thing.shape, "dimensions": thing.dimensions, "pose": pose,
+        "color": thing.color,
+    })

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from common import messages as m
 from common.applications.pick_place.choice import Pick, PickPlaceView
 from common.applications.pick_place.parameters import Config
 from common.config import GripperConfig
-from common.robot.transforms import matrix_to_pose, tool_down
+from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down, transform
 from common.tasks.stages import Grip, Move, Place, Stage
 
 
@@ -21,7 +22,7 @@ class Rows:
 
     def pick_and_place(self, cycle: Pick) -> list[Stage]:
         """Above the ball, straight down, close, up, across, release; uses up one yaw of the cycle."""
-        yaw = cycle.yaws.pop(0)
+        yaw = cycle.yaw = cycle.yaws.pop(0)
         x, y, z = cycle.target.position
         low = self.grasp_height(z)
         grasp = m.PoseGoal(pose=matrix_to_pose(tool_down(x, y, low, yaw)))
@@ -68,7 +69,10 @@ class Rows:
     def attach_pose(self, cycle: Pick) -> m.Pose:
         """Where the ball will lie in the tool frame, whose z axis points down."""
         z = cycle.target.position[2]
-        return m.Pose(position=m.Vector3(z=self.grasp_height(z) - z))
+        turn = -(cycle.target.yaw - cycle.yaw) if cycle.target.size else 0.0  # seen along the tool, which looks down
+        T_tcp_object = transform(rpy_to_matrix(math.pi, 0.0, turn), (0.0, 0.0, self.grasp_height(z) - z))
+        return matrix_to_pose(T_tcp_object) if cycle.target.size else m.Pose(
+            position=m.Vector3(z=self.grasp_height(z) - z))
 
     def grasp_height(self, z: float) -> float:
         """Height of the tool centre point at the grasp of a ball whose centre is at z [m]."""

@@ -1,60 +1,102 @@
-"""Balls on the table as things that persist: ids of our own for what is seen from frame to frame."""
+"""Objects on the table as things that persist: ids of our own for what is seen from frame to frame."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 from pydantic import Field
 
 from common.config import Parameters, Tunable
+from common.messages import Color, Marker, Quaternion
 
 Place = tuple[float, float, float]
+Shape = Literal["sphere", "box", "cylinder"]
+
+WIDTH_SLACK = 0.01  # [m] by which the fingers' width and the seen size of what they hold may differ
 
 
 class SceneParameters(Parameters):
     """How detections become objects; times are cell time."""
 
     match_radius: Tunable[float] = Field(
-        0.08, gt=0, le=0.5, description="a detection within this of a ball is that ball [m]"
+        0.08, gt=0, le=0.5, description="a detection of its kind within this of an object is that object [m]"
     )
     confirm_frames: Tunable[int] = Field(
-        2, ge=1, le=100, description="a ball exists once it was seen in this many frames"
+        2, ge=1, le=100, description="an object exists once it was seen in this many frames"
     )
-    forget_after: Tunable[float] = Field(0.35, ge=0, le=60, description="a ball not seen for this long is gone [s]")
+    forget_after: Tunable[float] = Field(0.35, ge=0, le=60, description="an object not seen for this long is gone [s]")
     smoothing: Tunable[float] = Field(
-        0.3, gt=0, le=1, description="weight of a new detection of a ball that lies still"
+        0.3, gt=0, le=1, description="weight of a new detection of an object that lies still"
     )
-    still: Tunable[float] = Field(0.003, ge=0, le=0.05, description="displacement below which a ball lies still [m]")
+    still: Tunable[float] = Field(0.003, ge=0, le=0.05, description="displacement below which an object lies still [m]")
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What one detection says of an object: where it is [m], world, what it is, and how large and of which colour.
+
+    `size` is that of the box about it along its own axes [m].
+    """
+
+    position: Place
+    kind: str = ""
+    shape: Shape = "sphere"
+    size: Place = (0.0, 0.0, 0.0)
+    orientation: Quaternion = field(default_factory=Quaternion)
+    color: Color = field(default_factory=Color)
+
+    @classmethod
+    def of(cls, marker: Marker) -> Sighting | None:
+        """What a marker says; None for one that is no object."""
+        if marker.type == "text":
+            return None
+        p, s = marker.pose.position, marker.scale
+        return cls((p.x, p.y, p.z), marker.ns, marker.type, (s.x, s.y, s.z), marker.pose.orientation, marker.color)
+
+    @property
+    def dimensions(self) -> list[float]:
+        """As a planning scene has them: of a box x, y, z, of a sphere its radius, of a cylinder radius and length."""
+        x, y, z = self.size
+        return {"sphere": [x / 2], "cylinder": [x / 2, z], "box": [x, y, z]}[self.shape]
+
+    def across(self, width: float, slack: float) -> bool:
+        """Whether fingers that hold it may be so far apart [m]."""
+        x, y, _ = self.size
+        least, most = (min(x, y), math.hypot(x, y)) if self.shape == "box" else (x, x)
+        return least - slack <= width <= most + slack
 
 
 @dataclass
 class Track:
-    """One ball: where it was seen last [m], in world, how often, and when [s]."""
+    """One object: where it is, in world [m], how often it was seen, when last [s], and what was seen then."""
 
     id: str
     position: Place
     seen: int
     last_seen: float
+    sighting: Sighting = Sighting((0.0, 0.0, 0.0))
 
 
 class Tracks:
-    """Matches detections to known balls, one to one, nearest pairs first."""
+    """Matches detections to known objects of their kind, one to one, nearest pairs first."""
 
     def __init__(self, parameters: SceneParameters) -> None:
-        """Start with no balls; the parameters may change between frames."""
+        """Start with no objects; the parameters may change between frames."""
         self.p = parameters
         self._tracks: list[Track] = []
         self._count = 0
 
-    def update(self, positions: Sequence[Place], now: float) -> None:
+    def update(self, sightings: Sequence[Sighting], now: float) -> None:
         """Take in all detections of one frame, taken at `now` [s]."""
         pairs = sorted(
-            (math.dist(t.position, p), i, j)
+            (math.dist(t.position, s.position), i, j)
             for i, t in enumerate(self._tracks)
-            for j, p in enumerate(positions)
-            if math.dist(t.position, p) <= self.p.match_radius
+            for j, s in enumerate(sightings)
+            if math.dist(t.position, s.position) <= self.p.match_radius
+            and (t.sighting.kind, t.sighting.shape) == (s.kind, s.shape)
         )
         matched_tracks: set[int] = set()
         matched: set[int] = set()
@@ -64,27 +106,33 @@ class Tracks:
             matched_tracks.add(i)
             matched.add(j)
             track, weight = self._tracks[i], self.p.smoothing if distance < self.p.still else 1.0
-            x, y, z = (a + weight * (b - a) for a, b in zip(track.position, positions[j], strict=True))
+            x, y, z = (a + weight * (b - a) for a, b in zip(track.position, sightings[j].position, strict=True))
             track.position, track.seen, track.last_seen = (x, y, z), track.seen + 1, now
+            track.sighting = sightings[j]
         self._tracks = [t for t in self._tracks if now - t.last_seen <= self.p.forget_after]
-        for j, position in enumerate(positions):
+        for j, sighting in enumerate(sightings):
             if j not in matched:
                 self._count += 1
-                self._tracks.append(Track(f"track_{self._count}", position, 1, now))
+                self._tracks.append(Track(f"track_{self._count}", sighting.position, 1, now, sighting))
 
     def confirmed(self) -> list[Track]:
-        """Balls that were seen often enough to be believed."""
+        """Objects that were seen often enough to be believed."""
         return [t for t in self._tracks if t.seen >= self.p.confirm_frames]
 
-    def take(self, position: Place, radius: float) -> Track | None:
-        """The ball nearest to a position, within `radius` [m], which is no longer tracked after this."""
-        near = min(self._tracks, key=lambda t: math.dist(t.position, position), default=None)
-        if near is None or math.dist(near.position, position) > radius:
+    def take(self, position: Place, radius: float, width: float = 0.0) -> Track | None:
+        """The object nearest to a position, within `radius` [m], which is no longer tracked after this.
+
+        One that fits between fingers which are `width` [m] apart, if they tell that and there is one.
+        """
+        within = [t for t in self._tracks if math.dist(t.position, position) <= radius]
+        fitting = [t for t in within if t.sighting.across(width, WIDTH_SLACK)] if width > 0 else []
+        near = min(fitting or within, key=lambda t: math.dist(t.position, position), default=None)
+        if near is None:
             return None
         self._tracks.remove(near)
         return near
 
     def new_id(self) -> str:
-        """An id for a ball that was never seen on the table."""
+        """An id for an object that was never seen on the table."""
         self._count += 1
         return f"track_{self._count}"

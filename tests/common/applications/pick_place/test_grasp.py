@@ -4,8 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from common.applications.pick_place.choice import finger_clearance, grasp_yaws, yaw_candidates
+from common.applications.pick_place.choice import Target, finger_clearance, grasp_yaws, yaw_candidates, yaws_of
 from common.applications.pick_place.parameters import HandShape
 from common.config import Container
 from common.robot.transforms import tool_down
@@ -50,3 +52,25 @@ def test_walls_of_the_container_are_cleared() -> None:
     beside = (box.x, box.y - box.half_side - 0.045)
     assert finger_clearance(HAND, beside, 0.0, [], 0.03, box) < 0
     assert finger_clearance(HAND, beside, math.pi / 2, [], 0.03, box) > 0.02
+
+
+@given(st.floats(-math.pi, math.pi))
+def test_a_box_is_taken_by_its_narrow_sides_with_the_pads_flat_on_them(yaw: float) -> None:
+    target = Target("box", (0.4, 0.0, 0.03), 0.06, (0.1, 0.03), yaw)
+    (found,) = yaws_of(target, HAND) or []
+    fingers = tool_down(0, 0, 0, found)[:2, 1]
+    assert abs(fingers @ [math.cos(yaw), math.sin(yaw)]) < 1e-9, "along its short side"
+    assert -math.pi / 2 <= found <= math.pi / 2
+
+
+def test_a_cube_is_taken_either_way_and_what_is_wider_than_the_fingers_open_not_at_all() -> None:
+    assert yaws_of(Target("cube", (0.4, 0.0, 0.03), 0.03, (0.04, 0.04), 0.1), HAND) == pytest.approx(
+        [0.1, 0.1 - math.pi / 2])
+    assert yaws_of(Target("crate", (0.4, 0.0, 0.03), 0.08, (0.1, 0.1)), HAND) == []
+    assert yaws_of(Target("ball", (0.4, 0.0, 0.03), 0.03), HAND) is None
+
+
+def test_a_neighbour_is_cleared_by_as_much_as_it_is_wide() -> None:
+    beside = (0.4 + 0.0, 0.09)
+    assert finger_clearance(HAND, (0.4, 0.0), 0.0, [(*beside, 0.02)], 0.03) == pytest.approx(0.09 - 0.056 - 0.02)
+    assert finger_clearance(HAND, (0.4, 0.0), 0.0, [beside], 0.03) == pytest.approx(0.09 - 0.056 - 0.03)

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import pytest
 
 from common import messages as m
 from common.applications.pick_place.perceived import PerceivedScene
 from common.applications.pick_place.tracks import SceneParameters
 from common.config import Surroundings, load_cell
 from common.perception.pinhole import Pinhole
-from common.robot.transforms import tool_down
+from common.robot.transforms import matrix_to_rpy, pose_to_matrix, tool_down
 
 CELL = load_cell("panda")
 AROUND = CELL.section(Surroundings)
@@ -86,3 +89,48 @@ def test_perceived_place_is_where_the_ball_was_seen() -> None:
     ball = next(o for o in s.scene().objects if o.role == "target")
     assert np.allclose([ball.pose.position.x, ball.pose.position.y], [0.5, -0.2])
     assert ball.color.r > 0.9
+
+
+def cube(x: float, y: float, yaw: float, *, u_v: tuple[float, float] | None = None) -> m.Marker:
+    z = math.sin(yaw / 2), math.cos(yaw / 2)
+    pose = m.Pose(position=m.Vector3(x=x, y=y, z=0.02), orientation=m.Quaternion(z=z[0], w=z[1]))
+    return m.Marker(ns="cube", id=0, type="box", scale=m.Vector3(x=0.04, y=0.05, z=0.04), pose=pose,
+                    color=m.Color(r=0, g=0.2, b=1), pixel=u_v)
+
+
+def shown(stamp: float, *markers: m.Marker) -> m.MarkerArray:
+    return m.MarkerArray(header=m.Header(stamp=int(stamp * 1e9), frame_id="world"), markers=list(markers))
+
+
+def test_shape_size_colour_and_turn_ride_from_the_detection_to_the_scene() -> None:
+    s = scene()
+    can = m.Marker(ns="can", id=1, type="cylinder", scale=m.Vector3(x=0.05, y=0.05, z=0.1),
+                   pose=m.Pose(position=m.Vector3(x=0.6, y=-0.2, z=0.05)))
+    note = m.Marker(ns="note", id=2, type="text", scale=m.Vector3(x=0.1), pose=m.Pose(), text="two things")
+    for t in (1.0, 1.1):
+        s.see(shown(t, cube(0.4, 0.0, 0.3), can, note), CAMERA, AWAY)
+    box, cylinder = (o for o in s.scene().objects if o.role == "target")
+    assert (box.shape, box.dimensions, box.color) == ("box", [0.04, 0.05, 0.04], m.Color(r=0, g=0.2, b=1))
+    assert matrix_to_rpy(pose_to_matrix(box.pose)[:3, :3])[2] == pytest.approx(0.3)
+    assert (cylinder.shape, cylinder.dimensions) == ("cylinder", [0.025, 0.1])
+
+
+def test_a_box_in_the_hand_keeps_its_shape_and_turn() -> None:
+    s = scene()
+    for t in (1.0, 1.1):
+        s.see(shown(t, cube(0.4, 0.0, 0.3)), CAMERA, AWAY)
+    hand = tool_down(0.402, 0.0, 0.02, 0.3)
+    s.feel(gripper(1.2, True).model_copy(update={"width": 0.05}), hand)
+    (held,) = s.scene().attached
+    assert (held.object.shape, held.object.id) == ("box", "track_1")
+    T_world_box = hand @ pose_to_matrix(held.object.pose)
+    assert matrix_to_rpy(T_world_box[:3, :3]) == pytest.approx((0.0, 0.0, 0.3), abs=1e-9)
+
+
+def test_a_box_in_the_container_is_contained_as_what_it_is() -> None:
+    s = scene()
+    c = AROUND.container
+    u, v = CAMERA.project([c.x, c.y, 0.025])
+    s.see(shown(1.0, cube(c.x, c.y, 0.0, u_v=(u, v))), CAMERA, AWAY)
+    (inside,) = (o for o in s.scene().objects if o.role == "contained")
+    assert (inside.id, inside.shape) == ("contained_1", "box")
