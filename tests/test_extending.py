@@ -20,19 +20,18 @@ import yaml
 
 from common import messages as m
 from common.application import find_application
-from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import check, load_cell, service_config
 from common.errors import ConfigError, UnknownName
 from common.hardware.interface import Limits
 from common.hardware.loading import find_backend, load_hardware
-from common.messages import CameraInfo, Image, Pose, PoseArray, Vector3
+from common.messages import CameraInfo, Image, Pose, Vector3, WorldObject, WorldObjects
 from common.planning.planners import load_planner
 from common.process.in_process import running_service
 from common.process.wiring import wiring
 from common.recording.reading import Recording
 from common.robot.model import RobotModel
 from common.tasks.stages import View
-from common.topics import CAMERA_IMAGE, CAMERA_INFO, GRIPPER_STATE
+from common.topics import CAMERA_IMAGE, CAMERA_INFO, GRIPPER_STATE, SCENE_OBJECTS
 from common.transport.codec import decode
 from common.transport.local import LocalNetwork
 from common.viewer.guard import close_server, make_server
@@ -152,7 +151,7 @@ async def test_services_read_and_write_what_the_page_says(folder: Path) -> None:
         module = importlib.import_module(f"my_pkg.{name}")
         wired = await wiring(module.run, service_config(cell, name, module.Config))
         keys[name] = {t.key for t in wired.reads}, {t.key for t in wired.writes}
-    assert keys["evening_camera"] == ({"scene_balls"}, {"camera/image_raw", "camera/camera_info"})
+    assert keys["evening_camera"] == ({"scene_objects"}, {"camera/image_raw", "camera/camera_info"})
     assert keys["nearest_target"] == ({"validated_targets"}, {"nearest_target"})
     dark = load_cell(str(folder / "my_cell.yaml"), ["services.evening_camera.blue=0"])
     with pytest.raises(ConfigError, match=r"services\.evening_camera\.blue: 0 must be greater than 0"):
@@ -168,8 +167,9 @@ async def test_camera_sends_pictures_with_less_blue(folder: Path) -> None:
     bus = net.bus()
     images, infos = bus.reader(CAMERA_IMAGE), bus.reader(CAMERA_INFO)
     async with running_service(net, module.run, config):
-        ball = Pose(position=Vector3(x=0.5, y=0.0, z=0.03))
-        bus.writer(SCENE_BALLS).put(PoseArray(header=bus.header("world"), poses=[ball], labels=["table"]))
+        ball = WorldObject(id="ball_1", shape="sphere", size=Vector3(x=0.06, y=0.06, z=0.06),
+                           pose=Pose(position=Vector3(x=0.5, y=0.0, z=0.03)))
+        bus.writer(SCENE_OBJECTS).put(WorldObjects(header=bus.header("world"), objects=[ball]))
         image: Image = await images.next()
         info: CameraInfo = await infos.next()
     picture = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
