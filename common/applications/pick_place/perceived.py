@@ -109,9 +109,10 @@ class PerceivedScene:
                 x=float(self._slots[k, 0]), y=float(self._slots[k, 1]), z=float(self._slots[k, 2]))))
             for k in sorted(self._occupied_slots())
         ]
-        contained += [
+        beside: list[Sighting] = max(self._beside_slots.values(), key=lambda things: len(things), default=[])
+        contained += [  # as the view has it that shows most of them
             _object(f"contained_{k + 1}", "contained", thing, _pose(Track("", thing.position, 0, 0.0, thing)))
-            for k, thing in enumerate(max(self._beside_slots.values(), key=len, default=[]))  # as the best view has it
+            for k, thing in enumerate(beside)
         ]
         held = [self._held] if self._held is not None else []
         return m.PlanningScene(
