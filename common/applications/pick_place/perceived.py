@@ -109,7 +109,9 @@ class PerceivedScene:
                 x=float(self._slots[k, 0]), y=float(self._slots[k, 1]), z=float(self._slots[k, 2]))))
             for k in sorted(self._occupied_slots())
         ]
-        beside: list[Sighting] = max(self._beside_slots.values(), key=lambda things: len(things), default=[])
+        beside: list[Sighting] = []
+        for things in self._beside_slots.values():
+            beside = things if len(things) > len(beside) else beside
         contained += [  # as the view has it that shows most of them
             _object(f"contained_{k + 1}", "contained", thing, _pose(Track("", thing.position, 0, 0.0, thing)))
             for k, thing in enumerate(beside)
