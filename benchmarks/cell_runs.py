@@ -17,9 +17,13 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from common.application import find_application
+from common.applications.pick_place.recheck import Contact, Recheck, Recording
 from common.config import load_cell
-from tests.cells.recheck import Contact, Recheck, record
-from tests.harness import RunningCell, folder_for
+from common.reporting.fold import Fold
+from common.transport.bus import Bus
+from common.transport.codec import decode
+from tests.harness import RunningCell, beside, folder_for
 
 CELL = "panda"
 TIMEOUT = 180.0  # [s] for one run
@@ -50,6 +54,24 @@ class Result:
     def good(self) -> bool:
         """Whether all went as it should."""
         return self.exit_code == 0 and self.in_box == self.balls and not self.contacts
+
+
+async def record(bus: Bus, stop: asyncio.Event) -> Recording:
+    """What is said about arm, hand and truth until `stop` is set; it is decoded when there is time for that."""
+    recording = Recording()
+    fold = Fold(bus.cell, find_application(load_cell(CELL).application), listeners=recording.hears())
+    raw: list[tuple[str, bytes]] = []
+    heard = {topic.key: topic for topic in fold.topics}
+
+    async def keep(key: str) -> None:
+        async for sample in bus.raw_reader(f"{bus.cell}/{key}"):
+            raw.append((key, sample.payload))
+
+    async with beside(*(keep(topic.key) for topic in recording.hears())):
+        await stop.wait()
+    for key, payload in raw:
+        fold.on(key, decode(heard[key].message, payload), 0.0, 0)
+    return recording
 
 
 async def run_once(label: str, balls: int, speed: float, options: list[str], folder: Path) -> Result:

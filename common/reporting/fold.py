@@ -1,11 +1,11 @@
-"""One fold over what a cell says: the live line, the summary and the report of a run all come from here.
+"""One fold over what a cell says: the live line, the summary, the report and the recheck of a run come from here.
 
 It is fed by whoever listens to a cell that is up, and from a recording alike; it asks nobody and reads no clock.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from common import topics as t
@@ -26,6 +26,7 @@ class Fold:
     def __init__(
         self, cell: str, application: Application | None, *, robot: RobotConfig | None = None, seed: int = 0,
         speed: float = 1.0, containers: Sequence[str] = (), gathering: Gathering | None = None,
+        listeners: Mapping[Topic[Any], Listener] | None = None,
     ) -> None:
         """Start with nothing heard.
 
@@ -37,6 +38,7 @@ class Fold:
             speed: seconds of cell time per second of wall time.
             containers: ids of those that the cell has.
             gathering: is fed as well, for a report.
+            listeners: who else is fed, as a recheck, and with what.
         """
         self.figures: Figures = figures_of(application)(robot, pictured=gathering is not None)
         self.summary = Summary(cell, seed, speed, self.figures, containers)
@@ -58,7 +60,7 @@ class Fold:
         self._hear(t.SCENE_OBJECTS, lambda _, message: summary.truth.on_objects(message))
         if self.figures.TRUTH is not None:
             self._hear(self.figures.TRUTH, lambda _, message: summary.truth.on_labels(message))
-        for topic, listener in self.figures.hears().items():
+        for topic, listener in (*self.figures.hears().items(), *(listeners or {}).items()):
             self._hear(topic, listener)
         if gathering is not None:
             gathering.truth = summary.truth

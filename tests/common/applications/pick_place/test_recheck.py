@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from common.application import Application
+from common.applications.pick_place.recheck import Recheck, Recording
 from common.config import load_cell
 from common.messages import GripperState, Header, JointState, Pose, PoseArray, Vector3
+from common.reporting.fold import Fold
 from common.robot.ik import solve_ik
 from common.robot.transforms import tool_down
-from tests.cells.recheck import Recheck, Recording
 
 Array = NDArray[np.float64]
 CELL = load_cell("panda")
@@ -77,3 +79,13 @@ def test_ball_that_is_taken_lifts_off_the_table_with_the_hand_and_may_touch_it_o
     assert recheck().contacts(Recording(arm(up, down, up, across), grips, taken)) == []
     dragged = arm(up, down, at(0.5, -0.15, 0.025), across)
     assert {c.pair for c in recheck().contacts(Recording(dragged, grips, taken))} == {("ball", "table")}
+
+
+def test_what_is_repeated_counts_once() -> None:
+    recording = Recording()
+    fold = Fold("panda", Application("pick_place"), listeners=recording.hears())
+    for second in (0, 0, 1):
+        fold.on("scene_balls", truth(second, "table", *BALL), 0.0, 0)
+        fold.on("joint_states", arm(at(0.5, 0.0, 0.2))[0], 0.0, 0)
+    assert (len(recording.balls), len(recording.joints)) == (2, 1)
+    assert fold.summary.as_dict()["truth"]["on_table"] == 1

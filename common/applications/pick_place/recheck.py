@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +21,6 @@ from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_pose
 from common.scene.fixtures import fixed_objects
 from common.topics import Topic
-from common.transport.bus import Bus
-from common.transport.codec import decode
-from tests.harness import beside
 
 Array = NDArray[np.float64]
 S = TypeVar("S", JointState, GripperState, PoseArray)
@@ -36,36 +32,24 @@ ABOUT = 0.16  # [m] from where the fingers move: within it they may touch that b
 
 @dataclass
 class Recording:
-    """What a cell said about arm, hand and truth, in the order in which it came."""
+    """What a cell said about arm, hand and truth, in the order in which it came; what comes again counts once."""
 
     joints: list[JointState] = field(default_factory=list)
     grips: list[GripperState] = field(default_factory=list)
     balls: list[PoseArray] = field(default_factory=list)
 
-
-async def record(bus: Bus, stop: asyncio.Event) -> Recording:
-    """Everything that is said until `stop` is set."""
-    raw: dict[str, list[bytes]] = {t.key: [] for t in (topics.JOINT_STATES, topics.GRIPPER_STATE, SCENE_BALLS)}
-
-    async def keep(key: str) -> None:
-        async for sample in bus.raw_reader(f"{bus.cell}/{key}"):
-            raw[key].append(sample.payload)
-
-    async with beside(*(keep(key) for key in raw)):
-        await stop.wait()
-
-    return Recording(
-        _decoded(topics.JOINT_STATES, raw), _decoded(topics.GRIPPER_STATE, raw), _decoded(SCENE_BALLS, raw)
-    )
+    def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
+        """What a fold is to hand over."""
+        return {
+            topics.JOINT_STATES: lambda _, state: _keep(self.joints, state),
+            topics.GRIPPER_STATE: lambda _, state: _keep(self.grips, state),
+            SCENE_BALLS: lambda _, balls: _keep(self.balls, balls),
+        }
 
 
-def _decoded(topic: Topic[S], raw: dict[str, list[bytes]]) -> list[S]:
-    messages: list[S] = []
-    for payload in raw[topic.key]:
-        message = decode(topic.message, payload)
-        if not messages or message.header.stamp > messages[-1].header.stamp:  # a state comes again each second
-            messages.append(message)
-    return messages
+def _keep(kept: list[S], message: S) -> None:
+    if not kept or message.header.stamp > kept[-1].header.stamp:  # a state comes again each second
+        kept.append(message)
 
 
 @dataclass(frozen=True)
