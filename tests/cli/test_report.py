@@ -1,3 +1,4 @@
+import importlib
 import re
 from html.parser import HTMLParser
 
@@ -222,6 +223,34 @@ def test_an_outline_is_compared_with_what_was_traced(tmp_path):
     assert "outlined Object_0" in head and "of 0.400 m" in head and "world w2" in head and "from the true edge" in head
     assert "4 points of the contour" in page.sections["outline"]
     assert "1 frame: median 300.0 ms" in page.sections["latency"]
+
+
+def test_an_application_of_ones_own_is_told_of_in_its_own_words(tmp_path, monkeypatch):
+    (tmp_path / "own_words").mkdir()
+    (tmp_path / "own_words" / "polish.py").write_text(
+        "from common import messages as m\nfrom common.reporting import application\n"
+        "from common.topics import Topic\n\n"
+        "class PolishStatus(m.TaskStatus):\n    pass\n\n"
+        'STATUS = Topic("polish_status", PolishStatus, "state", "how smooth it is")\n\n'
+        'class Figures(application.Figures):\n    COUNTED = "polished"\n'
+    )
+    (tmp_path / "cell.yaml").write_text(
+        "cell: shop\nrobot: panda\nworld: balls\npipeline: lerp\napplication: own_words.polish\n"
+        "task: trajectory_executor\nservices: {trajectory_executor: {}}\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    own = importlib.import_module("own_words.polish")
+    tape = Tape(tmp_path / "run.mcap", "shop")
+    tape.put(1, "polish_status", own.PolishStatus(header=tape.header(1), state="RUBBING", started=True, total=2))
+    tape.put(2, "polish_status", own.PolishStatus(
+        header=tape.header(2), state="DONE", started=True, done=2, total=2, figures={"roughness_um": 0.8}))
+    tape.writer.close()
+    assert app.execute(["report", "run.mcap", "--cell", "cell.yaml"]) == 0
+    page = Page((tmp_path / "run.html").read_text())
+    head = " ".join(page.sections["summary"].split())
+    assert "shop: DONE" in head and "polished 2 of 2" in head and "roughness_um 0.8" in head
+    assert "RUBBING" in page.sections["timeline"]
 
 
 def test_the_recording_of_a_cell_that_is_not_here_has_no_limits_and_says_so(tmp_path):
