@@ -45,7 +45,7 @@ M = TypeVar("M", bound=Message)
 
 ROOT = Path(__file__).resolve().parent.parent
 DOMAINS = range(60, 233)
-PATIENCE = 40.0  # [s] until a test gives up waiting for an event
+PATIENCE = 60.0  # [s] until a test gives up waiting for an event
 logging.getLogger("watcher").addHandler(logging.NullHandler())  # that the router goes at the end is no news
 _given: deque[int] = deque(maxlen=len(DOMAINS) // 4)  # lately, and perhaps not yet listened at
 SUMMARY, LOG = "summary.json", "cell.log"
@@ -169,12 +169,12 @@ class RunningCell:
 
     def listen(self) -> AbstractAsyncContextManager[Bus]:
         """A bus in the cell for whoever watches, as soon as its router is there."""
-        return connect(cell=self.name, service="watcher", endpoint=self.endpoint, timeout=30.0)
+        return connect(cell=self.name, service="watcher", endpoint=self.endpoint, timeout=PATIENCE)
 
     def tell(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """A zencell command that talks to this cell and ends by itself."""
         command = command_line(*arguments, "--domain", str(self.domain))
-        return subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=30, check=False)
+        return subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False)
 
 
 class Zencell:

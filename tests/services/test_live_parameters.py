@@ -144,7 +144,7 @@ class Flickering:
 
 async def waits(running: Running, values: list[dict[str, float]], said: list[str]) -> None:
     """Return when the camera has said how long it waits, after each change."""
-    async with running, asyncio.timeout(10):
+    async with running, asyncio.timeout(30):
         log = running.bus.reader(topics.LOG)
         for change_, wait in zip(values, said, strict=True):
             await running.tune(**change_)
@@ -295,7 +295,7 @@ async def test_the_shell_is_drawn_anew_and_the_next_target_judged_by_it(tmp_path
         shells, rejected = service.bus.reader(WORKSPACE_MARKERS), service.bus.reader(REJECTED_TARGETS)
         await service.turn()
         await service.tune(max_radius=0.5)
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             while (await shells.next()).markers[0].scale.x != 1.0:
                 pass
             turn = asyncio.create_task(service.turn())

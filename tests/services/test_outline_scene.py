@@ -58,7 +58,7 @@ class Neighbours:
                                      contours=[cube], selected=0))
 
     async def scene(self) -> m.PlanningScene:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             return await self.scenes.next()
 
     async def seen(self, since: int) -> m.PlanningScene:

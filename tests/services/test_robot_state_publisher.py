@@ -47,7 +47,7 @@ async def test_it_reads_joint_states_and_writes_tf() -> None:
 async def test_frames_agree_with_forward_kinematics_and_each_has_one_parent(robot: RobotModel) -> None:
     net = LocalNetwork()
     bus = net.bus()
-    async with running_service(net, robot_state_publisher.run, config()), asyncio.timeout(10):
+    async with running_service(net, robot_state_publisher.run, config()), asyncio.timeout(30):
         tf, static = bus.reader(topics.TF), bus.reader(topics.TF_STATIC)
         q = robot.named("home") + 0.1
         header = bus.header("world")
@@ -65,7 +65,7 @@ async def test_frames_agree_with_forward_kinematics_and_each_has_one_parent(robo
 async def test_camera_looks_straight_down_and_is_no_mirror() -> None:
     net = LocalNetwork()
     bus = net.bus()
-    async with running_service(net, robot_state_publisher.run, config()), asyncio.timeout(10):
+    async with running_service(net, robot_state_publisher.run, config()), asyncio.timeout(30):
         T = chain([await bus.reader(topics.TF_STATIC).next()], "camera_optical_frame")
     assert np.allclose(T[:3, :3], np.column_stack([(0, -1, 0), (-1, 0, 0), (0, 0, -1)]))
     assert np.allclose(T[:3, 3], (0.40, 0.0, 0.80)) and np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
@@ -75,7 +75,7 @@ async def test_messages_come_at_half_the_rate_of_joint_states(robot: RobotModel)
     net = LocalNetwork()
     bus = net.bus(clock=Clock())
     seen = []
-    async with running_service(net, robot_state_publisher.run, config()), asyncio.timeout(10):
+    async with running_service(net, robot_state_publisher.run, config()), asyncio.timeout(30):
         tf, joints = bus.reader(topics.TF), bus.writer(topics.JOINT_STATES)
         start = bus.header().stamp
         for number in range(20):
@@ -98,7 +98,7 @@ async def test_state_of_another_robot_is_told_once_and_skipped(robot: RobotModel
             lines.append(record.getMessage())
             told.set()
 
-    async with running_service(net, robot_state_publisher.run, config()) as service, asyncio.timeout(10):
+    async with running_service(net, robot_state_publisher.run, config()) as service, asyncio.timeout(30):
         service.log.addHandler(note := Note(logging.WARNING))
         tf, joints = bus.reader(topics.TF), bus.writer(topics.JOINT_STATES)
         start = bus.header().stamp
@@ -116,7 +116,7 @@ async def test_state_of_another_robot_is_told_once_and_skipped(robot: RobotModel
 async def test_restarted_executor_with_older_stamps_is_followed(robot: RobotModel) -> None:
     net = LocalNetwork()
     bus = net.bus()
-    async with running_service(net, robot_state_publisher.run, config()), asyncio.timeout(10):
+    async with running_service(net, robot_state_publisher.run, config()), asyncio.timeout(30):
         tf, joints = bus.reader(topics.TF), bus.writer(topics.JOINT_STATES)
         for stamp in (10**12, 10**11):
             header = bus.header().model_copy(update={"stamp": stamp})

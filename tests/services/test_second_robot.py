@@ -132,7 +132,7 @@ async def test_frames_agree_with_forward_kinematics_from_world_to_the_finger_tip
     bus = net.bus()
     config = service_config(CELL, "robot_state_publisher", robot_state_publisher.Config)
     fingers = finger_positions(GRIPPER, 0.03)
-    async with running_service(net, robot_state_publisher.run, config), asyncio.timeout(10):
+    async with running_service(net, robot_state_publisher.run, config), asyncio.timeout(30):
         tf, static = bus.reader(topics.TF), bus.reader(topics.TF_STATIC)
         q = robot.named("home") + 0.1
         state = JointState(header=bus.header("world"), name=[*robot.joint_names, *GRIPPER.joints],

@@ -339,7 +339,7 @@ async def test_wrong_message_is_refused_and_the_next_one_served(robot: RobotMode
         loop, session = asyncio.get_running_loop(), net.session()
         session.get(f"{CELL}/motion/execute", lambda reply: loop.call_soon_threadsafe(replies.put_nowait, reply),
                     lambda: None, payload=payload, encoding="application/msgpack;ExecuteRequest")
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             reply = await replies.get()
         assert reply.sample is None, "refused"
         person = Person(net, clock)

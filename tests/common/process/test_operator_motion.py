@@ -70,7 +70,7 @@ class Cell:
         return self.say(held=request.hold)
 
     async def until(self, kind: type[m.Message]) -> m.Message:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             while not isinstance(request := await self.came.get(), kind):
                 pass
             return request

@@ -71,7 +71,7 @@ class Executor:
         return m.MotionStatus(state="active")
 
     async def next(self) -> m.Message:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             return await self.asked.get()
 
 
@@ -146,7 +146,7 @@ async def test_what_is_missing_is_told_in_the_status_and_holds_the_arm_until_it_
         joints.put(m.JointState(header=m.Header(stamp=1), name=["j"], position=[0.0]))
         hold = await executor.next()
         assert isinstance(hold, m.HoldRequest) and hold.hold and hold.by == "watchdog"
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             while (await status.next()).message != "the arm waits: no joint states for 200 ms":
                 pass
         assert view.trouble

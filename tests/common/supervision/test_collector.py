@@ -58,7 +58,7 @@ async def test_collector_hears_the_cell_and_waits_for_what_still_falls() -> None
     cell.writer(VALIDATED_TARGETS).put(PoseArray(header=Header(stamp=stamp)))
     done = PickPlaceStatus(header=cell.header(), state="DONE", started=True, done=2, total=2)
     cell.writer(PICK_PLACE_STATUS).put(done)
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         await collector.ended.wait()
         settling = asyncio.create_task(collector.settle())
         await asyncio.sleep(0)

@@ -21,7 +21,7 @@ async def test_orders_of_any_thread_are_done_in_order_on_the_loop() -> None:
         desk.put(ended.set)
 
     await asyncio.to_thread(order)
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         await ended.wait()
     running.cancel()
     assert done == [(number, threading.get_ident()) for number in range(100)]
@@ -45,7 +45,7 @@ async def test_what_a_person_can_understand_is_told_and_the_rest_goes_on() -> No
 
     for act in (refuse, ask, last):
         desk.put(act)
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         await ended.wait()
     running.cancel()
     assert told == ["not now", "nobody answers motion/plan now"]
@@ -61,7 +61,7 @@ async def test_long_request_holds_nothing_up() -> None:
 
     desk.put(wait)
     desk.put(ended.set)
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         await ended.wait()
     running.cancel()
 
@@ -74,6 +74,6 @@ async def test_bug_ends_the_service() -> None:
 
     desk.put(broken)
     with pytest.raises(ExceptionGroup) as error:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             await desk.run()
     assert error.group_contains(KeyError)
