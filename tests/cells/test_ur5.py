@@ -54,7 +54,8 @@ def test_the_cube_is_outlined_and_every_figure_is_told(tmp_path: Path) -> None:
     assert set(outline) == {"object", "points", "fraction", "length_m", "closed", "deviation_mm", "tracking_mm"}
     assert outline["length_m"] == pytest.approx(0.4, abs=0.002)
     assert 4 <= outline["points"] < 1000
-    assert [plan["fraction"] for plan in summary["plans"]] == [1.0] * 5
+    assert {plan["fraction"] for plan in summary["plans"]} == {1.0}
+    assert len(summary["plans"]) >= 5, "one for each stage; on a machine that is busy some are made again"
     assert summary["restarts"] == dict.fromkeys(["router", *SERVICES], 0)
     assert 0 < summary["seconds"]["moving"] <= summary["seconds"]["task"]
 
