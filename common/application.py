@@ -16,7 +16,7 @@ What it brings lies in modules of these names within the package, or else in the
     verbs     (optional) verbs of the command line, as common/verbs.py says
 
 `TASK` in the package itself names the service that decides; without it the cell's `task` does. `GRASPS = True` says
-that the task takes objects in the hand.
+that the task takes objects in the hand, `FILLS = True` that `done` of its status counts those in containers.
 """
 
 from __future__ import annotations
@@ -73,6 +73,11 @@ class Application:
     def grasps(self) -> bool:
         """Whether its task takes objects in the hand, which then may slip."""
         return bool(getattr(self.module, "GRASPS", False))
+
+    @property
+    def fills(self) -> bool:
+        """Whether what its task has done lies in containers."""
+        return bool(getattr(self.module, "FILLS", False))
 
     @property
     def status(self) -> Topic[TaskStatus]:

@@ -264,6 +264,11 @@ def test_task_of_one_file_moves_a_cube_and_ends_the_run_with_a_status_and_figure
     assert (place.x, place.y) == pytest.approx((0.52, 0.1), abs=0.005), "where it really is"
 
 
+def test_task_of_one_file_runs_on_a_virtual_clock_and_breaks_nothing(folder: Path) -> None:
+    simulated = tell(next(line for line in COMMANDS if line.startswith("zencell simulate")), folder)
+    assert simulated.returncode == 0 and "seed 1: DONE" in simulated.stdout, simulated.stdout + simulated.stderr
+
+
 def test_task_of_one_file_goes_on_with_what_is_in_the_hand(folder: Path) -> None:
     cell = load_cell(str(folder / "cube.yaml"))
     module = importlib.import_module("my_pkg.move_cube")
