@@ -147,6 +147,14 @@ def _position(x: str, y: str) -> dict[str, float]:
     return {"x": options.number("X", x), "y": options.number("Y", y)}
 
 
+def _triple(option: str, text: str, names: str) -> dict[str, float]:
+    """Three numbers that stand apart by commas, or one for all of them, by name."""
+    parts = text.split(",")
+    if len(parts) not in (1, 3):
+        raise ConfigError(option, text, "must be three numbers apart by commas, or one")
+    return {name: options.number(option, part) for name, part in zip(names, parts * (3 // len(parts)), strict=True)}
+
+
 def _edit(values: dict[str, Any], cell: str | None, domain: str | None, connect: str | None) -> None:
     from common import topics
     from common.config import check
@@ -160,10 +168,26 @@ def _edit(values: dict[str, Any], cell: str | None, domain: str | None, connect:
 def add(
     x: X, y: Y,
     name: Annotated[str, typer.Option("--id", metavar="ID", help="chosen for you if not given")] = "",
+    like: Annotated[str, typer.Option(
+        "--like", metavar="ID", help="of the first layout; without it and a shape, like the first object there")] = "",
+    shape: Annotated[str, typer.Option("--shape", metavar="NAME", help="sphere, box or cylinder; else `zencell call world/edit`")] = "",
+    size: Annotated[str, typer.Option(
+        "--size", metavar="X,Y,Z", help="of the box about it [m]; one number for all three")] = "",
+    color: Annotated[str, typer.Option("--color", metavar="R,G,B", help="0 to 1 each")] = "",
+    yaw: Annotated[str, typer.Option("--yaw", metavar="RAD", help="[rad]")] = "",
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Put one more object on the table."""
-    _edit({"op": "add", "id": name, "position": _position(x, y)}, cell, domain, connect)
+    values: dict[str, Any] = {"op": "add", "id": name, "position": _position(x, y), "like": like}
+    if shape:
+        values["shape"] = shape
+    if size:
+        values["size"] = _triple("--size", size, "xyz")
+    if color:
+        values["color"] = _triple("--color", color, "rgb")
+    if yaw:
+        values["yaw"] = options.number("--yaw", yaw)
+    _edit(values, cell, domain, connect)
 
 
 @world.command(context_settings=NEGATIVE_NUMBERS)

@@ -49,6 +49,11 @@ CASES: dict[str, tuple[list[str], list[str]]] = {
     "unknown topic": (["topic", "info", "joint_state"], ["unknown key", "did you mean 'joint_states'?"]),
     "service of no name": (["service", "nobody"], ["unknown service 'nobody'", "motion_planner"]),
     "call without fields": (["call", "motion/plan", "{}"], ["motion/plan.id", "is missing"]),
+    "size of two numbers": (["world", "add", "0.5", "0", "--size", "1,2"], ["--size", "'1,2'", "three numbers"]),
+    "shape that is none": (["world", "add", "0.5", "0", "--shape", "cube"], ["world.shape", "'cube'", "cylinder"]),
+    "colour that is no number": (["world", "add", "0.5", "0", "--color", "red"], ["--color", "red"]),
+    "box without a size": (
+        ["run", "panda", "--set", "world.objects=[{id: crate, shape: box}]"], ["world.objects", "crate", "size"]),
     "count that counts nothing": (["topic", "echo", "tf", "-n", "0"], ["--count", "0"]),
 }
 
