@@ -170,7 +170,8 @@ def add(
     name: Annotated[str, typer.Option("--id", metavar="ID", help="chosen for you if not given")] = "",
     like: Annotated[str, typer.Option(
         "--like", metavar="ID", help="of the first layout; without it and a shape, like the first object there")] = "",
-    shape: Annotated[str, typer.Option("--shape", metavar="NAME", help="sphere, box or cylinder; else `zencell call world/edit`")] = "",
+    shape: Annotated[str, typer.Option(
+        "--shape", metavar="NAME", help="sphere, box or cylinder; else `zencell call world/edit`")] = "",
     size: Annotated[str, typer.Option(
         "--size", metavar="X,Y,Z", help="of the box about it [m]; one number for all three")] = "",
     color: Annotated[str, typer.Option("--color", metavar="R,G,B", help="0 to 1 each")] = "",
