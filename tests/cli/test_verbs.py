@@ -1,5 +1,6 @@
 """Applications bring verbs and options of `run` of their own, without a line in the command line's files."""
 
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 import typer
 
+import cli
 from cli import main, verbs
 from cli.main import app
 from common.errors import ConfigError
@@ -21,7 +23,7 @@ from common.topics import Topic
 from common.verbs import BeforeRun
 
 TASK = "thing"
-STATUS = Topic("thing_status", TaskStatus, "state", "thing", "state")
+STATUS = Topic("thing_status", TaskStatus, "state", "state")
 
 
 def greet(context: typer.Context, cell: str, overrides: list[str] | None = None, loud: bool = False) -> None:
@@ -105,3 +107,10 @@ def test_a_cell_whose_application_is_no_module_is_one_line(
     assert app.execute(["run", "cell.yaml", "--no-viewer"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "nowhere.thing" in line
+
+
+def test_the_command_line_loads_no_messages_before_a_verb_needs_them() -> None:
+    code = "import cli.main, sys; print([name for name in ('pydantic', 'zenoh', 'numpy') if name in sys.modules])"
+    root = Path(cli.__file__).parent.parent
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
