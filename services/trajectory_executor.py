@@ -83,7 +83,7 @@ def make_cycle(config: Config, simulated: bool, kept: Standing | None, now: floa
         bounds = bounds_told(config.reach.told)
         objects = layout(
             config.world, config.run.seed, lambda x, y, z: within_reach(robot, (x, y, z), config.grasp, bounds))
-        world = load_world(config.world, objects, config.grasp_tolerances)
+        world = load_world(config.world, objects, config.grasp_tolerances, config.robot.gripper)
         if kept is not None and (kept.layout != world.layout or len(kept.q) != robot.dof):
             kept = None
         if kept is not None:

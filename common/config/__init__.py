@@ -15,5 +15,14 @@ from common.config.files import config_root, find_file, names_of, read_robot, re
 from common.config.loading import load_cell, service_config, service_names
 from common.config.motion import Grasp, Motion, Pipeline, PlannerEntry, Run, Watchdogs
 from common.config.overrides import expanded, parse_override, yaml_line
-from common.config.robot import AttachmentConfig, GripperConfig, HardwareConfig, ParallelLinkage, RobotConfig, TcpConfig
+from common.config.robot import (
+    AttachmentConfig,
+    FingerShape,
+    GripperConfig,
+    HardwareConfig,
+    ParallelLinkage,
+    RobotConfig,
+    SuctionCup,
+    TcpConfig,
+)
 from common.config.world import CameraConfig, Container, Fixture, ObjectConfig, Surroundings, World

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -21,14 +21,33 @@ class ParallelLinkage(Section):
     closed: float = Field(gt=0, le=3.2, description="driven joint when the pads meet [rad]")
 
 
+class FingerShape(Section):
+    """The tips of open fingers along the closing axis and across it, from the tool centre point."""
+
+    inner: Length | None = Field(None, description="to the inner face; half of max_width if not given [m]")
+    depth: Length = Field(0.016, description="of a tip, from its inner to its outer face [m]")
+    half_width: Length = Field(0.011, description="half the width of a tip, across [m]")
+
+
+class SuctionCup(Section):
+    """A round cup at the tool centre point that looks along the tool's z axis."""
+
+    lip_radius: Length = Field(0.01, description="of the ring that has to lie on the object [m]")
+    give: Length = Field(0.005, description="by which the lip follows what it touches [m]")
+
+
 class GripperConfig(Section):
     """A parallel gripper: `width` is the distance between the inner faces of the fingers [m].
 
-    The first of the joints is driven. Without a linkage it slides by half the width.
+    The first of the joints is driven. Without a linkage it slides by half the width. A suction cup has no joints: its
+    width is that of a valve, `max_width` while it does not draw, 0 while it draws nothing in, half when it holds.
     """
 
+    closing_axis: Literal["x", "y"] = Field("y", description="axis of the tool centre point along which fingers close")
+    fingers: FingerShape = FingerShape()
+    cup: SuctionCup | None = Field(None, description="grips what its lip touches, in the place of fingers")
     group: str = Field("gripper", description="name of the fingers as a group")
-    joints: list[str] = Field(min_length=1, description="finger joints, the driven one first")
+    joints: list[str] = Field([], description="finger joints, the driven one first")
     mimic: list[Number] = Field([], description="each joint per driven joint; all 1 when empty")
     linkage: ParallelLinkage | None = Field(None, description="how the driven joint opens them; else each slides")
     links: list[str] = Field(description="links that may touch what is grasped")
@@ -42,6 +61,8 @@ class GripperConfig(Section):
 
     @model_validator(mode="after")
     def _fits(self) -> GripperConfig:
+        if bool(self.joints) == (self.cup is not None):
+            raise ValueError("gripper needs the joints of its fingers, or a cup, which has none")
         if self.mimic and len(self.mimic) != len(self.joints):
             raise ValueError(f"gripper.mimic has {len(self.mimic)} values for {len(self.joints)} joints")
         if self.mimic and self.mimic[0] != 1:
@@ -55,6 +76,16 @@ class GripperConfig(Section):
             if width > self.max_width:
                 raise ValueError(f"named width {name} is {width:g} m, more than max_width {self.max_width:g} m")
         return self
+
+    @property
+    def finger_inner(self) -> float:
+        """From the tool centre point to the inner face of an open finger [m]."""
+        return self.max_width / 2 if self.fingers.inner is None else self.fingers.inner
+
+    @property
+    def held_width(self) -> float:
+        """Of a cup that holds something [m]."""
+        return self.max_width / 2
 
 
 class AttachmentConfig(Section):

@@ -11,7 +11,7 @@ TOUCH = 1e-9  # widths closer than this are the same [m]
 
 
 class Fingers:
-    """A parallel gripper that reports what it is commanded, but does not close through an obstruction.
+    """A gripper that reports what it is commanded, but does not close through an obstruction; also the valve of a cup.
 
     While something blocks them the fingers press: when it goes away they close on to the width they were told.
     """
@@ -45,6 +45,8 @@ class Fingers:
         if freed:
             self._blocked = False
             self._start(self._now)
+        elif self._config.cup is not None and self._motion is None and self._target < width - TOUCH:
+            self._width, self._blocked = width, True  # a cup that draws takes what it comes to
 
     def place(self, width: float) -> None:
         """Be at rest at a width [m] at once."""

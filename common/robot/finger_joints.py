@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from common.config import GripperConfig
 
 
@@ -40,6 +43,14 @@ def finger_velocities(gripper: GripperConfig, width: float, rate: float) -> list
         bars = gripper.linkage
         driven = -rate / (2 * bars.length * math.cos(bars.open_angle - driven_position(gripper, width)))
     return [factor * driven for factor in _factors(gripper)]
+
+
+def closing_frame(gripper: GripperConfig) -> NDArray[np.float64]:
+    """(4, 4) pose in the frame of the tool centre point of one whose y axis is that along which the fingers close."""
+    T_tcp_closing = np.eye(4)
+    if gripper.closing_axis == "x":
+        T_tcp_closing[:2, :2] = [[0.0, 1.0], [-1.0, 0.0]]
+    return T_tcp_closing
 
 
 def _factors(gripper: GripperConfig) -> list[float]:

@@ -2,7 +2,8 @@
 
 A simulator is a module (of this folder, or a dotted one of the user's own) that `world.simulator` names, with
 
-    def create(world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances) -> SimulatedWorld
+    def create(world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances,
+               gripper: GripperConfig | None) -> SimulatedWorld
 
 where `objects` are those of the world, each with a place, and `tolerances` tell when the fingers catch something.
 Times are cell time [s], passed in.
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from common.config import ObjectConfig, Parameters, Tunable, World
+from common.config import GripperConfig, ObjectConfig, Parameters, Tunable, World
 from common.errors import ConfigError, UnknownName
 from common.messages import Header, SceneUpdate, WorldEdit, WorldObject, WorldObjects
 
@@ -51,8 +52,8 @@ class SimulatedWorld(Protocol):
         """The width [m] that the fingers cannot close below: what is between them now, or 0.
 
         Args:
-            T_world_tcp: (4, 4) pose of the hand; its y axis is the direction in which the fingers open.
-            width: between the inner faces of the fingers [m].
+            T_world_tcp: (4, 4) pose of the tool centre point.
+            width: between the inner faces of the fingers, or the valve of a cup [m].
         """
 
     def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
@@ -112,15 +113,19 @@ class Simulator(Protocol):
     """A module that simulates a world."""
 
     def create(
-        self, world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances, /
+        self, world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances,
+        gripper: GripperConfig | None, /,
     ) -> SimulatedWorld:
         """The world with its objects, each of which has a place."""
 
 
 def load_world(
-    world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances | None = None
+    world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances | None = None,
+    gripper: GripperConfig | None = None,
 ) -> SimulatedWorld:
     """The simulated world that `world.simulator` names, with these objects, each of which has a place.
+
+    Without a gripper fingers close along the tool's y axis.
 
     Raises:
         UnknownName: no such simulator; lists the choices.
@@ -135,4 +140,4 @@ def load_world(
         raise ConfigError("world.simulator", name, f"cannot be imported: {error}") from None
     if not hasattr(module, "create"):
         raise ConfigError("world.simulator", name, "is no simulator: it has no create")
-    return cast(Simulator, module).create(world, objects, tolerances or GraspTolerances())
+    return cast(Simulator, module).create(world, objects, tolerances or GraspTolerances(), gripper)

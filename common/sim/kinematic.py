@@ -6,6 +6,7 @@ stay where it falls appears at the nearest place where it can.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -14,9 +15,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import ObjectConfig, World
+from common.config import GripperConfig, ObjectConfig, SuctionCup, World
 from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Header, Pose, SceneUpdate, Vector3, WorldEdit, WorldObject, WorldObjects
+from common.robot.finger_joints import closing_frame
 from common.robot.transforms import invert, matrix_to_pose, matrix_to_quaternion, quaternion_to_matrix, transform
 from common.sim.interface import GraspTolerances, StandingObject
 from common.sim.objects import Solid, pose_of, prism, round_one, solid_of, solid_of_message, sphere
@@ -26,12 +28,15 @@ Array = NDArray[np.float64]
 
 GRAVITY = 9.81  # [m/s^2]
 TOUCH = 1e-6  # [m]
+LIP_POINTS = 8  # on the ring of a suction cup
 LINES = 5  # across a finger pad, along which it is felt what is between the fingers
 
 
-def create(world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances) -> KinematicWorld:
+def create(
+    world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances, gripper: GripperConfig | None
+) -> KinematicWorld:
     """The world with its objects, each of which has a place."""
-    return KinematicWorld(world, objects, tolerances)
+    return KinematicWorld(world, objects, tolerances, gripper)
 
 
 class KinematicWorld:
@@ -42,7 +47,8 @@ class KinematicWorld:
     """
 
     def __init__(
-        self, world: World, objects: Sequence[ObjectConfig] | None = None, tolerances: GraspTolerances | None = None
+        self, world: World, objects: Sequence[ObjectConfig] | None = None, tolerances: GraspTolerances | None = None,
+        gripper: GripperConfig | None = None,
     ) -> None:
         """Put every object where it lies at first; a sphere above a container lies in it.
 
@@ -52,6 +58,8 @@ class KinematicWorld:
         self.version = 0
         self._config = world
         self._tolerances = tolerances or GraspTolerances()
+        self._gripper = gripper
+        self._T_tcp_closing = closing_frame(gripper) if gripper else np.eye(4)
         self._ground = Ground(world)
         self._first = {thing.id: thing for thing in (world.objects if objects is None else objects)}
         self._solids = {name: solid_of(thing) for name, thing in self._first.items()}
@@ -125,8 +133,9 @@ class KinematicWorld:
         if held := self.held:
             return self._bodies[held].width
         found: dict[str, tuple[float, float]] = {}
+        T_world_hand = T_world_tcp @ self._T_tcp_closing
         for name, body in self._bodies.items():
-            if body.state in ("table", "contained") and (ends := self._felt(body, T_world_tcp, width)):
+            if body.state in ("table", "contained") and (ends := self._felt(body, T_world_hand, width)):
                 found[name] = ends
         self._between = found
         return max((high - low for low, high in found.values()), default=0.0)
@@ -136,6 +145,9 @@ class KinematicWorld:
 
         Once clear of both fingers a thing stays between them: the closing finger pushes it to the middle.
         """
+        if self._gripper is not None and self._gripper.cup is not None:
+            half = self._gripper.held_width / 2
+            return (-half, half) if lies_on(self._gripper.cup, body.solid, invert(T_world_tcp) @ body.T) else None
         allowed, solid = self._tolerances, body.solid
         away = body.T[:3, 3] - T_world_tcp[:3, 3]
         reach = allowed.across + allowed.along + max(width / 2, solid.reach)
@@ -161,7 +173,7 @@ class KinematicWorld:
 
     def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
         """Move on to a time: see `common.sim.interface`."""
-        held = self.held
+        held, T_world_tcp = self.held, T_world_tcp @ self._T_tcp_closing
         if not held and gripping and self._between:
             held = min(self._between,
                        key=lambda n: float(np.linalg.norm(self._bodies[n].T[:3, 3] - T_world_tcp[:3, 3])))
@@ -179,7 +191,8 @@ class KinematicWorld:
         low, high = self._between[body.name]
         body.grip = invert(T_world_tcp) @ body.T
         body.grip[1, 3] -= (low + high) / 2  # the fingers centre it
-        body.width = 2 * body.solid.radius if body.solid.shape == "sphere" else high - low
+        is_cupped = self._gripper is not None and self._gripper.cup is not None
+        body.width = 2 * body.solid.radius if body.solid.shape == "sphere" and not is_cupped else high - low
         slot, block = body.slot_taken, self._ground.block(body)
         body.state, body.container, body.slot, body.told = "held", "", None, None
         self._between = {}
@@ -358,6 +371,27 @@ class KinematicWorld:
             pose = Pose(position=Vector3(x=x, y=y, z=z)) if body.solid.shape == "sphere" else matrix_to_pose(body.T)
         self._events.append(SceneUpdate(data=f"{what}:{body.name}", pose=pose))
         self.version += 1
+
+
+def lies_on(cup: SuctionCup, solid: Solid, T_tcp_object: Array) -> bool:
+    """Whether the whole lip of a cup lies on a solid: middle and ring meet it, no further away than the lip gives."""
+    around = np.linspace(0.0, 2 * math.pi, LIP_POINTS, endpoint=False)
+    lip = np.vstack([(0.0, 0.0), cup.lip_radius * np.column_stack([np.cos(around), np.sin(around)])])
+    if solid.shape == "sphere":
+        x, y, z = T_tcp_object[:3, 3]
+        inside = solid.radius**2 - ((lip - (x, y)) ** 2).sum(axis=1)
+        if (inside <= 0).any():
+            return False
+        near = z - np.sqrt(inside)
+    else:
+        # Seen along the tool's z axis, which is the y axis of lines through (x, -y).
+        T_along_tcp = np.eye(4)
+        T_along_tcp[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
+        spans = solid.spans(T_along_tcp @ T_tcp_object, lip * (1.0, -1.0))[: len(lip)]
+        if any(not len(span) for span in spans):
+            return False
+        near = np.array([span[:, 0].min() for span in spans])
+    return bool((np.abs(near) <= cup.give).all())
 
 
 def _pressed(

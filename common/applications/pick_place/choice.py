@@ -251,9 +251,9 @@ def grasp_yaws(
 def yaws_of(target: Target, shape: HandShape) -> list[float] | None:
     """Yaws [rad] of the hand at which its pads lie flat on two sides of a box that fits between them.
 
-    None for what is round, which is taken at any.
+    None for what is round, which is taken at any, and for a cup, which takes anything so.
     """
-    if target.size is None:
+    if target.size is None or not shape.finger_inner:
         return None
     # At the yaw of the box the fingers close along its y axis, a quarter turn from there along its x axis.
     fitting = [target.yaw + turn for width, turn in ((target.size[1], 0.0), (target.size[0], math.pi / 2))

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+import warnings
+from typing import Self
 
-from common.config import Grasp, Parameters, Surroundings, Tunable
+from pydantic import Field, model_validator
+
+from common.config import Grasp, GripperConfig, Parameters, Surroundings, Tunable
 from common.tasks.deciding import TaskConfig
+
+PLACES = {"finger_inner": "gripper.fingers.inner", "finger_outer": "gripper.fingers.depth, from the inner face",
+          "finger_half_width": "gripper.fingers.half_width"}
 
 
 class HandShape(Parameters):
-    """The open fingers as seen from above: two rectangles beside the object, in the frame of the tool centre point."""
+    """The open fingers as seen from above: two rectangles beside the object, in the frame of the tool centre point.
+
+    Their shape is that of the robot file's gripper; one that is set here is taken in its place for one version more.
+    """
 
     finger_inner: Tunable[float] = Field(0.040, gt=0, le=0.2, description="centre to inner finger face, open [m]")
     finger_outer: Tunable[float] = Field(
@@ -54,3 +63,24 @@ class Config(TaskConfig):
         0.005, gt=0, le=0.05, description="an object that is further from where it was has moved [m]"
     )
     hand: HandShape = HandShape()
+
+    @model_validator(mode="after")
+    def _hand_is_that_of_the_robot(self) -> Self:
+        gripper = self.robot.gripper
+        if gripper is not None:
+            self.hand = shaped_as(gripper, self.hand)
+        return self
+
+
+def shaped_as(gripper: GripperConfig, hand: HandShape) -> HandShape:
+    """The hand with the shape of a gripper's fingers, where it was given no other."""
+    if gripper.cup is not None:  # two halves of the square about it
+        inner, depth, half_width = 0.0, gripper.cup.lip_radius, gripper.cup.lip_radius
+    else:
+        inner, depth, half_width = gripper.finger_inner, gripper.fingers.depth, gripper.fingers.half_width
+    shape = {"finger_inner": inner, "finger_outer": inner + depth, "finger_half_width": half_width}
+    for name in shape.keys() & hand.model_fields_set:
+        if getattr(hand, name) != shape[name]:
+            warnings.warn(f"services.<task>.hand.{name} belongs to the robot file: {PLACES[name]}", FutureWarning,
+                          stacklevel=2)
+    return hand.model_copy(update={name: value for name, value in shape.items() if name not in hand.model_fields_set})

@@ -85,13 +85,18 @@ class PerceivedScene:
             self._held = None
             return
         x, y, z = (float(v) for v in T_world_tcp[:3, 3])
-        track = self._tracks.take((x, y, z), self.p.match_radius, gripper.width)
+        track = self._tracks.take((x, y, z), self.p.match_radius, gripper.width if self.gripper.cup is None else 0.0)
         # The fingers have centred it between them; along them and along the tool it lies where it was seen.
         offset = np.zeros(3)
         if track is not None:
             offset = (invert(T_world_tcp) @ np.array([*track.position, 1.0]))[:3]
-            offset[1] = 0.0
-            offset = np.clip(offset, -0.015, 0.015)
+            # A cup holds it as it lay, by its top.
+            below = np.zeros(3)
+            if self.gripper.cup is not None:
+                below[2] = track.position[2] - self.around.table_height
+            else:
+                offset["xy".index(self.gripper.closing_axis)] = 0.0
+            offset = below + np.clip(offset - below, -0.015, 0.015)
         T_tcp_object = np.eye(4)
         T_tcp_object[:3, 3] = offset
         if track is not None and track.sighting.shape != "sphere":

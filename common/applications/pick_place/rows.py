@@ -25,7 +25,7 @@ class Rows:
         yaw = cycle.yaw = cycle.yaws.pop(0)
         x, y, z = cycle.target.position
         low = self.grasp_height(z)
-        grasp = m.PoseGoal(pose=matrix_to_pose(tool_down(x, y, low, yaw)))
+        grasp = m.PoseGoal(pose=matrix_to_pose(tool_down(x, y, low, yaw + self.turn)))
         return [
             Move("pre-grasp", "GRASPING", cycle, whole=True, fresh=True,
                  goal=self._region((x, y, low + self.p.grasp.approach_clearance), yaw)),
@@ -69,19 +69,27 @@ class Rows:
     def attach_pose(self, cycle: Pick) -> m.Pose:
         """Where the ball will lie in the tool frame, whose z axis points down."""
         z = cycle.target.position[2]
-        turn = -(cycle.target.yaw - cycle.yaw) if cycle.target.size else 0.0  # seen along the tool, which looks down
+        # Seen along the tool, which looks down.
+        turn = cycle.yaw + self.turn - cycle.target.yaw if cycle.target.size else 0.0
         T_tcp_object = transform(rpy_to_matrix(math.pi, 0.0, turn), (0.0, 0.0, self.grasp_height(z) - z))
         return matrix_to_pose(T_tcp_object) if cycle.target.size else m.Pose(
             position=m.Vector3(z=self.grasp_height(z) - z))
 
+    @property
+    def turn(self) -> float:
+        """Of the tool at a yaw of 0, at which the fingers close along world y [rad]."""
+        return math.pi / 2 if self.gripper.closing_axis == "x" else 0.0
+
     def grasp_height(self, z: float) -> float:
-        """Height of the tool centre point at the grasp of a ball whose centre is at z [m]."""
+        """Height of the tool centre point at the grasp of what lies with its centre at z [m]: a cup takes its top."""
+        if self.gripper.cup is not None:
+            return 2 * z - self.p.world.table_height
         return max(z + self.p.grasp.grasp_clearance, self.p.grasp.min_grasp_z)
 
     def _region(self, at: Place, yaw: float, side: float | None = None) -> m.PoseGoal:
         """Above a place with the tool pointing down, as far as it matters."""
         side = self.p.grasp_pos_tol if side is None else side
         return m.PoseGoal(
-            pose=matrix_to_pose(tool_down(*at, yaw)), position_tolerance=m.Vector3(x=side, y=side, z=side),
+            pose=matrix_to_pose(tool_down(*at, yaw + self.turn)), position_tolerance=m.Vector3(x=side, y=side, z=side),
             tilt_tolerance=self.p.orient_tol_rad, yaw_tolerance=self.p.orient_yaw_tol_rad,
         )

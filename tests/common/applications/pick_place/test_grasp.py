@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.applications.pick_place.choice import Target, finger_clearance, grasp_yaws, yaw_candidates, yaws_of
-from common.applications.pick_place.parameters import HandShape
-from common.config import Container
+from common.applications.pick_place.parameters import Config, HandShape
+from common.config import Container, load_cell, service_config
 from common.robot.transforms import tool_down
 
 HAND = HandShape()
@@ -74,3 +74,18 @@ def test_a_neighbour_is_cleared_by_as_much_as_it_is_wide() -> None:
     beside = (0.4 + 0.0, 0.09)
     assert finger_clearance(HAND, (0.4, 0.0), 0.0, [(*beside, 0.02)], 0.03) == pytest.approx(0.09 - 0.056 - 0.02)
     assert finger_clearance(HAND, (0.4, 0.0), 0.0, [beside], 0.03) == pytest.approx(0.09 - 0.056 - 0.03)
+
+
+def test_hand_has_the_shape_that_the_robot_file_gives_its_gripper() -> None:
+    hand = service_config(load_cell("panda"), "smart_pick_place", Config).hand
+    assert (hand.finger_inner, hand.finger_outer, hand.finger_half_width) == (0.040, 0.056, 0.011)
+    wider = load_cell("panda", ["robot.gripper.fingers={depth: 0.02, half_width: 0.015}"])
+    hand = service_config(wider, "smart_pick_place", Config).hand
+    assert (hand.finger_inner, hand.finger_outer, hand.finger_half_width) == (0.04, 0.06, 0.015)
+
+
+def test_shape_that_is_still_set_for_the_task_is_taken_with_a_warning() -> None:
+    cell = load_cell("panda", ["services.smart_pick_place.hand={finger_half_width: 0.02, yaw_count: 4}"])
+    with pytest.warns(FutureWarning, match=r"finger_half_width belongs to the robot file: gripper\.fingers\."):
+        hand = service_config(cell, "smart_pick_place", Config).hand
+    assert (hand.finger_half_width, hand.finger_outer, hand.yaw_count) == (0.02, 0.056, 4)

@@ -1,0 +1,112 @@
+"""What the robot file says of a gripper decides what can be taken with it: its closing axis, a suction cup."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from common.config import GripperConfig, ObjectConfig, SuctionCup, World
+from common.hardware.fingers import Fingers
+from common.robot.finger_joints import finger_positions
+from common.robot.transforms import tool_down
+from common.sim.kinematic import KinematicWorld, lies_on
+from common.sim.objects import solid_of
+
+CUP = GripperConfig(cup=SuctionCup(), links=["cup"])
+FINGERS = {"joints": ["a", "b"], "links": []}
+BALL = ObjectConfig(id="ball", shape="sphere", radius=0.03, x=0.5, y=0.0)
+BAR = ObjectConfig(id="bar", shape="box", size=(0.05, 0.20), height=0.04, x=0.5, y=0.0)
+
+
+class Rig:
+    """A hand in the simulated world, moved and told by hand."""
+
+    def __init__(self, gripper: GripperConfig, thing: ObjectConfig) -> None:
+        self.world = KinematicWorld(World(count=0), [thing], None, gripper)
+        self.fingers, self.now = Fingers(gripper, gripper.max_width), 100.0
+
+    def be_at(self, x: float, y: float, z: float, yaw: float = 0.0, width: float | None = None) -> None:
+        """Be there and do what was told until it is done."""
+        hand = tool_down(x, y, z, yaw)
+        if width is not None:
+            self.fingers.command(width, self.now)
+        for _ in range(150):
+            self.now += 0.01
+            self.fingers.obstruct(self.world.obstruction(hand, self.fingers.read(self.now).width))
+            reading = self.fingers.read(self.now)
+            self.world.tick(self.now, hand, reading.width, reading.holding)
+
+    @property
+    def holding(self) -> bool:
+        return self.fingers.read(self.now).holding and bool(self.world.held)
+
+    def place(self, name: str) -> np.ndarray:
+        from common.messages import Header
+
+        thing = next(thing for thing in self.world.objects(Header()).objects if thing.id == name)
+        return np.array([thing.pose.position.x, thing.pose.position.y, thing.pose.position.z])
+
+
+@pytest.mark.parametrize(("thing", "top"), [(BALL, 0.06), (BAR, 0.04)])
+def test_cup_takes_what_its_lip_touches_carries_it_and_lets_it_fall(thing: ObjectConfig, top: float) -> None:
+    rig = Rig(CUP, thing)
+    before = rig.place(thing.id)
+    rig.be_at(0.5, 0.0, top)
+    assert not rig.holding  # it does not draw yet
+    rig.be_at(0.5, 0.0, top, width=0.0)
+    assert rig.holding
+    rig.be_at(0.4, 0.1, top + 0.2)
+    assert rig.place(thing.id) == pytest.approx(np.add(before, (-0.1, 0.1, 0.2)), abs=1e-6)
+    rig.be_at(0.4, 0.1, top + 0.2, width=CUP.max_width)
+    assert not rig.holding and rig.place(thing.id) == pytest.approx(np.add(before, (-0.1, 0.1, 0.0)), abs=1e-6)
+
+
+@pytest.mark.parametrize(("x", "z"), [(0.5, 0.08), (0.53, 0.06), (0.5, 0.03)])
+def test_cup_draws_nothing_above_beside_or_within_a_ball(x: float, z: float) -> None:
+    rig = Rig(CUP, BALL)
+    rig.be_at(x, 0.0, z, width=0.0)
+    assert not rig.holding and rig.fingers.read(rig.now).width == pytest.approx(0.0, abs=1e-6)
+
+
+def test_cup_that_draws_takes_what_it_comes_to() -> None:
+    rig = Rig(CUP, BALL)
+    rig.be_at(0.5, 0.0, 0.2, width=0.0)
+    assert not rig.holding
+    rig.be_at(0.5, 0.0, 0.06)
+    assert rig.holding
+
+
+def test_lip_must_lie_on_the_object_all_round() -> None:
+    solid = solid_of(BAR)
+    cup = SuctionCup(lip_radius=0.012, give=0.002)
+    below = np.diag([1.0, -1.0, -1.0, 1.0])  # the tool looks down; the top of the bar is at its tip
+
+    def at(x: float, tilt: float = 0.0) -> bool:
+        T = np.eye(4)
+        T[:3, :3] = [[math.cos(tilt), 0, math.sin(tilt)], [0, 1, 0], [-math.sin(tilt), 0, math.cos(tilt)]]
+        T = T @ below
+        top = solid.triangles[..., 2].max()
+        T[:3, 3] = T[:3, :3] @ [-x, 0.0, -top]
+        return lies_on(cup, solid, T)
+
+    assert at(0.0) and at(0.012) and not at(0.02)  # over the edge
+    assert at(0.0, 0.1) and not at(0.0, 0.5)
+
+
+@pytest.mark.parametrize(("axis", "yaw", "takes"), [
+    ("y", 0.0, False), ("y", math.pi / 2, True), ("x", 0.0, True), ("x", math.pi / 2, False)])
+def test_fingers_close_along_the_axis_that_the_robot_file_names(axis: str, yaw: float, takes: bool) -> None:
+    rig = Rig(GripperConfig.model_validate({**FINGERS, "closing_axis": axis}), BAR)  # 50 mm along x, 200 along y
+    rig.be_at(0.5, 0.0, 0.02, yaw, width=0.0)
+    assert rig.holding is takes
+
+
+def test_gripper_has_joints_or_a_cup() -> None:
+    assert finger_positions(CUP, 0.04) == []
+    with pytest.raises(ValidationError, match="needs the joints of its fingers, or a cup"):
+        GripperConfig(links=[])
+    with pytest.raises(ValidationError, match="needs the joints of its fingers, or a cup"):
+        GripperConfig(links=[], joints=["a"], cup=SuctionCup())
