@@ -15,11 +15,11 @@ from common.process.service import main
 from common.transport.bus import Bus
 from common.viewer.access import address_of
 from common.viewer.console import Console
-from common.viewer.feeds import Feeds, Periods
+from common.viewer.feeds import Feeds, Periods, Topics
 from common.viewer.guard import close_server, make_server
 from common.viewer.layers import Layers, find_layers
 from common.viewer.layout import load_layout
-from common.viewer.page import Page, Topics
+from common.viewer.page import Page
 from common.viewer.plots import Limits
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ async def run(bus: Bus, config: Config) -> None:
     layout = load_layout(config.layout)
     application = find_application(config.members.application) if config.members.application else None
     layers = find_layers(application, config.layers, config.members.keys)
-    read = Topics(application, layers, config.members.keys)
+    read = Topics(application, layers.values(), config.members.keys)
     feeds = Feeds(bus, read.always, read.on_demand)
     console = Console(bus, config.members, feeds, read.requests)
     status = feeds.reader(read.status) if read.status is not None else None

@@ -6,9 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from common.messages import Message
+from common import topics
+from common.application import Application
+from common.messages import Image, Message, Rejections
 from common.remapping import Remapping
-from common.topics import Topic
+from common.topics import Request, Topic
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -16,6 +18,11 @@ if TYPE_CHECKING:
 
 M = TypeVar("M", bound=Message)
 
+ALWAYS: tuple[Topic[Any], ...] = (
+    topics.JOINT_STATES, topics.MOTION_STATUS, topics.GRIPPER_STATE, topics.SUPERVISOR_STATUS, topics.COUNTERS,
+    topics.LOG,
+)
+LIVE, ANNOTATED = "live", "annotated"  # pictures
 _LOG_SIZE = 2000  # lines that may wait
 
 
@@ -80,6 +87,54 @@ def under_all_keys(topic: Topic[M], tables: Iterable[Mapping[str, str]]) -> list
     return [replace(topic, key=key) for key in keys]
 
 
+class HasTopics(Protocol):
+    """A part of the page, or its class."""
+
+    @property
+    def TOPICS(self) -> Sequence[Topic[Any]]:
+        """What it is shown."""
+
+
+class Topics:
+    """What the page has to do with: what every cell has, what the application names, and what layers show.
+
+    Attributes:
+        status, rejected, decided_by: of the application, if it has them.
+        images: pictures as the cameras send them, and with what was found in them.
+        requests: what the application asks.
+        on_demand: what is read while somebody looks at it.
+    """
+
+    def __init__(
+        self, application: Application | None, parts: Iterable[HasTopics], keys: Sequence[Mapping[str, str]] = ()
+    ) -> None:
+        """Look at what an application and parts of the page say, and what services call otherwise by their `keys`."""
+
+        def named(part: str, name: str) -> Any:
+            return application.find(part, name) if application is not None else None
+
+        self.status: Topic[Any] | None = named("topics", "STATUS")
+
+        def everywhere(*found: Topic[Any] | None) -> list[Topic[Any]]:
+            return [each for topic in found if topic is not None for each in under_all_keys(topic, keys)]
+
+        self.rejected: list[Topic[Rejections]] = everywhere(named("topics", "REJECTED"))
+        self.decided_by: list[Topic[Any]] = everywhere(named("topics", "DECIDED_BY"))
+        self.images: dict[str, list[Topic[Image]]] = {
+            LIVE: everywhere(topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
+            ANNOTATED: everywhere(named("topics", "ANNOTATED")),
+        }
+        self.requests: Sequence[Request[Any, Any]] = named("page", "REQUESTS") or ()
+        controls = getattr(named("page", "Controls"), "TOPICS", ())
+        shown = [topic for part in parts for topic in part.TOPICS]
+        self.on_demand: list[Topic[Any]] = [*self.images[LIVE], *self.images[ANNOTATED], *controls, *shown]
+
+    @property
+    def always(self) -> list[Topic[Any]]:
+        """What is read all the time: small or seldom."""
+        return [*ALWAYS, *([self.status] if self.status is not None else []), *self.rejected, *self.decided_by]
+
+
 class Latest(Protocol):
     """Where the newest message of a topic comes from: `Feeds.latest`."""
 
@@ -87,12 +142,8 @@ class Latest(Protocol):
         """The newest message, or None."""
 
 
-class Shows(Protocol):
+class Shows(HasTopics, Protocol):
     """A part of the page that shows messages."""
-
-    @property
-    def TOPICS(self) -> Sequence[Topic[Any]]:
-        """What it is shown."""
 
     @property
     def PERIOD(self) -> float:

@@ -12,7 +12,7 @@ An application adds to it in its part `page`: words for its task (words.py), lay
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,17 +22,17 @@ from common import topics
 from common.application import Application
 from common.config import Members, check
 from common.errors import ZencellError
-from common.messages import Image, Rejections
+from common.messages import Rejections
 from common.reporting.summary import Rejected
-from common.topics import Request, Topic
+from common.topics import Topic
 from common.viewer.console import Console
-from common.viewer.feeds import Feeds, News, Periods, under_all_keys
+from common.viewer.feeds import ANNOTATED, LIVE, Feeds, News, Periods, Topics
 from common.viewer.health import HealthPanel, LogPanel
 from common.viewer.layers import Layers, layers_shown
 from common.viewer.layout import TABS, Layout, Tab, Viewpoint, save_layout
 from common.viewer.markup import block, span
 from common.viewer.move import Motions, MovePanel
-from common.viewer.pictures import ANNOTATED, LIVE, PicturePanel
+from common.viewer.pictures import PicturePanel
 from common.viewer.plots import Limits, PlotPanel
 from common.viewer.task_panel import TaskPanel
 from common.viewer.tuning import TuningPanel
@@ -40,51 +40,6 @@ from common.viewer.words import TaskWords, gripper
 
 if TYPE_CHECKING:
     from common.viewer.scene import Scene
-
-ALWAYS: tuple[Topic[Any], ...] = (
-    topics.JOINT_STATES, topics.MOTION_STATUS, topics.GRIPPER_STATE, topics.SUPERVISOR_STATUS, topics.COUNTERS,
-    topics.LOG,
-)
-
-
-class Topics:
-    """What the page has to do with: what every cell has, what the application names, and what layers show.
-
-    Attributes:
-        status, rejected, decided_by: of the application, if it has them.
-        images: pictures as the cameras send them, and with what was found in them.
-        requests: what the application asks.
-        on_demand: what is read while somebody looks at it.
-    """
-
-    def __init__(
-        self, application: Application | None, layers: Layers, keys: Sequence[Mapping[str, str]] = ()
-    ) -> None:
-        """Look at what an application and layers say, and what services call otherwise by their `keys`."""
-
-        def named(part: str, name: str) -> Any:
-            return application.find(part, name) if application is not None else None
-
-        self.status: Topic[Any] | None = named("topics", "STATUS")
-
-        def everywhere(*found: Topic[Any] | None) -> list[Topic[Any]]:
-            return [each for topic in found if topic is not None for each in under_all_keys(topic, keys)]
-
-        self.rejected: list[Topic[Rejections]] = everywhere(named("topics", "REJECTED"))
-        self.decided_by: list[Topic[Any]] = everywhere(named("topics", "DECIDED_BY"))
-        self.images: dict[str, list[Topic[Image]]] = {
-            LIVE: everywhere(topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
-            ANNOTATED: everywhere(named("topics", "ANNOTATED")),
-        }
-        self.requests: Sequence[Request[Any, Any]] = named("page", "REQUESTS") or ()
-        controls = getattr(named("page", "Controls"), "TOPICS", ())
-        shown = [topic for kind in layers.values() for topic in kind.TOPICS]
-        self.on_demand: list[Topic[Any]] = [*self.images[LIVE], *self.images[ANNOTATED], *controls, *shown]
-
-    @property
-    def always(self) -> list[Topic[Any]]:
-        """What is read all the time: small or seldom."""
-        return [*ALWAYS, *([self.status] if self.status is not None else []), *self.rejected, *self.decided_by]
 
 
 class Page:
@@ -121,7 +76,7 @@ class Page:
         self._server, self._feeds, self.console = server, feeds, console
         self._motions, self._cell, self._kinds = motions, cell, layers
         self._layout, self._layout_file, self._periods = layout, layout_file, periods
-        self._topics, self._words = Topics(application, layers, members.keys), TaskWords.of(application)
+        self._topics, self._words = Topics(application, layers.values(), members.keys), TaskWords.of(application)
         self._shown, self._editing = layers_shown(layout.layers, layers), layout.edit_world
         self._rejected = Rejected()
         self._happened: list[tuple[Topic[Any], Any]] = []  # before there is a scene: an event does not come again

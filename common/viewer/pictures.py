@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from common.messages import Image
 from common.perception.image import ImageError, image_to_array
 from common.viewer.console import Desk
+from common.viewer.feeds import ANNOTATED, LIVE
 from common.viewer.markup import block, span
 
 WIDEST = 640  # [px] that are sent: more than the panel shows
 QUALITY = 75
-LIVE, ANNOTATED = "live", "annotated"
 LABELS = {ANNOTATED: "With what was found", LIVE: "As it comes"}
 
 Picture = NDArray[np.uint8]

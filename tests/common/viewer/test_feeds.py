@@ -9,19 +9,18 @@ from common.applications.outlining.topics import CONTOURS, OUTLINE_SELECT
 from common.applications.pick_place.topics import VALIDATED_TARGETS
 from common.topics import Topic
 from common.transport.local import LocalNetwork
-from common.viewer.feeds import Feeds, News
+from common.viewer.feeds import Feeds, News, Topics
 from common.viewer.layers import find_layers
-from common.viewer.page import Topics
 
 READ, ON_DEMAND = [topics.GRIPPER_STATE], [CONTOURS, topics.SCENE_OBJECTS, topics.SCENE_OBJECT_UPDATES]
 
 
 def test_page_has_to_do_with_the_platform_and_one_application_and_not_with_others() -> None:
-    panda, ur5 = (Topics(app, find_layers(app)) for app in map(find_application, ("pick_place", "outlining")))
+    panda, ur5 = (Topics(app, find_layers(app).values()) for app in map(find_application, ("pick_place", "outlining")))
     assert VALIDATED_TARGETS in panda.always and CONTOURS not in panda.on_demand
     assert CONTOURS in ur5.on_demand and VALIDATED_TARGETS not in [*ur5.always, *ur5.on_demand]
     assert OUTLINE_SELECT in ur5.requests and not panda.requests
-    for of_cell in (panda, ur5, Topics(None, {})):
+    for of_cell in (panda, ur5, Topics(None, ())):
         assert topics.LOG in of_cell.always and topics.CAMERA_IMAGE in of_cell.on_demand
 
 
