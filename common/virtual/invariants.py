@@ -16,6 +16,7 @@ from common.config import Cell
 from common.hardware.interface import Limits, Vector
 from common.messages import (
     CameraInfo,
+    ExecuteRequest,
     GripperState,
     HoldRequest,
     Image,
@@ -34,6 +35,7 @@ from common.virtual.process import Requests
 OVER = ("succeeded", "aborted", "cancelled")
 SEEN_BY_CAMERAS = (Image, CameraInfo, PointCloud2, ServiceCounters, LogLine)  # what one who sees the truth may say
 MOST_BROKEN = 5  # are told of
+OLDEST = 2.6  # [s] from when a motion is decided to its begin; later ones are refused, by clocks that are wrong
 LATE = 0.5  # [s] that the end of a request may come after its time-out
 MOVED = 2e-3  # [m] farther from where it lay, a thing was moved
 JUMP = 0.02  # [rad] from where the arm was to the first set-point of another process
@@ -50,6 +52,7 @@ OBJECTS = "no object lost or doubled"
 TWO = "never two goals"
 ONCE = "a goal id acts once"
 LIMITS = "every set-point within limits"
+FRESH = "no motion begins that was decided long ago"
 GOAL = "the arm moves for a goal only"
 HELD = "an arm that is held rests"
 TRUTH = "nothing that decides saw the truth"
@@ -75,7 +78,7 @@ class Invariants:
         self.checked: Counter[str] = Counter()
         self.truth_readers: set[str] = set()  # processes that hear what only cameras may see
         self._requests, self._now = requests, now
-        requests.on_answer = self._on_answer
+        requests.on_ask, requests.on_answer = self._on_ask, self._on_answer
         application = find_application(cell.application)
         self._fills = application.fills
         known: dict[str, AnyTopic] = {**topics.platform_topics(), **application.topics}
@@ -90,6 +93,7 @@ class Invariants:
         self._lying: dict[str, tuple[str, Vector]] = {}  # by object: state and place
         self._held_since: float | None = None  # cell time
         self._last: tuple[Vector, Vector, float] | None = None  # newest set-points and when
+        self._decided: dict[str, float] = {}  # by goal: when it was asked for first
         self._stray = 0  # set-points that moved without a goal
         self._strange = 0
 
@@ -146,6 +150,10 @@ class Invariants:
             # The fingers' newer goal ends the older one.
             if self._broke(not known.active or goal == known.active or key == self._gripper, TWO):
                 self._tell(TWO, f"{key}: {goal} is active while {known.active} is")
+            if goal != known.active and goal in self._decided:
+                age = self._now() - self._decided[goal]
+                if self._broke(age <= OLDEST, FRESH):
+                    self._tell(FRESH, f"{goal} begins {age:.2f} s after it was asked for first")
             known.active = goal
 
     def _on_truth(self, objects: list[dict[str, Any]]) -> None:
@@ -199,6 +207,10 @@ class Invariants:
             self._tell(HELD, f"it moves {way.max():.4f} rad")
 
     # --- requests -----------------------------------------------------------------------------------------------------
+
+    def _on_ask(self, request: Message) -> None:
+        if isinstance(request, ExecuteRequest):
+            self._decided.setdefault(request.id, self._now())
 
     def _on_answer(self, service: str, request: Message, answer: Message) -> None:
         asked = isinstance(request, HoldRequest) and request.hold and isinstance(answer, MotionStatus)

@@ -1,0 +1,118 @@
+"""Ten bugs to put back, one at a time, into code that was cured of them; and after how many seeds each is found.
+
+`python -m tests.simulated.known_bugs [MOST]` prints the table.
+"""
+
+import asyncio
+import contextlib
+import sys
+from unittest.mock import patch
+
+from common import topics
+from common.applications.pick_place.perceived import PerceivedScene
+from common.config import load_cell
+from common.control.controller import TrajectoryController
+from common.control.goals import GoalMemory
+from common.transport import requests
+from common.transport.reader import Newness
+from common.virtual.simulation import Simulation
+from services import smart_pick_place, trajectory_executor
+
+CELL = ("panda", ["world.count=3"])
+
+
+def _truth_read():
+    honest = smart_pick_place.run
+
+    async def run(bus, config):
+        bus.reader(topics.SCENE_OBJECTS)
+        await honest(bus, config)
+
+    return patch.object(smart_pick_place, "run", run)
+
+
+def _hold_forgotten():
+    honest = TrajectoryController.hold
+
+    def hold(self, *arguments, **named):
+        honest(self, *arguments, **named)
+        self._holds.clear()
+        return self.status
+
+    return patch.object(TrajectoryController, "hold", hold)
+
+
+def _hold_without_brakes():
+    return patch("common.control.controller.next_rate", lambda at, time, rate, target, seconds, acceleration: target)
+
+
+def _two_goals():
+    honest = TrajectoryController.accept
+
+    def accept(self, goal, *arguments, **named):
+        if self._memory.get(goal) is None:
+            self._goal = None
+        return honest(self, goal, *arguments, **named)
+
+    return patch.object(TrajectoryController, "accept", accept)
+
+
+def _waits_without_end():
+    async def ask(self, payload, seconds, timeout):
+        future = self._loop.create_future()
+
+        def settle(reply):
+            self._loop.call_soon_threadsafe(requests._settle, future, reply)
+
+        self._session.get(self._key, settle, lambda: None, payload=payload, timeout=1e9)
+        return await future
+
+    return patch.object(requests.Client, "_ask", ask)
+
+
+def _never_asked_again():
+    async def once(client, request, timeout, refused, note):
+        try:
+            return await client.call(request, timeout=timeout)
+        except Exception as error:
+            note(str(error))
+            await asyncio.Event().wait()
+
+    return patch("common.process.task_runner.persist", once)
+
+
+BUGS = {
+    "what is not newer is read": lambda: patch.object(Newness, "is_new", lambda self, attachment: True),
+    "a repeated goal id acts again": lambda: patch.object(GoalMemory, "get", lambda self, goal: None),
+    "the task reads the truth": _truth_read,
+    "a hold is forgotten": _hold_forgotten,
+    "a hold without brakes": _hold_without_brakes,
+    "a motion that was decided long ago begins": lambda: patch.object(
+        trajectory_executor, "objection", lambda age, oldest, ahead: None),
+    "objects and arm forgotten at a restart": lambda: patch.object(
+        trajectory_executor, "state_file", lambda cell: None),
+    "a new goal while another runs": _two_goals,
+    "a request that waits without end": _waits_without_end,
+    "a request that is not asked again": _never_asked_again,
+    "what is in the hand is forgotten": lambda: patch.object(
+        PerceivedScene, "feel", lambda self, state, T_world_tcp: None),
+    "goal ids that repeat after a restart": lambda: patch.object(smart_pick_place, "new_id", lambda: "0000"),
+}
+
+
+def found_within(bug, most):
+    """The number of seeds that were run until one told of the bug, and what it told; None when none did."""
+    cell = load_cell(*CELL)
+    for seed in range(1, most + 1):
+        with BUGS[bug]():
+            outcome = Simulation(cell, seed, faults=True, limit=200.0).run()
+        if not outcome.ok or outcome.crashes:
+            return seed, "; ".join([f"{outcome.state} {outcome.message}", *outcome.crashes[:1]])
+    return None
+
+
+if __name__ == "__main__":
+    most = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
+    for name in sys.argv[2:] or BUGS:
+        with contextlib.suppress(BrokenPipeError):
+            print(f"{name}: {found_within(name, most)}", flush=True)
