@@ -13,7 +13,7 @@ from common.virtual.network import FAIR, Weather
 Kind = Literal["crash", "restart", "cut", "router lost"]
 
 CRASHES: tuple[Kind, ...] = ("crash", "crash", "crash")  # at least, and soon: short runs see them all too
-FIRST_GAPS = 0.2, 4.0  # [s] between those
+FIRST_GAPS = 0.2, 2.5  # [s] between those
 LATER_GAP = 12.0  # [s] on average to each further fault
 LONGEST = 60.0  # [s] from the cell being ready; what comes after is left to it to finish
 MOST_FAULTS = 20  # of one run

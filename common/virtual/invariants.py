@@ -76,6 +76,7 @@ class Invariants:
         """Begin without having seen anything; `now` is the virtual time [s]."""
         self.broken: list[str] = []
         self.checked: Counter[str] = Counter()
+        self.ended = False  # what comes from now on is no part of the run
         self.truth_readers: set[str] = set()  # processes that hear what only cameras may see
         self._requests, self._now = requests, now
         requests.on_ask, requests.on_answer = self._on_ask, self._on_answer
@@ -180,6 +181,8 @@ class Invariants:
 
     def on_set_point(self, limits: Limits, measured: Vector, q: Vector, dq: Vector, now: float) -> None:
         """Look at set-points q (dof,) [rad] and dq [rad/s], given where the arm is, at cell time [s]."""
+        if self.ended:
+            return
         fastest = 1.03 * limits.velocity + BLEND
         fits = np.isfinite(q).all() and np.isfinite(dq).all() and (np.abs(dq) <= fastest).all()
         if self._broke(fits and ((q >= limits.lower - 2e-3) & (q <= limits.upper + 2e-3)).all(), LIMITS):

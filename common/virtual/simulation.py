@@ -163,6 +163,7 @@ class Simulation:
             outcome.crashes, outcome.requests = host.crashes, host.requests.outcomes
             outcome.faults = self._done + self._network.counted + Counter({"crash": host.killed})
             outcome.broken, outcome.checked = self.invariants.broken, self.invariants.checked
+            self.invariants.ended = True
             self._network.on_put = lambda session, sample: None  # what comes now is no part of the run
             await self._clear(working, supervisor, bus, host)
 

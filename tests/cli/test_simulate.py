@@ -16,6 +16,7 @@ from cli.simulate import listed, seeds_of
 from common.errors import ConfigError
 from common.recording.reading import Recording
 
+pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
 SMALL = ["panda", "--set", "world.count=1"]
 
 

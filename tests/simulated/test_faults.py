@@ -1,0 +1,65 @@
+"""Cells on the virtual clock in which things go wrong: they end well, the same each time, and bugs are found."""
+
+import pytest
+
+from common.config import load_cell
+from common.errors import ConfigError
+from common.virtual.faults import SKEW, make_plan
+from common.virtual.simulation import Simulation
+from common.virtual.watched_arm import with_watched_arm
+from tests.simulated.known_bugs import BUGS, found_within
+
+pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
+
+
+@pytest.mark.parametrize(("cell", "overrides", "seed"), [
+    ("panda", ["world.count=2"], 1), pytest.param("ur5", [], 2, marks=pytest.mark.slow),
+])
+def test_cell_ends_well_whatever_goes_wrong(cell, overrides, seed):
+    outcome = Simulation(load_cell(cell, overrides), seed, faults=True).run()
+    assert outcome.ok and not outcome.broken and not outcome.crashes, outcome
+    assert outcome.faults["crash"] >= 3 and outcome.faults["cut"] + outcome.faults["router lost"] >= 1
+    assert sum(outcome.restarts.values()) >= 3
+    assert all(count > 0 for count in outcome.checked.values()) and len(outcome.checked) >= 9
+
+
+def test_same_seed_is_the_same_run_with_faults_too():
+    cell = load_cell("panda", ["world.count=1"])
+    first, second = (Simulation(cell, 5, faults=True, digest=True).run() for _ in range(2))
+    assert first.digest == second.digest and first.faults == second.faults
+
+
+@pytest.mark.parametrize("bug", ["what is not newer is read", "the task reads the truth"])
+def test_known_bug_is_found(bug):
+    found = found_within(bug, 3)
+    assert found is not None and "BROKEN" in found[1]
+
+
+def test_ten_bugs_are_known():
+    assert len(BUGS) >= 10
+
+
+def test_every_plan_has_three_crashes_a_cut_and_wrong_clocks():
+    for seed in range(200):
+        plan = make_plan(seed, ["one", "two", "three"])
+        kinds = [fault.kind for fault in plan.faults]
+        assert kinds.count("crash") >= 3 and kinds.count("cut") + kinds.count("router lost") >= 1
+        assert [fault.at for fault in plan.faults] == sorted(fault.at for fault in plan.faults)
+        assert plan.weather.loss > 0 and plan.weather.hiccup > 0 and plan.weather.doubled > 0
+        assert all(abs(skew) <= SKEW for _, skew in plan.skews) and len(plan.skews) == 3
+
+
+def test_plans_of_two_seeds_differ():
+    assert make_plan(1, ["one", "two"]) != make_plan(2, ["one", "two"])
+    assert make_plan(1, ["one", "two"]) == make_plan(1, ["one", "two"])
+
+
+def test_real_arm_cannot_be_simulated(tmp_path, monkeypatch):
+    (tmp_path / "steel.py").write_text(
+        "from common.hardware.mock import Options, create\nsimulated = False\n__all__ = ['Options', 'create']\n")
+    (tmp_path / "of").mkdir()
+    (tmp_path / "of" / "__init__.py").write_text("")
+    (tmp_path / "steel.py").rename(tmp_path / "of" / "steel.py")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(ConfigError, match="is a real arm"):
+        with_watched_arm(load_cell("panda", ["robot.hardware.backend=of.steel"]))
