@@ -372,6 +372,16 @@ async def test_random_layout_follows_the_seed_and_is_within_reach() -> None:
         assert all(0.18 <= np.hypot(p.position.x, p.position.y) <= 0.82 for p in one.poses)
 
 
+async def test_random_layout_keeps_to_the_limits_of_reach_of_the_cells_own_services() -> None:
+    limits = ("services.workspace_validator.max_radius=0.52", "services.workspace_validator.min_radius=0.3")
+    async with executor("world.layout=random", "world.count=4", *limits) as person:
+        seen = await person.see(person.balls, lambda b: True)
+    assert all(0.3 <= np.hypot(p.position.x, p.position.y) <= 0.52 for p in seen.poses) and len(seen.poses) == 4
+    with pytest.raises(ConfigError, match=r"services\.workspace_validator\.max_radius: -3"):
+        async with executor("world.layout=random", "services.workspace_validator.max_radius=-3"):
+            pass
+
+
 @pytest.mark.parametrize("off", [-0.005, 0.005])
 async def test_random_layout_is_within_reach_also_when_seen_a_few_millimetres_off(off: float) -> None:
     cell = load_cell("panda")
