@@ -25,7 +25,7 @@ async def test_a_run_under_a_plan_of_faults_ends_done_with_every_ball_in_the_box
         assert await cell.ended(150) == 0, cell.tail(80)
         assert not cell.processes()
         assert cell.summary["state"] == "DONE"
-        assert cell.summary["truth"] == {"in_box": BALLS, "on_table": 0, "elsewhere": 0}
+        assert cell.summary["truth"] == {"in_box": BALLS, "on_table": 0, "elsewhere": 0, "containers": {"box": BALLS}}
         assert cell.summary["chaos"], cell.tail(80)
         for fault in cell.summary["chaos"]:
             assert f"CHAOS {fault['t']:.1f} s: {fault['what'].partition(':')[0]}" in cell.text
@@ -41,7 +41,7 @@ async def test_bad_messages_stop_no_service_and_a_ball_that_slips_is_taken_again
     old = [Fault(0.0, "replay", key, 0.5, count=3) for key in keys]
     with RunningCell(tmp_path, "run", "panda", "--speed", "5", "--set", f"world.count={BALLS}") as cell:
         async with cell.listen() as bus:
-            chaos = Chaos(bus, [Fault(0.0, "drop"), *bad, *old], dict, panda.world.container, patience=60)
+            chaos = Chaos(bus, [Fault(0.0, "drop"), *bad, *old], dict, [panda.world.container], patience=60)
             async with beside(chaos.run()):
                 assert await cell.ended(150) == 0, cell.tail(80)
         summary = cell.summary
