@@ -94,7 +94,7 @@ class Access:
             return True
         if is_loopback(self.host):
             return False
-        # An address can not be rebound; a name must be this machine's own.
+        # An address cannot be rebound; a name must be this machine's own.
         return _address(name) is not None or name in _own_names()
 
     def _has_cookie(self, headers: Sequence[str]) -> bool:
@@ -173,7 +173,7 @@ def open_socket(host: str, port: int) -> socket.socket:
     """A socket that listens at host and port (0: any that is free).
 
     Raises:
-        OSError: it can not.
+        OSError: it cannot.
     """
     if host.lower() == "localhost":
         host = "127.0.0.1"  # a browser that tries ::1 first comes back to it
@@ -184,7 +184,7 @@ def open_socket(host: str, port: int) -> socket.socket:
 
 
 def refusal(error: OSError, host: str, port: int, field: str = "") -> ConfigError:
-    """What to tell the person who asked for a host and port that can not be listened at.
+    """What to tell the person who asked for a host and port that cannot be listened at.
 
     Args:
         error: from `open_socket`.
@@ -199,7 +199,7 @@ def refusal(error: OSError, host: str, port: int, field: str = "") -> ConfigErro
     if error.errno == errno.EACCES:
         return ConfigError(field or "services.viewer.port", port, "may not be used by this user; take 1024 or more")
     reason = error.strerror or str(error)
-    return ConfigError("services.viewer.host", host, f"can not be listened at: {reason}")
+    return ConfigError("services.viewer.host", host, f"cannot be listened at: {reason}")
 
 
 class FreePort:

@@ -71,7 +71,7 @@ def save_layout(given: str, layout: Layout) -> Path:
     """Write the file, all of it or nothing; returns where it is.
 
     Raises:
-        OSError: it can not be written.
+        OSError: it cannot be written.
     """
     path = layout_file(given)
     values = layout.model_dump(mode="json")

@@ -33,7 +33,7 @@ STYLE = """<style>
 
 
 def text(value: object) -> str:
-    """The value as text that HTML can not mistake for anything else."""
+    """The value as text that HTML cannot mistake for anything else."""
     return escape(str(value), quote=True)
 
 

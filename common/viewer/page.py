@@ -309,7 +309,7 @@ class Page:
             })
             path = save_layout(self._layout_file, layout)
         except OSError as error:
-            self._say(f"{error.filename or 'the layout'} can not be written: {error.strerror}", "bad")
+            self._say(f"{error.filename or 'the layout'} cannot be written: {error.strerror}", "bad")
         except ZencellError as error:
             self._say(str(error), "bad")
         else:

@@ -51,7 +51,7 @@ def visual_pieces(robot: RobotModel, triangles: int = 25_000) -> list[Piece]:
     Descriptions come with 100 000 and more, which a browser without a graphics card draws once a second.
 
     Raises:
-        ConfigError: a mesh is not there or can not be read.
+        ConfigError: a mesh is not there or cannot be read.
     """
     found: dict[tuple[str, Rgb], list[trimesh.Trimesh]] = defaultdict(list)
     for visual in visuals_of(robot):
@@ -115,7 +115,7 @@ def _coloured(visual: Visual) -> list[tuple[Rgb, trimesh.Trimesh]]:
     try:
         scene = trimesh.load_scene(visual.path)
     except (ValueError, OSError, NotImplementedError) as error:
-        raise ConfigError("robot.urdf", str(visual.path), f"is a mesh that can not be read: {error}") from None
+        raise ConfigError("robot.urdf", str(visual.path), f"is a mesh that cannot be read: {error}") from None
     meshes = []
     for mesh in scene.dump():
         if isinstance(mesh, trimesh.Trimesh):

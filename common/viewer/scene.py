@@ -29,7 +29,7 @@ GHOST = 0.3  # share of the robot's triangles that its ghost has
 class Scene:
     """The layers of a cell on a server's scene. Used by one thread at a time.
 
-    Messages that can not be shown, such as poses of unknown links, are left out.
+    Messages that cannot be shown, such as poses of unknown links, are left out.
 
     Attributes:
         stage: what the layers stand on.
@@ -63,7 +63,7 @@ class Scene:
 
         Raises:
             UnknownName: a layer in `shown` does not exist.
-            ConfigError: a mesh of the robot can not be read.
+            ConfigError: a mesh of the robot cannot be read.
         """
         self._kinds, self._shown = layers, layers_shown(shown or {}, layers)
         self._server, self._editing = server, False

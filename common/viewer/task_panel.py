@@ -70,7 +70,7 @@ class TaskPanel:
             task: what it says of itself.
             motion: what the arm does.
             gripper: what the fingers do, in words.
-            rejected: places that can not be taken.
+            rejected: places that cannot be taken.
         """
         word, kind = self._words.state(task)
         lines = [f'<div>{span("●", kind + " dot")} {span(word, "big")}</div>']

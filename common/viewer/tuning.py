@@ -145,7 +145,7 @@ class Knob:
         """The value that was given with it.
 
         Raises:
-            ConfigError: a text that can not be read.
+            ConfigError: a text that cannot be read.
         """
         if not self.as_text:
             return given  # type: ignore[no-any-return]

@@ -100,7 +100,7 @@ def test_port_that_is_none_is_refused(cell: Cell, port: str) -> None:
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no.such.host.invalid"])
 def test_host_that_is_not_of_this_machine_is_refused(cell: Cell, host: str) -> None:
-    with pytest.raises(ConfigError, match=f"services.viewer.host: '{host}' can not be listened at: "):
+    with pytest.raises(ConfigError, match=f"services.viewer.host: '{host}' cannot be listened at: "):
         page_of(cell, host, None)
 
 

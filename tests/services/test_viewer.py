@@ -294,7 +294,7 @@ async def test_saved_layout_opens_with_what_was_on(tmp_path: Path) -> None:
         assert saved.viewpoint("panda").position == (1.0, 2.0, 3.0)
         file.chmod(0o444)
         await page.click("Save layout")
-        await page.until(lambda: f"{file} can not be written: it is read-only" in page.text)
+        await page.until(lambda: f"{file} cannot be written: it is read-only" in page.text)
         assert [path.name for path in tmp_path.iterdir()] == [file.name]  # noqa: ASYNC240
 
 

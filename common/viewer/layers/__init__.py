@@ -92,7 +92,7 @@ def find_layers(
         keys: of services that call topics otherwise: a layer shows these topics, too.
 
     Raises:
-        ConfigError: a module can not be imported, or has no layer.
+        ConfigError: a module cannot be imported, or has no layer.
     """
     parts = [application.part("page")] if application is not None else []
     found: dict[str, type[Layer]] = {}
@@ -142,7 +142,7 @@ def _import_own(name: str) -> ModuleType:
     try:
         module = importlib.import_module(name)
     except ImportError as error:
-        raise ConfigError(FIELD, name, f"can not be imported: {error}") from None
+        raise ConfigError(FIELD, name, f"cannot be imported: {error}") from None
     if not layers_in(module):
         raise ConfigError(FIELD, name, "has no layer: a class derived from Layer, or LABEL, TOPICS and show()")
     return module

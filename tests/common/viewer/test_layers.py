@@ -76,7 +76,7 @@ def test_module_may_have_several_layers_as_classes(own: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("import no_such_thing", "can not be imported: No module named 'no_such_thing'"),
+    [("import no_such_thing", "cannot be imported: No module named 'no_such_thing'"),
      ("TOPICS = ()", "has no layer: a class derived from Layer, or LABEL, TOPICS and show"), ],
 )
 def test_module_that_is_no_layer_is_refused_by_name(own: Path, text: str, said: str) -> None:
