@@ -96,7 +96,7 @@ BUGS = {
     "a request that is not asked again": _never_asked_again,
     "what is in the hand is forgotten": lambda: patch.object(
         PerceivedScene, "feel", lambda self, state, T_world_tcp: None),
-    "goal ids that repeat after a restart": lambda: patch.object(smart_pick_place, "new_id", lambda: "0000"),
+    "goal ids that repeat after a restart": lambda: patch("common.process.task_runner.new_id", lambda: "0000"),
 }
 
 

@@ -1,0 +1,29 @@
+"""What a simulation runs asks nobody for time and ids but common/sources.py."""
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+ROOMS = ("control", "hardware", "planning", "perception", "robot", "scene", "sim", "tasks", "applications")
+SINGLE = (
+    "common/clock.py", "common/process/task_runner.py", "common/process/persist.py", "common/process/pace.py",
+    "common/transport/bus.py", "common/transport/reader.py", "common/transport/writer.py",
+    "common/transport/requests.py", "common/transport/tokens.py", "common/transport/trace.py",
+    "common/supervision/supervisor.py", "common/supervision/operation.py",
+)
+OF_THE_MACHINE = {"time", "uuid", "secrets", "random", "datetime"}
+
+
+def test_simulated_code_takes_time_and_ids_from_one_place():
+    files = [path for room in ROOMS for path in (ROOT / "common" / room).rglob("*.py")]
+    files += [ROOT / name for name in SINGLE]
+    assert len(files) > 80
+    found = []
+    for path in files:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names = {alias.name for alias in node.names}
+            else:
+                names = {node.module or ""} if isinstance(node, ast.ImportFrom) else set()
+            found += [f"{path.relative_to(ROOT)}:{node.lineno} imports {name}" for name in names & OF_THE_MACHINE]
+    assert found == []
