@@ -43,7 +43,7 @@ BLEND = 0.08  # [rad/s] by which the difference to the start of a trajectory, wh
 SHARP = 1.0  # [rad/s^2] the same for acceleration
 AT_REST = 2.0  # [s] of cell time after which an arm that is held is at rest
 STILL = 1e-9  # [rad]
-UNTOLD = 3  # set-points of a goal that may come before it is told of
+UNTOLD = 3  # set-points that may come before it is told of the goal, or of being let go
 CYCLE = 0.025  # [s] of cell time at most between two cycles of a controller that is not held up
 STALL = 0.3  # [s] of cell time after which a trajectory goes on where it was
 CARRIED, CONTAINED, LOST = ("held", "falling"), "contained", "elsewhere"  # what the truth says of an object
@@ -96,6 +96,7 @@ class Invariants:
         self._last: tuple[Vector, Vector, float] | None = None  # newest set-points and when
         self._decided: dict[str, float] = {}  # by goal: when it was asked for first
         self._stray = 0  # set-points that moved without a goal
+        self._restless = 0  # set-points that moved although the arm is held
         self._strange = 0
 
     def _broke(self, holds: object, what: str) -> bool:
@@ -206,7 +207,9 @@ class Invariants:
         self._stray = 0 if goals is not None and goals.active else self._stray + 1
         if self._broke(self._stray <= UNTOLD, GOAL):
             self._tell(GOAL, f"{way.max():.4f} rad without one")
-        if self._broke(self._held_since is None or now - self._held_since < AT_REST, HELD):
+        resting = self._held_since is not None and now - self._held_since >= AT_REST
+        self._restless = self._restless + 1 if resting else 0
+        if self._broke(self._restless <= UNTOLD, HELD):
             self._tell(HELD, f"it moves {way.max():.4f} rad")
 
     # --- requests -----------------------------------------------------------------------------------------------------
