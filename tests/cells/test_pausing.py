@@ -124,7 +124,7 @@ def test_stopped_robot_is_brought_home_by_a_person_and_the_task_starts_again(tmp
             status = bus.reader(PICK_PLACE_STATUS)
             person = OperatorMotion(bus, [status])
             await until(status, lambda s: s.stage == "pre-grasp", 90)
-            with pytest.raises(MotionFailed, match=r"smart_pick_place is GRASPING .*stop the task first"):
+            with pytest.raises(MotionFailed, match=r"the task is GRASPING .*stop the task first"):
                 await person.move(JointGoal(named="home"))
             await tell(bus, "pause")
             await held(motion)
