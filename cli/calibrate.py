@@ -56,7 +56,7 @@ def board_command(
         matplotlib.image.imsave(Path(output).expanduser(), page, format=suffix[1:], cmap="gray", vmin=0, vmax=255,
                                 dpi=density * 0.0254)
     except OSError as error:
-        raise ConfigError("--output", output, f"can not be written: {error.strerror}") from None
+        raise ConfigError("--output", output, f"cannot be written: {error.strerror}") from None
     width, height = (1e3 * pixels / density for pixels in reversed(page.shape))
     typer.echo(f"{output}: {board.options}; {width:.1f} x {height:.1f} mm. Print it at 100 %, measure the line on it, "
                "fix it to something flat.")
@@ -196,7 +196,7 @@ def pictures(source: str, size: tuple[int, int] | None, seconds: float) -> Itera
 
     opened = open_source(source, size, None, loop=False)
     if opened is None:
-        raise ConfigError("SOURCE", source, "is a device that can not be opened")
+        raise ConfigError("SOURCE", source, "is a device that cannot be opened")
     until = time.monotonic() + seconds
     try:
         while (picture := opened.read()) is not None and (not opened.live or time.monotonic() < until):

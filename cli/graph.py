@@ -69,7 +69,7 @@ def graph(
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise ConfigError("--output", output, f"can not be written: {error.strerror or error}") from None
+        raise ConfigError("--output", output, f"cannot be written: {error.strerror or error}") from None
     typer.echo(f"{path}: {len(made.services)} services, {len(made.kinds)} keys"
                f"{'' if made.alive is None else f', {sum(map(made.is_lit, names(made)))} services alive'}")
 
@@ -87,7 +87,7 @@ def _writer_of(path: Path | None) -> Callable[[Graph], str]:
 
 
 def _wired_services(cell: Cell) -> list[Wired]:
-    """The services of a cell in start order; one that can not be wired is drawn without its keys."""
+    """The services of a cell in start order; one that cannot be wired is drawn without its keys."""
     from cli.wired import Unwired, Wired, wired
 
     found = []

@@ -28,7 +28,7 @@ class Share:
         """The launch with the router listening and linked as options or environment say.
 
         Raises:
-            ConfigError: one of the endpoints can not be used, or the router is somebody else's.
+            ConfigError: one of the endpoints cannot be used, or the router is somebody else's.
         """
         from common.transport.endpoint import LINK_VARIABLE, LISTEN_VARIABLE, endpoints_of, listening
 
@@ -67,7 +67,7 @@ class Share:
         """When cell time and wall time are equal [ns since the Unix epoch], where that was handed down.
 
         Raises:
-            ConfigError: it can not be used, or is missing though hosts could not agree on cell time without it.
+            ConfigError: it cannot be used, or is missing though hosts could not agree on cell time without it.
         """
         given = os.environ.get(EPOCH_VARIABLE)
         if given:

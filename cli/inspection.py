@@ -160,7 +160,7 @@ async def _look(domain: str | None, connect: str | None) -> dict[str, Presence]:
 
 
 def somebody_listens(endpoint: str) -> bool:
-    """Whether something takes connections at an endpoint; True where that can not be told without Zenoh."""
+    """Whether something takes connections at an endpoint; True where that cannot be told without Zenoh."""
     protocol, _, address = endpoint.partition("/")
     if protocol in ("udp", "quic"):
         return True

@@ -103,7 +103,7 @@ class Operation:
         """Say where the operator's page is to be, if the cell has one; without this the cell's own words hold.
 
         Raises:
-            ConfigError: there is no page, the port is taken, or host or port can not be used.
+            ConfigError: there is no page, the port is taken, or host or port cannot be used.
         """
         self._page = page = viewing.page_of(self.cell, host, port)
         if page is not None:
@@ -133,7 +133,7 @@ class Operation:
         """Have faults made on purpose once the cell is up: without end, or until a run has time left to finish.
 
         Raises:
-            ConfigError: seed or rate can not be used.
+            ConfigError: seed or rate cannot be used.
         """
         from common.chaos.plan import MOST_PER_MINUTE, PER_MINUTE
         from common.errors import ConfigError

@@ -155,7 +155,7 @@ def dump(
     try:
         Path(output).expanduser().write_text(text, encoding="utf-8")
     except OSError as error:
-        raise ConfigError("--output", output, f"can not be written: {error.strerror or error}") from None
+        raise ConfigError("--output", output, f"cannot be written: {error.strerror or error}") from None
 
 
 class Listing:

@@ -37,7 +37,7 @@ def report(
     if page_path.suffix not in (".html", ".htm"):
         raise ConfigError("--output", output, "must end in .html")
     if not page_path.absolute().parent.is_dir():
-        raise ConfigError("--output", output, "can not be written: the folder does not exist")
+        raise ConfigError("--output", output, "cannot be written: the folder does not exist")
     with Recording(path) as recording:
         text = page_of(recording, cell)
         if not recording.finished:
@@ -45,7 +45,7 @@ def report(
     try:
         page_path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise ConfigError("--output", str(page_path), f"can not be written: {error.strerror}") from None
+        raise ConfigError("--output", str(page_path), f"cannot be written: {error.strerror}") from None
     typer.echo(f"{page_path}: {len(text) / 1e6:.1f} MB")
 
 

@@ -53,7 +53,7 @@ def collisions(
     try:
         Path(output).expanduser().write_text(text, encoding="utf-8")
     except OSError as error:
-        raise ConfigError("--output", output, f"can not be written: {error.strerror}") from None
+        raise ConfigError("--output", output, f"cannot be written: {error.strerror}") from None
     found = Counter(pair.reason for pair in pairs)
     typer.echo(f"{output}: {len(pairs)} pairs need no check "
                f"({', '.join(f'{found[reason]} {reason.lower()}' for reason in sorted(found))})")

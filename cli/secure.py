@@ -96,7 +96,7 @@ def show(folder: Folder, as_json: options.Json = False) -> None:
         try:
             until = f"{certificate_in(file).not_valid_after_utc:%Y-%m-%d}" if file.is_file() else ""
         except PermissionError:
-            raise ConfigError("DIR", str(file), "can not be read by this user") from None
+            raise ConfigError("DIR", str(file), "cannot be read by this user") from None
         rights = {kind: sorted(keys) for kind, keys in allowed.get(name, {}).items() if kind in SHOWN}
         if as_json:
             typer.echo(json.dumps({"name": name, "valid_until": until, **rights}))
@@ -155,7 +155,7 @@ def rights_in(cell: Cell, names: Collection[str] | None = None) -> dict[str, Rig
         names: of the services that are looked at; all when not given.
 
     Raises:
-        ConfigError: one of them can not be configured so, or two of them write or serve one key.
+        ConfigError: one of them cannot be configured so, or two of them write or serve one key.
         Unwired: one of them does not get so far.
     """
     from common.process.wiring import Wiring, require_one_owner, wiring_of
@@ -179,7 +179,7 @@ def rights_in(cell: Cell, names: Collection[str] | None = None) -> dict[str, Rig
                 found[entry.name] = await wiring_of(apart, entry)
             except ZencellError:
                 raise
-            except Exception as error:  # whatever a service does that can not run so
+            except Exception as error:  # whatever a service does that cannot run so
                 raise Unwired(entry.name, error) from error
         return found
 

@@ -20,7 +20,7 @@ SAID = "zencell: "  # before the line in which a command says what is wrong
 
 
 class NotSecured(ZencellError):
-    """The certificates do not fit the cell, or its services can not say what they need."""
+    """The certificates do not fit the cell, or its services cannot say what they need."""
 
     def __init__(self, message: str, exit_code: int = 2) -> None:
         super().__init__(message)

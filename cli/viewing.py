@@ -42,7 +42,7 @@ def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
         port: of `--viewer-port`.
 
     Raises:
-        ConfigError: there is no page, the port is taken, or one of the options can not be used.
+        ConfigError: there is no page, the port is taken, or one of the options cannot be used.
     """
     from common.errors import ConfigError
     from common.viewer.access import (

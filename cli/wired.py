@@ -19,7 +19,7 @@ UNWIRED = ("log", "counters")  # of everybody
 
 
 class Unwired(ZencellError):
-    """A service that can not say what it declares."""
+    """A service that cannot say what it declares."""
 
     exit_code = 1
 
@@ -46,7 +46,7 @@ def wired(cell: Cell, entry: ServiceEntry) -> Wired:
     """One service of a cell, run until it would be ready, on a network of its own.
 
     Raises:
-        ConfigError: its parameters or its module can not be used.
+        ConfigError: its parameters or its module cannot be used.
         Unwired: it does not get so far.
     """
     from common.config import service_config

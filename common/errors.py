@@ -13,7 +13,7 @@ class ZencellError(Exception):
 
 
 class ConfigError(ZencellError):
-    """A value of the configuration that can not be used: names the field, the value and what would do.
+    """A value of the configuration that cannot be used: names the field, the value and what would do.
 
     The value `...` stands for none, where one is missing or several do not fit together.
     """

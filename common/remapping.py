@@ -62,7 +62,7 @@ def checked_table(field: str, given: object) -> dict[str, str]:
     """A table of keys as it stands in a cell file.
 
     Raises:
-        ConfigError: names the entry that can not be used.
+        ConfigError: names the entry that cannot be used.
     """
     if not isinstance(given, Mapping):
         raise ConfigError(field, given, "must be a mapping of keys, as in {camera/*: left_camera/*}")

@@ -69,7 +69,7 @@ CONTROLLER = [
                   "Home is a joint pose with panda_link8 within 2 cm of that point, so that it is the same every time. "
                   "Only visited after a failure."),
     SeedParameter("(text) grace period", "8 s", "", ("services.smart_pick_place.grace",), "kept",
-                  "How long the task waits before it ends when only balls are left that can not be taken."),
+                  "How long the task waits before it ends when only balls are left that cannot be taken."),
     SeedParameter("(text) match radius", "0.08 m", "", ("services.scene_manager.match_radius",), "kept",
                   "A detection within this of a known ball is that ball. Wider than touching balls are apart, so matching "
                   "is one to one."),

@@ -44,7 +44,7 @@ def calibrated(config: Config) -> CameraFile:
     """The camera's intrinsics.
 
     Raises:
-        ConfigError: their file can not be used, or knows of another pose than the rest of the cell.
+        ConfigError: their file cannot be used, or knows of another pose than the rest of the cell.
     """
     world = CameraFile.of(config.world.camera)
     if not config.intrinsics:

@@ -43,7 +43,7 @@ def initial_choice(select: str | int) -> OutlineSelect | None:
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Look at every picture as it comes; what can not be looked at is dropped, counted and told once."""
+    """Look at every picture as it comes; what cannot be looked at is dropped, counted and told once."""
     images = bus.reader(topics.DEPTH_CAMERA_IMAGE)
     found, shown = bus.writer(CONTOURS), bus.writer(CONTOUR_IMAGE)
     cv2.setNumThreads(1)  # the other cores have other services

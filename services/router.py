@@ -32,11 +32,11 @@ _CLOSE_SECONDS = 0.4
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        fail(ConfigError(self.prog, message, "can not be used; --help lists the options"))
+        fail(ConfigError(self.prog, message, "cannot be used; --help lists the options"))
 
 
 def main() -> NoReturn:
-    """Be the router until SIGINT, SIGTERM or the end of the supervisor; exit 2 when it can not listen."""
+    """Be the router until SIGINT, SIGTERM or the end of the supervisor; exit 2 when it cannot listen."""
     parser = _Parser(prog="router")
     parser.add_argument("--domain", help="0 to 232 (ZENCELL_DOMAIN, 42)")
     parser.add_argument("--listen", metavar="ENDPOINT", action="append", default=[],

@@ -47,7 +47,7 @@ def markers(detections: list[Detection], around: Surroundings, stamp: int) -> Ma
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Look at every picture as it comes; what can not be looked at is dropped, counted and told once."""
+    """Look at every picture as it comes; what cannot be looked at is dropped, counted and told once."""
     images = bus.reader(topics.CAMERA_IMAGE)
     infos, statics = bus.reader(topics.CAMERA_INFO), bus.reader(topics.TF_STATIC)
     found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)

@@ -131,14 +131,14 @@ def test_hardware_reads_in_steps_of_its_encoders(folder: Path) -> None:
     too_coarse = load_cell("panda", [*options, "robot.hardware.options.resolution=1"]).robot
     with pytest.raises(ConfigError, match=r"robot\.hardware\.options\.resolution: 1 "):
         load_hardware(too_coarse, limits, q)
-    with pytest.raises(ConfigError, match=r"my_pkg\.no_arm.*can not be imported"):
+    with pytest.raises(ConfigError, match=r"my_pkg\.no_arm.*cannot be imported"):
         find_backend(load_cell("panda", ["robot.hardware.backend=my_pkg.no_arm"]).robot)
 
 
 def test_options_of_the_planner_are_checked_as_all_are(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"my_pkg\.over_home\.goals: 0 must be greater than or equal to 1"):
         load_planner("my_pkg.over_home", {"goals": 0})
-    with pytest.raises(ConfigError, match=r"my_pkg\.over_hill.*can not be imported"):
+    with pytest.raises(ConfigError, match=r"my_pkg\.over_hill.*cannot be imported"):
         load_planner("my_pkg.over_hill", {})
     with pytest.raises(ConfigError, match=r"my_pkg\.my_topics.*must have plan\(\)"):
         load_planner("my_pkg.my_topics", {})

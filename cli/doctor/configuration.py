@@ -72,5 +72,5 @@ def cell(name: str) -> Finding:
     except ZencellError as error:
         return fail(f"cell {name}: {error}", f"correct {file}")
     except Exception as error:  # whatever a person's own module does
-        return fail(f"cell {name}: services can not be imported: {error!r}", "install what is missing, or correct it")
+        return fail(f"cell {name}: services cannot be imported: {error!r}", "install what is missing, or correct it")
     return ok(f"cell {name}: {len(loaded.services)} services, all parameters valid")

@@ -27,7 +27,7 @@ def router(endpoint: str) -> Finding:
     except ConnectionRefusedError:
         return ok(f"{endpoint} is free: no cell is up there")
     except OSError as error:
-        return warn(f"{endpoint} can not be reached ({error})", "check --connect and the network")
+        return warn(f"{endpoint} cannot be reached ({error})", "check --connect and the network")
     holder = holder_of(int(port))
     if ROUTER_MODULE in holder:
         return ok(f"{endpoint}: a router of zencell answers there, {holder}")

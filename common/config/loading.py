@@ -38,7 +38,7 @@ def _override(tree: dict[str, Any], path: Sequence[str], value: Any) -> None:
         if child is None:
             child = node[part] = {}
         if not isinstance(child, dict):
-            raise ConfigError("--set", ".".join(path), f"can not go below {'.'.join(path[: depth + 1])}, a value")
+            raise ConfigError("--set", ".".join(path), f"cannot go below {'.'.join(path[: depth + 1])}, a value")
         node = child
     node[path[-1]] = value
 

@@ -29,7 +29,7 @@ def expanded(overrides: Sequence[str]) -> list[str]:
     """The overrides, with `PATH=VALUE` for every value of a file in the place of `@FILE`.
 
     Raises:
-        ConfigError: a file can not be read, or holds no mapping.
+        ConfigError: a file cannot be read, or holds no mapping.
     """
     found = []
     for text in overrides:

@@ -72,7 +72,7 @@ class ControlCycle:
         """Control this hardware; `world` and `kinematics` with simulated hardware only.
 
         Raises:
-            ConfigError: the backend's gripper can not feel the simulated world, or it has none.
+            ConfigError: the backend's gripper cannot feel the simulated world, or it has none.
         """
         self._hardware, self._limits = hardware, limits
         self._kinematics, self._world = kinematics, world
@@ -195,7 +195,7 @@ class ControlCycle:
             Refused: with the reason; nothing has changed then.
         """
         if self._world is None:
-            raise Refused("not_simulated", "the world of real hardware can not be edited")
+            raise Refused("not_simulated", "the world of real hardware cannot be edited")
         return WorldEditReply(id=self._world.edit(request, now), ids=self._world.ids)
 
     def close(self) -> None:

@@ -24,7 +24,7 @@ Vector = NDArray[np.float64]
 
 
 class HardwareFault(ZencellError):
-    """Raised by a backend when it can not read or move: ends the goal, and new ones are rejected until it is gone."""
+    """Raised by a backend when it cannot read or move: ends the goal, and new ones are rejected until it is gone."""
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ def find_backend(robot: RobotConfig) -> Backend:
 
     Raises:
         UnknownName: no such backend; lists the choices.
-        ConfigError: a module that can not be imported, or is no backend.
+        ConfigError: a module that cannot be imported, or is no backend.
     """
     name = robot.hardware.backend
     if "." not in name and name not in backend_names():
@@ -43,7 +43,7 @@ def find_backend(robot: RobotConfig) -> Backend:
     try:
         module = importlib.import_module(name if "." in name else f"{PACKAGE}.{name}")
     except ImportError as error:
-        raise ConfigError("robot.hardware.backend", name, f"can not be imported: {error}") from None
+        raise ConfigError("robot.hardware.backend", name, f"cannot be imported: {error}") from None
     missing = [part for part in ("Options", "create", "simulated") if not hasattr(module, part)]
     if missing:
         raise ConfigError("robot.hardware.backend", name, f"is no backend: it has no {', '.join(missing)}")

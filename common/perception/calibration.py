@@ -26,7 +26,7 @@ _FIXED = (cv2.CALIB_FIX_K1, cv2.CALIB_FIX_K2, cv2.CALIB_FIX_K3, cv2.CALIB_FIX_K4
 
 
 class CalibrationFailed(ZencellError):
-    """Pictures that a camera can not be calibrated with: says what is missing."""
+    """Pictures that a camera cannot be calibrated with: says what is missing."""
 
     exit_code = 1
 
@@ -225,7 +225,7 @@ def _fit(views: list[Sighting], k_coefficients: int) -> tuple[float, Array, list
 def _deviations(
     views: list[Sighting], K: Array, distortion: list[float], poses: list[tuple[Array, Array]], rms: float
 ) -> Array:
-    """Standard deviations of fx, fy, cx, cy [px] when corners err independently; infinite for what can not be told.
+    """Standard deviations of fx, fy, cx, cy [px] when corners err independently; infinite for what cannot be told.
 
     From the normal equations, of which the poses of the views are eliminated. OpenCV has its own, but they are tiny
     where the views leave a parameter open.

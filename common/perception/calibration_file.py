@@ -46,7 +46,7 @@ class CameraFile(Parameters):
         """The camera of a YAML file.
 
         Raises:
-            ConfigError: the file can not be read, or names the field that does not fit.
+            ConfigError: the file cannot be read, or names the field that does not fit.
         """
         return check(cls, read_yaml(Path(path).expanduser()), path)
 
@@ -59,7 +59,7 @@ class CameraFile(Parameters):
         """Write it as a YAML file that `load` and a cell read.
 
         Raises:
-            ConfigError: it can not be written.
+            ConfigError: it cannot be written.
         """
         values = {field: value for field, value in self.model_dump().items() if value is not None}
         values |= {field: [float(x) for x in values[field]] for field in ("position", "rpy") if field in values}
@@ -68,7 +68,7 @@ class CameraFile(Parameters):
         try:
             place.write_text(_HEADER.format(name=place.name) + text, encoding="utf-8")
         except OSError as error:
-            raise ConfigError("--output", path, f"can not be written: {error.strerror}") from None
+            raise ConfigError("--output", path, f"cannot be written: {error.strerror}") from None
 
     @property
     def matrix(self) -> Array:

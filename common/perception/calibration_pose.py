@@ -18,7 +18,7 @@ from common.robot.transforms import invert, matrix_to_rpy, transform
 Array = npt.NDArray[np.float64]
 
 _OUTLIER = 3.0, 0.2  # a picture is dropped when its residual is above so many medians, and above so many [px]
-_WORST_FIT = 2.0  # [px] rms above which the board can not have lain still where it is said to have been
+_WORST_FIT = 2.0  # [px] rms above which the board cannot have lain still where it is said to have been
 _GRID = 5  # places along each side of the picture at which the uncertainty is looked at
 
 

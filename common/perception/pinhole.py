@@ -20,7 +20,7 @@ Array = npt.NDArray[np.float64]
 
 
 class CameraError(ZencellError):
-    """A camera that can not be: a pose that is not rigid, a distortion that is not handled here."""
+    """A camera that cannot be: a pose that is not rigid, a distortion that is not handled here."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -150,7 +150,7 @@ class ObstacleBank:
         environment = [i for i, solid in zip(indices, solids, strict=True) if solid.joint == 0]
         held = [(i, solid.joint) for i, solid in zip(indices, solids, strict=True) if solid.joint != 0]
         for link in range(self.robot_count):
-            if robot.joints[link] != 0:  # the base can not move: what stands beside it is no collision
+            if robot.joints[link] != 0:  # the base cannot move: what stands beside it is no collision
                 self._add_pairs(link, environment)
             for index, joint in held:
                 if robot.joints[link] != joint and robot.links[link] not in may_touch_held:

@@ -35,7 +35,7 @@ class PlanningPipeline:
         """Load the robot's collision geometry and the planners.
 
         Raises:
-            ConfigError, UnknownName: a planner, an option or a mesh that can not be used.
+            ConfigError, UnknownName: a planner, an option or a mesh that cannot be used.
         """
         self.robot = robot
         self._motion = motion

@@ -42,7 +42,7 @@ class TimedPath:
 
 
 class RetimingFailed(Exception):
-    """A path that can not be followed within the limits, which only a broken path or limit brings about."""
+    """A path that cannot be followed within the limits, which only a broken path or limit brings about."""
 
 
 def parametrise(
@@ -172,7 +172,7 @@ def _forward(highest: list[float], lengths: Array, A: Array, B: Array) -> tuple[
         u = min(a - b * x for a, b in zip(As[i], Bs[i], strict=True))
         following = min(highest[i + 1], x + 2 * length * u)
         if following < 0 or (following <= 0 and x <= 0):
-            raise RetimingFailed(f"the path can not be left at grid point {i} of {len(Ls)}")
+            raise RetimingFailed(f"the path cannot be left at grid point {i} of {len(Ls)}")
         us.append((following - x) / (2 * length))
         x = following
         xs.append(x)

@@ -33,7 +33,7 @@ def retime(problem: Problem, result: Result, blend: float = BLENDS[0]) -> TimedP
         blend: length [rad] taken at most from both edges at a corner of a path that is not dense.
 
     Raises:
-        RetimingFailed: the path can not be followed.
+        RetimingFailed: the path cannot be followed.
     """
     assert result.waypoints is not None
     waypoints = distinct(result.waypoints)
@@ -98,7 +98,7 @@ def follow_in_time(problem: Problem, path: ToolWaypoints, limits: ToolLimits) ->
         limits: of the tool.
 
     Raises:
-        RetimingFailed: the path can not be followed.
+        RetimingFailed: the path cannot be followed.
     """
     robot = problem.robot
     scale_v = float((problem.velocity / robot.velocity).max())

@@ -1,7 +1,7 @@
 """Ends a process whose event loop has got stuck, so that whoever keeps it going starts it again.
 
 A thread asks the loop for a turn and counts the time until it comes. What computes in a thread beside the loop leaves
-it its turns; what blocks the loop itself does not. Where even that thread can not run, because foreign code keeps the
+it its turns; what blocks the loop itself does not. Where even that thread cannot run, because foreign code keeps the
 interpreter's lock, a timer without an interpreter ends the process after a longer time.
 """
 

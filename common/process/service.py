@@ -39,7 +39,7 @@ _SWITCH_SECONDS = 0.0005
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        fail(ConfigError(self.prog, message, "can not be used; --help lists the options"))
+        fail(ConfigError(self.prog, message, "cannot be used; --help lists the options"))
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def clock_from(speed: float | None, environ: Mapping[str, str] = os.environ) -> 
     """The clock that was handed down, at the given speed if there is one.
 
     Raises:
-        ConfigError: speed or epoch can not be used.
+        ConfigError: speed or epoch cannot be used.
     """
     variables = dict(environ)
     if speed is not None:
@@ -91,7 +91,7 @@ def clock_from(speed: float | None, environ: Mapping[str, str] = os.environ) -> 
         return Clock.from_environment(variables)
     except ValueError as error:
         given = {name: variables[name] for name in (SPEED_VARIABLE, EPOCH_VARIABLE) if name in variables}
-        raise ConfigError("speed", given, f"can not be used: {error}") from None
+        raise ConfigError("speed", given, f"cannot be used: {error}") from None
 
 
 def prepare(kind: str, config: type[P], options: argparse.Namespace) -> Start[P]:

@@ -133,7 +133,7 @@ async def wiring_of(cell: Cell, entry: ServiceEntry) -> Wiring:
 
     Raises:
         RuntimeError: as `wiring`.
-        ConfigError: it can not be configured so.
+        ConfigError: it cannot be configured so.
     """
     module = importlib.import_module(entry.module)
     config = service_config(cell, entry.name, module.Config)

@@ -22,7 +22,7 @@ class SplitWriter:
         """Create the first file.
 
         Raises:
-            RecordingError: it is there already, or can not be written.
+            RecordingError: it is there already, or cannot be written.
         """
         self._path = path
         self._most = most_bytes

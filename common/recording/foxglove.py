@@ -50,7 +50,7 @@ def export(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) 
     Colour pictures become JPEG. What Foxglove has no schema for is written as JSON of its own.
 
     Raises:
-        RecordingError: the target is there already or can not be written, or the recording is damaged.
+        RecordingError: the target is there already or cannot be written, or the recording is damaged.
     """
     file = AppendedFile(target)
     count = 0

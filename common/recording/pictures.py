@@ -35,7 +35,7 @@ def export_images(recording: Recording, folder: Path, wants: Wanted, decoder: De
     Depth is written as 16 bit millimetres with 0 for none, as in ROS.
 
     Raises:
-        RecordingError: the recording is damaged, or a file can not be written.
+        RecordingError: the recording is damaged, or a file cannot be written.
     """
     topics = set(image_topics(recording, wants))
     counts: Counter[str] = Counter()
@@ -49,7 +49,7 @@ def export_images(recording: Recording, folder: Path, wants: Wanted, decoder: De
         counts[sample.topic] += 1
         path = place / f"{counts[sample.topic]:06d}_{sample.publish_time}.png"
         if not cv2.imwrite(str(path), pixels):
-            raise RecordingError(f"{path}: can not be written")
+            raise RecordingError(f"{path}: cannot be written")
     return dict(counts)
 
 
@@ -89,7 +89,7 @@ def export_video(recording: Recording, target: Path, topic: str, decoder: Decode
                 size = (pixels.shape[1], pixels.shape[0])
                 writer = cv2.VideoWriter(str(target), cv2.VideoWriter.fourcc(*CODEC), rate, size)
                 if not writer.isOpened():
-                    raise RecordingError(f"{target}: this OpenCV can not write {CODEC} video there; try --images DIR")
+                    raise RecordingError(f"{target}: this OpenCV cannot write {CODEC} video there; try --images DIR")
             writer.write(pixels)
             count += 1
     finally:

@@ -29,7 +29,7 @@ class Recording:
         """Open a file and look where what lies.
 
         Raises:
-            RecordingError: there is no such file, it can not be read, or is no recording of ours.
+            RecordingError: there is no such file, it cannot be read, or is no recording of ours.
         """
         self.path = path
         try:
@@ -37,7 +37,7 @@ class Recording:
         except FileNotFoundError:
             raise RecordingError(f"{path}: there is no such file") from None
         except OSError as error:
-            raise RecordingError(f"{path}: can not be read: {error.strerror}") from None
+            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
         try:
             self.layout: Layout = layout_of(self.file, path)
             if self.layout.loose_messages:

@@ -28,7 +28,7 @@ def recover(source: Path, target: Path) -> Recovered:
     Every chunk that is whole in the source is in the target.
 
     Raises:
-        RecordingError: the source is no recording, or the target is there already or can not be written.
+        RecordingError: the source is no recording, or the target is there already or cannot be written.
     """
     if target.exists():
         raise RecordingError(f"{target}: is there already; choose another name")

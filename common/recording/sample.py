@@ -10,7 +10,7 @@ PREFIX = "application/msgpack;"  # of an encoding; the name of the message class
 
 
 class RecordingError(ZencellError):
-    """A recording that can not be read, written or used like this: names the file and what to do."""
+    """A recording that cannot be read, written or used like this: names the file and what to do."""
 
 
 @dataclass(frozen=True, slots=True)

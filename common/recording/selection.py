@@ -22,7 +22,7 @@ class Selection:
         """The selection that a person asked for.
 
         Raises:
-            ConfigError: names the key or expression that can not be used.
+            ConfigError: names the key or expression that cannot be used.
         """
         given = tuple(keys)
         for key in given:

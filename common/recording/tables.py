@@ -56,7 +56,7 @@ def _rows(recording: Recording, topic: str, decoder: Decoder) -> Iterator[dict[s
 
 
 def _seconds(nanoseconds: int) -> str:
-    return f"{nanoseconds // 1_000_000_000}.{nanoseconds % 1_000_000_000:09d}"  # a float can not hold it
+    return f"{nanoseconds // 1_000_000_000}.{nanoseconds % 1_000_000_000:09d}"  # a float cannot hold it
 
 
 def row_of(message: Message) -> dict[str, Any]:

@@ -48,7 +48,7 @@ class AppendedFile:
         """Create the file.
 
         Raises:
-            RecordingError: it is there already, or can not be made.
+            RecordingError: it is there already, or cannot be made.
         """
         self.path = path
         try:
@@ -56,7 +56,7 @@ class AppendedFile:
         except FileExistsError:
             raise RecordingError(f"{path}: is there already; choose another name") from None
         except OSError as error:
-            raise RecordingError(f"{path}: can not be written: {error.strerror}") from None
+            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
         self._size = 0
 
     def write(self, data: bytes) -> int:
@@ -98,7 +98,7 @@ class RecordingWriter:
         """Create the file and write what the recording is about.
 
         Raises:
-            RecordingError: it is there already, or can not be written.
+            RecordingError: it is there already, or cannot be written.
         """
         self.path = path
         self.messages = 0

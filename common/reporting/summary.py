@@ -62,7 +62,7 @@ class Counted:
         )
 
     def restarted_since(self, earlier: Counted) -> bool:
-        """Whether these figures can not follow the earlier ones in one life of the process."""
+        """Whether these figures cannot follow the earlier ones in one life of the process."""
         return (
             self.failures < earlier.failures
             or self.retries < earlier.retries

@@ -96,13 +96,13 @@ class RobotModel:
         """Collision or visual shapes of all links, placed on the joints of `full_model`.
 
         Raises:
-            ConfigError: a mesh is not there or can not be read.
+            ConfigError: a mesh is not there or cannot be read.
         """
         folders = [str(folder) for folder in self.package_folders]
         try:
             return pin.buildGeomFromUrdfString(self.full_model, self.urdf, kind, package_dirs=folders)
         except ValueError as error:
-            raise ConfigError("robot.urdf", self.config.urdf, f"has a mesh that can not be loaded: {error}") from None
+            raise ConfigError("robot.urdf", self.config.urdf, f"has a mesh that cannot be loaded: {error}") from None
 
     @property
     def groups(self) -> list[str]:

@@ -109,7 +109,7 @@ def reach_reason(
     grasp: Grasp | None = None,
     bounds: WorkspaceBounds | None = None,
 ) -> str:
-    """Why the arm can not take an object whose centre is at (x, y, z) [m] in world; empty when it can."""
+    """Why the arm cannot take an object whose centre is at (x, y, z) [m] in world; empty when it can."""
     limits = bounds or WorkspaceBounds()
     return outside_reason(limits, position) or chain_reason(robot, position, grasp or Grasp(), limits)
 

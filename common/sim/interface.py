@@ -129,7 +129,7 @@ def load_world(
 
     Raises:
         UnknownName: no such simulator; lists the choices.
-        ConfigError: a module that can not be imported or is no simulator, or an object that can not be where it is.
+        ConfigError: a module that cannot be imported or is no simulator, or an object that cannot be where it is.
     """
     name = world.simulator
     if "." not in name and name not in SIMULATORS:

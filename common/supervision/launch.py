@@ -109,7 +109,7 @@ def require_modules(cell: Cell) -> None:
     """Return when every service of the cell that is not the project's own can be found.
 
     Raises:
-        ConfigError: names the first that can not.
+        ConfigError: names the first that cannot.
     """
     for entry in cell.services.values():
         require_module(entry.name if entry.name != entry.kind else entry.module.removeprefix("services."), entry)
@@ -119,7 +119,7 @@ def require_module(key: str, entry: ServiceEntry) -> None:
     """Return when the module of a service, which goes by `key` in the cell, can be found.
 
     Raises:
-        ConfigError: it can not.
+        ConfigError: it cannot.
     """
     look_where_one_stands()
     try:

@@ -122,7 +122,7 @@ class Elsewhere:
                 self._heard[service.name] = service
 
     def statuses(self, alive: Collection[str]) -> list[ServiceStatus]:
-        """All of them as they are now: a host that can not be reached does not tell any more.
+        """All of them as they are now: a host that cannot be reached does not tell any more.
 
         Args:
             alive: names of the services whose readiness tokens are there.

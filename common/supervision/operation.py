@@ -148,7 +148,7 @@ async def _require_unused(bus: Bus, endpoint: str, names: set[str]) -> None:
         try:
             others = {service.name for service in decode(SupervisorStatus, sample.payload).services}
         except DecodeError:
-            others = names  # of another version: its services can not be told apart from ours
+            others = names  # of another version: its services cannot be told apart from ours
         if names & others:
             raise ConfigError("--connect", endpoint, f"is where a cell named {bus.cell} is up already")
 

@@ -75,7 +75,7 @@ def credentials_of(name: str, folder: Path) -> Credentials:
         if not file.is_file():
             raise ConfigError("--secure", str(folder), f"has no {file.name}: {REMEDY}")
         if not os.access(file, os.R_OK):
-            raise ConfigError("--secure", str(file), "can not be read by this user")
+            raise ConfigError("--secure", str(file), "cannot be read by this user")
     if found.key.stat().st_mode & 0o077:
         raise ConfigError("--secure", str(found.key), "can be read by others: chmod 600 it")
     return found
@@ -85,7 +85,7 @@ def read_access(folder: Path) -> dict[str, Any]:
     """The router's rules of who may do what.
 
     Raises:
-        ConfigError: there are none, or they can not be read.
+        ConfigError: there are none, or they cannot be read.
     """
     path = folder / ACCESS
     try:

@@ -190,7 +190,7 @@ class _Decode(Protocol[M]):
 
 
 class _Newest(Generic[M]):
-    """The newest message of each sender, so that rubbish from one can not displace what another said."""
+    """The newest message of each sender, so that rubbish from one cannot displace what another said."""
 
     def __init__(self) -> None:
         self.reported = False

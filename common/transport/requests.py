@@ -189,7 +189,7 @@ class Client(Generic[Q, A]):
 
         Raises:
             NoResponder: nobody serves the key, or the router is not reached: nothing was sent.
-            RemoteError: the responder refused, or its answer can not be read.
+            RemoteError: the responder refused, or its answer cannot be read.
             RequestLost: the responder or the router went away: it may have been done.
             RequestTimeout: no answer in time: it may still be done.
         """
@@ -214,7 +214,7 @@ class Client(Generic[Q, A]):
             require_whole(decode_attachment(reply.sample.attachment), self._key, reply.sample.payload)
             return decode(self.topic.answer, reply.sample.payload, self._limit)
         except DecodeError as error:
-            raise RemoteError(self.topic.key, "bad_answer", f"the answer can not be read: {error}") from None
+            raise RemoteError(self.topic.key, "bad_answer", f"the answer cannot be read: {error}") from None
 
     async def _ask(self, payload: bytes, seconds: float, timeout: float) -> RawReply | None:
         future: asyncio.Future[RawReply | None] = self._loop.create_future()

@@ -55,7 +55,7 @@ def open_router(endpoints: Sequence[str], secured: Path | None = None, links: Se
 
     Raises:
         PortInUse: names the port, the domain and the process that holds it.
-        ConfigError: the router can not listen there for another reason.
+        ConfigError: the router cannot listen there for another reason.
     """
     for option, given in (("--listen", endpoints), ("--link", links)):
         for each in given:
@@ -72,7 +72,7 @@ def open_router(endpoints: Sequence[str], secured: Path | None = None, links: Se
         if "os error 98" in text or "in use" in text:
             raise PortInUse(endpoint, holder_of(int(endpoint.rpartition(":")[2]))) from None
         reason = text.split(" at /", maxsplit=1)[0]  # without the place in Zenoh's own source
-        raise ConfigError("endpoint", endpoint, f"can not be listened at: {reason}") from None
+        raise ConfigError("endpoint", endpoint, f"cannot be listened at: {reason}") from None
 
 
 def tell_of_links(session: zenoh.Session, stop: threading.Event) -> None:

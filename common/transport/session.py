@@ -78,7 +78,7 @@ class Session(Protocol):
         """Whether the router is reached (always, in process)."""
 
     def publisher(self, key: str, encoding: str, *, reliable: bool) -> Publisher:
-        """Declare a publisher; one that is not reliable drops what the network can not take."""
+        """Declare a publisher; one that is not reliable drops what the network cannot take."""
 
     def subscriber(self, key: str, on_sample: OnSample) -> Declared:
         """Call back for each value put under a matching key."""

@@ -124,7 +124,7 @@ class ZenohSession:
         return declared
 
     def publisher(self, key: str, encoding: str, *, reliable: bool) -> _Publisher:
-        """Declare a publisher; a stream is dropped by a network that can not take it, the rest waits in the outbox."""
+        """Declare a publisher; a stream is dropped by a network that cannot take it, the rest waits in the outbox."""
         control = zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP
         # Apart from the streams, so that small messages do not queue behind pictures.
         priority = zenoh.Priority.DATA_HIGH if reliable else zenoh.Priority.DATA

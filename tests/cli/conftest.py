@@ -29,7 +29,7 @@ async def run(bus, config):
         bus.log.info("waiting for the moon")
         await asyncio.Event().wait()
     if config.behave == "wrong":
-        raise ConfigError("behave", config.behave, "can not be done")
+        raise ConfigError("behave", config.behave, "cannot be done")
     if config.behave == "crash once" and not os.path.exists(sys.argv[0] + ".crashed"):
         open(sys.argv[0] + ".crashed", "w").close()
         raise RuntimeError("a bug")

@@ -61,7 +61,7 @@ def test_wrong_configuration_of_one_service_ends_everything_with_one_line(zencel
 def test_what_turns_out_wrong_only_in_use_ends_everything_too(zencell: Start) -> None:
     command = zencell("up", "tiny.yaml", "--set", "services.last.behave=wrong", "--log-json")
     assert command.end() == 2
-    assert "zencell: behave: 'wrong' can not be done" in command.lines
+    assert "zencell: behave: 'wrong' cannot be done" in command.lines
     assert not command.children()
 
 
@@ -93,7 +93,7 @@ def test_a_frozen_service_is_killed_and_a_second_interrupt_does_so_at_once(zence
     command.until(UP)
     command.children()["middle"].send_signal(signal.SIGSTOP)
     command.interrupt()
-    command.until("stopped")  # the last one; the middle can not
+    command.until("stopped")  # the last one; the middle cannot
     command.interrupt()
     command.until("middle does not end; killed")
     assert command.end() == 0

@@ -87,7 +87,7 @@ def test_a_video_serves_as_well_as_pictures(pictures, tmp_path):
     path = str(tmp_path / "views.avi")
     writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"FFV1"), 10, (640, 480))
     if not writer.isOpened():
-        pytest.skip("this OpenCV can not write a video")
+        pytest.skip("this OpenCV cannot write a video")
     for k in range(10):
         writer.write(cv2.imread(str(pictures / "views" / f"p{k}.png")))
     writer.release()
@@ -120,8 +120,8 @@ def test_a_board_is_written_with_its_true_size(tmp_path, capsys):
         (["intrinsics", "views", "--squares", "6x5"], 1, ["another board", "6x5"]),
         (["intrinsics", "nowhere"], 2, ["nowhere", "is no device number"]),
         (["intrinsics", "broken"], 2, ["p0.png", "is no image"]),
-        (["intrinsics", "/dev/zencell-none"], 2, ["/dev/zencell-none", "can not be opened"]),
-        (["intrinsics", "views", "-o", "no/where.yaml"], 2, ["--output", "no/where.yaml", "can not be written"]),
+        (["intrinsics", "/dev/zencell-none"], 2, ["/dev/zencell-none", "cannot be opened"]),
+        (["intrinsics", "views", "-o", "no/where.yaml"], 2, ["--output", "no/where.yaml", "cannot be written"]),
         (["intrinsics", "views", "--views", "x"], 2, ["--views", "'x'", "3 or more"]),
         (["intrinsics", "views", "--size", "big"], 2, ["--size", "'big'", "as 640x480"]),
         (["intrinsics", "views", "--square", "0"], 2, ["square", "0"]),
@@ -129,7 +129,7 @@ def test_a_board_is_written_with_its_true_size(tmp_path, capsys):
         (["intrinsics", "views", "--k-coefficients", "7"], 2, ["k_coefficients", "7", "6"]),
         (["board", "-o", "board.jpg"], 2, ["board.jpg", ".png or .pdf"]),
         (["board", "-o", "board.png", "--squares", "40x40"], 2, ["800 markers", "50"]),
-        (["pose", "a", "--intrinsics", "none.yaml", "--board-position", "0,0,0"], 2, ["none.yaml", "can not be read"]),
+        (["pose", "a", "--intrinsics", "none.yaml", "--board-position", "0,0,0"], 2, ["none.yaml", "cannot be read"]),
         (["pose", "a", "--intrinsics", "FILE", "--board-position", "0,0"], 2, ["--board-position", "'0,0'", "three"]),
         (["pose", "a", "b", "--intrinsics", "FILE", "--board-position", "0,0,0"], 2, ["1 times for 2 places"]),
         (["pose", "empty", "--intrinsics", "FILE", "--board-position", "0,0,0"], 1, ["none of 2", "no marker"]),

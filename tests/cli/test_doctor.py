@@ -186,7 +186,7 @@ def test_router_that_can_not_be_reached_is_a_warning(monkeypatch: pytest.MonkeyP
         raise TimeoutError("timed out")
 
     monkeypatch.setattr(socket, "create_connection", refuse)
-    not_well(network.router("tcp/192.0.2.1:7447"), "can not be reached", "--connect")
+    not_well(network.router("tcp/192.0.2.1:7447"), "cannot be reached", "--connect")
 
 
 def test_cell_that_speaks_another_version_fails(listener: int, monkeypatch: pytest.MonkeyPatch) -> None:

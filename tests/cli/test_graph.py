@@ -123,7 +123,7 @@ def test_cell_is_drawn_without_being_up(suffix: str, tmp_path: Path, capsys: pyt
 
 @pytest.mark.parametrize(("arguments", "wanted"), [
     (["ur5", "-o", "it.png"], ["--output", "'it.png'", ".svg, .dot, .mmd"]),
-    (["ur5", "-o", "/no/where/it.svg", "--connect", "tcp/127.0.0.1:1"], ["/no/where/it.svg", "can not be written"]),
+    (["ur5", "-o", "/no/where/it.svg", "--connect", "tcp/127.0.0.1:1"], ["/no/where/it.svg", "cannot be written"]),
     (["ur6"], ["unknown cell 'ur6'", "ur5"]),
 ])
 def test_bad_input_is_one_line(arguments: list[str], wanted: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -170,10 +170,10 @@ def test_a_service_that_would_refuse_keeps_the_others_as_they_are(person: Person
     (["set", "tuned.rate"], ["'tuned.rate'", "must be PATH=VALUE"]),
     (["set", "tuned.rate=[1"], ["'[1'", "is not a YAML value"]),
     (["set", "tuned.rate=.nan"], ["services.tuned.rate: nan"]),
-    (["set", "@no.yaml"], ["no.yaml", "can not be read"]),
+    (["set", "@no.yaml"], ["no.yaml", "cannot be read"]),
     (["get", "tuned"], ["unknown parameter 'services.tuned'"]),
     (["list", "tund"], ["unknown service 'tund'", "choices: last, other, tuned"]),
-    (["dump", "-o", "no/where.yaml"], ["--output", "no/where.yaml", "can not be written"]),
+    (["dump", "-o", "no/where.yaml"], ["--output", "no/where.yaml", "cannot be written"]),
 ])
 def test_bad_input_is_one_line_with_the_choices(person: Person, arguments: list[str], wanted: list[str]) -> None:
     code, said = person.refused(*arguments)

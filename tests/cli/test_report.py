@@ -315,7 +315,7 @@ def test_what_is_no_recording_of_a_run_is_one_line(content, code, wanted, tmp_pa
     ("arguments", "wanted"),
     [
         (["-o", "report.pdf"], ["--output", "report.pdf", "must end in .html"]),
-        (["-o", "no/where/report.html"], ["--output", "report.html", "can not be written"]),
+        (["-o", "no/where/report.html"], ["--output", "report.html", "cannot be written"]),
         (["--cell", "pnada"], ["unknown cell 'pnada'", "panda"]),
     ],
 )

@@ -43,7 +43,7 @@ def test_robot_file_of_ones_own_may_name_the_srdf_that_is_still_to_be_made(tmp_p
         (["panda", "--seed", "x"], ["--seed", "'x'"]),
         (["panda", "--margin", "-1"], ["--margin", "-1", "0 or more"]),
         (["panda", "--margin", "wide"], ["--margin", "'wide'", "must be a number"]),
-        (["panda", "--samples", "1", "-o", "/no/where/x.srdf"], ["--output", "/no/where/x.srdf", "can not be written"]),
+        (["panda", "--samples", "1", "-o", "/no/where/x.srdf"], ["--output", "/no/where/x.srdf", "cannot be written"]),
     ],
 )
 def test_bad_input_is_one_line(arguments: list[str], wanted: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -43,7 +43,7 @@ def test_container_is_locked_down(name: str) -> None:
     assert service["read_only"] and service["cap_drop"] == ["ALL"]
     assert service["security_opt"] == ["no-new-privileges:true"]
     assert service["mem_limit"] and service["restart"] == "unless-stopped"
-    assert service["init"], "the health check can not kill a service that is the container's first process"
+    assert service["init"], "the health check cannot kill a service that is the container's first process"
     assert "./config:/app/config:ro" in service["volumes"]
 
 

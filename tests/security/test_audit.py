@@ -121,4 +121,4 @@ def test_without_the_database_one_line_says_so(database: Database, audit: Audit)
     done = audit()
     assert (done.returncode, done.stdout) == (0, "")
     (line,) = done.stderr.splitlines()
-    assert line == "dependencies were not audited: https://pypi.org/pypi/pip/24.0/json can not be reached"
+    assert line == "dependencies were not audited: https://pypi.org/pypi/pip/24.0/json cannot be reached"

@@ -1,4 +1,4 @@
-"""`--secure` refuses what can not be secured before anything is started: one line that says what would do."""
+"""`--secure` refuses what cannot be secured before anything is started: one line that says what would do."""
 
 from __future__ import annotations
 

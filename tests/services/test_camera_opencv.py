@@ -86,7 +86,7 @@ async def test_a_video_file_is_sent(tmp_path, intrinsics):
     path = str(tmp_path / "clip.avi")
     writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
     if not writer.isOpened():
-        pytest.skip("this OpenCV can not write a video")
+        pytest.skip("this OpenCV cannot write a video")
     for value in (40, 80, 160):
         writer.write(plain(value))
     writer.release()

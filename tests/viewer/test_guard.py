@@ -1,4 +1,4 @@
-"""A real server of pages: whom it lets in, whom it refuses, and what it can not be made to do."""
+"""A real server of pages: whom it lets in, whom it refuses, and what it cannot be made to do."""
 
 import asyncio
 import http.client

@@ -79,7 +79,7 @@ async def _keep(path: Path, contours: Contours, image: Image) -> None:
     try:
         await asyncio.to_thread(path.write_bytes, data.tobytes())
     except OSError as error:
-        raise ConfigError("--ask", str(path), f"can not be written: {error.strerror or error}") from None
+        raise ConfigError("--ask", str(path), f"cannot be written: {error.strerror or error}") from None
 
 
 async def _line() -> str:
@@ -105,7 +105,7 @@ async def store(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
 
     Raises:
         NoOutline: there is a picture and no outline in it.
-        StageFileError: a file can not be written.
+        StageFileError: a file cannot be written.
     """
     pictures, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
     contours, points = bus.reader(CONTOURS), bus.reader(CONTOUR_POINTS)

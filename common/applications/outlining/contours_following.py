@@ -55,12 +55,12 @@ class Following:
             return -1, str(error)
 
     def _distance(self, contour: Contour) -> float:
-        """How far a contour is from the chosen one [px]; infinite when it can not be the same."""
+        """How far a contour is from the chosen one [px]; infinite when it cannot be the same."""
         return min((distance(contour, known) for known in (self._last, self._chosen) if known), default=math.inf)
 
 
 def distance(contour: Contour, known: Contour) -> float:
-    """How far a contour is from one that is known [px]; infinite when it can not be the same object."""
+    """How far a contour is from one that is known [px]; infinite when it cannot be the same object."""
     smaller, larger = sorted((contour.area + 1, known.area + 1))
     away = float(np.linalg.norm(np.mean(contour.pixels, axis=0) - np.mean(known.pixels, axis=0)))
     same_kind = (contour.parent < 0) == (known.parent < 0)

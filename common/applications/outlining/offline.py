@@ -27,7 +27,7 @@ Picture = NDArray[np.uint8]
 
 
 class Impossible(ZencellError):
-    """An outline that can not be found or traced; ends a command with exit code 1."""
+    """An outline that cannot be found or traced; ends a command with exit code 1."""
 
     exit_code = 1
 
@@ -92,7 +92,7 @@ def plan_outline(
         given: the points need not go round anything in the scene.
 
     Raises:
-        Impossible: the first motion that can not be planned says why.
+        Impossible: the first motion that cannot be planned says why.
     """
     poses = [m.Pose(position=m.Vector3(x=x, y=y, z=z)) for x, y, z in points.tolist()]
     path = OutlinePoints(header=scene.header, poses=poses, object=label, given=given)

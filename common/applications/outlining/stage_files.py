@@ -36,7 +36,7 @@ CLEARED = "relevant_contours_cleared_coordinates.json"
 
 
 class StageFileError(ZencellError):
-    """A file of a stage that can not be used: names the file and what is wrong with it."""
+    """A file of a stage that cannot be used: names the file and what is wrong with it."""
 
     def __init__(self, path: Path, message: str) -> None:
         super().__init__(f"{path}: {message}")
@@ -47,7 +47,7 @@ def write_pictures(folder: Path, picture: Picture, depth: Depth) -> None:
     """Put the bgr8 picture and the depth image (height, width) [m] into a folder, which is made when it is not there.
 
     Raises:
-        StageFileError: a file can not be written.
+        StageFileError: a file cannot be written.
     """
     known = is_valid(depth)
     metres = np.where(known, depth, 0.0)
@@ -60,17 +60,17 @@ def write_pictures(folder: Path, picture: Picture, depth: Depth) -> None:
         for name, image in ((PICTURE, picture), (DEPTH_PICTURE, millimetres), (NORMALIZED, scaled.astype(np.uint8))):
             coded, data = cv2.imencode(".png", image)
             if not coded:
-                raise StageFileError(folder / name, "can not be coded as PNG")
+                raise StageFileError(folder / name, "cannot be coded as PNG")
             (folder / name).write_bytes(data.tobytes())
     except OSError as error:
-        raise StageFileError(folder, f"can not be written: {error.strerror or error}") from None
+        raise StageFileError(folder, f"cannot be written: {error.strerror or error}") from None
 
 
 def write_points(path: Path, points: npt.ArrayLike) -> None:
     """Write pixels (n, 2) or points (n, 3) as a list of lists, one to a line; whole numbers without a decimal point.
 
     Raises:
-        StageFileError: the file can not be written.
+        StageFileError: the file cannot be written.
     """
     rows = [[int(value) if float(value).is_integer() and path.name == PIXELS else round(float(value), 9)
              for value in row] for row in np.asarray(points, dtype=float)]
@@ -79,7 +79,7 @@ def write_points(path: Path, points: npt.ArrayLike) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise StageFileError(path, f"can not be written: {error.strerror or error}") from None
+        raise StageFileError(path, f"cannot be written: {error.strerror or error}") from None
 
 
 def read_pictures(folder: Path) -> tuple[Picture, Depth]:
@@ -167,7 +167,7 @@ def _bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise StageFileError(path, f"can not be read: {error.strerror or error}") from None
+        raise StageFileError(path, f"cannot be read: {error.strerror or error}") from None
 
 
 def _is_number(value: object) -> bool:

@@ -89,7 +89,7 @@ def before_run(
     """How the object to outline is chosen.
 
     Raises:
-        ConfigError: nobody can be asked, the coordinates can not be used, or the cell outlines nothing.
+        ConfigError: nobody can be asked, the coordinates cannot be used, or the cell outlines nothing.
     """
     if not ask and source is None:
         return BeforeRun(overrides)

@@ -71,7 +71,7 @@ class Resting:
         """z [m] at which the centre of a ball seen at a pixel can be."""
         if not self.meets_container(*camera.ray(pixel)):
             return [self.plane]
-        # Heights that differ by a few millimetres can not be told apart by how large a ball looks.
+        # Heights that differ by a few millimetres cannot be told apart by how large a ball looks.
         apart = all(abs(z - self.plane) > self.radius / 3 for z in self.layers)
         return [self.plane, *self.layers] if apart else self.layers
 

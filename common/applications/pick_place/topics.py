@@ -11,7 +11,7 @@ DETECTED_OBJECTS = Topic("detected_objects", m.MarkerArray, "stream", "balls fou
 DETECTION_IMAGE = Topic("detection_image", m.Image, "stream", "the picture with what was found")
 VALIDATED_TARGETS = Topic("validated_targets", m.PoseArray, "stream", "detections that the arm can take, in world")
 REJECTED_TARGETS = Topic("rejected_targets", m.Rejections, "event",
-                         "detections that it can not take, with the reason, once for each place")
+                         "detections that it cannot take, with the reason, once for each place")
 WORKSPACE_MARKERS = Topic("workspace_markers", m.MarkerArray, "state",
                           "reachable shell and excluded column as cylinders")
 PICK_PLACE_STATUS = Topic("pick_place_status", PickPlaceStatus, "state",

@@ -21,7 +21,7 @@ class Verdict:
 
     Attributes:
         targets: can be taken.
-        rejections: can not, with the reason; only those that were not told before.
+        rejections: cannot, with the reason; only those that were not told before.
         inside: number of those in the container, which are nobody's target and no rejection.
         unknown: inverse kinematics has to tell first.
     """

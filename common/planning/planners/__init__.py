@@ -36,7 +36,7 @@ def load_planner(name: str, options: Mapping[str, Any]) -> tuple[Plan, Parameter
     try:
         module = importlib.import_module(path)
     except ModuleNotFoundError as error:
-        raise ConfigError("pipeline.planners", name, f"can not be imported: {error}") from None
+        raise ConfigError("pipeline.planners", name, f"cannot be imported: {error}") from None
     plan, model = getattr(module, "plan", None), getattr(module, "Options", None)
     if not callable(plan) or not (isinstance(model, type) and issubclass(model, Parameters)):
         raise ConfigError("pipeline.planners", name, "must have plan() and Options(Parameters)")

@@ -26,7 +26,7 @@ class Options(circ.Options):
 
 
 def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
-    """One trajectory along all motions, or what ends one of them: nothing is begun that can not be finished."""
+    """One trajectory along all motions, or what ends one of them: nothing is begun that cannot be finished."""
     if not isinstance(problem.goal, GoalSequence):
         return Result(error=NOT_APPLICABLE, message="a sequence needs a sequence goal")
     parts = problem.goal.parts

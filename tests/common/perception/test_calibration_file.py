@@ -64,9 +64,9 @@ def test_a_file_that_a_cell_can_not_take_is_one_line(path, change, told):
 
 
 def test_a_file_that_is_not_there_or_can_not_be_written_is_one_line(tmp_path):
-    with pytest.raises(ConfigError, match="can not be read"):
+    with pytest.raises(ConfigError, match="cannot be read"):
         load_cell("panda", [f"world.camera={tmp_path / 'none.yaml'}"])
-    with pytest.raises(ConfigError, match="can not be written"):
+    with pytest.raises(ConfigError, match="cannot be written"):
         FULL.save(str(tmp_path / "no" / "camera.yaml"))
 
 

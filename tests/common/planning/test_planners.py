@@ -105,7 +105,7 @@ def test_algorithm_that_is_not_known_is_refused_with_the_choices():
         with_planner("ompl", algorithm="Dijkstra")
     with pytest.raises(UnknownName, match=r"cartesian, .*joint_move, .*ompl"):
         load_planner("dijkstra", {})
-    with pytest.raises(ConfigError, match="can not be imported"):
+    with pytest.raises(ConfigError, match="cannot be imported"):
         load_planner("nobody.planner", {})
     with pytest.raises(ConfigError, match=r"plan\(\) and Options"):
         load_planner("common.planning.path", {})

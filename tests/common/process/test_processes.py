@@ -303,7 +303,7 @@ async def test_exit_code_tells_how_run_ended(stage: Stage, bus: Bus, mode: str, 
     assert {line["service"] for line in lines} == {"toy"}
     crashes = [line["message"] for line in lines if "RuntimeError: the service has a bug" in line.get("traceback", "")]
     assert crashes == (["crashed"] if mode == "crash" else [])
-    assert ("services.toy.mode: 'bad_config' can not be used" in stage.output(toy)) == (mode == "bad_config")
+    assert ("services.toy.mode: 'bad_config' cannot be used" in stage.output(toy)) == (mode == "bad_config")
 
 
 async def test_second_router_names_the_process_that_holds_the_port(stage: Stage) -> None:

@@ -56,7 +56,7 @@ async def run(bus: Bus, config: Config) -> None:
     if config.mode == "crash":
         raise RuntimeError("the service has a bug")
     if config.mode == "bad_config":
-        raise ConfigError("services.toy.mode", config.mode, "can not be used")
+        raise ConfigError("services.toy.mode", config.mode, "cannot be used")
     if config.mode != "end":
         await asyncio.Event().wait()
 

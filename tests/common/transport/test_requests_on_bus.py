@@ -205,7 +205,7 @@ async def test_answer_of_another_kind_is_a_remote_error(new_bus) -> None:
     await server.ready()
     call = client.client(topics.TASK_COMMAND)
     await call.wait_available(PATIENCE)
-    with pytest.raises(RemoteError, match="can not be read") as caught:
+    with pytest.raises(RemoteError, match="cannot be read") as caught:
         await call.call(START)
     assert caught.value.code == "bad_answer"
 

@@ -75,7 +75,7 @@ def test_layout_that_can_not_be_used_names_the_file_the_field_and_what_would_do(
 
 
 def test_file_that_was_asked_for_must_be_there(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="can not be read"):
+    with pytest.raises(ConfigError, match="cannot be read"):
         load_layout(str(tmp_path / "none.yaml"))
 
 

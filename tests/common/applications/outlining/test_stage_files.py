@@ -95,7 +95,7 @@ def test_picture_and_depth_of_different_sizes_are_refused(tmp_path):
 def test_a_folder_that_can_not_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     _, picture, depth = seen_world("w2")
-    with pytest.raises(StageFileError, match="can not be written"):
+    with pytest.raises(StageFileError, match="cannot be written"):
         files.write_pictures(tmp_path / "file", picture, depth)
-    with pytest.raises(StageFileError, match="can not be written"):
+    with pytest.raises(StageFileError, match="cannot be written"):
         files.write_points(tmp_path / "file" / files.PIXELS, np.zeros((3, 2)))
