@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 BEFORE = ("IDLE", "SELECTING", "PLANNING")
 UNDER_WAY = ("APPROACHING", "TRACING", "RETREATING")
 CLOSED = 1e-3  # [m] first and last place of a closed outline are no farther apart, but for what lies between two looks
+UNHEARD = 2.0  # [s] at begin and end in which the tool may have gone on without a joint state being heard
 MOST_STATES = 100_000  # joint states of one tracing that are kept: a quarter of an hour at 100 Hz
 
 
@@ -141,7 +142,7 @@ class Traced:
 
     def figures(self) -> dict[str, Any]:
         """The block "outline" of a summary; without deviations where nothing was traced or no truth is known."""
-        tips = self._tips()
+        times, tips = self._tips()
         tips[:, 2] -= self._status.standoff
         path, outlines = self._path_points(), self._outlines()
         near = [distances(tips, points) for points in outlines] if len(tips) else []
@@ -150,7 +151,7 @@ class Traced:
             "points": self._status.points,
             "fraction": round(self._fraction(tips), 4),
             "length_m": round(self._status.length_m, 4),
-            "closed": self._status.closed and (self._robot is None or _is_closed(tips)),
+            "closed": self._status.closed and (self._robot is None or _is_closed(tips, times)),
             "deviation_mm": _millimetres(min(near, key=lambda d: float(d.mean()), default=None)),
             "tracking_mm": _millimetres(distances(tips, path) if len(tips) and len(path) > 1 else None),
         }
@@ -162,7 +163,7 @@ class Traced:
 
         from common.reporting.figures import LINES, QUIET, STYLE, from_above, svg
 
-        contour, tips, edges = self._path_points(), self._tips(), self._outlines()
+        contour, (_, tips), edges = self._path_points(), self._tips(), self._outlines()
         with mpl.rc_context(STYLE):
             figure = Figure(figsize=(7.5, 6.0), layout="constrained")
             axes = figure.subplots()
@@ -188,20 +189,22 @@ class Traced:
         way = float(np.linalg.norm(np.diff(tips, axis=0), axis=1).sum()) if len(tips) > 1 else 0.0
         return min(self._status.fraction, way / self._status.length_m)
 
-    def _tips(self) -> Array:
-        """Places (N, 3) [m] of the tool tip while it traced."""
+    def _tips(self) -> tuple[Array, Array]:
+        """Times (N + 2,) [s] and places (N, 3) [m] of the tool tip while it traced; the outer times: begin and end."""
         began, ended = self._began, self._ended
         if began is None or self._robot is None:
-            return np.zeros((0, 3))
+            return np.zeros(2), np.zeros((0, 3))
         from common.robot.model import RobotModel  # takes as long to load as all else: only when it is needed
 
         robot = RobotModel.load(self._robot)
-        tips = []
+        stamps, tips = [], []
         for state in self._states:
             q = robot.order(state.name, state.position)
             if q is not None and began <= state.header.stamp and (ended is None or state.header.stamp <= ended):
+                stamps.append(state.header.stamp)
                 tips.append(robot.fk(q)[:3, 3])
-        return np.array(tips).reshape(-1, 3)
+        last = ended if ended is not None else max(stamps, default=began)
+        return 1e-9 * (np.array([began, *stamps, last]) - began), np.array(tips).reshape(-1, 3)
 
     def _path_points(self) -> Array:
         poses = self._path.poses if self._path else []
@@ -217,12 +220,19 @@ class Traced:
         return [np.column_stack([np.array(edge), np.full(len(edge), top)]) for edge, top in edges]
 
 
-def _is_closed(tips: Array) -> bool:
-    """Whether the first and the last place (N, 3) are the same, as well as joint states that come now and then show."""
+def _is_closed(tips: Array, times: Array) -> bool:
+    """Whether the first and the last place (N, 3) are the same, as well as joint states that come now and then show.
+
+    Between the begin and the first of them, and between the last and the end, the tool may have gone on at the fastest
+    that was seen, for UNHEARD at most; `times` (N + 2,) [s] are those of the places, and outside them begin and end.
+    """
     if len(tips) < 2:
         return False
     steps = np.linalg.norm(np.diff(tips, axis=0), axis=1)
-    return float(np.linalg.norm(tips[0] - tips[-1])) <= CLOSED + float(steps.max())
+    gaps = np.diff(times)
+    speed = float((steps / np.maximum(gaps[1:-1], 1e-3)).max())
+    unseen = float(steps.max()) + speed * min(float(gaps[0] + gaps[-1]), UNHEARD)
+    return float(np.linalg.norm(tips[0] - tips[-1])) <= CLOSED + unseen
 
 
 def distances(places: Array, corners: Array) -> Array:

@@ -114,6 +114,25 @@ def test_outline_that_ends_elsewhere_is_not_closed() -> None:
     assert not follower.figures()["closed"]
 
 
+def test_outline_whose_first_moments_nobody_heard_is_closed_where_the_speed_allows_it() -> None:
+    def heard(missing: float, end: float) -> bool:
+        """Whether a square that is traced at 0.05 m/s until `end` [s] counts as closed without its first states."""
+        follower, second = Traced(CELL.robot), 1_000_000_000
+        follower.on_path(path())
+        follower.on_status(status("APPROACHING", 0))
+        follower.on_status(status("TRACING", second))
+        corners = np.array([*SQUARE, SQUARE[0]])
+        for time in np.arange(missing, end + 1e-9, 0.25):
+            side, rest = divmod(min(0.05 * time, 0.4 - 1e-9), 0.1)
+            x, y = corners[int(side)] + rest / 0.1 * (corners[int(side) + 1] - corners[int(side)])
+            follower.on_joints(joints_at(float(x), float(y), TOP, second + int(time * second)))
+        follower.on_status(status("RETREATING", second + int(8 * second), closed=True))
+        return bool(follower.figures()["closed"])
+
+    assert heard(0.0, 8.0) and heard(1.0, 8.0)
+    assert not heard(0.0, 4.0)
+
+
 def test_nothing_traced_and_no_truth_give_no_deviation() -> None:
     empty = Traced(CELL.robot).figures()
     assert (empty["deviation_mm"], empty["tracking_mm"], empty["closed"], empty["object"]) == (None, None, False, "")
