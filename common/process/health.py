@@ -58,10 +58,6 @@ def main() -> int:
     return 1
 
 
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 PROC = Path("/proc")
 FIRST = 1  # the container's init
 LOOKS, PERIOD = 12, 0.25  # stopped at so many looks [s]: looks and not time, which also passes while nobody runs
@@ -93,3 +89,7 @@ def end_if_frozen(parent: int = FIRST, wait: Callable[[float], None] = time.slee
             return False
     os.kill(found, signal.SIGKILL)
     return True
+
+
+if __name__ == "__main__":
+    sys.exit(main())
