@@ -2,6 +2,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
 
 import msgpack
 import pytest
@@ -86,6 +90,25 @@ async def test_events_come_all_and_in_order(new_bus, until) -> None:
     assert got == list(range(500))
     assert reader.overflow == 0
     assert reader.latest.message == "499"
+
+
+@pytest.fixture
+def busy_cores() -> Iterator[None]:
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3 * (os.cpu_count() or 1))]
+    yield
+    for process in busy:
+        process.kill()
+        process.wait()
+
+
+async def test_no_event_is_lost_while_every_core_is_busy(new_bus, until, busy_cores) -> None:
+    sender, receiver = await new_bus("sender"), await new_bus("receiver")
+    reader, writer = receiver.reader(topics.LOG, size=3000), sender.writer(topics.LOG)
+    await matched(writer, until)
+    for number in range(3000):
+        writer.put(event(number))
+    got = [int((await next_of(reader)).message) for _ in range(3000)]
+    assert got == list(range(3000))
 
 
 async def test_events_that_overflow_are_counted_and_reported(new_bus, until, caplog) -> None:
