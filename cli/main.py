@@ -58,7 +58,7 @@ class CommandLine(typer.Typer):
             command = typer.main.get_command(self)
             code = command(list(arguments), standalone_mode=False, prog_name="zencell", obj=verbs.CommandShell())
         except typer.TyperException as error:
-            code = _fail(error.format_message(), error.exit_code)
+            code = _fail(_with_choices(error), error.exit_code)
         except RequestFailed as error:
             code = _fail(str(error), EXIT_FAILED)
         except ZencellError as error:
@@ -68,6 +68,13 @@ class CommandLine(typer.Typer):
         except BrokenPipeError:  # as in `zencell topic echo ... | head`
             code = EXIT_FAILED
         return code if isinstance(code, int) else 0
+
+
+def _with_choices(error: typer.TyperException) -> str:
+    """What is wrong with the arguments; a verb that does not exist is told with those that do."""
+    message = error.format_message()
+    verbs_there = getattr(getattr(getattr(error, "ctx", None), "command", None), "commands", {})
+    return f"{message} choices: {', '.join(verbs_there)}" if message.startswith("No such command") else message
 
 
 def _fail(message: str, code: int) -> int:

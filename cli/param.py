@@ -102,7 +102,7 @@ def set_(
 
     values = {}
     for text in expanded(assignments):
-        parts, value = parse_override(text)
+        parts, value = parse_override(text, "param set")
         values[".".join(parts)] = value
 
     async def visit(bus: Bus) -> None:

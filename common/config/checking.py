@@ -52,7 +52,11 @@ def _fields_at(model: type[BaseModel], location: Sequence[int | str]) -> list[st
         if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
             break
         current = annotation
-    return sorted(name for name, f in current.model_fields.items() if not is_section(f.annotation))
+    # The sections of the cell that a service reads are no parameters of its own.
+    own = current.model_fields.items() if issubclass(current, Section) else (
+        (name, field) for name, field in current.model_fields.items() if not is_section(field.annotation)
+    )
+    return sorted(name for name, _ in own)
 
 
 def is_section(annotation: object) -> bool:

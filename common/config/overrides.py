@@ -14,15 +14,15 @@ from common.config.files import read_yaml
 from common.errors import ConfigError
 
 
-def parse_override(text: str) -> tuple[list[str], Any]:
-    """The dotted path and the value (as YAML) of `PATH=VALUE`."""
+def parse_override(text: str, given_as: str = "--set") -> tuple[list[str], Any]:
+    """The dotted path and the value (as YAML) of `PATH=VALUE`, which an error names by how it was given."""
     path, found, value = text.partition("=")
     if not found or not path.strip():
-        raise ConfigError("--set", text, "must be PATH=VALUE, for example world.count=5, or @FILE.yaml")
+        raise ConfigError(given_as, text, "must be PATH=VALUE, for example world.count=5, or @FILE.yaml")
     try:
         return path.strip().split("."), yaml.safe_load(value)
     except yaml.YAMLError:
-        raise ConfigError(f"--set {path}", value, "is not a YAML value") from None
+        raise ConfigError(f"{given_as} {path}", value, "is not a YAML value") from None
 
 
 def expanded(overrides: Sequence[str]) -> list[str]:
