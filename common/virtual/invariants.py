@@ -25,6 +25,7 @@ from common.messages import (
     MotionStatus,
     PointCloud2,
     ServiceCounters,
+    WorldEdit,
 )
 from common.topics import AnyTopic
 from common.transport.codec import decode
@@ -91,6 +92,7 @@ class Invariants:
         self._goals: dict[str, _Goals] = {}
         self._over: dict[tuple[str, str], str] = {}  # by key and goal
         self._ids: list[str] = []  # what there is
+        self._edits = 0  # of the world, that were asked for and not answered yet
         self._lying: dict[str, tuple[str, Vector]] = {}  # by object: state and place
         self._held_since: float | None = None  # cell time
         self._last: tuple[Vector, Vector, float] | None = None  # newest set-points and when
@@ -160,7 +162,8 @@ class Invariants:
 
     def _on_truth(self, objects: list[dict[str, Any]]) -> None:
         ids = sorted(str(thing["id"]) for thing in objects)
-        self._ids = self._ids or ids
+        if self._edits or not self._ids:  # somebody's hands are on the table
+            self._ids = ids
         if self._broke(ids == self._ids and len(set(ids)) == len(ids), OBJECTS):
             self._tell(OBJECTS, f"{ids} instead of {self._ids}")
         things: dict[str, tuple[str, Vector]] = {}
@@ -174,7 +177,7 @@ class Invariants:
             was, there = self._lying.get(name, (state, place))
             self._lying[name] = state, place
             way = 0.0 if state in CARRIED else float(np.linalg.norm(place - there))
-            legal = state in CARRIED or was in CARRIED or (state == was and way < MOVED)
+            legal = bool(self._edits) or state in CARRIED or was in CARRIED or (state == was and way < MOVED)
             if self._broke(legal and state != LOST, OBJECTS):
                 self._tell(OBJECTS, f"{name} went from {was} to {state} by itself, {way:.3f} m")
 
@@ -217,8 +220,12 @@ class Invariants:
     def _on_ask(self, request: Message) -> None:
         if isinstance(request, ExecuteRequest):
             self._decided.setdefault(request.id, self._now())
+        elif isinstance(request, WorldEdit):
+            self._edits += 1
 
     def _on_answer(self, service: str, request: Message, answer: Message) -> None:
+        if isinstance(request, WorldEdit):
+            self._edits -= 1
         asked = isinstance(request, HoldRequest) and request.hold and isinstance(answer, MotionStatus)
         if asked and self._broke(getattr(answer, "held", False), HELD):
             self._tell(HELD, f"it is not held when {service} asks for it")

@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -46,9 +46,11 @@ LOOK = 0.5  # [s] of virtual time between looks at requests
 AGAIN = 0.1  # [s] between looks whether a process is there on which something is to be done
 SETTLE = 2.0  # [s] of virtual time for what still falls when the task has ended
 CLEARING = 30.0  # [s] of virtual time for what was cut off to come to its end
-SUPERVISOR, HOST = "supervisor", "simulated"
+SUPERVISOR, VISITOR, HOST = "supervisor", "visitor", "simulated"
 ENDED = ("DONE", "ERROR")
 LEFT_OUT = ("viewer",)  # a page in a browser has no place on a virtual clock
+
+Visit = Callable[[Bus], Coroutine[Any, Any, None]]
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +86,7 @@ class Simulation:
 
     def __init__(
         self, cell: Cell, seed: int, *, faults: bool = False, limit: float = LIMIT, digest: bool = False,
-        trace: Trace | None = None, tell: Callable[[str], None] = lambda line: None,
+        trace: Trace | None = None, tell: Callable[[str], None] = lambda line: None, visit: Visit | None = None,
     ) -> None:
         """Prepare a run.
 
@@ -96,6 +98,8 @@ class Simulation:
             digest: whether a digest of the message log is made.
             trace: takes all messages.
             tell: is called with each log line and each fault.
+            visit: what somebody does in the cell, who came to see it; begins when all is ready, and the run ends with
+                the task after it. The invariants do not look at what a visitor says.
 
         Raises:
             ConfigError: the cell has a real arm, or is none that can be simulated.
@@ -105,7 +109,8 @@ class Simulation:
         names = [entry.name for entry in kept.values()]
         self.plan = make_plan(seed, names) if faults else Plan()
         self.outcome = Outcome(seed)
-        self._limit, self._trace, self._tell = limit, trace, tell
+        self._limit, self._trace, self._tell, self._visit = limit, trace, tell, visit
+        self._failed: Exception | None = None  # of the visit
         self._hash = hashlib.blake2b(digest_size=16) if digest else None
         self._status = find_application(cell.application).status
         self._status_key = f"{cell.name}/{self._status.key}"
@@ -120,7 +125,7 @@ class Simulation:
         self._done: Counter[str] = Counter()  # faults that were made
 
     def run(self) -> Outcome:
-        """What became of it."""
+        """What became of it; what the visit raises is raised."""
         began = time.process_time()
         with drawn_from(self._loop), shown_to(self.invariants.on_set_point), _state_folder(), _quiet():
             try:
@@ -130,7 +135,18 @@ class Simulation:
         if self._hash is not None:
             self.outcome.digest = self._hash.hexdigest()
         self.outcome.cpu_seconds = time.process_time() - began
+        if self._failed is not None:
+            raise self._failed
         return self.outcome
+
+    def kill(self, name: str) -> None:
+        """End a process of the cell where it is, as SIGKILL does."""
+        self._host.processes[name].kill()
+
+    def lose_router(self, seconds: float) -> None:
+        """Cut all links for a time [s], as when the router is started again."""
+        self._network.lose_router()
+        self._loop.call_later(seconds, self._network.find_router)
 
     async def _run(self) -> None:
         outcome, clock = self.outcome, Clock()
@@ -182,12 +198,29 @@ class Simulation:
     async def _work(self, bus: Bus) -> None:
         """Wait for the end of the task, and for what still falls then."""
         making = asyncio.create_task(self._make_faults())
+        await self._visited()
         await self._ended.wait()
         self.outcome.seconds = self._loop.time()
         making.cancel()
         await asyncio.wait({making})
         self._network.find_router()
         await asyncio.sleep(SETTLE)
+
+    async def _visited(self) -> None:
+        """Return when the visitor has seen what there was to see."""
+        if self._visit is None:
+            return
+        host = self._host
+        session = self._network.attach(contextvars.copy_context(), VISITOR)
+        bus = VirtualBus(session, VISITOR, self.cell.name, host.clock, host.requests)
+        try:
+            await self._visit(bus)
+        except Exception as error:
+            self._failed = error
+            raise
+        finally:
+            await bus.close()
+            session.close()
 
     async def _make_faults(self) -> None:
         """Let go wrong what the plan says."""
@@ -196,8 +229,7 @@ class Simulation:
             await asyncio.sleep(max(0.0, began + fault.at - self._loop.time()))
             self._say(f"FAULT {fault.kind} {fault.target}{f' for {fault.seconds:.1f} s' if fault.seconds else ''}")
             if fault.kind == "router lost":
-                self._network.lose_router()
-                self._loop.call_later(fault.seconds, self._network.find_router)
+                self.lose_router(fault.seconds)
                 self._done[fault.kind] += 1
                 continue
             process = self._host.processes[fault.target]
@@ -248,11 +280,15 @@ class Simulation:
             self._hash.update(sample.payload)
         if self._trace is not None:
             self._trace.add(sample, self._loop.wall_ns())
+        if session.name == VISITOR:  # who may say anything, also what is no message
+            return
         self.invariants.on_put(session.name, session.life, sample)
         if sample.key == self._status_key and (self._last_status is None or sample != self._last_status):
             self._last_status = sample
             if decode(self._status.message, sample.payload).state in ENDED:
                 self._ended.set()
+            else:
+                self._ended.clear()
 
     async def _clear(self, working: asyncio.Task[None], supervisor: Supervisor, bus: VirtualBus, host: Host) -> None:
         """Leave nothing behind that runs."""

@@ -1,0 +1,80 @@
+"""A whole cell on the virtual clock, and somebody in it who looks, tells it what to do and breaks things.
+
+What a run of it comes to is told as `zencell run` tells it: in the figures of its summary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine, Sequence
+from pathlib import Path
+from typing import Any
+
+from common.application import find_application
+from common.config import Cell, load_cell
+from common.reporting.fold import Fold
+from common.supervision.collector import Collector
+from common.transport.bus import Bus
+from common.virtual.simulation import Outcome, Simulation
+from common.virtual.trace import Trace
+from tests.harness import beside
+
+Visit = Callable[["SimulatedCell", Bus], Coroutine[Any, Any, None]]
+
+
+class SimulatedCell:
+    """A run of a cell: its outcome, its summary, and the lines that it wrote."""
+
+    def __init__(
+        self, cell: str | Path | Cell, overrides: Sequence[str] = (), *, world: str | None = None, seed: int = 1,
+        visit: Visit | None = None, limit: float = 300.0, record: Path | None = None,
+    ) -> None:
+        """Run it to the end of its task, after which the invariants have held and nobody crashed by itself.
+
+        Args:
+            cell: name or file, or resolved.
+            overrides: as of `--set`.
+            world: name of another.
+            seed: of the simulation.
+            visit: what somebody does in it from when it is up, on a bus of the cell.
+            limit: virtual time in which the task has to end [s].
+            record: a recording is made there.
+        """
+        loaded = cell if isinstance(cell, Cell) else load_cell(str(cell), overrides, world=world)
+        self.cell = loaded
+        self.lines: list[str] = []
+        self._visit = visit
+        self._fold = Fold(loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
+                          containers=list(loaded.world.containers))
+        trace = None if record is None else Trace(record, {"cell": loaded.name})
+        self._simulation = Simulation(loaded, seed, limit=limit, trace=trace, tell=self.lines.append, visit=self._look)
+        self.outcome: Outcome = self._simulation.run()
+        if trace is not None:
+            trace.close("simulated")
+        assert not self.outcome.broken and not self.outcome.crashes, self.outcome
+
+    async def _look(self, bus: Bus) -> None:
+        collector = Collector(bus, self._fold, 0.0, lambda line: None)
+        async with beside(collector.run()):
+            if self._visit is not None:
+                await self._visit(self, bus)
+            await collector.ended.wait()
+            await collector.settle()
+
+    def kill(self, name: str) -> None:
+        """End a process where it is, as SIGKILL does."""
+        self._simulation.kill(name)
+
+    def lose_router(self, seconds: float) -> None:
+        """Cut all links for a time [s]."""
+        self._simulation.lose_router(seconds)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The figures of the run, as `--summary` writes them."""
+        self._fold.summary.restarts = self.outcome.restarts
+        return self._fold.summary.as_dict()
+
+    @property
+    def text(self) -> str:
+        """All that its processes wrote."""
+        return "\n".join(self.lines)
