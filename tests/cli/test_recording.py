@@ -80,6 +80,10 @@ def until_it_holds(path: Path, wanted: Callable[[Recording], bool]) -> None:
     raise AssertionError(f"{path} never held what was waited for")
 
 
+def of(topic: str) -> Callable[[Recording], bool]:
+    return lambda recording: any(recording.samples(lambda each: each == topic))
+
+
 def pictures(least: int) -> Callable[[Recording], bool]:
     return lambda recording: sum(1 for s in recording.samples(lambda topic: topic == "camera/image_raw")) >= least
 
@@ -87,6 +91,7 @@ def pictures(least: int) -> Callable[[Recording], bool]:
 def test_ctrl_c_ends_a_recording_that_has_everything_from_the_start(place: Recorded) -> None:
     command = place.record("all.mcap")
     until_it_holds(place.folder / "all.mcap", pictures(5))
+    until_it_holds(place.folder / "all.mcap", of("counters"))  # which come once a second
     command.interrupt()
     assert command.end() == 0, command.lines
     assert any(line.startswith("recorded ") and line.endswith(": all.mcap") for line in command.lines)
