@@ -52,11 +52,26 @@ class Pick(Cycle):
     target: Target = field(kw_only=True)
     yaws: list[float] = field(default_factory=list, kw_only=True)
     yaw: float = field(default=0.0, kw_only=True)  # of the hand, of those the one that is tried
+    again: bool = field(default=False, kw_only=True)  # there was no way to it from another posture of the arm
     first_error: str = ""
 
     def __post_init__(self) -> None:
         """Its subject is the target."""
         self.subject = self.target.id
+
+
+@dataclass
+class GivenUp:
+    """An object that is left alone until something changes on the table where `spots` are.
+
+    One to which there was no way is tried once more, from another posture of the arm: then it is `open` meanwhile.
+    """
+
+    target: Target
+    reason: str
+    spots: Spots
+    retry: bool = False
+    open: bool = False
 
 
 @dataclass
@@ -101,7 +116,7 @@ class Choice:
         """
         self.p, self.container, self.radius = config, container, radius
         self._misses: list[tuple[Place, int]] = []
-        self._given_up: list[tuple[Target, str, Spots]] = []
+        self._given_up: list[GivenUp] = []
         self._judged_by: dict[str, Any] = {}  # values of the parameters
         self._expected = (0, 0.0)  # balls that will be in the container soon, and until when that is only expected
 
@@ -113,11 +128,11 @@ class Choice:
             self._given_up, self._judged_by = [], judged_by
         # Only while the table stays as it was: one ball less may be all that was needed.
         self._given_up = [
-            g for g in self._given_up if not appeared(spots, g[2], moved) and not appeared(g[2], spots, moved)
+            g for g in self._given_up if not appeared(spots, g.spots, moved) and not appeared(g.spots, spots, moved)
         ]
         full = self._is_full(view, bool(under_way))
         if not full:  # it was emptied, or only expected to be full
-            self._given_up = [g for g in self._given_up if g[1] != FULL]
+            self._given_up = [g for g in self._given_up if g.reason != FULL]
         candidates = [ball for ball in view.balls() if self._is_open(ball, view, under_way)]
         candidates.sort(key=lambda ball: math.dist(ball.position[:2], origin[:2]))
         for ball in candidates:
@@ -129,14 +144,24 @@ class Choice:
             elif not yaws:
                 self.give_up(ball, "no turn of the hand clears what stands beside it", view)
             else:
-                return Pick(target=ball, yaws=yaws)
+                return Pick(target=ball, yaws=yaws, again=self._given_up_at(ball.position) is not None)
         return None
+
+    def once_more(self) -> bool:
+        """Open again what no plan was found for, each once while the table stays as it is; whether there is any."""
+        again = [g for g in self._given_up if g.retry]
+        for g in again:
+            g.retry, g.open = False, True
+        return bool(again)
+
+    def _given_up_at(self, place: Place) -> GivenUp | None:
+        return next((g for g in self._given_up if same_place(g.target.position, place, self.radius)), None)
 
     def _is_open(self, ball: Target, view: PickPlaceView, under_way: Sequence[Pick]) -> bool:
         seen = any(math.dist(t[:2], ball.position[:2]) <= self.p.moved for t in view.targets)
         taken = any(same_place(c.target.position, ball.position, self.radius) for c in under_way)
-        given_up = any(same_place(g[0].position, ball.position, self.radius) for g in self._given_up)
-        return seen and not taken and not given_up
+        left = self._given_up_at(ball.position)
+        return seen and not taken and (left is None or left.open)
 
     def _is_full(self, view: PickPlaceView, carrying: bool) -> bool:
         """Whether no slot is left, counting what is on its way into the container."""
@@ -163,16 +188,18 @@ class Choice:
     def _forget(self, target: Target) -> None:
         self._misses = [(p, n) for p, n in self._misses if not same_place(p, target.position, self.radius)]
 
-    def give_up(self, target: Target, reason: str, view: PickPlaceView) -> None:
-        """Leave a ball alone until something changes on the table."""
-        self._given_up = [g for g in self._given_up if not same_place(g[0].position, target.position, self.radius)]
-        self._given_up.append((target, reason, view.spots(None, self.radius)))
+    def give_up(self, target: Target, reason: str, view: PickPlaceView, *, retry: bool = False) -> None:
+        """Leave a ball alone until something changes on the table, or until it is opened for a retry."""
+        if (left := self._given_up_at(target.position)) is not None:
+            self._given_up.remove(left)
+        self._given_up.append(GivenUp(target, reason, view.spots(None, self.radius), retry))
 
     def rejections(self) -> list[m.Rejection]:
         """What is given up now, and why."""
         return [
-            m.Rejection(position=m.Vector3(x=t.position[0], y=t.position[1], z=t.position[2]), reason=reason)
-            for t, reason, _ in self._given_up
+            m.Rejection(position=m.Vector3(x=g.target.position[0], y=g.target.position[1], z=g.target.position[2]),
+                        reason=g.reason)
+            for g in self._given_up
         ]
 
 

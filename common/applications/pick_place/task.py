@@ -13,7 +13,7 @@ from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.parameters import Config
 from common.applications.pick_place.rows import Rows
 from common.tasks.engine import Task
-from common.tasks.stages import Grip, Look, Move, Stage
+from common.tasks.stages import Cycle, Grip, Look, Move, Stage
 from common.tasks.watchdogs import Patience
 
 CONTAINED_FOR = 0.5  # [s] balls that are seen in the container for so long are there
@@ -59,6 +59,10 @@ class PickPlace(Task[PickPlaceView]):
         running = _pick_of(self.running.stage) if self.running else None
         box = self._around.container
         cycle = self._choice.next(view, (box.x, box.y) if running else view.tool, [running] if running else [])
+        if cycle is None and not running and self._choice.once_more():
+            # Whether the last way down can be followed depends on how the arm arrived above it.
+            self.row.append(Move("home", "HOMING", Cycle(), goal=m.JointGoal(named="home")))
+            return True
         if cycle is None:
             return False
         if not running and view.gripper.width < self.gripper.max_width - 0.002:
@@ -122,6 +126,9 @@ class PickPlace(Task[PickPlaceView]):
     def plan_failed(self, move: Move, response: m.PlanResponse, view: PickPlaceView) -> None:
         """Try the next yaw for a ball that was not begun with, or leave it alone."""
         pick = _pick_of(move)
+        if pick is None and move.cycle is not None:  # on the way home for another try, which begins here then
+            self.clear()
+            return
         if pick is None or pick.begun or self.stands_against(move, response):
             super().plan_failed(move, response, view)
             return
@@ -131,7 +138,7 @@ class PickPlace(Task[PickPlaceView]):
         if pick.yaws:
             self.row += self._rows.pick_and_place(pick)
         else:
-            self._choice.give_up(pick.target, pick.first_error, view)
+            self._choice.give_up(pick.target, pick.first_error, view, retry=not pick.again)
 
     # --- what its motions need -------------------------------------------------------------------------------
 
@@ -158,7 +165,10 @@ class PickPlace(Task[PickPlaceView]):
         if move.carries:
             move.attach = target
             move.attach_pose = self._rows.attach_pose(pick) if pick and not in_hand else None
-        return super().request(move, start, view)
+        request = super().request(move, start, view)
+        if pick is not None and pick.again:  # other samples of the goal than those from which there was no way on
+            request.seed = self.p.run.seed + 1
+        return request
 
     def _object_of(self, move: Move, view: PickPlaceView) -> tuple[str, bool]:
         """The track id of a move's object, and whether it is in the hand now.

@@ -154,6 +154,26 @@ def test_target_that_can_not_be_planned_is_tried_at_every_yaw_then_skipped_until
     assert cell.stages().count("descend") == yaws + 2
 
 
+def test_last_target_without_a_way_down_is_tried_once_more_from_home() -> None:
+    cell = CellDouble([(0.40, -0.09)])
+    cell.unplannable = lambda r: "joint_jump" if r.stage == "descend" and "home" not in cell.stages() else ""
+    cell.until("DONE")
+    yaws = cell.task.p.hand.yaw_count
+    assert cell.contained == 1 and not cell.task.status.skipped and not cell.task.status.failures
+    assert (cell.stages().count("descend"), cell.stages().count("home")) == (yaws + 1, 1)
+    seeds = {r.seed for r in cell.requests if isinstance(r, m.PlanRequest) and r.stage == "pre-grasp"}
+    assert len(seeds) == 2  # else the same goals were drawn again
+
+
+def test_target_that_can_not_be_planned_is_tried_twice_and_then_left() -> None:
+    cell = CellDouble([(0.40, -0.09)])
+    cell.unplannable = lambda r: "joint_jump" if r.stage == "descend" else ""
+    cell.until("DONE")
+    assert cell.contained == 0 and "joint_jump" in cell.task.status.skipped[0].reason
+    assert cell.stages().count("descend") == 2 * cell.task.p.hand.yaw_count
+    assert cell.stages().count("home") == 1 and not cell.task.status.failures
+
+
 def test_ball_that_moves_before_the_grasp_is_chosen_anew() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.until("pre-grasp")
