@@ -93,6 +93,7 @@ class Invariants:
         self._over: dict[tuple[str, str], str] = {}  # by key and goal
         self._ids: list[str] = []  # what there is
         self._edits = 0  # of the world, that were asked for and not answered yet
+        self._edited = False  # and nothing was said of what there is since
         self._lying: dict[str, tuple[str, Vector]] = {}  # by object: state and place
         self._held_since: float | None = None  # cell time
         self._last: tuple[Vector, Vector, float] | None = None  # newest set-points and when
@@ -162,7 +163,8 @@ class Invariants:
 
     def _on_truth(self, objects: list[dict[str, Any]]) -> None:
         ids = sorted(str(thing["id"]) for thing in objects)
-        if self._edits or not self._ids:  # somebody's hands are on the table
+        touched, self._edited = self._edited, self._edits > 0  # somebody's hands were on the table
+        if touched or not self._ids:
             self._ids = ids
         if self._broke(ids == self._ids and len(set(ids)) == len(ids), OBJECTS):
             self._tell(OBJECTS, f"{ids} instead of {self._ids}")
@@ -177,7 +179,7 @@ class Invariants:
             was, there = self._lying.get(name, (state, place))
             self._lying[name] = state, place
             way = 0.0 if state in CARRIED else float(np.linalg.norm(place - there))
-            legal = bool(self._edits) or state in CARRIED or was in CARRIED or (state == was and way < MOVED)
+            legal = touched or state in CARRIED or was in CARRIED or (state == was and way < MOVED)
             if self._broke(legal and state != LOST, OBJECTS):
                 self._tell(OBJECTS, f"{name} went from {was} to {state} by itself, {way:.3f} m")
 
@@ -221,7 +223,7 @@ class Invariants:
         if isinstance(request, ExecuteRequest):
             self._decided.setdefault(request.id, self._now())
         elif isinstance(request, WorldEdit):
-            self._edits += 1
+            self._edits, self._edited = self._edits + 1, True
 
     def _on_answer(self, service: str, request: Message, answer: Message) -> None:
         if isinstance(request, WorldEdit):

@@ -5,6 +5,7 @@ What a run of it comes to is told as `zencell run` tells it: in the figures of i
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ class SimulatedCell:
         loaded = cell if isinstance(cell, Cell) else load_cell(str(cell), overrides, world=world)
         self.cell = loaded
         self.lines: list[str] = []
+        self.ended = asyncio.Event()  # the task
         self._visit = visit
         self._fold = Fold(loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
                           containers=list(loaded.world.containers))
@@ -54,6 +56,7 @@ class SimulatedCell:
 
     async def _look(self, bus: Bus) -> None:
         collector = Collector(bus, self._fold, 0.0, lambda line: None)
+        self.ended = collector.ended
         async with beside(collector.run()):
             if self._visit is not None:
                 await self._visit(self, bus)

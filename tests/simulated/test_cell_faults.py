@@ -1,0 +1,97 @@
+"""Processes that die at the worst moments, and a table that somebody else changes: every ball ends where it should."""
+
+from __future__ import annotations
+
+import pytest
+
+from common import topics
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.topics import PICK_PLACE_STATUS, SCENE_BALLS
+from common.messages import GripperState, MotionStatus, PoseArray, Vector3, WorldEdit
+from common.transport.bus import Bus
+from tests.harness import until
+from tests.simulated.visited import SimulatedCell
+
+pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
+
+
+def holding(state: GripperState) -> bool:
+    return state.holding
+
+
+def empty(state: GripperState) -> bool:
+    return not state.holding
+
+
+def halfway(status: MotionStatus) -> bool:
+    return status.state == "active" and status.progress > 0.3
+
+
+def test_task_and_scene_manager_are_killed_with_a_ball_in_the_hand() -> None:
+    async def visit(cell: SimulatedCell, bus: Bus) -> None:
+        gripper = bus.reader(topics.GRIPPER_STATE)
+        for victim in ("smart_pick_place", "scene_manager"):
+            await until(gripper, holding)
+            cell.kill(victim)
+            await until(gripper, empty)
+
+    summary = SimulatedCell("panda", ["world.count=3"], visit=visit).summary
+    assert summary["truth"] == {"in_box": 3, "on_table": 0, "elsewhere": 0, "containers": {"box": 3}}
+    assert (summary["state"], summary["placed"]) == ("DONE", 3)
+    assert summary["restarts"] == {"smart_pick_place": 1, "scene_manager": 1}
+
+
+def test_the_router_is_lost_in_the_middle_of_a_motion_which_goes_on_to_its_end() -> None:
+    async def visit(cell: SimulatedCell, bus: Bus) -> None:
+        motion = bus.reader(topics.MOTION_STATUS)
+        await until(bus.reader(topics.GRIPPER_STATE), holding)
+        before = await until(motion, halfway)
+        cell.lose_router(1.0)
+        ended = await until(motion, lambda m: m.id != before.id or m.state != "active")
+        assert (ended.id, ended.state) == (before.id, "succeeded")
+
+    summary = SimulatedCell("panda", ["world.count=2"], visit=visit).summary
+    assert summary["truth"] == {"in_box": 2, "on_table": 0, "elsewhere": 0, "containers": {"box": 2}}
+    assert (summary["state"], summary["restarts"]) == ("DONE", {})
+
+
+def test_balls_that_are_moved_added_and_taken_away_end_up_where_they_should() -> None:
+    def placing(status: PickPlaceStatus) -> bool:
+        return status.state == "PLACING"
+
+    def in_place(balls: PoseArray) -> bool:
+        wanted = dict.fromkeys(["ball_1", "ball_2", "ball_4", "new"], "box")
+        return dict(zip(balls.ids, balls.labels, strict=True)) == wanted
+
+    async def visit(_cell: SimulatedCell, bus: Bus) -> None:
+        edit = bus.client(topics.WORLD_EDIT)
+        await until(bus.reader(PICK_PLACE_STATUS), placing)
+        for change in (WorldEdit(op="move", id="ball_1", position=Vector3(x=0.50, y=-0.38)),
+                       WorldEdit(op="add", id="new", position=Vector3(x=0.40, y=0.10)),
+                       WorldEdit(op="remove", id="ball_3")):
+            await edit.call(change)
+        await until(bus.reader(SCENE_BALLS), in_place, 120)
+
+    summary = SimulatedCell("panda", ["world.count=4"], visit=visit).summary
+    assert summary["state"] == "DONE"
+    assert summary["truth"] == {"in_box": 4, "on_table": 0, "elsewhere": 0, "containers": {"box": 4}}
+    assert summary["rejected"] == []
+
+
+def test_what_can_not_be_taken_is_reported_and_the_run_ends_done() -> None:
+    places = {  # by how the reason begins
+        "": [(0.40, -0.30), (0.52, -0.30), (0.62, -0.25), (0.40, -0.17), (0.52, -0.17), (0.64, -0.13), (0.40, -0.04)],
+        "the container is full": [(0.52, -0.04)],
+        "inside the container": [(0.55, 0.25)],
+        "too far": [(0.72, 0.42)],
+        "singularity column": [(0.07, 0.01)],
+        "partly out of view": [(0.40, 0.47)],
+    }
+    balls = [list(place) for group in places.values() for place in group]
+    camera = "world.camera.position=[0.39, 0.0, 0.85]"  # sees the column too
+    summary = SimulatedCell("panda", [f"world.balls={balls}", camera]).summary
+    assert summary["state"] == "DONE"
+    assert summary["truth"] == {"in_box": 8, "on_table": 4, "elsewhere": 0, "containers": {"box": 8}}
+    told = {place["reason"].partition(":")[0] for place in summary["rejected"]}
+    assert told == set(places) - {"", "inside the container"}
+    assert len(summary["rejected"]) == 4
