@@ -11,7 +11,7 @@ from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import JointState, TFMessage, TransformStamped
 from common.process.service import main
 from common.robot.model import RobotModel
-from common.robot.transforms import invert, pose_fields, rpy_to_matrix, transform
+from common.robot.transforms import pose_fields, rpy_to_matrix, transform
 from common.transport.bus import Bus
 
 MOST_MESSAGES = 250.0  # per second of wall time
@@ -28,9 +28,11 @@ class Config(Parameters):
 
 def stamped(parent: str, child: str, T_parent_child: NDArray[np.float64], stamp: int) -> TransformStamped:
     """The pose of child in parent as a message."""
-    header = {"stamp": stamp, "frame_id": parent}
-    fields = {"header": header, "child_frame_id": child, "transform": pose_fields(T_parent_child)}
-    return TransformStamped.model_validate(fields)
+    return TransformStamped.model_validate(_fields(parent, child, pose_fields(T_parent_child), stamp))
+
+
+def _fields(parent: str, child: str, pose: dict[str, dict[str, float]], stamp: int) -> dict[str, object]:
+    return {"header": {"stamp": stamp, "frame_id": parent}, "child_frame_id": child, "transform": pose}
 
 
 class LinkFrames:
@@ -48,7 +50,7 @@ class LinkFrames:
 
     def fixed(self, stamp: int) -> list[TransformStamped]:
         """Links that are fixed to the one they hang on, such as the tool centre point."""
-        return self._transforms(self._fixed, self._robot.link_poses(self._robot.named("home")), stamp)
+        return self._transforms(self._fixed, self._robot.named("home"), None, stamp)
 
     def moving(self, state: JointState) -> list[TransformStamped]:
         """Links that a joint moves, at that joint state; empty when a joint of the arm is missing in it."""
@@ -57,14 +59,19 @@ class LinkFrames:
             return []
         others = {name: value for name, value in zip(state.name, state.position, strict=True)
                   if name in self._robot.config.locked_joints}
-        return self._transforms(self._moving, self._robot.link_poses(q, others), state.header.stamp)
+        return self._transforms(self._moving, q, others, state.header.stamp)
 
     def _transforms(
-        self, links: list[str], T_world_link: dict[str, NDArray[np.float64]], stamp: int
+        self, links: list[str], q: NDArray[np.float64], others: dict[str, float] | None, stamp: int
     ) -> list[TransformStamped]:
-        parents = self._robot.link_parents
-        return [stamped(parents[link], link, invert(T_world_link[parents[link]]) @ T_world_link[link], stamp)
-                for link in links]
+        poses = self._robot.poses_in_parents(links, q, others)
+        transforms = [
+            _fields(self._robot.link_parents[link], link, {
+                "position": {"x": px, "y": py, "z": pz}, "orientation": {"x": x, "y": y, "z": z, "w": w},
+            }, stamp)
+            for link, (px, py, pz, x, y, z, w) in zip(links, poses, strict=True)
+        ]
+        return TFMessage.model_validate({"transforms": transforms}).transforms  # checked as a whole
 
 
 async def run(bus: Bus, config: Config) -> None:

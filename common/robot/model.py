@@ -61,6 +61,8 @@ class RobotModel:
                 raise ConfigError("robot.urdf", config.urdf, f"has no usable limits for joint {name}")
         self._links = _link_frames(self.model)
         self._full_links = _link_frames(full_model)
+        names = list(full_model.names)[1:]
+        self._full_joints = {name: full_model.joints[full_model.getJointId(name)].idx_q for name in names}
         for field, link in (("tcp_link", config.tcp_link), ("base_link", config.base_link)):
             if link not in self._links:
                 raise ConfigError(f"robot.{field}", link, f"is not a link; choices: {', '.join(self._links)}")
@@ -122,8 +124,8 @@ class RobotModel:
 
     def fk(self, q: ArrayLike) -> Array:
         """(4, 4) T_world_tcp at joint positions q (dof,) [rad]."""
-        pin.framesForwardKinematics(self.model, self.data, self._checked(q))
-        return np.array(self.data.oMf[self.tcp_frame].homogeneous)
+        pin.forwardKinematics(self.model, self.data, self._checked(q))
+        return np.array(pin.updateFramePlacement(self.model, self.data, self.tcp_frame).homogeneous)
 
     def link_poses(self, q: ArrayLike, others: Mapping[str, float] | None = None) -> dict[str, Array]:
         """(4, 4) T_world_link of every link at q (dof,) [rad].
@@ -132,17 +134,40 @@ class RobotModel:
             q: positions of the group.
             others: positions [rad or m] of joints outside the group, such as the fingers; else where they are locked.
         """
+        placed, links = self._placed(q, others), self._full_links if others else self._links
+        return {name: np.array(placed[i].homogeneous) for name, i in links.items()}
+
+    def poses_in_parents(
+        self, links: Sequence[str], q: ArrayLike, others: Mapping[str, float] | None = None
+    ) -> list[list[float]]:
+        """For each link its pose in that of the link which it hangs on: x, y, z [m], then a quaternion x, y, z, w >= 0.
+
+        Args:
+            links: have parents.
+            q: positions of the group, (dof,) [rad].
+            others: as in `link_poses`.
+        """
+        placed, index = self._placed(q, others), self._full_links if others else self._links
+        found = []
+        for link in links:
+            in_parent = placed[index[self.link_parents[link]]].actInv(placed[index[link]])
+            x, y, z, *quaternion = pin.SE3ToXYZQUAT(in_parent).tolist()
+            found.append([x, y, z, *(quaternion if quaternion[3] >= 0 else [-value for value in quaternion])])
+        return found
+
+    def _placed(self, q: ArrayLike, others: Mapping[str, float] | None) -> pin.StdVec_SE3:
+        """Where all frames are: of the group's model, or with `others` of the full one."""
         checked = self._checked(q)
         if not others:
             pin.framesForwardKinematics(self.model, self.data, checked)
-            return {name: np.array(self.data.oMf[i].homogeneous) for name, i in self._links.items()}
+            return self.data.oMf
         full = self.full_reference.copy()
-        for name, value in [*zip(self.joint_names, checked, strict=True), *others.items()]:
-            if not self.full_model.existJointName(name):
-                raise UnknownName("joint", name, list(self.full_model.names)[1:])
-            full[self.full_model.joints[self.full_model.getJointId(name)].idx_q] = value
+        for name, value in [*zip(self.joint_names, checked.tolist(), strict=True), *others.items()]:
+            if name not in self._full_joints:
+                raise UnknownName("joint", name, list(self._full_joints))
+            full[self._full_joints[name]] = value
         pin.framesForwardKinematics(self.full_model, self._full_data, full)
-        return {name: np.array(self._full_data.oMf[i].homogeneous) for name, i in self._full_links.items()}
+        return self._full_data.oMf
 
     def named(self, name: str) -> Array:
         """Joint positions (dof,) [rad] of a named pose of the robot file.
