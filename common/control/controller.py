@@ -44,6 +44,11 @@ class _Goal:
         left, slope = 1 - u**3 * (10 - 15 * u + 6 * u**2), -30 * u**2 * (1 - u) ** 2 / blend
         return q + left * self.offset, dq + slope * self.offset
 
+    @property
+    def progress(self) -> float:
+        """The share of the trajectory that is behind it."""
+        return min(self.time / self.trajectory.duration, 1.0)
+
     def advance(self, seconds: float, target: float, acceleration: Vector) -> None:
         """Move on by cell time [s], bringing the rate towards the target."""
         rate = next_rate(self.at, self.time, self.rate, target, seconds, acceleration)
@@ -183,7 +188,12 @@ class TrajectoryController:
             goal.ended = now
         self._hold, change = goal.at(goal.time)
         if not goal.stopping:
-            self._report("active", message=self._holding(goal))
+            message = self._holding(goal)
+            if message == self._status.message:
+                self._status.progress = goal.progress  # all else of it is as it was
+                self._memory.put(goal.id, self._status)
+            else:
+                self._report("active", message=message)
         return self._hold, change * goal.rate
 
     def abort(self, error: str, message: str, measured: Vector | None = None, source: str = "") -> None:
@@ -223,7 +233,7 @@ class TrajectoryController:
 
     def _report(self, state: GoalState, error: str = "", message: str = "", source: str = "") -> MotionStatus:
         assert self._goal is not None
-        progress = 1.0 if state == "succeeded" else min(self._goal.time / self._goal.trajectory.duration, 1.0)
+        progress = 1.0 if state == "succeeded" else self._goal.progress
         self._status = MotionStatus(
             id=self._goal.id, state=state, progress=progress, error=error, message=message, source=source or self._name
         )

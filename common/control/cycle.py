@@ -21,6 +21,7 @@ from common.messages import (
     Header,
     HoldRequest,
     JointState,
+    Message,
     MotionStatus,
     SceneUpdate,
     StopRequest,
@@ -227,8 +228,9 @@ class ControlCycle:
 
     def _news_of_motion(self, header: Header, now: float) -> MotionStatus | None:
         status, told = self._arm.status, self._told_motion
-        same = told is not None and told.model_copy(update={"progress": status.progress}) == status
-        if same and (told == status or now - self._told_motion_at < PROGRESS_PERIOD):
+        if told is not None and _same(told, status, "progress") and (
+            told.progress == status.progress or now - self._told_motion_at < PROGRESS_PERIOD
+        ):
             return None
         self._told_motion, self._told_motion_at = status, now
         return status.model_copy(update={"header": header})
@@ -237,8 +239,17 @@ class ControlCycle:
         if self._gripper is None:
             return None
         state, told = self._gripper.state, self._told_gripper
-        same = told is not None and told.model_copy(update={"width": state.width, "position": state.position}) == state
-        if same and (told == state or now - self._told_gripper_at < PROGRESS_PERIOD):
+        if told is state:
+            return None
+        if told is not None and _same(told, state, "width", "position") and (
+            told.width == state.width or now - self._told_gripper_at < PROGRESS_PERIOD
+        ):
             return None
         self._told_gripper, self._told_gripper_at = state, now
         return state.model_copy(update={"header": header})
+
+
+def _same(told: Message, state: Message, *but: str) -> bool:
+    """Whether all fields are as they were told, but for those named."""
+    was = told.__dict__
+    return all(value == was[name] for name, value in state if name not in but)

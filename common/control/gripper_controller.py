@@ -57,16 +57,18 @@ class GripperController:
 
     def update(self, reading: GripperReading) -> GripperState:
         """The state with the newest reading: a goal is over when the fingers have stopped."""
+        state = self.state
         changes: dict[str, object] = {
             "width": reading.width, "position": driven_position(self._config, reading.width),
             "effort": reading.effort, "holding": reading.holding, "moving": reading.moving,
         }
-        if self.state.state == "active" and not reading.moving:
+        if state.state == "active" and not reading.moving:
             changes["state"] = "succeeded"
             if abs(reading.width - self._target) > SETTLED and not reading.holding:
                 changes["state"] = "aborted"
                 changes["message"] = f"fingers stopped at {reading.width:.4f} m, not at {self._target:.4f} m"
-        self.state = self.state.model_copy(update=changes)
+        if not changes.items() <= vars(state).items():
+            self.state = state.model_copy(update=changes)
         if self.state.id:
             self._memory.put(self.state.id, self.state)
         return self.state

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -27,7 +28,7 @@ class Trajectory:
     accelerations: Vector
     quintic: bool = False
 
-    @property
+    @cached_property
     def duration(self) -> float:
         """Time of the last point [s]."""
         return float(self.times[-1])
@@ -39,21 +40,21 @@ class Trajectory:
             zero = 0.0 * self.positions[end]
             return self.positions[end], zero, zero
         index = int(np.searchsorted(self.times, time, side="right")) - 1
-        step = self.times[index + 1] - self.times[index]
-        q, dq, ddq = self._interpolate(slice(index, index + 1), (time - self.times[index]) / step)
-        return q[0], dq[0], ddq[0]
+        begin, end = self.times[index], self.times[index + 1]
+        return _interpolated((time - begin) / (end - begin), *(each[index] for each in self._segments))
 
     def between(self, fraction: float) -> tuple[Vector, Vector, Vector]:
         """Positions, velocities and accelerations (N - 1, dof) at a fraction, 0 to 1, of every segment."""
-        return self._interpolate(slice(0, len(self.times) - 1), fraction)
+        return _interpolated(fraction, *self._segments)
 
-    def _interpolate(self, segments: slice, u: float) -> tuple[Vector, Vector, Vector]:
-        after = slice(segments.start + 1, segments.stop + 1)
-        h = (self.times[after] - self.times[segments])[:, None]
-        q0, move = self.positions[segments], self.positions[after] - self.positions[segments]
-        v0, v1 = self.velocities[segments] * h, self.velocities[after] * h
+    @cached_property
+    def _segments(self) -> tuple[Vector, ...]:
+        """Durations (N - 1, 1) [s] of the segments, and the coefficients (N - 1, dof) of their polynomials [rad]."""
+        h = (self.times[1:] - self.times[:-1])[:, None]
+        q0, move = self.positions[:-1], self.positions[1:] - self.positions[:-1]
+        v0, v1 = self.velocities[:-1] * h, self.velocities[1:] * h
         if self.quintic:
-            a0, a1 = self.accelerations[segments] * h**2 / 2, self.accelerations[after] * h**2 / 2
+            a0, a1 = self.accelerations[:-1] * h**2 / 2, self.accelerations[1:] * h**2 / 2
             rest, slope, bend = move - v0 - a0, v1 - v0 - 2 * a0, 2 * a1 - 2 * a0
             c3 = 10 * rest - 4 * slope + bend / 2
             c4 = -15 * rest + 7 * slope - bend
@@ -61,10 +62,17 @@ class Trajectory:
         else:
             a0, c3 = 3 * move - 2 * v0 - v1, v0 + v1 - 2 * move
             c4 = c5 = np.zeros_like(move)
-        q = q0 + u * (v0 + u * (a0 + u * (c3 + u * (c4 + u * c5))))
-        dq = (v0 + u * (2 * a0 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / h
-        ddq = (2 * a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / h**2
-        return q, dq, ddq
+        return h, q0, v0, a0, c3, c4, c5
+
+
+def _interpolated(
+    u: float, h: Vector, q0: Vector, v0: Vector, a0: Vector, c3: Vector, c4: Vector, c5: Vector
+) -> tuple[Vector, Vector, Vector]:
+    """Positions, velocities and accelerations at a share u of segments."""
+    q = q0 + u * (v0 + u * (a0 + u * (c3 + u * (c4 + u * c5))))
+    dq = (v0 + u * (2 * a0 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / h
+    ddq = (2 * a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / h**2
+    return q, dq, ddq
 
 
 def from_message(message: JointTrajectory, names: tuple[str, ...]) -> Trajectory:
