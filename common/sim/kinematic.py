@@ -87,18 +87,9 @@ class KinematicWorld:
         return self._kept[1]
 
     def _standing(self) -> dict[str, StandingObject]:
-        return {
-            name: StandingObject(
-                pose=_numbers(b.T), like=b.like, made=b.message() if b.added and not b.like else None,
-                details={
-                    "state": b.state, "container": b.container, "slot": b.slot, "dropped": b.dropped, "since": b.since,
-                    "width": b.width, "grip": None if b.grip is None else _numbers(b.grip), "added": b.added,
-                    "rest": None if b.rest is None else [
-                        _numbers(b.rest.T), b.rest.state, b.rest.container, b.rest.slot],
-                },
-            )
-            for name, b in self._bodies.items()
-        }
+        for body in self._bodies.values():
+            body.kept = body.kept or _standing(body)
+        return {name: body.kept for name, body in self._bodies.items() if body.kept is not None}
 
     def restore(self, objects: Mapping[str, StandingObject]) -> None:
         """Put everything where it was; what is of a shape that there is not is passed over."""
@@ -149,9 +140,11 @@ class KinematicWorld:
             half = self._gripper.held_width / 2
             return (-half, half) if lies_on(self._gripper.cup, body.solid, invert(T_world_tcp) @ body.T) else None
         allowed, solid = self._tolerances, body.solid
+        reach = allowed.across + allowed.along + max(width / 2, solid.reach) + solid.reach
+        if abs(body.T[2, 3] - T_world_tcp[2, 3]) > reach:
+            return None
         away = body.T[:3, 3] - T_world_tcp[:3, 3]
-        reach = allowed.across + allowed.along + max(width / 2, solid.reach)
-        if abs(away[2]) > reach + solid.reach or float(np.linalg.norm(away)) > reach + solid.reach:
+        if math.hypot(*away.tolist()) > reach:
             return None
         if solid.shape == "sphere":
             x, y, z = T_world_tcp[:3, :3].T @ away
@@ -194,7 +187,8 @@ class KinematicWorld:
         is_cupped = self._gripper is not None and self._gripper.cup is not None
         body.width = 2 * body.solid.radius if body.solid.shape == "sphere" and not is_cupped else high - low
         slot, block = body.slot_taken, self._ground.block(body)
-        body.state, body.container, body.slot, body.told = "held", "", None, None
+        body.state, body.container, body.slot = "held", "", None
+        body.changed()
         self._between = {}
         self._say("remove", body)
         self._sink(slot, now)
@@ -206,7 +200,8 @@ class KinematicWorld:
         if body.solid.shape == "sphere":
             T[:3, :3] = body.T[:3, :3]
         if not np.array_equal(T, body.T):
-            body.T, body.told = T, None
+            body.T = T
+            body.changed()
             self.version += 1
 
     def _release(self, body: Body, now: float) -> None:
@@ -215,7 +210,8 @@ class KinematicWorld:
 
     def _drop(self, body: Body, now: float) -> None:
         body.state, body.grip, body.dropped, body.since = "falling", None, float(body.T[2, 3]), now
-        body.container, body.slot, body.told = "", None, None
+        body.container, body.slot = "", None
+        body.changed()
         self.version += 1
 
     def _fall(self, body: Body, now: float) -> None:
@@ -223,7 +219,8 @@ class KinematicWorld:
         self.version += 1
         z = body.dropped - GRAVITY * (now - body.since) ** 2 / 2
         if z > body.rest.T[2, 3]:
-            body.T, body.told = transform(body.T[:3, :3], (float(body.T[0, 3]), float(body.T[1, 3]), z)), None
+            body.T = transform(body.T[:3, :3], (float(body.T[0, 3]), float(body.T[1, 3]), z))
+            body.changed()
             return
         body.lie(body.rest)
         if body.state != "elsewhere":
@@ -241,6 +238,7 @@ class KinematicWorld:
                 position = self._ground.slot_position(container, body.solid.radius, slot)
                 lies = body.state == "contained"
                 body.rest = Rest(transform(body.T[:3, :3], position), "contained", container, slot)
+                body.changed()
                 if lies:
                     self._say("remove", body)
                     self._drop(body, now)
@@ -438,8 +436,22 @@ def _requested(request: WorldEdit) -> Solid:
     return prism("prism", np.array(request.polygon), size.z)
 
 
+def _standing(body: Body) -> StandingObject:
+    """A body as it is, for `restore`."""
+    rest = body.rest
+    return StandingObject(
+        pose=_numbers(body.T), like=body.like, made=body.message() if body.added and not body.like else None,
+        details={
+            "state": body.state, "container": body.container, "slot": body.slot, "dropped": body.dropped,
+            "since": body.since, "width": body.width, "grip": None if body.grip is None else _numbers(body.grip),
+            "added": body.added,
+            "rest": None if rest is None else [_numbers(rest.T), rest.state, rest.container, rest.slot],
+        },
+    )
+
+
 def _numbers(T: Array) -> tuple[float, ...]:
-    return (*(float(v) for v in T[:3, 3]), *matrix_to_quaternion(T[:3, :3]))
+    return (*T[:3, 3].tolist(), *matrix_to_quaternion(T[:3, :3]))
 
 
 def _matrix(numbers: Sequence[float]) -> Array:

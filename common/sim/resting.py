@@ -20,6 +20,7 @@ from common.errors import Refused
 from common.messages import WorldObject
 from common.robot.transforms import rpy_to_matrix, transform
 from common.sim.footprints import covers_point, footprint, heights, overlap, within
+from common.sim.interface import StandingObject
 from common.sim.objects import Solid, message_of
 from common.sim.places import Slot, Slots, Table, is_inside, is_over, tables
 
@@ -62,11 +63,17 @@ class Body:
     added: bool = False  # by a person
     like: str = ""  # the object of the first layout whose shape it has
     told: WorldObject | None = None  # the message about it, while it is as it was
+    kept: StandingObject | None = None  # the same of how it stands
 
     def lie(self, rest: Rest) -> None:
         """Be at rest there."""
         self.T, self.state, self.container, self.slot = rest.T, rest.state, rest.container, rest.slot
-        self.rest, self.grip, self.told = None, None, None
+        self.rest, self.grip = None, None
+        self.changed()
+
+    def changed(self) -> None:
+        """Forget what was said about it: it is not as it was."""
+        self.told = self.kept = None
 
     @property
     def lying(self) -> Array:
