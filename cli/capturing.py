@@ -3,49 +3,101 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import threading
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from common import topics
-from common.application import all_topics
+from common.application import all_topics, bring_in
 from common.errors import DecodeError
 from common.messages import SupervisorStatus
 from common.recording.sample import Sample, message_of
 from common.recording.stamps import Sequences
 from common.recording.writing import RUN
+from common.remapping import Remapping
 from common.transport.codec import decode, decode_attachment
 from common.transport.credentials import secure_folder
+from common.transport.keys import owns_key
+from common.transport.ownership import Owner
 
 if TYPE_CHECKING:
+    from common.config import Cell
     from common.recording.selection import Selection
     from common.recording.sink import Sink
+    from common.topics import AnyTopic
     from common.transport.bus import Bus
     from common.transport.session import Declared, RawSample
 
 ASK_TIMEOUT = 1.0  # [s] for the values of states
 
 
+@dataclass(frozen=True)
+class Own:
+    """What a cell has that does not come with the project: modules of a person's own, and keys under other names."""
+
+    modules: tuple[str, ...] = ()
+    renamed: tuple[Mapping[str, str], ...] = ()  # as common/remapping.py has it, by service
+
+    @classmethod
+    def of(cls, cell: Cell) -> Own:
+        """That of a cell file."""
+        services = cell.services.values()
+        named = dict.fromkeys([cell.application, *(entry.module for entry in services)])
+        own = (name for name in named if "." in name and not name.startswith("services."))
+        return cls(tuple(own), tuple(entry.topics for entry in services if entry.topics))
+
+    @classmethod
+    def read(cls, text: str) -> Own:
+        """What `str` wrote."""
+        return cls(*(tuple(part) for part in json.loads(text)))
+
+    def __str__(self) -> str:
+        return json.dumps([self.modules, self.renamed])
+
+    def topics(self) -> dict[str, AnyTopic]:
+        """Every topic by its key before it is renamed; the messages of all modules are known from now on."""
+        return {**all_topics(), **bring_in(self.modules)}
+
+    def kinds(self, known: Mapping[str, AnyTopic]) -> dict[str, str]:
+        """Kinds of topics by key in the cell."""
+        kinds = {key: str(topic.kind) for key, topic in known.items()}
+        return kinds | {Remapping(table).key(key): kind for table in self.renamed for key, kind in kinds.items()}
+
+
 class Capture:
     """Hands every wanted message to a sink, repetitions left out and gaps counted."""
 
-    def __init__(self, bus: Bus, selection: Selection, sink: Sink) -> None:
-        """Take nothing yet."""
+    def __init__(self, bus: Bus, selection: Selection, sink: Sink, own: Own | None = None) -> None:
+        """Take nothing yet.
+
+        Args:
+            bus: in the cell.
+            selection: what is wanted.
+            sink: where it goes.
+            own: what there is in the cell beside what comes with the project.
+        """
         self.sequences = Sequences()
         self._bus = bus
         self._selection = selection
         self._sink = sink
         self._lock = threading.Lock()
         self._ahead = time.time_ns() - time.monotonic_ns()  # a step of the system clock must not turn messages round
-        self._kinds = {topic.key: str(topic.kind) for topic in all_topics().values()}
+        own = own or Own()
+        self._known = own.topics()
+        self._kinds = own.kinds(self._known)
         self._run_known = False
         self._declared: list[Declared] = []
 
     async def begin(self) -> None:
         """Listen from now on; returns when the values of all states that were there are in the recording."""
         wanted = [f"{self._bus.cell}/{key}" for key in self._selection.expressions]
+        # Where no file of the cell was given, tokens tell which services have their keys under other names.
+        self._declared = [self._bus.raw_watch(owns_key(self._bus.cell), self._on_owner)]
         status = f"{self._bus.cell}/{topics.SUPERVISOR_STATUS.key}"
-        self._declared = [self._bus.raw_subscriber(key, self.on_sample) for key in wanted]
+        self._declared += [self._bus.raw_subscriber(key, self.on_sample) for key in wanted]
         if f"{self._bus.cell}/**" not in wanted and status not in wanted:
             self._declared.append(self._bus.raw_subscriber(status, self._on_status))
             for sample in await self._bus.raw_get(status, ASK_TIMEOUT):
@@ -80,6 +132,11 @@ class Capture:
                 raw.key, raw.payload, time.monotonic_ns() + self._ahead, message=message_of(raw.encoding),
                 kind=self._kinds.get(topic) or kind or "stream", writer=writer, sequence=sequence, trace=trace,
             ))
+
+    def _on_owner(self, token: str) -> None:
+        owner = Owner.of(token)
+        if (topic := self._known.get(owner.own)) is not None:
+            self._kinds[owner.key] = str(topic.kind)
 
     def _on_status(self, raw: RawSample) -> None:
         if self._run_known:

@@ -118,6 +118,7 @@ class Operation:
         """
         if file is None:
             return
+        from cli.capturing import Own
         from cli.recording import NAME, require_new
         from common.supervision.launch import python_module
 
@@ -127,6 +128,7 @@ class Operation:
         place = ["--connect", self.launch.connect] if self.launch.connect else ["--domain", str(self.launch.domain)]
         self._watchers[NAME] = [
             *python_module("cli.main"), "record", "--cell", self.cell.name, "-o", str(path), *place, "--gate",
+            "--own", str(Own.of(self.cell)),
         ]
 
     def disturb(self, seed: str | None, rate: str | None, *, until_ended: bool) -> None:
@@ -300,8 +302,8 @@ class Operation:
 
             assert self._supervisor is not None
             seed, per_minute, until_ended = self._disturbance
-            keys = keys_of(await bus.owners(), [entry.name for entry in self.cell.services.values()])
-            self._chaos = chaos_in(bus, self.cell, self._supervisor, keys, seed, per_minute, until_ended=until_ended)
+            known = keys_of(await bus.owners(), [entry.name for entry in self.cell.services.values()])
+            self._chaos = chaos_in(bus, self.cell, self._supervisor, known, seed, per_minute, until_ended=until_ended)
         return self._collector
 
     def _write_summary(self) -> None:

@@ -18,6 +18,7 @@ from common.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from cli.capturing import Own
     from common.recording.selection import Selection
     from common.recording.sink import Figures, Sink
     from common.supervision.interrupts import Interrupts
@@ -48,19 +49,26 @@ def record(
     domain: options.Domain = None,
     connect: options.Connect = None,
     gate: Annotated[bool, typer.Option("--gate", hidden=True, help="under a supervisor: wait for a line")] = False,
+    own: Annotated[str, typer.Option("--own", hidden=True, help="under a supervisor: what is in the cell's file")] = "",
 ) -> None:
     """Record what travels in a cell, all keys if none are given, until Ctrl-C."""
+    from cli.capturing import Own
     from cli.inspection import inspect
+    from common.config import load_cell
     from common.recording.selection import Selection
     from common.transport.credentials import identity_of_listener
 
+    beside = Own.read(own) if own else Own()
+    if cell is not None and cell.endswith((".yaml", ".yml")):
+        loaded = load_cell(cell)
+        cell, beside = loaded.name, Own.of(loaded)
     selection = Selection.of(keys or (), regex, exclude)
     _require_published(selection)
     seconds = _positive("--duration", duration)
     megabytes = _positive("--max-size", max_size)
     if megabytes is not None and megabytes < LEAST_FILE:
         raise ConfigError("--max-size", max_size, f"must be {LEAST_FILE:g} or more")
-    asked = _Asked(output, None if megabytes is None else round(megabytes * 1e6), seconds, gate)
+    asked = _Asked(output, None if megabytes is None else round(megabytes * 1e6), seconds, gate, beside)
     if gate:
         asyncio.run(_gated(selection, asked, cell, domain, connect))
     else:
@@ -71,11 +79,14 @@ def record(
 class _Asked:
     """What a person asked for."""
 
-    def __init__(self, output: str | None, most_bytes: int | None, seconds: float | None, gate: bool) -> None:
+    def __init__(
+        self, output: str | None, most_bytes: int | None, seconds: float | None, gate: bool, own: Own
+    ) -> None:
         self.output = Path(output) if output else None
         self.most_bytes = most_bytes
         self.seconds = seconds
         self.gate = gate
+        self.own = own
         if self.output is not None:
             require_new(self.output)
 
@@ -143,7 +154,7 @@ async def _record(bus: Bus, selection: Selection, asked: _Asked) -> None:
     path = asked.output or Path(f"{bus.cell}_{time.strftime('%Y%m%d_%H%M%S')}.mcap")
     writer = SplitWriter(path, about(bus.cell), asked.most_bytes)
     sink = Sink(writer, on_failure=lambda: call_on_loop(loop, interrupts.stop.set))
-    capture = Capture(bus, selection, sink)
+    capture = Capture(bus, selection, sink, asked.own)
     reason = "interrupted"
     try:
         await capture.begin()

@@ -13,19 +13,19 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-# What a person would send first. Each is checked by a test against its message.
+# What a person would send first, by message. Each is checked by a test.
 EXAMPLES: dict[str, dict[str, Any]] = {
-    "motion/plan": {"id": "try-1", "goal": {"kind": "joints", "named": "home"}},
-    "motion/stop": {"reason": "asked to"},
-    "gripper/command": {"id": "open-1", "width": 0.08},
-    "world/edit": {"op": "add", "position": {"x": 0.45, "y": -0.1, "z": 0.03}},
-    "task/command": {"command": "pause"},
+    "PlanRequest": {"id": "try-1", "goal": {"kind": "joints", "named": "home"}},
+    "StopRequest": {"reason": "asked to"},
+    "GripperCommand": {"id": "open-1", "width": 0.08},
+    "WorldEdit": {"op": "add", "position": {"x": 0.45, "y": -0.1, "z": 0.03}},
+    "TaskCommand": {"command": "pause"},
 }
 
 
-def example_of(key: str, model: type[BaseModel]) -> dict[str, Any]:
-    """An example of a request: the one for its key, or one made of the fields that are required."""
-    return EXAMPLES.get(key) or {name: _sample(field.annotation) for name, field in _required(model)}
+def example_of(model: type[BaseModel]) -> dict[str, Any]:
+    """An example of a request: one made of the fields that are required, or what a person would rather send."""
+    return EXAMPLES.get(model.__name__) or {name: _sample(field.annotation) for name, field in _required(model)}
 
 
 def fields_of(model: type[BaseModel], indent: int = 0, seen: tuple[type[BaseModel], ...] = ()) -> Iterator[str]:

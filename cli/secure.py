@@ -186,4 +186,4 @@ def rights_in(cell: Cell, names: Collection[str] | None = None) -> dict[str, Rig
     wirings = asyncio.run(find())
     require_one_owner(wirings)
     rights = {name: rights_of(name, declared) for name, declared in wirings.items()}
-    return {**rights, SUPERVISOR: rights_of_supervisor(), RECORDER: rights_of_recorder()}
+    return {**rights, SUPERVISOR: rights_of_supervisor(), RECORDER: rights_of_recorder(rights.values())}

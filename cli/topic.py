@@ -68,7 +68,7 @@ def info(
         }
         if answer:
             described |= {"answer": answer.__name__, "answer_schema": answer.model_json_schema()}
-            described["example"] = example_of(topic.key, topic.message)
+            described["example"] = example_of(topic.message)
         typer.echo(json.dumps(described))
         return
     typer.echo(f"{topic.key}: {topic.doc}\nkind: {topic.kind}")
@@ -80,7 +80,7 @@ def info(
         typer.echo(f"answer: {answer.__name__}")
         for line in fields_of(answer):
             typer.echo(f"  {line}")
-        typer.echo(f"example: zencell call {topic.key} '{json.dumps(example_of(topic.key, topic.message))}'")
+        typer.echo(f"example: zencell call {topic.key} '{json.dumps(example_of(topic.message))}'")
 
 
 @app.command()

@@ -25,7 +25,8 @@ import importlib
 import importlib.util
 import pkgutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -170,17 +171,43 @@ def find_topic(key: str) -> Topic[Any] | Request[Any, Any] | None:
     return all_topics().get(key)
 
 
+def bring_in(modules: Iterable[str]) -> dict[str, AnyTopic]:
+    """Topics by key that modules of a person's own bring; their messages are known from now on.
+
+    One that cannot be imported brings none: the service that it is says why.
+    """
+    look_where_one_stands()
+    found: dict[str, AnyTopic] = {}
+    for name in modules:
+        with suppress(Exception):
+            found |= {**_topics_in(importlib.import_module(name)), **Application(name).topics}
+    return found
+
+
 @cache
-def message_class(name: str) -> type[Message] | None:
-    """The message class of that name, of the platform or of an application that comes with it; None for no such."""
+def _message_classes() -> dict[str, type[Message]]:
+    """Those of the platform and of the applications that come with it, by name."""
     from common import messages
 
-    modules = [messages, *(part for found in applications() if (part := found.part("messages")) is not None)]
-    for module in modules:
-        found = vars(module).get(name)
-        if isinstance(found, type) and issubclass(found, messages.Message):
-            return found
-    return None
+    parts = (found.part("messages") for found in applications())
+    modules = [*(part for part in parts if part is not None), messages]  # the platform's win
+    return {name: found for module in modules for name, found in vars(module).items()
+            if isinstance(found, type) and issubclass(found, messages.Message)}
+
+
+def message_class(name: str) -> type[Message] | None:
+    """The message class of that name, of the platform, of an application, or of any module that was imported."""
+    return _message_classes().get(name) or next((found for found in _imported() if found.__name__ == name), None)
+
+
+def _imported() -> Iterator[type[Message]]:
+    from common.messages import Message
+
+    left = [Message]
+    while left:
+        found = left.pop()
+        yield found
+        left += found.__subclasses__()
 
 
 def _topics_in(module: ModuleType | None) -> dict[str, AnyTopic]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
 import json
 import os
@@ -256,12 +257,23 @@ def test_task_of_one_file_moves_a_cube_and_ends_the_run_with_a_status_and_figure
     assert set(summary["figures"]) == {"off_mm"} and summary["figures"]["off_mm"] < 5
     assert "off_mm" in ran.stdout
     with Recording(recording) as kept:
+        states = list(kept.samples(lambda topic: topic == "move_cube_status"))
+        assert {(sample.kind, json.loads(sample.schema)["title"]) for sample in states} == {("state", "MoveCubeStatus")}
         newest = {sample.topic: sample.payload for sample in kept.samples(
             lambda topic: topic in ("scene_objects", "move_cube_status"))}
     status = decode(m.TaskStatus, newest["move_cube_status"])
     assert (status.state, status.figures) == ("DONE", summary["figures"])
     place = decode(m.WorldObjects, newest["scene_objects"]).objects[0].pose.position
     assert (place.x, place.y) == pytest.approx((0.52, 0.1), abs=0.005), "where it really is"
+    elsewhere = tmp_path / "elsewhere"  # where its module is not found
+    elsewhere.mkdir()
+    exported = tell(f"zencell export {recording} --csv tables --topics move_cube_status", elsewhere)
+    assert exported.returncode == 0 and not exported.stderr, exported.stderr
+    rows = list(csv.DictReader((elsewhere / "tables" / "move_cube_status.csv").read_text().splitlines()))
+    assert (len(rows), rows[-1]["state"]) == (len(states), "DONE")
+    assert float(rows[-1]["figures.off_mm"]) == summary["figures"]["off_mm"]
+    reported = tell(f"zencell report {recording} --cell cube.yaml -o {elsewhere / 'run.html'}", folder)
+    assert reported.returncode == 0 and "off_mm" in (elsewhere / "run.html").read_text(encoding="utf-8")
 
 
 def test_task_of_one_file_runs_on_a_virtual_clock_and_breaks_nothing(folder: Path) -> None:

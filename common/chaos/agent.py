@@ -9,7 +9,7 @@ import math
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ import msgpack
 import numpy as np
 
 from common import topics
-from common.application import find_topic
+from common.application import all_topics
 from common.chaos.plan import STATELESS_FORMS, Fault, Form
 from common.config import Container
 from common.errors import DecodeError, RequestFailed
@@ -33,6 +33,7 @@ from common.transport.codec import (
 )
 
 if TYPE_CHECKING:
+    from common.topics import AnyTopic
     from common.transport.bus import Bus, Reader
     from common.transport.session import RawSample
 
@@ -61,6 +62,7 @@ class Chaos:
     def __init__(
         self, bus: Bus, plan: Iterable[Fault], pids: Callable[[], dict[str, int]],
         containers: Sequence[Container] | None, patience: float = SLIP_PATIENCE,
+        known: Mapping[str, AnyTopic] | None = None,
     ) -> None:
         """Declare what is listened to.
 
@@ -70,10 +72,12 @@ class Chaos:
             pids: the processes that run now, by name.
             containers: objects are let slip clear of their edges; None where no object is taken.
             patience: that there has to be something in the hand before it slips [s, wall time].
+            known: topics whose messages are damaged, by key of the cell; else those that come with the project.
         """
         self.happened: list[Happened] = []
         self._bus, self._plan, self._pids, self._containers = bus, plan, pids, containers
         self._patience = patience
+        self._known = all_topics() if known is None else known
         taken = containers is not None
         self._gripper = bus.reader(topics.GRIPPER_STATE) if taken else None
         self._objects = bus.reader(topics.SCENE_OBJECTS) if taken else None
@@ -170,7 +174,7 @@ class Chaos:
 
     async def _disturb(self, fault: Fault) -> None:
         """Put bad messages under a key, as if they came from who writes it, or from nobody."""
-        topic: Any = find_topic(fault.target)
+        topic: Any = self._known[fault.target]
         key, encoding = f"{self._bus.cell}/{topic.key}", encoding_of(topic.message)
         rng = np.random.default_rng(fault.seed)
         if topic.kind == "request":

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 from common.application import all_topics, find_application
 from common.chaos.agent import Chaos
@@ -10,13 +11,15 @@ from common.chaos.plan import CELL_SECONDS, faults, plan
 from common.config import Cell
 from common.hardware.loading import find_backend
 from common.supervision.supervisor import Supervisor
+from common.topics import AnyTopic
 from common.transport.bus import Bus
 from common.transport.keys import ROUTER
 from common.transport.ownership import Owner
 
 
 def chaos_in(
-    bus: Bus, cell: Cell, supervisor: Supervisor, keys: list[str], seed: int, per_minute: float, *, until_ended: bool
+    bus: Bus, cell: Cell, supervisor: Supervisor, known: Mapping[str, AnyTopic], seed: int, per_minute: float, *,
+    until_ended: bool,
 ) -> Chaos:
     """Faults for the processes and keys of a cell that is up.
 
@@ -24,7 +27,7 @@ def chaos_in(
         bus: of the supervisor.
         cell: the resolved cell.
         supervisor: knows the processes.
-        keys: of messages that may be damaged.
+        known: topics whose messages may be damaged, by key.
         seed: of the plan.
         per_minute: faults per minute of wall time, on average.
         until_ended: the faults end while a run of the task has time left to finish; else they go on.
@@ -32,6 +35,7 @@ def chaos_in(
     ours = [entry.name for entry in cell.services.values()]
     processes = [status.name for status in supervisor.statuses if status.name in (ROUTER, *ours)]
     grasps = find_application(cell.application).grasps and cell.task in ours
+    keys = list(known)
     objects = grasps and find_backend(cell.robot).simulated
     if until_ended:
         seconds = CELL_SECONDS / bus.clock.speed
@@ -42,10 +46,13 @@ def chaos_in(
     def pids() -> dict[str, int]:
         return {status.name: status.pid for status in supervisor.statuses if status.pid is not None}
 
-    return Chaos(bus, planned, pids, list(cell.world.containers.values()) if objects else None)
+    return Chaos(bus, planned, pids, list(cell.world.containers.values()) if objects else None, known=known)
 
 
-def keys_of(owners: Iterable[Owner], services: Iterable[str]) -> list[str]:
-    """Keys that these services write or answer, but for their parameters; the platform's first."""
-    owned = {owner.key for owner in owners if owner.service in set(services)}
-    return [key for key in all_topics() if key in owned]
+def keys_of(owners: Iterable[Owner], services: Iterable[str]) -> dict[str, AnyTopic]:
+    """What these services write or answer by its key in the cell, but for their parameters, in the order of the topics.
+
+    Of a key that a service has under another name it is known what it carries by the service's own word for it.
+    """
+    owned = sorted({(owner.own, owner.key) for owner in owners if owner.service in set(services)})
+    return {key: replace(topic, key=key) for word, topic in all_topics().items() for own, key in owned if own == word}

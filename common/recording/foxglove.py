@@ -65,7 +65,7 @@ def export(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) 
                 continue
             name, value = convert(message)
             if name not in schemas:
-                text = json.dumps(SCHEMAS[name]).encode() if name in SCHEMAS else schema_of(name)
+                text = json.dumps(SCHEMAS[name]).encode() if name in SCHEMAS else sample.schema or schema_of(name)
                 schemas[name] = writer.register_schema(name, "jsonschema", text)
             if sample.key not in channels:
                 channels[sample.key] = writer.register_channel(sample.key, "json", schemas[name])

@@ -173,8 +173,12 @@ class Recording:
                     channel.topic, message.data, message.log_time, message.publish_time,
                     self._name(message.channel_id), channel.metadata.get("kind", "stream"),
                     channel.metadata.get("writer", ""), message.sequence,
-                    traces.get((message.channel_id, message.sequence), ""),
+                    traces.get((message.channel_id, message.sequence), ""), self._schema(message.channel_id),
                 )
+
+    def _schema(self, channel: int) -> bytes:
+        schema = self._schemas.get(self._channels[channel].schema_id)
+        return schema.data if schema else b""
 
     def _name(self, channel: int) -> str:
         schema = self._schemas.get(self._channels[channel].schema_id)

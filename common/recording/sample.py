@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from common.errors import ZencellError
 
@@ -26,6 +26,7 @@ class Sample:
     writer: str = ""  # empty for a sender that does not say who it is
     sequence: int = 0
     trace: str = ""
+    schema: bytes = field(default=b"", repr=False, compare=False)  # JSON, where a recording tells it
 
     @property
     def topic(self) -> str:

@@ -145,13 +145,14 @@ class RecordingWriter:
         name = (sample.key, sample.writer, sample.message, sample.kind)
         if name not in self._channels:
             self._channels[name] = self._writer.register_channel(
-                sample.key, "msgpack", self._schema_of(sample.message), {"kind": sample.kind, "writer": sample.writer}
+                sample.key, "msgpack", self._schema_of(sample), {"kind": sample.kind, "writer": sample.writer}
             )
         return self._channels[name]
 
-    def _schema_of(self, message: str) -> int:
+    def _schema_of(self, sample: Sample) -> int:
+        message = sample.message
         if message not in self._schemas:
-            data = schema_of(message)
+            data = sample.schema or schema_of(message)
             self._schemas[message] = self._writer.register_schema(message, "jsonschema" if data else "", data)
         return self._schemas[message]
 

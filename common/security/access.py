@@ -62,22 +62,23 @@ def rights_of_supervisor() -> Rights:
     return Rights(write={LOG.key, COUNTERS.key}, keep={SUPERVISOR_STATUS.key}, read={"**"}, get={"**"}, call={"**"})
 
 
-def rights_of_recorder() -> Rights:
-    """What the recorder of a cell may do: it hears everything and commands nothing."""
-    return Rights(write={LOG.key, COUNTERS.key}, read={"**"}, get=_states())
+def rights_of_recorder(services: Iterable[Rights] = ()) -> Rights:
+    """What the recorder of a cell with these services may do: it hears everything and commands nothing."""
+    return Rights(write={LOG.key, COUNTERS.key}, read={"**"}, get=_states(services))
 
 
-def rights_of_tools() -> dict[str, Rights]:
-    """What people's tools may do, in all cells behind a router."""
+def rights_of_tools(services: Iterable[Rights] = ()) -> dict[str, Rights]:
+    """What people's tools may do, in all cells behind a router, which have these services."""
     return {
         OPERATOR: Rights(read={"**"}, get={"**"}, call={"**"}),
-        OBSERVER: Rights(read={"**"}, get=_states()),
+        OBSERVER: Rights(read={"**"}, get=_states(services)),
     }
 
 
-def _states() -> set[str]:
+def _states(services: Iterable[Rights]) -> set[str]:
     # Not `**`: who may ask for every key may call every request, since both are the same to the router.
-    return {topic.key for topic in all_topics().values() if topic.kind == "state"}
+    known = {topic.key for topic in all_topics().values() if topic.kind == "state"}
+    return known.union(*(rights.keep for rights in services))
 
 
 def access_control(cells: Mapping[str, Mapping[str, Rights]]) -> dict[str, Any]:
@@ -88,7 +89,8 @@ def access_control(cells: Mapping[str, Mapping[str, Rights]]) -> dict[str, Any]:
     """
     rules: list[dict[str, Any]] = []
     subjects, policies = [], []
-    for cell, processes in {**cells, "*": rights_of_tools()}.items():
+    every = [rights for processes in cells.values() for rights in processes.values()]
+    for cell, processes in {**cells, "*": rights_of_tools(every)}.items():
         for process, rights in processes.items():
             name = common_name(cell, process)
             own = list(_rules(cell, process, rights))

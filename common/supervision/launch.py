@@ -7,7 +7,7 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -36,12 +36,12 @@ class Launch:
     clock: Clock = field(default_factory=Clock)
     extra: Mapping[str, str] = field(default_factory=dict, repr=False)  # environment that no command line may show
 
-    def router_command(self) -> list[str]:
-        """Command line of the router."""
+    def router_command(self, small: Sequence[str] = ()) -> list[str]:
+        """Command line of the router; `small` are keys of the cell's own under which nothing large travels."""
         command = [*python_module(ROUTER_MODULE), "--domain", str(self.domain)]
-        for option, endpoints in (("--listen", self.listen), ("--link", self.link)):
-            for endpoint in endpoints:
-                command += [option, endpoint]
+        for option, values in (("--listen", self.listen), ("--link", self.link), ("--small", small)):
+            for value in values:
+                command += [option, value]
         return [*command, *self._process_options()]
 
     def service_command(self, entry: ServiceEntry, *, gate: bool = True) -> list[str]:

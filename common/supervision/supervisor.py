@@ -17,6 +17,7 @@ from common.messages import ServiceStatus
 from common.sources import monotonic
 from common.supervision.child import Backoff, Child, describe_exit
 from common.supervision.launch import Launch
+from common.transport.endpoint import small_keys_renamed
 from common.transport.keys import ROUTER
 
 T = TypeVar("T")
@@ -120,7 +121,8 @@ class Supervisor:
         ]
         self._router = None
         if not launch.connect:
-            self._router = Watched(make_child(ROUTER, launch.router_command(), environment, on_line))
+            small = small_keys_renamed(entry.topics for entry in cell.services.values())
+            self._router = Watched(make_child(ROUTER, launch.router_command(small), environment, on_line))
         self._all = [self._router, *self._services] if self._router else list(self._services)
         self._by_name = {watched.child.name: watched for watched in self._all}
         self._tasks: set[asyncio.Task[None]] = set()

@@ -269,6 +269,12 @@ class Bus:
         """
         return self._session.subscriber(key, on_sample)
 
+    def raw_watch(self, key: str, on_token: Callable[[str], None]) -> Declared:
+        """Call back, on any thread, for each liveliness token under a full key expression that is there or appears."""
+        return self._session.watch_tokens(
+            key, lambda token, there: on_token(token) if there else None, on_token, lambda: None
+        )
+
     def raw_writer(self, key: str, encoding: str, kind: PublishedKind) -> RawWriter:
         """A writer of bytes under a full key, such as what was recorded there."""
         writer = RawWriter(self._session, key, encoding, kind, self.service)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from common.errors import ConfigError
@@ -142,15 +142,15 @@ def client_config(endpoint: str, *, connect_ms: int, credentials: Credentials | 
 
 def router_config(
     endpoints: Sequence[str], credentials: Credentials | None = None, access: dict[str, Any] | None = None,
-    links: Sequence[str] = (),
+    links: Sequence[str] = (), small: Sequence[str] = (),
 ) -> zenoh.Config:
     """Configuration of a router that listens at these endpoints only: that of `router_settings`."""
-    return _config(router_settings(endpoints, credentials, access, links))
+    return _config(router_settings(endpoints, credentials, access, links, small))
 
 
 def router_settings(
     endpoints: Sequence[str], credentials: Credentials | None = None, access: dict[str, Any] | None = None,
-    links: Sequence[str] = (),
+    links: Sequence[str] = (), small: Sequence[str] = (),
 ) -> dict[str, Any]:
     """What a router is told, as the tree of a Zenoh configuration file; all else is as Zenoh has it.
 
@@ -159,6 +159,7 @@ def router_settings(
         credentials: with which it proves itself; without them everybody is let in.
         access: who may do what.
         links: endpoints of routers of other hosts, which it tries to reach for as long as it runs.
+        small: more keys under which nothing large travels, without the cell: `small_keys` under other names.
     """
     first, most = LINK_RETRY_MS
     secure = {"transport__link__tls": credentials.tls(listens=True)} if credentials else {}
@@ -177,7 +178,7 @@ def router_settings(
         mode="router", listen__endpoints=list(endpoints), connect__endpoints=list(links),
         connect__timeout_ms=-1, connect__exit_on_failure=False,
         connect__retry={"period_init_ms": first, "period_max_ms": most, "period_increase_factor": 1.5},
-        low_pass_filter=[size_limit()],
+        low_pass_filter=[size_limit(small)],
         transport__unicast__max_sessions=MOST_SESSIONS,
         transport__unicast__accept_pending=MOST_PENDING,
         transport__unicast__accept_timeout=ACCEPT_MS,
@@ -185,16 +186,31 @@ def router_settings(
     )
 
 
-def size_limit() -> dict[str, Any]:
-    """What the router drops, because it is larger than any message of its topic ever is."""
+def size_limit(more: Sequence[str] = ()) -> dict[str, Any]:
+    """What the router drops, because it is larger than any message of its topic ever is; `more` keys beside our own."""
+    return {
+        "id": "no pictures", "flows": ["ingress"], "messages": ["put", "query", "reply"],
+        "key_exprs": sorted(f"*/{key.replace('<service>', '*')}" for key in (*small_keys(), *more)),
+        "size_limit": MOST_BYTES_BESIDES,
+    }
+
+
+def small_keys() -> list[str]:
+    """Keys of all topics whose messages are neither pictures nor clouds."""
     from common.application import all_topics
     from common.messages import Image, PointCloud2
 
-    small = [topic.key for topic in all_topics().values() if topic.message not in (Image, PointCloud2)]
-    return {
-        "id": "no pictures", "flows": ["ingress"], "messages": ["put", "query", "reply"],
-        "key_exprs": sorted(f"*/{key.replace('<service>', '*')}" for key in small), "size_limit": MOST_BYTES_BESIDES,
-    }
+    return [topic.key for topic in all_topics().values() if topic.message not in (Image, PointCloud2)]
+
+
+def small_keys_renamed(tables: Iterable[Mapping[str, str]]) -> list[str]:
+    """The same under the other names that services give them, as common/remapping.py has it."""
+    from common.remapping import Remapping
+
+    if not (given := [Remapping(table) for table in tables if table]):
+        return []
+    own = small_keys()
+    return sorted({names.key(key) for names in given for key in own}.difference(own))
 
 
 def _settings(**values: Any) -> dict[str, Any]:

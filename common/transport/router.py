@@ -45,13 +45,16 @@ def holder_of(port: int) -> str:
     return "another process"
 
 
-def open_router(endpoints: Sequence[str], secured: Path | None = None, links: Sequence[str] = ()) -> zenoh.Session:
+def open_router(
+    endpoints: Sequence[str], secured: Path | None = None, links: Sequence[str] = (), small: Sequence[str] = ()
+) -> zenoh.Session:
     """A session that routes for everybody who connects to the endpoints, and listens nowhere else.
 
     Args:
         endpoints: where.
         secured: folder of certificates and rules; without one everybody may do everything.
         links: endpoints of routers of other hosts; it is no error when nobody is there yet.
+        small: more keys, without the cell, under which nothing large travels.
 
     Raises:
         PortInUse: names the port, the domain and the process that holds it.
@@ -63,9 +66,9 @@ def open_router(endpoints: Sequence[str], secured: Path | None = None, links: Se
                 raise ConfigError(option, each, "is an open endpoint: with certificates it must be tls/HOST:PORT")
     try:
         if secured is None:
-            return zenoh.open(router_config(endpoints, links=links))
+            return zenoh.open(router_config(endpoints, links=links, small=small))
         credentials = credentials_of(ROUTER_NAME, secured)
-        return zenoh.open(router_config(endpoints, credentials, read_access(secured), links))
+        return zenoh.open(router_config(endpoints, credentials, read_access(secured), links, small))
     except zenoh.ZError as error:
         text = str(error)
         endpoint = next((each for each in endpoints if each in text), endpoints[0])

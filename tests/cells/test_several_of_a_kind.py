@@ -33,6 +33,9 @@ async def test_a_cell_that_is_up_knows_them_by_their_names(tmp_path: Path) -> No
         assert {f"two_cameras/{name}" for name in SERVICES} <= set(listed)
         told = json.loads(cell.tell("topic", "info", "left/camera/image_raw", "--json").stdout)
         assert (told["writer"], told["message"], told["kind"]) == ("left_camera", "Image", "stream")
+        listed = [json.loads(line) for line in cell.tell("topic", "list", "--json").stdout.splitlines()]
+        own = {one["key"]: (one["writer"], one["message"], one["kind"]) for one in listed}
+        assert own["right/camera/camera_info"] == ("right_camera", "CameraInfo", "state")
         assert cell.tell("param", "set", "services.right_camera.rate=5").returncode == 0
         rates = [cell.tell("param", "get", f"services.{name}.rate").stdout.strip() for name in
                  ("left_camera", "right_camera")]

@@ -76,5 +76,5 @@ def test_every_topic_has_a_message_that_can_be_shown(topic: topics.AnyTopic) -> 
 
     assert list(fields_of(topic.message))
     if topic.kind == "request" and topic.key != "motion/execute":
-        example = example_of(topic.key, topic.message)
+        example = example_of(topic.message)
         assert decode(f"panda/{topic.key}", encode(f"panda/{topic.key}", json.dumps(example)))

@@ -17,7 +17,7 @@ from common.errors import ConfigError
 from common.security.access import Rights, access_control
 from common.security.certificates import Authority
 from common.transport.credentials import ACCESS, ROUTER_NAME, credentials_of, read_access
-from common.transport.endpoint import port_of, router_config
+from common.transport.endpoint import MOST_BYTES_BESIDES, port_of, router_config
 from common.transport.router import open_router
 from tests.harness import ROOT, environment, free_domain
 from tests.security.holders import REFUSED, Holder
@@ -40,6 +40,21 @@ def folder(tmp_path: Path) -> Path:
     rights = {"writer": Rights(write={"seen", "secret"}), "reader": Rights(read={"seen"})}
     (tmp_path / ACCESS).write_text(json.dumps(access_control({"cell": rights})))
     return tmp_path
+
+
+def test_what_is_too_large_for_a_key_under_another_name_goes_no_farther_than_the_router() -> None:
+    here, key = f"tcp/127.0.0.1:{free_port()}", "cell/left/camera/camera_info"
+    with ExitStack() as stack:
+        stack.enter_context(open_router([here], small=["left/camera/camera_info"]))
+        writer, reader = (stack.enter_context(Holder(here, None)) for _ in range(2))
+        heard = reader.hear(key)
+        for _ in range(100):
+            writer.put(key, bytes(MOST_BYTES_BESIDES + 1))
+            writer.put(key, b"small")
+            if heard.samples:
+                break
+            heard.soon(0.1)
+        assert {len(payload) for _, payload in heard.samples} == {len(b"small")}
 
 
 def test_linked_routers_pass_on_what_each_lets_through_and_no_more(folder: Path) -> None:

@@ -15,7 +15,7 @@ from common.chaos.agent import damaged, nonsense
 from common.chaos.plan import CELL_SECONDS, LABELS, Fault, Form, Kind, faults, plan
 from common.chaos.setting import keys_of
 from common.errors import DecodeError
-from common.messages import StopRequest
+from common.messages import Image, StopRequest
 from common.transport.codec import Attachment, checksum_of, decode, encode, require_whole
 from common.transport.ownership import Owner
 
@@ -75,8 +75,16 @@ def test_keys_are_those_that_the_services_write_or_answer() -> None:
     owned = {"trajectory_executor": ["motion/execute", "joint_states", "param/trajectory_executor"],
              "scene_manager": ["planning_scene"], "camera_simulator": ["camera/image_raw"]}
     owners = [Owner(key, key, service, "1") for service, keys in owned.items() for key in keys]
-    assert keys_of(owners, ["trajectory_executor", "scene_manager"]) == [
+    assert list(keys_of(owners, ["trajectory_executor", "scene_manager"])) == [
         "planning_scene", "joint_states", "motion/execute"]
+
+
+def test_a_key_under_another_name_is_disturbed_as_what_its_service_calls_it() -> None:
+    own = "camera/image_raw"
+    owners = [Owner(f"{side}/{own}", own, f"{side}_camera", "1") for side in ("left", "right")]
+    known = keys_of(owners, ["left_camera", "right_camera"])
+    assert list(known) == ["left/camera/image_raw", "right/camera/image_raw"]
+    assert all(topic.key == key and topic.message is Image for key, topic in known.items())
 
 
 @pytest.mark.parametrize("form", [form for form in get_args(Form) if form])

@@ -23,6 +23,7 @@ from common.recording.decoding import Decoder
 from common.recording.foxglove import convert
 from common.recording.foxglove_schemas import SCHEMAS
 from common.recording.reading import Recording
+from common.recording.recovery import recover
 from common.recording.sample import RecordingError, Sample
 from tests.common.recording.samples import START, STEP, joints, packed, status, write
 
@@ -126,6 +127,28 @@ def test_file_for_foxglove_is_whole_and_says_what_was_left_out(tmp_path: Path) -
     assert found[0] == ("foxglove.JointStates", "panda/joint_states", "json", START)
     assert [name for name, *_ in found] == [
         "foxglove.JointStates", "foxglove.JointStates", "PickPlaceStatus", "foxglove.CompressedImage"]
+
+
+def told(number: int) -> Sample:
+    """A message whose class is not here, with the schema that was recorded."""
+    values = {"header": {"stamp": START + number, "frame_id": "w"}, "gloss": number / 4, "raw": b"\xff\x00"}
+    return Sample("panda/gloss", msgpack.packb(values), START + number * STEP, message="Gloss", writer="polisher.1",
+                  sequence=number + 1, schema=json.dumps({"title": "Gloss", "type": "object"}).encode())
+
+
+def test_messages_whose_class_is_not_here_are_exported_by_the_schema_that_was_recorded(tmp_path: Path) -> None:
+    cut = write(tmp_path / "a.mcap", [told(0), told(1), foreign()])
+    recover(cut, tmp_path / "b.mcap")
+    decoder = Decoder()
+    with Recording(tmp_path / "b.mcap") as recording:
+        assert tables.export(recording, tmp_path / "csv", lambda topic: True, decoder) == {"gloss.csv": 2}
+        assert foxglove.export(recording, tmp_path / "f.mcap", lambda topic: True, decoder) == 2
+    assert set(decoder.skipped) == {"mine"}
+    assert [row["gloss"] for row in table(tmp_path / "csv" / "gloss.csv")] == ["0.0", "0.25"]
+    with (tmp_path / "f.mcap").open("rb") as file:
+        schema, _, message = next(iter(make_reader(file).iter_messages()))
+    assert (schema.name, json.loads(schema.data)["title"]) == ("Gloss", "Gloss")
+    assert base64.urlsafe_b64decode(json.loads(message.data)["raw"]) == b"\xff\x00"
 
 
 def table(path: Path) -> list[dict[str, str]]:
