@@ -8,7 +8,6 @@ import logging
 import math
 import os
 import signal
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
@@ -22,6 +21,7 @@ from common.chaos.plan import STATELESS_FORMS, Fault, Form
 from common.config import Container
 from common.errors import DecodeError, RequestFailed
 from common.messages import Message, WorldEdit
+from common.sources import monotonic
 from common.transport.codec import (
     DEFAULT_LIMIT,
     Attachment,
@@ -87,11 +87,11 @@ class Chaos:
 
     async def run(self) -> None:
         """Carry the plan out; what is stopped and was not noticed goes on when this is cancelled."""
-        self._began = time.monotonic()
+        self._began = monotonic()
         try:
             async with asyncio.TaskGroup() as lasting:
                 for fault in self._plan:
-                    await asyncio.sleep(max(0.0, self._began + fault.at - time.monotonic()))
+                    await asyncio.sleep(max(0.0, self._began + fault.at - monotonic()))
                     if fault.holding:
                         await _until(self._gripper, self._is_holding, PATIENCE)
                     await self._begin(fault, lasting)
@@ -121,7 +121,7 @@ class Chaos:
             lasting.create_task(self._stop_and_go(fault, pid))
 
     def _note(self, fault: Fault) -> None:
-        now = time.monotonic() - self._began
+        now = monotonic() - self._began
         log.warning("CHAOS %.1f s: %s", now, fault)
         self.happened.append(Happened(round(now, 2), fault.what, fault.target))
 
