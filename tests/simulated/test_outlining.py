@@ -1,0 +1,90 @@
+"""The UR5 cell: an outline that was seen, one that a person chose or wrote, and what cannot be outlined."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from common import topics
+from common.applications.outlining import stage_files
+from common.applications.outlining.contours_choice import parse_choice
+from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT
+from common.applications.outlining.verbs import before_run
+from common.messages import TaskCommand
+from common.transport.bus import Bus
+from tests.harness import until
+from tests.simulated.visited import SimulatedCell
+
+pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
+
+
+def assert_good(summary: dict[str, Any]) -> None:
+    outline = summary["outline"]
+    assert summary["state"] == "DONE"
+    assert outline["fraction"] == 1.0 and outline["closed"]
+    assert outline["deviation_mm"]["max"] < 0.5 and outline["deviation_mm"]["mean"] < 0.2
+    assert outline["tracking_mm"]["max"] < 0.15
+    assert summary["failures"] == 0
+
+
+def test_the_cube_is_outlined_and_every_figure_is_told() -> None:
+    summary = SimulatedCell("ur5", world="w2").summary
+    assert_good(summary)
+    outline = summary["outline"]
+    assert set(outline) == {"object", "points", "fraction", "length_m", "closed", "deviation_mm", "tracking_mm"}
+    assert outline["length_m"] == pytest.approx(0.4, abs=0.002)
+    assert 4 <= outline["points"] < 1000
+    assert [plan["fraction"] for plan in summary["plans"]] == [1.0] * 5, "one for each stage"
+    assert 0 < summary["seconds"]["moving"] <= summary["seconds"]["task"]
+    assert summary["restarts"] == {}
+
+
+def test_the_object_that_was_chosen_is_outlined() -> None:
+    chosen: list[str] = []
+
+    async def visit(_cell: SimulatedCell, bus: Bus) -> None:
+        found = await until(bus.reader(CONTOURS), lambda found: len(found.contours) == 3)
+        wanted = parse_choice("red")
+        assert wanted is not None
+        answer = await bus.client(OUTLINE_SELECT).call(wanted)
+        assert answer.index != found.selected, "not the one that it takes by itself"
+        chosen.append(answer.label)
+        await until(bus.reader(CONTOUR_PATH), lambda path: path.object == chosen[0])
+        await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"))
+
+    summary = SimulatedCell("ur5", ["autostart=false"], world="w5", visit=visit).summary
+    assert_good(summary)
+    outline = summary["outline"]
+    assert outline["object"] == chosen[0] and outline["length_m"] == pytest.approx(2 * math.pi * 0.03, abs=0.005)
+
+
+def test_coordinates_edited_by_hand_are_traced(tmp_path: Path) -> None:
+    smaller = [[0.5 + dx, dy, 1.105] for dx, dy in ((-0.03, -0.03), (0.03, -0.03), (0.03, 0.03), (-0.03, 0.03))]
+    stage_files.write_points(tmp_path / stage_files.CLEARED, smaller)
+    told = before_run("ur5", [], None, source=str(tmp_path)).overrides  # of `run ur5 --from`
+    outline = SimulatedCell("ur5", told).summary["outline"]
+    assert outline["closed"] and outline["points"] == 4
+    assert outline["length_m"] == pytest.approx(0.24)
+    assert outline["tracking_mm"]["max"] < 0.15
+
+
+@pytest.mark.parametrize(
+    ("objects", "said"),
+    [
+        ("[]", "no contour"),
+        ("[{id: tower, shape: box, x: 0.5, y: 0.0, z: 1.0, size: [0.04, 0.04], height: 1.2}]", "reach"),
+    ],
+    ids=["nothing there", "out of reach"],
+)
+def test_what_can_not_be_outlined_ends_with_one_line_and_the_arm_at_home(objects: str, said: str) -> None:
+    cell = SimulatedCell("ur5", [f"world.objects={objects}", "services.contour_tracer.selection_timeout=4"])
+    summary = cell.summary
+    assert summary["state"] == "ERROR"
+    assert summary["seconds"]["moving"] < 4  # cell time: the fingers at most
+    assert summary["seconds"]["first_motion"] is None
+    told = [line for line in cell.lines if "  ERROR contour_tracer: " in line]
+    assert len(told) == 1 and said in told[0]
+    assert "Traceback" not in cell.text
