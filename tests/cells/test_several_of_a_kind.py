@@ -18,13 +18,6 @@ SERVICES = ["motion_planner", "robot_state_publisher", "trajectory_executor", "l
             "left_detector", "right_detector", "workspace_validator", "scene_manager", "smart_pick_place"]
 
 
-async def test_two_cameras_two_detectors_and_one_scene_clear_the_table(tmp_path: Path) -> None:
-    with RunningCell(tmp_path, "run", CELL, "--speed", "3") as cell:
-        assert await cell.ended(150) == 0, cell.tail(80)
-        assert cell.summary["restarts"] == dict.fromkeys(["router", *SERVICES], 0)
-        assert cell.summary["truth"]["in_box"] == 3 and not cell.processes()
-
-
 async def test_a_cell_that_is_up_knows_them_by_their_names(tmp_path: Path) -> None:
     with RunningCell(tmp_path, "up", CELL, "--set", "autostart=false") as cell:
         async with connect(cell="two_cameras", service="watcher", endpoint=cell.endpoint, timeout=60.0) as bus:
