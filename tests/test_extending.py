@@ -37,7 +37,8 @@ from common.transport.codec import decode
 from common.transport.local import LocalNetwork
 from common.viewer.guard import close_server, make_server
 from tests.common.viewer.scene_cell import Stage
-from tests.harness import free_domain
+from tests.harness import ask, free_domain
+from tests.simulated.visited import no_processes
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
@@ -198,11 +199,15 @@ def planners(summary: dict[str, object]) -> set[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.cell
 @pytest.mark.parametrize("line", HERE)
 def test_cell_of_the_clone_runs_with_one_part_of_ours(line: str, folder: Path, tmp_path: Path) -> None:
-    summary = run_to_end(line, folder, tmp_path / "summary.json")
-    assert ("over_home" in planners(summary)) == ("my_pipeline" in line)
+    file = tmp_path / "summary.json"
+    with no_processes():
+        ran = ask(folder, *shlex.split(line)[1:], "--set", "world.count=1", "--summary", str(file), "--domain",
+                  str(free_domain()))
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert DONE in ran.stdout
+    assert ("over_home" in planners(json.loads(file.read_text(encoding="utf-8")))) == ("my_pipeline" in line)
 
 
 @pytest.mark.slow

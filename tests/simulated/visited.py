@@ -1,4 +1,4 @@
-"""A whole cell on the virtual clock, and somebody in it who looks, tells it what to do and breaks things.
+"""Whole cells on the virtual clock: with somebody in it who looks and breaks things, or in the place of `zencell run`.
 
 What a run of it comes to is told as `zencell run` tells it: in the figures of its summary.
 """
@@ -6,13 +6,21 @@ What a run of it comes to is told as `zencell run` tells it: in the figures of i
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
+import typer
+
+from cli.operation import Operation
+from common import topics
 from common.application import find_application
 from common.config import Cell, load_cell
+from common.messages import TaskCommand
 from common.reporting.fold import Fold
+from common.reporting.summary import describe
 from common.supervision.collector import Collector
 from common.transport.bus import Bus
 from common.virtual.simulation import Outcome, Simulation
@@ -81,3 +89,28 @@ class SimulatedCell:
     def text(self) -> str:
         """All that its processes wrote."""
         return "\n".join(self.lines)
+
+
+@contextmanager
+def no_processes() -> Iterator[None]:
+    """Inside, `zencell run` in this process runs its cell on the virtual clock; all the rest of it is as it is."""
+    with patch.object(Operation, "run_to_end", _run_to_end):
+        yield
+
+
+def _run_to_end(operation: Operation) -> int:
+    async def work(bus: Bus) -> None:
+        collector = Collector(bus, operation.fold, 0.0, lambda line: None)
+        async with beside(collector.run()):
+            if not operation.cell.run.autostart:
+                await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"))
+            await collector.ended.wait()
+            await collector.settle()
+
+    outcome = Simulation(operation.cell, 1, visit=work).run()
+    assert not outcome.broken and not outcome.crashes, outcome
+    operation.summary.restarts = outcome.restarts
+    operation._write_summary()
+    for line in describe(operation.summary.as_dict(), operation.fold.figures):
+        typer.echo(line)
+    return 0 if operation.summary.state == "DONE" else 1
