@@ -24,12 +24,15 @@ from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 Rgb = tuple[int, int, int]
 
 _PLAIN: Rgb = (230, 230, 230)  # where neither URDF nor file give a colour
 _FEW = 150  # triangles of a connected part that are always kept
 _SHRINKS = 2e-3  # [m] the box about a part may change by less
 _SHARP = 0.6  # [rad] triangles that meet at more than this have an edge between them
+_LARGE = 0.1  # of a surface: a plane that is larger has an edge all around
+_FLAT = 5000.0  # squared radius that two triangles bend at by their span: more is a plane, as trimesh has it
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +90,29 @@ def _simplified(mesh: trimesh.Trimesh, kept: float) -> trimesh.Trimesh:
     Each connected part by itself, since among others small ones are lost first; those of few triangles stay as they
     are, as do those that would shrink.
     """
-    parts = [_simplified_part(part, kept) for part in mesh.split(only_watertight=False)]
-    return cast(trimesh.Trimesh, trimesh.util.concatenate(parts))
+    groups = _groups(_parts(mesh.face_adjacency, len(mesh.faces)))
+    parts: Any = mesh.submesh(groups, only_watertight=False, repair=True)  # small holes are filled
+    return cast(trimesh.Trimesh, trimesh.util.concatenate([_simplified_part(part, kept) for part in parts]))
+
+
+def _parts(edges: Indices, count: int) -> Indices:
+    """(count,) number of the connected part of each node, which is its lowest node, by the (n, 2) edges between nodes.
+
+    trimesh asks networkx for them where scipy is not installed, which takes half of the time that a robot takes.
+    """
+    lowest = np.arange(count)
+    while (lowest[edges[:, 0]] != lowest[edges[:, 1]]).any():
+        ends = lowest[edges]
+        np.minimum.at(lowest, ends.max(axis=1), ends.min(axis=1))
+        while (lowest[lowest] != lowest).any():
+            lowest = lowest[lowest]
+    return lowest
+
+
+def _groups(parts: Indices) -> list[Indices]:
+    """The nodes of each part."""
+    order = np.argsort(parts, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(parts[order])) + 1)
 
 
 def _simplified_part(part: trimesh.Trimesh, kept: float) -> trimesh.Trimesh:
@@ -104,8 +128,19 @@ def _simplified_part(part: trimesh.Trimesh, kept: float) -> trimesh.Trimesh:
 
 
 def _piece(link: str, color: Rgb, mesh: trimesh.Trimesh) -> Piece:
-    smooth = trimesh.graph.smooth_shade(mesh, angle=_SHARP)
-    return Piece(link, color, np.asarray(smooth.vertices, dtype=np.float32), np.asarray(smooth.faces, dtype=np.uint32))
+    """A vertex for each place and smooth surface there: a large plane is one of its own, whatever it meets at."""
+    adjacent, faces = mesh.face_adjacency, np.asarray(mesh.faces)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        flat = ~((mesh.face_adjacency_radius / mesh.face_adjacency_span) ** 2 <= _FLAT)
+    planes = _parts(adjacent[flat], len(faces))
+    large = (np.bincount(planes, mesh.area_faces, len(faces)) > _LARGE * mesh.area)[planes]
+    alone = large & (np.bincount(planes, minlength=len(faces))[planes] > 1)
+    smooth = (mesh.face_adjacency_angles < _SHARP) & ~alone[adjacent].any(axis=1)
+    surface = np.where(alone, planes, _parts(adjacent[smooth], len(faces)))
+    corners = np.stack([faces.ravel(), np.repeat(surface, 3)])
+    shared, index = np.unique(corners, axis=1, return_inverse=True)
+    return Piece(link, color, np.asarray(mesh.vertices[shared[0]], dtype=np.float32),
+                 index.reshape(-1, 3).astype(np.uint32))
 
 
 def _coloured(visual: Visual) -> list[tuple[Rgb, trimesh.Trimesh]]:

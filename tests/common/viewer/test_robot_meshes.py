@@ -9,12 +9,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from common.config import RobotConfig
 from common.errors import ConfigError
 from common.robot.model import RobotModel
-from common.viewer.robot_meshes import coarse, visual_pieces
+from common.viewer.robot_meshes import _groups, _parts, _piece, coarse, visual_pieces
 from tests.common.viewer.scene_cell import pieces_of, robot_of
 
 URDF = """<robot name="post">
@@ -95,6 +97,32 @@ def test_few_triangles_are_left_and_no_part_is_lost(cell: str) -> None:
         assert simple.faces.max() < len(simple.vertices)
         np.testing.assert_allclose(simple.vertices.min(axis=0), full.vertices.min(axis=0), atol=0.003)
         np.testing.assert_allclose(simple.vertices.max(axis=0), full.vertices.max(axis=0), atol=0.003)
+
+
+@given(st.integers(1, 30), st.data())
+def test_parts_are_those_that_edges_connect(count: int, data: st.DataObject) -> None:
+    node = st.integers(0, count - 1)
+    edges = data.draw(st.lists(st.tuples(node, node), max_size=40))
+    lowest = list(range(count))
+    for _ in range(count):
+        for a, b in edges:
+            lowest[a] = lowest[b] = min(lowest[a], lowest[b])
+    parts = _parts(np.array(edges, dtype=np.intp).reshape(-1, 2), count)
+    assert parts.tolist() == lowest
+    groups = [sorted(group.tolist()) for group in _groups(parts)]
+    assert sorted(groups) == sorted([i for i in range(count) if lowest[i] == part] for part in set(lowest))
+
+
+@pytest.mark.parametrize("mesh", [
+    trimesh.creation.box(), trimesh.creation.cylinder(1, 2), trimesh.creation.icosphere(), trimesh.creation.torus(2, 1),
+    trimesh.creation.capsule(), trimesh.creation.cone(1, 3), trimesh.creation.cylinder(1, 2, sections=6),
+    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False),
+])
+def test_surfaces_are_parted_at_edges_as_trimesh_does(mesh: trimesh.Trimesh) -> None:
+    wanted = trimesh.graph.smooth_shade(mesh, angle=0.6)
+    piece = _piece("link", (0, 0, 0), mesh)
+    assert len(piece.vertices) == len(wanted.vertices)
+    np.testing.assert_allclose(piece.vertices[piece.faces], mesh.triangles, atol=1e-6)
 
 
 def test_ghost_has_fewer_triangles_of_the_same_links() -> None:
