@@ -38,7 +38,7 @@ class _Goal:
 
     def at(self, time: float) -> tuple[Vector, Vector]:
         """Positions [rad] and their change per second of the trajectory (dof,), blended from where the robot was."""
-        q, dq, _ = self.trajectory.at(time)
+        q, dq = self.trajectory.at(time)
         blend = min(BLEND_TIME, self.trajectory.duration)
         u = min(time / blend, 1.0)
         left, slope = 1 - u**3 * (10 - 15 * u + 6 * u**2), -30 * u**2 * (1 - u) ** 2 / blend

@@ -33,23 +33,25 @@ class Trajectory:
         """Time of the last point [s]."""
         return float(self.times[-1])
 
-    def at(self, time: float) -> tuple[Vector, Vector, Vector]:
-        """Positions, velocities and accelerations (dof,) at a time [s]; at rest at the ends outside of it."""
+    def at(self, time: float) -> tuple[Vector, Vector]:
+        """Positions and velocities (dof,) at a time [s]; at rest at the ends outside of it."""
         if time <= 0.0 or time >= self.duration:
             end = 0 if time <= 0.0 else -1
-            zero = 0.0 * self.positions[end]
-            return self.positions[end], zero, zero
+            return self.positions[end], 0.0 * self.positions[end]
         index = int(np.searchsorted(self.times, time, side="right")) - 1
         begin, end = self.times[index], self.times[index + 1]
-        return _interpolated((time - begin) / (end - begin), *(each[index] for each in self._segments))
+        return _interpolated((time - begin) / (end - begin), end - begin, self._segments[:, index])
 
     def between(self, fraction: float) -> tuple[Vector, Vector, Vector]:
         """Positions, velocities and accelerations (N - 1, dof) at a fraction, 0 to 1, of every segment."""
-        return _interpolated(fraction, *self._segments)
+        h, (_, _, a0, c3, c4, c5) = np.diff(self.times)[:, None], self._segments
+        u = fraction
+        ddq = (2 * a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / h**2
+        return *_interpolated(u, h, self._segments), ddq
 
     @cached_property
-    def _segments(self) -> tuple[Vector, ...]:
-        """Durations (N - 1, 1) [s] of the segments, and the coefficients (N - 1, dof) of their polynomials [rad]."""
+    def _segments(self) -> Vector:
+        """Coefficients (6, N - 1, dof) [rad] of the polynomials of the segments, from the lowest up."""
         h = (self.times[1:] - self.times[:-1])[:, None]
         q0, move = self.positions[:-1], self.positions[1:] - self.positions[:-1]
         v0, v1 = self.velocities[:-1] * h, self.velocities[1:] * h
@@ -62,17 +64,15 @@ class Trajectory:
         else:
             a0, c3 = 3 * move - 2 * v0 - v1, v0 + v1 - 2 * move
             c4 = c5 = np.zeros_like(move)
-        return h, q0, v0, a0, c3, c4, c5
+        return np.stack([q0, v0, a0, c3, c4, c5])
 
 
-def _interpolated(
-    u: float, h: Vector, q0: Vector, v0: Vector, a0: Vector, c3: Vector, c4: Vector, c5: Vector
-) -> tuple[Vector, Vector, Vector]:
-    """Positions, velocities and accelerations at a share u of segments."""
+def _interpolated(u: float, duration: float | Vector, coefficients: Vector) -> tuple[Vector, Vector]:
+    """Positions and velocities at a share u of segments of these durations [s]."""
+    q0, v0, a0, c3, c4, c5 = coefficients
     q = q0 + u * (v0 + u * (a0 + u * (c3 + u * (c4 + u * c5))))
-    dq = (v0 + u * (2 * a0 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / h
-    ddq = (2 * a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / h**2
-    return q, dq, ddq
+    dq = (v0 + u * (2 * a0 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / duration
+    return q, dq
 
 
 def from_message(message: JointTrajectory, names: tuple[str, ...]) -> Trajectory:

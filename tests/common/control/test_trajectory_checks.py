@@ -33,7 +33,7 @@ def test_smooth_trajectory_is_taken_and_meets_its_points(limits, rest_to_rest):
     message = rest_to_rest([0, 0], [0.5, -0.3])
     trajectory = check(message, limits)
     for point in message.points[1:-1]:
-        q, dq, _ = trajectory.at(point.time_from_start)
+        q, dq = trajectory.at(point.time_from_start)
         assert np.allclose(q, point.positions) and np.allclose(dq, point.velocities)
 
 
@@ -135,7 +135,7 @@ def test_few_points_without_accelerations_are_followed_smoothly(limits, rest_to_
     assert not trajectory.quintic and check(message, limits).quintic
     before = trajectory.at(0.0)[0]
     for t in np.arange(0.0, 3.0, 0.01):
-        q, dq, _ = trajectory.at(float(t))
+        q, dq = trajectory.at(float(t))
         assert np.all(np.abs(q - before) <= 0.011 * limits.velocity) and np.all(np.abs(dq) <= limits.velocity)
         before = q
 
@@ -148,7 +148,7 @@ def test_every_sampled_quintic_within_limits_is_taken_and_stays_within(limits, r
     duration = max(1.875 * largest / 2.0, math.sqrt(5.774 * largest / 10.0)) / share
     trajectory = check(rest_to_rest([0, 0], list(end), duration, points), limits)
     for t in np.linspace(0.0, duration, 50):
-        q, dq, _ = trajectory.at(float(t))
+        q, dq = trajectory.at(float(t))
         assert np.all(np.abs(q) <= largest + 1e-6) and np.all(np.abs(dq) <= 1.02 * limits.velocity + 1e-9)
 
 
