@@ -190,8 +190,8 @@ class Invariants:
         if self.ended:
             return
         fastest = 1.03 * limits.velocity + BLEND
-        fits = np.isfinite(q).all() and np.isfinite(dq).all() and (np.abs(dq) <= fastest).all()
-        if self._broke(fits and ((q >= limits.lower - 2e-3) & (q <= limits.upper + 2e-3)).all(), LIMITS):
+        fits = (q >= limits.lower - 2e-3) & (q <= limits.upper + 2e-3) & (np.abs(dq) <= fastest)
+        if self._broke(fits.all(), LIMITS):  # what is not a number is within nothing
             self._tell(LIMITS, f"q {np.round(q, 4).tolist()}, dq {np.round(dq, 3).tolist()}")
         last, self._last = self._last, (q.copy(), dq.copy(), now)
         if last is None:
