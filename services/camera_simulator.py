@@ -7,11 +7,11 @@ from pydantic import Field
 
 from common import topics
 from common.config import Parameters, Run, Surroundings, Tunable
-from common.messages import WorldObjects
+from common.messages import Image, WorldObjects
 from common.perception.image import array_to_image
 from common.process.pace import Pace
 from common.process.service import main
-from common.sim.rendering import Renderer, disturbed
+from common.sim.rendering import Picture, Renderer, disturbed
 from common.transport.bus import Bus
 
 
@@ -37,10 +37,17 @@ async def run(bus: Bus, config: Config) -> None:
     await truth.next()
     infos.put(renderer.camera.info(bus.header(frame)))
     pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
+    sent: Image | None = None
+    shown: Picture | None = None
     while True:
         header = bus.header(frame)  # the instant of exposure: what is drawn is where everything is now
-        picture = renderer.see((truth.latest or WorldObjects()).objects).colour
-        images.put(array_to_image(disturbed(picture, config.noise_std, config.brightness, rng), "bgr8", header))
+        drawn = renderer.see((truth.latest or WorldObjects()).objects).colour
+        picture = disturbed(drawn, config.noise_std, config.brightness, rng)
+        if sent is None or picture is not shown:
+            sent, shown = array_to_image(picture, "bgr8", header), picture
+        else:
+            sent = sent.model_copy(update={"header": header})  # with the pixels as they are
+        images.put(sent)
         await pace.wait()
 
 
