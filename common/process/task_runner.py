@@ -59,17 +59,21 @@ async def run_task(
     robot = RobotModel.load(config.robot)
     task = make(config, status.message(), new_id(), bus.clock.speed)
     known = view(now=bus.clock.now())
+    measured: m.JointState | None = None
 
     def look() -> V:
+        nonlocal measured
         known.now = bus.clock.now()
         known.scene, known.motion = scene.latest, motion.latest
         known.gripper = gripper.latest if config.robot.gripper is not None else m.GripperState()
         for name, reader in own.items():
             setattr(known, name, reader.latest)
-        measured = joints.latest
-        q = robot.order(measured.name, measured.position) if measured else None
-        if q is not None:
-            known.q, known.tcp = q.tolist(), matrix_to_pose(robot.fk(q))
+        newest = joints.latest
+        if newest is not None and newest is not measured:
+            measured = newest
+            q = robot.order(newest.name, newest.position)
+            if q is not None:
+                known.q, known.tcp = q.tolist(), matrix_to_pose(robot.fk(q))
         return known
 
     watchdog = LivenessWatchdog(lambda: joints.received, lambda: config.joint_states_timeout)
