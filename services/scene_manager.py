@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from common import topics
@@ -39,12 +41,14 @@ async def run(bus: Bus, config: Config) -> None:
     out.put(scene.scene())
     await bus.ready()
 
-    def hand() -> None:
-        """Feel before every look: what the hand does now decides what a frame means."""
+    def hand() -> NDArray[np.float64] | None:
+        """Feel before every look: what the hand does now decides what a frame means. Returns T_world_tcp, if known."""
         state, measured = gripper.latest, joints.latest
+        q = robot.order(measured.name, measured.position) if measured else None
+        T_world_tcp = robot.fk(q) if q is not None else None
         if state is not None:
-            q = robot.order(measured.name, measured.position) if measured else None
-            scene.feel(state, robot.fk(q) if q is not None else None)
+            scene.feel(state, T_world_tcp)
+        return T_world_tcp
 
     async def watch_hand() -> None:
         held: bool | None = None
@@ -55,10 +59,7 @@ async def run(bus: Bus, config: Config) -> None:
                 out.put(scene.scene())
 
     async def look(view: int, seen: Seen) -> None:
-        hand()
-        measured = joints.latest
-        q = robot.order(measured.name, measured.position) if measured else None
-        scene.see(seen.frame, seen.camera, robot.fk(q) if q is not None else None, view)
+        scene.see(seen.frame, seen.camera, hand(), view)
         out.put(scene.scene())
 
     async with asyncio.TaskGroup() as group:

@@ -6,6 +6,8 @@ pixel in the upper left corner. There is no other mapping anywhere: a mirrored o
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -93,9 +95,12 @@ class Pinhole:
         d /= np.linalg.norm(d, axis=-1, keepdims=True)
         return d @ self._rotation.T
 
-    def ray(self, pixel: npt.ArrayLike) -> tuple[Array, Array]:
+    def ray(self, pixel: Sequence[float] | Array) -> tuple[Array, Array]:
         """Origin (3,) [m] and unit direction (3,) in world of the ray through a pixel (u, v)."""
-        return self._position, self.directions(pixel)
+        u, v = pixel
+        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        length = math.sqrt(x * x + y * y + 1)
+        return self._position, self._rotation @ (x / length, y / length, 1 / length)
 
     def on_plane(self, pixels: npt.ArrayLike, z: float) -> Array:
         """Where the rays through pixels meet the horizontal plane at z [m]: (..., 2) [m]; nan where they do not."""

@@ -41,17 +41,15 @@ def occupied_slots(
         radius: of a sphere [m].
     """
     images = camera.project(slots)
-    seen = list(pixels)
+    seen = np.array(list(pixels)).reshape(-1, 2)
     reach = camera.fx * radius / float(np.min(camera.to_camera(slots)[:, 2]))
-    pairs = sorted(
-        (float(np.hypot(*(images[slot] - pixel))), slot, number)
-        for number, pixel in enumerate(seen)
-        for slot in range(len(slots))
-    )
+    away = images[:, None] - seen
+    distances = np.hypot(away[..., 0], away[..., 1])
+    near = np.argwhere(distances <= reach).tolist()
     taken: set[int] = set()
     matched: set[int] = set()
-    for distance, slot, number in pairs:
-        if distance > reach or slot in taken or number in matched:
+    for slot, number in sorted(near, key=lambda pair: distances[pair[0], pair[1]]):
+        if slot in taken or number in matched:
             continue
         taken.add(slot)
         matched.add(number)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +68,7 @@ class Resting:
             entry, leave = max(entry, min(first, second)), min(leave, max(first, second))
         return entry <= leave
 
-    def heights(self, camera: Pinhole, pixel: npt.ArrayLike) -> list[float]:
+    def heights(self, camera: Pinhole, pixel: Sequence[float] | Array) -> list[float]:
         """z [m] at which the centre of a ball seen at a pixel can be."""
         if not self.meets_container(*camera.ray(pixel)):
             return [self.plane]
@@ -84,6 +85,6 @@ class Resting:
         return bool(abs(x - self.container.x) <= room and abs(y - self.container.y) <= room)
 
 
-def inside_container(camera: Pinhole, pixel: npt.ArrayLike, around: Surroundings) -> bool:
+def inside_container(camera: Pinhole, pixel: Sequence[float] | Array, around: Surroundings) -> bool:
     """Whether the ray through a pixel (u, v) meets the volume of the container up to the height of a full stack."""
     return Resting.of(around).meets_container(*camera.ray(pixel))
