@@ -10,17 +10,25 @@ import numpy as np
 
 from common.virtual.network import FAIR, Weather
 
-Kind = Literal["crash", "restart", "cut", "router lost"]
+Kind = Literal["crash", "restart", "cut", "router lost", "stalled", "person"]
+Amid = Literal["", "asker", "asked"]
 
-CRASHES: tuple[Kind, ...] = ("crash", "crash", "crash")  # at least, and soon: short runs see them all too
-FIRST_GAPS = 0.2, 2.5  # [s] between those
-LATER_GAP = 12.0  # [s] on average to each further fault
-LONGEST = 60.0  # [s] from the cell being ready; what comes after is left to it to finish
+FIRST: tuple[Kind, ...] = ("crash", "crash", "crash", "cut", "stalled")  # at least, and soon: in short runs as well
+LATER: tuple[Kind, ...] = ("crash", "crash", "restart", "cut", "stalled", "person")
+FIRST_GAPS = 0.1, 2.0  # [s] of cell time between those
+LATER_GAP = 12.0  # [s] of cell time on average to each further fault
+LONGEST = 60.0  # [s] of cell time from the cell being ready; what comes after is left to it to finish
 MOST_FAULTS = 20  # of one run
 MOST_TURNS = 40  # of a process, from the time at which it is to crash to where it does
-CUT_SECONDS = 0.3, 3.0
+AMID_SHARE = 0.6  # of what hits one process: in the middle of a request
+AMID_TURNS = 12  # of a process, from a request to where it crashes
+CUT_SECONDS = 0.3, 4.0
+STALL_SECONDS = 0.2, 1.6  # less than Zenoh's lease of 2 s, after which a link is cut
 SKEW = 0.09  # [s] by which clocks are wrong at most; two of them differ by less than their tolerance of 0.2 s
 ROUTER_SHARE = 0.25  # of the cuts
+PERSON_SHARE = 0.5  # of the runs: somebody stops the task early on
+SPEEDS = 0.5, 2.0, 3.0  # cell time per wall time of those runs that have another than 1
+OTHER_SPEED = 0.3  # share of those
 
 
 @dataclass(frozen=True)
@@ -28,27 +36,32 @@ class Fault:
     """One fault.
 
     Attributes:
-        at: when [s] from the cell being ready.
-        kind: an end without `finally`; SIGTERM; a link that is cut; all links that are cut.
-        target: name of the process; empty for the router.
+        at: when [s] of cell time from the cell being ready.
+        kind: an end without `finally`; SIGTERM; a link that is cut; all links that are cut; a link on which everything
+            comes late; a person who stops the task, moves the arm and starts the task again.
+        target: name of the process; empty for the router and for a person.
+        amid: it hits who asks or is asked next, instead of the target.
         turns: of the process from then on until it crashes.
-        seconds: for which a link is cut.
+        seconds: for which a link is cut or stalled.
     """
 
     at: float
     kind: Kind
     target: str = ""
+    amid: Amid = ""
     turns: int = 0
     seconds: float = 0.0
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All that goes wrong in one run; clocks by service [s]."""
+    """All that goes wrong in one run, and what is left to chance; clocks by service [s]."""
 
     faults: tuple[Fault, ...] = ()
     weather: Weather = FAIR
     skews: tuple[tuple[str, float], ...] = ()
+    speed: float = 1.0  # cell time per wall time
+    shuffled: bool = False  # the processes take the turns that are due at once in any order
 
 
 def make_plan(seed: int, services: Sequence[str]) -> Plan:
@@ -59,28 +72,36 @@ def make_plan(seed: int, services: Sequence[str]) -> Plan:
         services: names of those that may be hit.
     """
     random = np.random.default_rng([seed, 5])
-    first: list[Kind] = [*CRASHES, "cut"]
-    later: tuple[Kind, ...] = ("crash", "crash", "restart", "cut")
-    kinds = [first[i] for i in random.permutation(len(first))]
+    first = [*FIRST, *(("person",) if random.random() < PERSON_SHARE else ())]
+    kinds: list[Kind] = [first[i] for i in random.permutation(len(first))]
     gaps = [float(gap) for gap in random.uniform(*FIRST_GAPS, len(kinds))]
     while len(kinds) < MOST_FAULTS:
-        kinds.append(later[int(random.integers(len(later)))])
+        kinds.append(LATER[int(random.integers(len(LATER)))])
         gaps.append(float(random.exponential(LATER_GAP)))
     faults: list[Fault] = []
     for kind, gap in zip(kinds, gaps, strict=True):
         at = (faults[-1].at if faults else 0.0) + gap
         if at > LONGEST:
             break
+        if kind == "person":
+            faults.append(Fault(at, kind))
+            continue
         target, seconds = str(random.choice(list(services))), 0.0
-        if kind == "cut":
-            seconds = float(random.uniform(*CUT_SECONDS))
-            if random.random() < ROUTER_SHARE:
+        if kind in ("cut", "stalled"):
+            seconds = float(random.uniform(*(CUT_SECONDS if kind == "cut" else STALL_SECONDS)))
+            if kind == "cut" and random.random() < ROUTER_SHARE:
                 faults.append(Fault(at, "router lost", seconds=seconds))
                 continue
-        faults.append(Fault(at, kind, target, int(random.integers(MOST_TURNS)), seconds))
+        amid: Amid = ""
+        if kind != "restart" and random.random() < AMID_SHARE:
+            amid = "asker" if random.random() < 0.5 else "asked"
+        turns = int(random.integers(AMID_TURNS if amid else MOST_TURNS))
+        faults.append(Fault(at, kind, target, amid, turns, seconds))
     weather = Weather(
         delay=float(random.uniform(0.0002, 0.004)), hiccup=float(random.uniform(0.0002, 0.002)),
         loss=float(random.uniform(0.0, 0.05)), doubled=float(random.uniform(0.0, 0.02)),
+        late=float(random.uniform(0.0, 0.03)),
     )
     skews = tuple((name, float(random.uniform(-SKEW, SKEW))) for name in services)
-    return Plan(tuple(faults), weather, skews)
+    speed = float(random.choice(SPEEDS)) if random.random() < OTHER_SPEED else 1.0
+    return Plan(tuple(faults), weather, skews, speed, shuffled=True)

@@ -17,12 +17,14 @@ from common.hardware.interface import Limits, Vector
 from common.messages import (
     CameraInfo,
     ExecuteRequest,
+    GripperCommand,
     GripperState,
     HoldRequest,
     Image,
     LogLine,
     Message,
     MotionStatus,
+    PlanRequest,
     PointCloud2,
     ServiceCounters,
     WorldEdit,
@@ -33,10 +35,12 @@ from common.transport.local import intersects
 from common.transport.session import RawSample
 from common.virtual.process import Requests
 
+GOALS = (ExecuteRequest, GripperCommand)
+WITH_ID = (*GOALS, PlanRequest)
 OVER = ("succeeded", "aborted", "cancelled")
 SEEN_BY_CAMERAS = (Image, CameraInfo, PointCloud2, ServiceCounters, LogLine)  # what one who sees the truth may say
 MOST_BROKEN = 5  # are told of
-OLDEST = 2.6  # [s] from when a motion is decided to its begin; later ones are refused, by clocks that are wrong
+OLDEST = 2.3  # [s] from when a motion is decided to its begin; later ones are refused, by clocks that are wrong
 LATE = 0.5  # [s] that the end of a request may come after its time-out
 MOVED = 2e-3  # [m] farther from where it lay, a thing was moved
 JUMP = 0.02  # [rad] from where the arm was to the first set-point of another process
@@ -80,7 +84,7 @@ class Invariants:
         self.ended = False  # what comes from now on is no part of the run
         self.truth_readers: set[str] = set()  # processes that hear what only cameras may see
         self._requests, self._now = requests, now
-        requests.on_ask, requests.on_answer = self._on_ask, self._on_answer
+        requests.on_ask, requests.on_serve, requests.on_answer = self._on_ask, self._on_serve, self._on_answer
         application = find_application(cell.application)
         self._fills = application.fills
         known: dict[str, AnyTopic] = {**topics.platform_topics(), **application.topics}
@@ -98,6 +102,8 @@ class Invariants:
         self._held_since: float | None = None  # cell time
         self._last: tuple[Vector, Vector, float] | None = None  # newest set-points and when
         self._decided: dict[str, float] = {}  # by goal: when it was asked for first
+        self._asked: dict[str, Message] = {}  # by id
+        self._told: dict[tuple[str, str], bool] = {}  # by controller's process and goal: whether it was accepted
         self._stray = 0  # set-points that moved without a goal
         self._restless = 0  # set-points that moved although the arm is held
         self._strange = 0
@@ -220,10 +226,25 @@ class Invariants:
     # --- requests -----------------------------------------------------------------------------------------------------
 
     def _on_ask(self, request: Message) -> None:
+        """An id stands for one thing, whoever asks for it and however often."""
+        if isinstance(request, WITH_ID):
+            known = self._asked.setdefault(request.id, request)
+            if self._broke(known is request or known == request, ONCE):
+                self._tell(ONCE, f"{request.id} is asked for twice, as {type(known).__name__} and another time as "
+                                 f"{type(request).__name__}, which are not the same")
         if isinstance(request, ExecuteRequest):
             self._decided.setdefault(request.id, self._now())
         elif isinstance(request, WorldEdit):
             self._edits, self._edited = self._edits + 1, True
+
+    def _on_serve(self, life: str, request: Message, answer: Message) -> None:
+        """Who asks for a goal again hears what became of it: what was accepted stays so, and what was refused too."""
+        if isinstance(request, GOALS) and isinstance(answer, MotionStatus | GripperState):
+            accepted = answer.state != "rejected"
+            before = self._told.setdefault((life, request.id), accepted)
+            if self._broke(before == accepted, ONCE):
+                self._tell(ONCE, f"{request.id} was {'accepted' if before else 'refused'}, then asked for again and "
+                                 f"{answer.state}: {answer.message}")
 
     def _on_answer(self, service: str, request: Message, answer: Message) -> None:
         if isinstance(request, WorldEdit):

@@ -84,9 +84,10 @@ class VirtualLoop(base_events.BaseEventLoop):
     _timer_cancelled_count: int
     _stopping: bool
 
-    def __init__(self, seed: int) -> None:
-        """Begin at 0 s."""
+    def __init__(self, seed: int, *, shuffled: bool = False) -> None:
+        """Begin at 0 s; shuffled, the lives take the turns that are due at once in an order of the seed's."""
         super().__init__()
+        self._shuffle = Random(f"turns of {seed}").shuffle if shuffled else None  # a text: the same in every process
         self._now = 0.0
         self._work_ns = 0  # done by the call that computes now
         self._computing = False
@@ -136,10 +137,27 @@ class VirtualLoop(base_events.BaseEventLoop):
             timer._scheduled = False
             if not timer._cancelled:
                 ready.append(timer)
+        if self._shuffle is not None and len(ready) > 1:
+            self._shuffle_lives(self._shuffle)
         for _ in range(len(ready)):
             handle = ready.popleft()
             if not handle._cancelled:
                 handle._run()
+
+    def _shuffle_lives(self, shuffle: Callable[[list[Any]], None]) -> None:
+        """Bring the turns that are ready into another order, in which each life's own keep theirs."""
+        ready = self._ready
+        lives = [handle._context.get(_life) for handle in ready]
+        if lives.count(lives[0]) == len(lives):
+            return
+        turns: dict[Life | None, list[Any]] = {}
+        for life, handle in zip(lives, ready, strict=True):
+            turns.setdefault(life, []).append(handle)
+        for own in turns.values():
+            own.reverse()
+        shuffle(lives)
+        ready.clear()
+        ready.extend(turns[life].pop() for life in lives)
 
     def call_soon(
         self, callback: Callable[..., object], *args: object, context: Context | None = None

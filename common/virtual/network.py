@@ -34,6 +34,7 @@ class Weather:
         hiccup, hiccup_delay: a message that is held up, and for how long at most; what follows it under its key too.
         loss: of streams.
         doubled: of what is put.
+        late, late_delay: a request or an answer that is held up, and for how long at most.
     """
 
     delay: float = 0.0003
@@ -41,6 +42,8 @@ class Weather:
     hiccup_delay: float = 0.3
     loss: float = 0.0
     doubled: float = 0.0
+    late: float = 0.0
+    late_delay: float = 1.8
 
 
 FAIR = Weather()
@@ -58,6 +61,8 @@ class VirtualSession(LocalSession):
         self.cut = False
         self.detached = False
         self.links = 0  # that were cut so far: what travelled on them is lost
+        self.latest_due = 0.0  # [s] when the last of what is on its way to it arrives
+        self.stalled_until = 0.0  # [s] before which nothing comes through its link
         self._on_change: list[Callable[[], None]] = []
 
     @property
@@ -127,6 +132,9 @@ class VirtualNetwork(LocalNetwork):
         if weather.hiccup and self._chance() < weather.hiccup:
             self.counted["held up"] += 1
             delay += weather.hiccup_delay * self._chance()
+        if lane == "query" and weather.late and self._chance() < weather.late:
+            self.counted["late"] += 1
+            delay += weather.late_delay * self._chance()
         # What the router says of tokens comes in its order, whoever they belong to.
         link = target if lane == "token" else source, target, lane, key
         self._bring(link, source, delay, call)
@@ -143,8 +151,13 @@ class VirtualNetwork(LocalNetwork):
         return -self.weather.delay * math.log1p(-self._chance())
 
     def _bring(self, link: Link, source: VirtualSession, delay: float, call: Callable[[], None]) -> None:
-        due = max(self._loop.time() + delay, self._arrival.get(link, 0.0) + SOON)
+        sent = max(self._loop.time(), source.stalled_until, link[1].stalled_until)
+        due = max(sent + delay, self._arrival.get(link, 0.0) + SOON)
         self._arrival[link] = due
+        if due < link[1].latest_due:
+            self.counted["changed places"] += 1
+        else:
+            link[1].latest_due = due
         self._arrive_at(due, source, link[1], call)
 
     def _arrive_at(self, due: float, source: VirtualSession, target: VirtualSession, call: Callable[[], None]) -> None:
@@ -170,6 +183,10 @@ class VirtualNetwork(LocalNetwork):
                 for watcher, token in self._seen_by(session):
                     self._arrive_at(self._loop.time(), session, session, partial(watcher, token, False))
                 session.tell_connection()
+
+    def stall(self, session: VirtualSession, seconds: float) -> None:
+        """Have everything that is sent from or to a session from now on come later, but come."""
+        session.stalled_until = max(session.stalled_until, self._loop.time() + seconds)
 
     def lose_router(self) -> None:
         """Cut all links, also of processes that start meanwhile, until it is back."""
@@ -221,7 +238,8 @@ class VirtualNetwork(LocalNetwork):
 
     def _tell_late(self, link: Link, call: Callable[[], None]) -> None:
         """Bring what the router says of a session that is gone, after what came from it before."""
-        due = max(self._loop.time() + self._delay(), self._arrival.get(link, 0.0) + SOON)
+        sent = max(self._loop.time(), link[1].stalled_until)
+        due = max(sent + self._delay(), self._arrival.get(link, 0.0) + SOON)
         self._arrival[link] = due
         self._arrive_at(due, link[1], link[1], call)
 

@@ -6,7 +6,7 @@ import asyncio
 import importlib
 import logging
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any, TypeVar
@@ -59,7 +59,9 @@ class Requests:
     repeated: list[str] = field(default_factory=list)  # what was read again, or after what is newer
     read: int = 0  # messages
     begun: int = 0
+    on_begin: Callable[[str, str], None] = lambda asker, asked: None
     on_ask: Callable[[Message], None] = lambda request: None
+    on_serve: Callable[[str, Message, Message], None] = lambda life, request, answer: None
     on_answer: Callable[[str, Message, Message], None] = lambda service, request, answer: None
 
 
@@ -71,6 +73,7 @@ class _WatchedClient(Client[Q, A]):
     async def call(self, request: Q, timeout: float = 5.0) -> A:
         """The answer to a request."""
         noted = self.noted
+        noted.on_begin(self._service, self.server)
         noted.on_ask(request)
         number = noted.begun = noted.begun + 1
         noted.open[number] = self._service, self.topic.key, monotonic() + timeout
@@ -130,6 +133,16 @@ class VirtualBus(Bus):
         client.noted = self._noted
         return client
 
+    def serve(self, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]]) -> None:
+        """Answer requests, of which is noted what is answered."""
+
+        async def watched(request: Q) -> A:
+            answer = await handler(request)
+            self._noted.on_serve(self.session.life, request, answer)
+            return answer
+
+        super().serve(topic, watched)
+
     def reader(self, topic: Topic[M], *, size: int = 1000, listening: bool = True) -> Reader[M]:
         """A reader of the topic."""
         reader = super().reader(topic, size=size, listening=listening)
@@ -151,7 +164,6 @@ class Host:
     processes: dict[str, VirtualProcess] = field(default_factory=dict)
     ended: list[tuple[Life, asyncio.Task[int]]] = field(default_factory=list)  # cut off, not cleared away yet
     started: int = 0
-    killed: int = 0
     skews: dict[str, float] = field(default_factory=dict)  # by service [s]
     crashes: list[str] = field(default_factory=list)  # of services, by themselves
 
@@ -285,7 +297,6 @@ class VirtualProcess:
         if self._pid is None or self._task is None:
             return
         host = self._host
-        host.killed += 1
         self._ending.reason = "SIGKILL"
         host.loop.end(self.life)
         host.ended.append((self.life, self._task))

@@ -36,6 +36,7 @@ from common.transport.session import RawSample
 from common.virtual.faults import Plan, make_plan
 from common.virtual.invariants import Invariants
 from common.virtual.loop import VirtualLoop
+from common.virtual.misfortune import Misfortune
 from common.virtual.network import VirtualNetwork, VirtualSession
 from common.virtual.process import Host, Requests, VirtualBus, VirtualProcess
 from common.virtual.trace import Trace
@@ -43,7 +44,6 @@ from common.virtual.watched_arm import shown_to, with_watched_arm
 
 LIMIT = 300.0  # [s] virtual time in which the task has to end
 LOOK = 0.5  # [s] of virtual time between looks at requests
-AGAIN = 0.1  # [s] between looks whether a process is there on which something is to be done
 SETTLE = 2.0  # [s] of virtual time for what still falls when the task has ended
 CLEARING = 30.0  # [s] of virtual time for what was cut off to come to its end
 SUPERVISOR, VISITOR, HOST = "supervisor", "visitor", "simulated"
@@ -116,13 +116,13 @@ class Simulation:
         self._status_key = f"{cell.name}/{self._status.key}"
         self._last_status: RawSample | None = None
         self._ended = asyncio.Event()
-        self._loop = VirtualLoop(seed)
+        self._over = False  # what the task says from now on does not count: somebody may have started it again
+        self._loop = VirtualLoop(seed, shuffled=self.plan.shuffled)
         self._network = VirtualNetwork(self._loop, seed, self.plan.weather)
         self._network.on_put = self._on_put
         self._requests = Requests()
         self.invariants = Invariants(self.cell, self._requests, self._loop.time)
         self._network.on_listen = lambda session, key: self.invariants.on_listen(session.name, key)
-        self._done: Counter[str] = Counter()  # faults that were made
 
     def run(self) -> Outcome:
         """What became of it; what the visit raises is raised."""
@@ -149,12 +149,13 @@ class Simulation:
         self._loop.call_later(seconds, self._network.find_router)
 
     async def _run(self) -> None:
-        outcome, clock = self.outcome, Clock()
+        outcome, clock = self.outcome, Clock(self.plan.speed)
         host = Host(
             self._loop, self._network, self.cell, clock, np.random.default_rng([outcome.seed, 4]), self._requests,
             skews=dict(self.plan.skews),
         )
         self._host = host
+        self._misfortune = Misfortune(host, self.plan, outcome.seed, self._status, self._say)
         entries = {entry.name: entry for entry in self.cell.services.values()}
 
         def make_child(name: str, _command: object, _environment: object, on_line: Callable[[str, str], None]) -> Any:
@@ -177,7 +178,7 @@ class Simulation:
         finally:
             outcome.restarts = {name: count for name, count in supervisor.restarts.items() if count}
             outcome.crashes, outcome.requests = host.crashes, host.requests.outcomes
-            outcome.faults = self._done + self._network.counted + Counter({"crash": host.killed})
+            outcome.faults = self._misfortune.made + self._network.counted
             outcome.broken, outcome.checked = self.invariants.broken, self.invariants.checked
             self.invariants.ended = True
             self._network.on_put = lambda session, sample: None  # what comes now is no part of the run
@@ -197,9 +198,11 @@ class Simulation:
 
     async def _work(self, bus: Bus) -> None:
         """Wait for the end of the task, and for what still falls then."""
-        making = asyncio.create_task(self._make_faults())
+        making = asyncio.create_task(self._misfortune.run())
         await self._visited()
-        await self._ended.wait()
+        while not self._ended.is_set():
+            await self._ended.wait()
+        self._over = True
         self.outcome.seconds = self._loop.time()
         making.cancel()
         await asyncio.wait({making})
@@ -221,38 +224,6 @@ class Simulation:
         finally:
             await bus.close()
             session.close()
-
-    async def _make_faults(self) -> None:
-        """Let go wrong what the plan says."""
-        began = self._loop.time()
-        for fault in self.plan.faults:
-            await asyncio.sleep(max(0.0, began + fault.at - self._loop.time()))
-            self._say(f"FAULT {fault.kind} {fault.target}{f' for {fault.seconds:.1f} s' if fault.seconds else ''}")
-            if fault.kind == "router lost":
-                self.lose_router(fault.seconds)
-                self._done[fault.kind] += 1
-                continue
-            process = self._host.processes[fault.target]
-            session = await self._when_there(process, connected=fault.kind == "cut")
-            if fault.kind == "crash":
-                process.kill_at_turn(fault.turns)
-                continue
-            self._done[fault.kind] += 1
-            if fault.kind == "cut":
-                self._network.cut([session])
-                self._loop.call_later(fault.seconds, self._mend, session)
-            else:
-                process.terminate()
-
-    async def _when_there(self, process: VirtualProcess, connected: bool) -> VirtualSession:
-        """The place of a process on the network, as soon as it runs."""
-        while (session := process.session) is None or (connected and session.cut):  # noqa: ASYNC110 - time is free here
-            await asyncio.sleep(AGAIN)
-        return session
-
-    def _mend(self, session: VirtualSession) -> None:
-        if not session.detached and not self._network.router_lost:
-            self._network.mend([session])
 
     def _judge(self) -> None:
         """Take down what the task said last."""
@@ -283,7 +254,7 @@ class Simulation:
         if session.name == VISITOR:  # who may say anything, also what is no message
             return
         self.invariants.on_put(session.name, session.life, sample)
-        if sample.key == self._status_key and (self._last_status is None or sample != self._last_status):
+        if sample.key == self._status_key and not self._over and sample != self._last_status:
             self._last_status = sample
             if decode(self._status.message, sample.payload).state in ENDED:
                 self._ended.set()

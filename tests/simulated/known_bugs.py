@@ -105,7 +105,7 @@ def found_within(bug, most):
     cell = load_cell(*CELL)
     for seed in range(1, most + 1):
         with BUGS[bug]():
-            outcome = Simulation(cell, seed, faults=True, limit=200.0).run()
+            outcome = Simulation(cell, seed, faults=True, limit=120.0).run()
         if not outcome.ok or outcome.crashes:
             return seed, "; ".join([f"{outcome.state} {outcome.message}", *outcome.crashes[:1]])
     return None

@@ -1,0 +1,176 @@
+"""Makes the faults of a plan happen to a simulated cell, and plays the person who comes between."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from common import messages as m
+from common import topics
+from common.errors import RequestFailed
+from common.process.operator_motion import MotionFailed, OperatorMotion
+from common.process.persist import persist
+from common.topics import Topic
+from common.virtual.faults import Fault, Plan
+from common.virtual.loop import Life, context_of
+from common.virtual.network import VirtualSession
+from common.virtual.process import Host, VirtualBus, VirtualProcess
+
+AGAIN = 0.1  # [s] between looks whether something has come about
+LATEST = 0.3  # [s] after which a process crashes that does not get to the turn at which it was to
+NEXT_REQUEST = 1.5  # [s] for which the next request is waited for
+TURN = 0.0005  # [s] that stands for a turn where something is to happen amid a request
+PERSON = "person"
+PERSON_TIMEOUT = 2.0  # [s] of a person's request
+PERSON_LATE = 1.0  # [s] at most between a person's stop and what is done next, in two places at once
+
+
+class Misfortune:
+    """Lets go wrong in one run what its plan says; `made` counts."""
+
+    def __init__(
+        self, host: Host, plan: Plan, seed: int, status: Topic[Any], tell: Callable[[str], None]
+    ) -> None:
+        """Prepare.
+
+        Args:
+            host: of the processes that are hit.
+            plan: what goes wrong, and when.
+            seed: decides what the plan leaves open.
+            status: of the cell's task.
+            tell: is called with a line for each fault.
+        """
+        self.made: Counter[str] = Counter()
+        self._host, self._plan, self._status, self._tell = host, plan, status, tell
+        self._network = host.network
+        self._random = np.random.default_rng([seed, 6])
+
+    async def run(self) -> None:
+        """Return when all has happened; cancelled, nothing more does."""
+        loop, speed = self._host.loop, self._plan.speed
+        began, persons = loop.time(), []
+        try:
+            for fault in self._plan.faults:
+                await asyncio.sleep(max(0.0, began + fault.at / speed - loop.time()))
+                if fault.kind == "person":
+                    persons.append(self._begin_person())
+                else:
+                    await self._hit(fault)
+            await asyncio.gather(*persons)
+        finally:
+            for person in persons:
+                person.cancel()
+
+    def _note(self, fault: Fault, name: str) -> None:
+        lasts = f" for {fault.seconds:.1f} s" if fault.seconds else ""
+        self._tell(f"FAULT {fault.kind} {name}{' amid a request' if fault.amid else ''}{lasts}")
+        self.made[fault.kind] += 1
+
+    async def _hit(self, fault: Fault) -> None:
+        loop, network = self._host.loop, self._network
+        if fault.kind == "router lost":
+            self._note(fault, "")
+            network.lose_router()
+            loop.call_later(fault.seconds, network.find_router)
+            return
+        process, session = await self._victim(fault)
+        if fault.kind == "crash":
+            while not await self._crash(process, fault):  # it ended by itself meanwhile
+                process, session = await self._victim(replace(fault, amid=""))
+            return
+        self._note(fault, process.name)
+        if fault.kind == "cut":
+            if fault.amid:
+                await asyncio.sleep(fault.turns * TURN)
+            network.cut([session])
+            loop.call_later(fault.seconds, self._mend, session)
+        elif fault.kind == "stalled":
+            network.stall(session, fault.seconds)
+        else:
+            process.terminate()
+
+    async def _crash(self, process: VirtualProcess, fault: Fault) -> bool:
+        """Whether the process crashed, at its turn or somewhat later."""
+        life, pid = process.life, process.pid
+        process.kill_at_turn(fault.turns)
+        deadline = self._host.loop.time() + LATEST
+        try:
+            while not life.over and self._host.loop.time() < deadline:  # noqa: ASYNC110 - time is free here
+                await asyncio.sleep(AGAIN)
+        finally:
+            life.at_turn = None
+        if not life.over and process.pid == pid:
+            process.kill()
+        if life.over:
+            self._note(fault, process.name)
+        return life.over
+
+    async def _victim(self, fault: Fault) -> tuple[VirtualProcess, VirtualSession]:
+        """Whom a fault hits: who has to do with the next request, its target, or another that runs."""
+        processes = self._host.processes
+        names = [fault.target, *processes]
+        if fault.amid:
+            asker, asked = await self._next_request()
+            names = [asker, asked, *names] if fault.amid == "asker" else [asked, asker, *names]
+        while True:
+            for process in [processes[name] for name in names if name in processes]:
+                session = process.session
+                if session is not None and not (fault.kind == "cut" and session.cut):
+                    return process, session
+            await asyncio.sleep(AGAIN)
+
+    async def _next_request(self) -> tuple[str, str]:
+        """Who asks, and who is asked, as soon as somebody does; two empty texts when nobody does for a while."""
+        requests = self._host.requests
+        begun: asyncio.Future[tuple[str, str]] = asyncio.get_running_loop().create_future()
+        requests.on_begin = lambda asker, asked: None if begun.done() else begun.set_result((asker, asked))
+        try:
+            async with asyncio.timeout(NEXT_REQUEST):
+                return await begun
+        except TimeoutError:
+            return "", ""
+        finally:
+            requests.on_begin = lambda asker, asked: None
+
+    def _mend(self, session: VirtualSession) -> None:
+        if not session.detached and not self._network.router_lost:
+            self._network.mend([session])
+
+    # --- a person -----------------------------------------------------------------------------------------------------
+
+    def _begin_person(self) -> asyncio.Task[None]:
+        self._tell("a person stops the task, moves the arm home, and starts the task again")
+        self.made[PERSON] += 1
+        context = context_of(Life(PERSON))
+        session = self._network.attach(context, PERSON, self.made[PERSON])
+        return context.run(lambda: asyncio.create_task(self._be_person(session)))
+
+    async def _be_person(self, session: VirtualSession) -> None:
+        """Stop the task; then send the arm home and start the task, from two places that know nothing of each other."""
+        host = self._host
+        bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
+        command = bus.client(topics.TASK_COMMAND)
+        motion = OperatorMotion(bus, [bus.reader(self._status)])
+
+        async def go_home() -> None:
+            await asyncio.sleep(float(self._random.uniform(0.0, PERSON_LATE)))
+            with contextlib.suppress(MotionFailed, RequestFailed):
+                await motion.move(m.JointGoal(named="home"))
+
+        try:
+            with contextlib.suppress(RequestFailed):
+                await command.call(m.TaskCommand(command="stop"), PERSON_TIMEOUT)
+            async with asyncio.TaskGroup() as group:
+                group.create_task(go_home())
+                await asyncio.sleep(float(self._random.uniform(0.0, PERSON_LATE)))
+                start = m.TaskCommand(command="start")
+                await persist(command, start, PERSON_TIMEOUT, lambda error: m.TaskStatus(), lambda problem: None)
+        finally:
+            await bus.close()
+            self._network.detach(session)
