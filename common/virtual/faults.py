@@ -10,20 +10,23 @@ import numpy as np
 
 from common.virtual.network import FAIR, Weather
 
-Kind = Literal["crash", "restart", "cut", "router lost", "stalled", "person"]
+Kind = Literal["crash", "restart", "cut", "router lost", "stalled", "late goal", "person"]
 Amid = Literal["", "asker", "asked"]
 
-FIRST: tuple[Kind, ...] = ("crash", "crash", "crash", "cut", "stalled")  # at least, and soon: in short runs as well
-LATER: tuple[Kind, ...] = ("crash", "crash", "restart", "cut", "stalled", "person")
-FIRST_GAPS = 0.1, 2.0  # [s] of cell time between those
+# At least, and soon: in short runs as well.
+FIRST: tuple[Kind, ...] = ("crash", "crash", "crash", "cut", "stalled", "late goal", "late goal")
+LATER: tuple[Kind, ...] = ("crash", "crash", "restart", "cut", "stalled", "late goal", "person")
+FIRST_GAPS = 0.0, 1.5  # [s] of cell time between those
 LATER_GAP = 12.0  # [s] of cell time on average to each further fault
 LONGEST = 60.0  # [s] of cell time from the cell being ready; what comes after is left to it to finish
 MOST_FAULTS = 20  # of one run
 MOST_TURNS = 40  # of a process, from the time at which it is to crash to where it does
-AMID_SHARE = 0.6  # of what hits one process: in the middle of a request
-AMID_TURNS = 12  # of a process, from a request to where it crashes
+AMID_SHARE = 0.6  # of crashes and cuts: just when a goal is asked for
+AMID_TURNS = 12  # of a process, from a goal being asked for to where it crashes
 CUT_SECONDS = 0.3, 4.0
+LATE_SECONDS = 0.3, 3.0  # two links, each of which holds something up for less than its lease
 STALL_SECONDS = 0.2, 1.6  # less than Zenoh's lease of 2 s, after which a link is cut
+SECONDS = {"cut": CUT_SECONDS, "stalled": STALL_SECONDS, "late goal": LATE_SECONDS}
 SKEW = 0.09  # [s] by which clocks are wrong at most; two of them differ by less than their tolerance of 0.2 s
 ROUTER_SHARE = 0.25  # of the cuts
 PERSON_SHARE = 0.5  # of the runs: somebody stops the task early on
@@ -38,11 +41,13 @@ class Fault:
     Attributes:
         at: when [s] of cell time from the cell being ready.
         kind: an end without `finally`; SIGTERM; a link that is cut; all links that are cut; a link on which everything
-            comes late; a person who stops the task, moves the arm and starts the task again.
+            comes late; a goal that is asked for, or the answer, comes late; a person who stops the task, moves the
+            arm and starts the task again.
         target: name of the process; empty for the router and for a person.
-        amid: it hits who asks or is asked next, instead of the target.
+        amid: it hits who next asks for a goal of arm or fingers, or who is asked for it, instead of the target; what
+            is late is the answer or the request.
         turns: of the process from then on until it crashes.
-        seconds: for which a link is cut or stalled.
+        seconds: for which a link is cut or stalled, or by which something is late.
     """
 
     at: float
@@ -79,22 +84,19 @@ def make_plan(seed: int, services: Sequence[str]) -> Plan:
         kinds.append(LATER[int(random.integers(len(LATER)))])
         gaps.append(float(random.exponential(LATER_GAP)))
     faults: list[Fault] = []
-    for kind, gap in zip(kinds, gaps, strict=True):
+    for chosen, gap in zip(kinds, gaps, strict=True):
+        kind = chosen
         at = (faults[-1].at if faults else 0.0) + gap
         if at > LONGEST:
             break
         if kind == "person":
             faults.append(Fault(at, kind))
             continue
-        target, seconds = str(random.choice(list(services))), 0.0
-        if kind in ("cut", "stalled"):
-            seconds = float(random.uniform(*(CUT_SECONDS if kind == "cut" else STALL_SECONDS)))
-            if kind == "cut" and random.random() < ROUTER_SHARE:
-                faults.append(Fault(at, "router lost", seconds=seconds))
-                continue
-        amid: Amid = ""
-        if kind != "restart" and random.random() < AMID_SHARE:
-            amid = "asker" if random.random() < 0.5 else "asked"
+        target, amid, seconds = str(random.choice(list(services))), _amid(random, kind), 0.0
+        if kind in SECONDS:
+            seconds = float(random.uniform(*SECONDS[kind]))
+        if kind == "cut" and random.random() < ROUTER_SHARE:
+            kind, target = "router lost", ""
         turns = int(random.integers(AMID_TURNS if amid else MOST_TURNS))
         faults.append(Fault(at, kind, target, amid, turns, seconds))
     weather = Weather(
@@ -105,3 +107,10 @@ def make_plan(seed: int, services: Sequence[str]) -> Plan:
     skews = tuple((name, float(random.uniform(-SKEW, SKEW))) for name in services)
     speed = float(random.choice(SPEEDS)) if random.random() < OTHER_SPEED else 1.0
     return Plan(tuple(faults), weather, skews, speed, shuffled=True)
+
+
+def _amid(random: np.random.Generator, kind: Kind) -> Amid:
+    """Whether and whom a fault hits when a goal is asked for."""
+    if kind == "late goal" or (kind in ("crash", "cut") and random.random() < AMID_SHARE):
+        return "asker" if random.random() < 0.5 else "asked"
+    return ""

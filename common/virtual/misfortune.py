@@ -17,15 +17,16 @@ from common.errors import RequestFailed
 from common.process.operator_motion import MotionFailed, OperatorMotion
 from common.process.persist import persist
 from common.topics import Topic
-from common.virtual.faults import Fault, Plan
+from common.virtual.faults import Amid, Fault, Plan
 from common.virtual.loop import Life, context_of
 from common.virtual.network import VirtualSession
 from common.virtual.process import Host, VirtualBus, VirtualProcess
 
 AGAIN = 0.1  # [s] between looks whether something has come about
 LATEST = 0.3  # [s] after which a process crashes that does not get to the turn at which it was to
-NEXT_REQUEST = 1.5  # [s] for which the next request is waited for
-TURN = 0.0005  # [s] that stands for a turn where something is to happen amid a request
+NEXT_GOAL = 1.5  # [s] for which the next goal is waited for
+TURN = 0.0005  # [s] that stands for a turn where something is to happen just when a goal is asked for
+GOALS = (topics.MOTION_EXECUTE.key, topics.GRIPPER_COMMAND.key)
 PERSON = "person"
 PERSON_TIMEOUT = 2.0  # [s] of a person's request
 PERSON_LATE = 1.0  # [s] at most between a person's stop and what is done next, in two places at once
@@ -69,25 +70,27 @@ class Misfortune:
 
     def _note(self, fault: Fault, name: str) -> None:
         lasts = f" for {fault.seconds:.1f} s" if fault.seconds else ""
-        self._tell(f"FAULT {fault.kind} {name}{' amid a request' if fault.amid else ''}{lasts}")
+        self._tell(f"FAULT {fault.kind} {name}{f' amid a goal: {fault.amid}' if fault.amid else ''}{lasts}")
         self.made[fault.kind] += 1
 
     async def _hit(self, fault: Fault) -> None:
         loop, network = self._host.loop, self._network
-        if fault.kind == "router lost":
-            self._note(fault, "")
-            network.lose_router()
-            loop.call_later(fault.seconds, network.find_router)
+        if fault.kind == "late goal":
+            if await self._next_goal(fault.amid, fault.seconds) is not None:
+                self._note(fault, "")
             return
         process, session = await self._victim(fault)
         if fault.kind == "crash":
             while not await self._crash(process, fault):  # it ended by itself meanwhile
                 process, session = await self._victim(replace(fault, amid=""))
             return
-        self._note(fault, process.name)
-        if fault.kind == "cut":
-            if fault.amid:
-                await asyncio.sleep(fault.turns * TURN)
+        if fault.amid:
+            await asyncio.sleep(fault.turns * TURN)
+        self._note(fault, process.name if fault.target else "")
+        if fault.kind == "router lost":
+            network.lose_router()
+            loop.call_later(fault.seconds, network.find_router)
+        elif fault.kind == "cut":
             network.cut([session])
             loop.call_later(fault.seconds, self._mend, session)
         elif fault.kind == "stalled":
@@ -112,11 +115,11 @@ class Misfortune:
         return life.over
 
     async def _victim(self, fault: Fault) -> tuple[VirtualProcess, VirtualSession]:
-        """Whom a fault hits: who has to do with the next request, its target, or another that runs."""
+        """Whom a fault hits: who has to do with the next goal, its target, or another that runs."""
         processes = self._host.processes
         names = [fault.target, *processes]
-        if fault.amid:
-            asker, asked = await self._next_request()
+        if fault.amid and (found := await self._next_goal()) is not None:
+            asker, asked = found
             names = [asker, asked, *names] if fault.amid == "asker" else [asked, asker, *names]
         while True:
             for process in [processes[name] for name in names if name in processes]:
@@ -125,18 +128,33 @@ class Misfortune:
                     return process, session
             await asyncio.sleep(AGAIN)
 
-    async def _next_request(self) -> tuple[str, str]:
-        """Who asks, and who is asked, as soon as somebody does; two empty texts when nobody does for a while."""
+    async def _next_goal(self, late: Amid = "", seconds: float = 0.0) -> tuple[str, str] | None:
+        """Who asks for the next goal, and who is asked; None when nobody asks for a while.
+
+        Args:
+            late: whether what is sent by who asks, or by who is asked, is to be late.
+            seconds: by how much [s].
+        """
         requests = self._host.requests
         begun: asyncio.Future[tuple[str, str]] = asyncio.get_running_loop().create_future()
-        requests.on_begin = lambda asker, asked: None if begun.done() else begun.set_result((asker, asked))
+
+        def on_begin(asker: str, asked: str, key: str) -> None:
+            if key in GOALS and not begun.done():
+                begun.set_result((asker, asked))
+                found = [self._host.processes.get(name) for name in (asker, asked)]
+                ends = [session for process in found if process and (session := process.session) is not None]
+                if late and len(ends) == 2:
+                    source, target = ends if late == "asker" else reversed(ends)
+                    self._network.hold_up(source, target, f"{self._host.cell.name}/{key}", seconds)
+
+        requests.on_begin = on_begin
         try:
-            async with asyncio.timeout(NEXT_REQUEST):
+            async with asyncio.timeout(NEXT_GOAL):
                 return await begun
         except TimeoutError:
-            return "", ""
+            return None
         finally:
-            requests.on_begin = lambda asker, asked: None
+            requests.on_begin = lambda asker, asked, key: None
 
     def _mend(self, session: VirtualSession) -> None:
         if not session.detached and not self._network.router_lost:

@@ -100,6 +100,7 @@ class VirtualNetwork(LocalNetwork):
         self._random = np.random.default_rng([seed, 3])
         self._drawn: list[float] = []
         self._arrival: dict[Link, float] = {}
+        self._lateness: dict[tuple[VirtualSession, VirtualSession, str], float] = {}  # [s] of the next that is sent
         self._sessions: list[VirtualSession] = []
 
     def attach(self, context: Context, name: str, number: int = 0) -> VirtualSession:
@@ -132,9 +133,11 @@ class VirtualNetwork(LocalNetwork):
         if weather.hiccup and self._chance() < weather.hiccup:
             self.counted["held up"] += 1
             delay += weather.hiccup_delay * self._chance()
-        if lane == "query" and weather.late and self._chance() < weather.late:
-            self.counted["late"] += 1
-            delay += weather.late_delay * self._chance()
+        if lane == "query":
+            delay += self._lateness.pop((source, target, key), 0.0)
+            if weather.late and self._chance() < weather.late:
+                self.counted["late"] += 1
+                delay += weather.late_delay * self._chance()
         # What the router says of tokens comes in its order, whoever they belong to.
         link = target if lane == "token" else source, target, lane, key
         self._bring(link, source, delay, call)
@@ -188,6 +191,10 @@ class VirtualNetwork(LocalNetwork):
         """Have everything that is sent from or to a session from now on come later, but come."""
         session.stalled_until = max(session.stalled_until, self._loop.time() + seconds)
 
+    def hold_up(self, source: VirtualSession, target: VirtualSession, key: str, seconds: float) -> None:
+        """Have the next request or answer under a key from one session to another come later by that."""
+        self._lateness[source, target, key] = seconds
+
     def lose_router(self) -> None:
         """Cut all links, also of processes that start meanwhile, until it is back."""
         self.router_lost = True
@@ -221,6 +228,7 @@ class VirtualNetwork(LocalNetwork):
         self.forget_matches()
         self._sessions.remove(session)
         self._arrival = {link: due for link, due in self._arrival.items() if session not in link[:2]}
+        self._lateness = {link: late for link, late in self._lateness.items() if session not in link[:2]}
 
     def _lose(self, session: VirtualSession) -> None:
         """Have everybody else hear that a session is gone: its tokens, and what it was asked."""

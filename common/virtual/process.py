@@ -59,7 +59,7 @@ class Requests:
     repeated: list[str] = field(default_factory=list)  # what was read again, or after what is newer
     read: int = 0  # messages
     begun: int = 0
-    on_begin: Callable[[str, str], None] = lambda asker, asked: None
+    on_begin: Callable[[str, str, str], None] = lambda asker, asked, key: None
     on_ask: Callable[[Message], None] = lambda request: None
     on_serve: Callable[[str, Message, Message], None] = lambda life, request, answer: None
     on_answer: Callable[[str, Message, Message], None] = lambda service, request, answer: None
@@ -73,7 +73,7 @@ class _WatchedClient(Client[Q, A]):
     async def call(self, request: Q, timeout: float = 5.0) -> A:
         """The answer to a request."""
         noted = self.noted
-        noted.on_begin(self._service, self.server)
+        noted.on_begin(self._service, self.server, self.topic.key)
         noted.on_ask(request)
         number = noted.begun = noted.begun + 1
         noted.open[number] = self._service, self.topic.key, monotonic() + timeout
