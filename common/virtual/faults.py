@@ -21,14 +21,14 @@ LATER_GAP = 12.0  # [s] of cell time on average to each further fault
 LONGEST = 60.0  # [s] of cell time from the cell being ready; what comes after is left to it to finish
 MOST_FAULTS = 20  # of one run
 MOST_TURNS = 40  # of a process, from the time at which it is to crash to where it does
-AMID_SHARE = 0.6  # of crashes and cuts: just when a goal is asked for
+AMID_SHARE = 0.6  # of crashes and cuts: just when a plan or a goal is asked for
 AMID_TURNS = 12  # of a process, from a goal being asked for to where it crashes
 CUT_SECONDS = 0.3, 4.0
 LATE_SECONDS = 0.3, 3.0  # two links, each of which holds something up for less than its lease
 STALL_SECONDS = 0.2, 1.6  # less than Zenoh's lease of 2 s, after which a link is cut
 SECONDS = {"cut": CUT_SECONDS, "stalled": STALL_SECONDS, "late goal": LATE_SECONDS}
 SKEW = 0.09  # [s] by which clocks are wrong at most; two of them differ by less than their tolerance of 0.2 s
-ROUTER_SHARE = 0.25  # of the cuts
+ROUTER_SHARE = 0.25  # of the cuts but for the first
 PERSON_SHARE = 0.5  # of the runs: somebody stops the task early on
 SPEEDS = 0.5, 2.0, 3.0  # cell time per wall time of those runs that have another than 1
 OTHER_SPEED = 0.3  # share of those
@@ -44,8 +44,8 @@ class Fault:
             comes late; a goal that is asked for, or the answer, comes late; a person who stops the task, moves the
             arm and starts the task again.
         target: name of the process; empty for the router and for a person.
-        amid: it hits who next asks for a goal of arm or fingers, or who is asked for it, instead of the target; what
-            is late is the answer or the request.
+        amid: it hits who next asks for a plan or a goal of arm or fingers, or who is asked for it, instead of the
+            target; of a late goal it is the request, or the answer.
         turns: of the process from then on until it crashes.
         seconds: for which a link is cut or stalled, or by which something is late.
     """
@@ -95,7 +95,7 @@ def make_plan(seed: int, services: Sequence[str]) -> Plan:
         target, amid, seconds = str(random.choice(list(services))), _amid(random, kind), 0.0
         if kind in SECONDS:
             seconds = float(random.uniform(*SECONDS[kind]))
-        if kind == "cut" and random.random() < ROUTER_SHARE:
+        if kind == "cut" and any(fault.kind == "cut" for fault in faults) and random.random() < ROUTER_SHARE:
             kind, target = "router lost", ""
         turns = int(random.integers(AMID_TURNS if amid else MOST_TURNS))
         faults.append(Fault(at, kind, target, amid, turns, seconds))

@@ -27,6 +27,7 @@ LATEST = 0.3  # [s] after which a process crashes that does not get to the turn 
 NEXT_GOAL = 1.5  # [s] for which the next goal is waited for
 TURN = 0.0005  # [s] that stands for a turn where something is to happen just when a goal is asked for
 GOALS = (topics.MOTION_EXECUTE.key, topics.GRIPPER_COMMAND.key)
+PLAN = topics.MOTION_PLAN.key
 PERSON = "person"
 PERSON_TIMEOUT = 2.0  # [s] of a person's request
 PERSON_LATE = 1.0  # [s] at most between a person's stop and what is done next, in two places at once
@@ -129,17 +130,17 @@ class Misfortune:
             await asyncio.sleep(AGAIN)
 
     async def _next_goal(self, late: Amid = "", seconds: float = 0.0) -> tuple[str, str] | None:
-        """Who asks for the next goal, and who is asked; None when nobody asks for a while.
+        """Who asks for the next goal or plan, and who is asked; None when nobody asks for a while.
 
         Args:
-            late: whether what is sent by who asks, or by who is asked, is to be late.
+            late: whether what is sent by who asks, or by who is asked, is to be late: of a goal only.
             seconds: by how much [s].
         """
         requests = self._host.requests
         begun: asyncio.Future[tuple[str, str]] = asyncio.get_running_loop().create_future()
 
         def on_begin(asker: str, asked: str, key: str) -> None:
-            if key in GOALS and not begun.done():
+            if (key in GOALS or (key == PLAN and not late)) and not begun.done():
                 begun.set_result((asker, asked))
                 found = [self._host.processes.get(name) for name in (asker, asked)]
                 ends = [session for process in found if process and (session := process.session) is not None]
