@@ -30,6 +30,7 @@ GOALS = (topics.MOTION_EXECUTE.key, topics.GRIPPER_COMMAND.key)
 PLAN = topics.MOTION_PLAN.key
 PERSON = "person"
 PERSON_TIMEOUT = 2.0  # [s] of a person's request
+PERSON_SLOW = 0.3  # [s] that a message takes to or from a person on average, at most
 PERSON_LATE = 1.0  # [s] at most between a person's stop and what is done next, in two places at once
 
 
@@ -164,10 +165,11 @@ class Misfortune:
     # --- a person -----------------------------------------------------------------------------------------------------
 
     def _begin_person(self) -> asyncio.Task[None]:
-        self._tell("a person stops the task, moves the arm home, and starts the task again")
+        self._tell("FAULT person: stops the task, moves the arm home, and starts the task again")
         self.made[PERSON] += 1
         context = context_of(Life(PERSON))
         session = self._network.attach(context, PERSON, self.made[PERSON])
+        session.slow = float(self._random.uniform(0.0, PERSON_SLOW))
         return context.run(lambda: asyncio.create_task(self._be_person(session)))
 
     async def _be_person(self, session: VirtualSession) -> None:

@@ -62,6 +62,7 @@ class VirtualSession(LocalSession):
         self.detached = False
         self.links = 0  # that were cut so far: what travelled on them is lost
         self.latest_due = 0.0  # [s] when the last of what is on its way to it arrives
+        self.slow = 0.0  # [s] that all which comes or goes takes longer on average
         self.stalled_until = 0.0  # [s] before which nothing comes through its link
         self._on_change: list[Callable[[], None]] = []
 
@@ -130,6 +131,8 @@ class VirtualNetwork(LocalNetwork):
             self.counted["lost"] += 1
             return
         delay = self._delay()
+        if slow := source.slow + target.slow:
+            delay -= slow * math.log1p(-self._chance())
         if weather.hiccup and self._chance() < weather.hiccup:
             self.counted["held up"] += 1
             delay += weather.hiccup_delay * self._chance()
