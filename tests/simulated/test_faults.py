@@ -4,7 +4,7 @@ import pytest
 
 from common.config import load_cell
 from common.errors import ConfigError
-from common.virtual.faults import SKEW, make_plan
+from common.virtual.faults import SKEW, SPEEDS, make_plan
 from common.virtual.simulation import Simulation
 from common.virtual.watched_arm import with_watched_arm
 from tests.simulated.known_bugs import BUGS, found_within
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that
 def test_cell_ends_well_whatever_goes_wrong(cell, overrides, seed):
     outcome = Simulation(load_cell(cell, overrides), seed, faults=True).run()
     assert outcome.ok and not outcome.broken and not outcome.crashes, outcome
-    assert outcome.faults["crash"] >= 3 and outcome.faults["cut"] + outcome.faults["router lost"] >= 1
+    assert outcome.faults["crash"] >= 3 and outcome.faults["cut"] >= 1 and outcome.faults["changed places"] > 100
     assert sum(outcome.restarts.values()) >= 3
     assert all(count > 0 for count in outcome.checked.values()) and len(outcome.checked) >= 9
 
@@ -29,23 +29,27 @@ def test_same_seed_is_the_same_run_with_faults_too():
     assert first.digest == second.digest and first.faults == second.faults
 
 
-@pytest.mark.parametrize("bug", ["what is not newer is read", "the task reads the truth"])
-def test_known_bug_is_found(bug):
-    found = found_within(bug, 3)
-    assert found is not None and "BROKEN" in found[1]
+AT_ONCE = ["what is not newer is read", "the task reads the truth", "a request that waits without end"]
+
+
+@pytest.mark.parametrize("bug", [bug if bug in AT_ONCE else pytest.param(bug, marks=pytest.mark.slow) for bug in BUGS])
+def test_known_bug_is_found_within_a_few_tens_of_seeds(bug):
+    found = found_within(bug, 30)
+    assert found is not None
 
 
 def test_ten_bugs_are_known():
-    assert len(BUGS) >= 10
+    assert len(BUGS) >= 10 and set(AT_ONCE) < set(BUGS)
 
 
 def test_every_plan_has_three_crashes_a_cut_and_wrong_clocks():
     for seed in range(200):
         plan = make_plan(seed, ["one", "two", "three"])
         kinds = [fault.kind for fault in plan.faults]
-        assert kinds.count("crash") >= 3 and kinds.count("cut") + kinds.count("router lost") >= 1
+        assert kinds.count("crash") >= 3 and kinds.count("cut") >= 1 and kinds.count("late goal") >= 2
         assert [fault.at for fault in plan.faults] == sorted(fault.at for fault in plan.faults)
-        assert plan.weather.loss > 0 and plan.weather.hiccup > 0 and plan.weather.doubled > 0
+        assert plan.weather.loss > 0 and plan.weather.hiccup > 0 and plan.weather.doubled > 0 and plan.weather.late > 0
+        assert plan.shuffled and plan.speed in (1.0, *SPEEDS)
         assert all(abs(skew) <= SKEW for _, skew in plan.skews) and len(plan.skews) == 3
 
 

@@ -9,8 +9,8 @@ from common.sources import drawn_from, monotonic, new_id
 from common.virtual.loop import EPOCH_NS, LOOK_NS, Deadlock, Life, VirtualLoop, context_of
 
 
-def run(main, seed=1):
-    loop = VirtualLoop(seed)
+def run(main, seed=1, *, shuffled=False):
+    loop = VirtualLoop(seed, shuffled=shuffled)
     with drawn_from(loop):
         try:
             return loop.run_until_complete(main(loop))
@@ -138,6 +138,33 @@ def test_life_ends_at_the_turn_that_was_said():
         return done
 
     assert 1 <= len(run(main)) < 10
+
+
+def order_of_turns(seed, *, shuffled=True):
+    async def main(loop):
+        order, contexts = [], [context_of(Life(name)) for name in "abc"]
+        for turn in range(5):
+            for name, context in zip("abc", contexts, strict=True):
+                loop.call_soon(order.append, (name, turn), context=context)
+        for name, context in zip("abc", contexts, strict=True):
+            loop.call_later(1.0, order.append, (name, 5), context=context)
+        await asyncio.sleep(2.0)
+        return order
+
+    return run(main, seed, shuffled=shuffled)
+
+
+def test_lives_take_the_turns_that_are_due_at_once_in_any_order_each_its_own_in_theirs():
+    orders = [order_of_turns(seed) for seed in range(20)]
+    assert len({tuple(order) for order in orders}) == 20
+    for order in orders:
+        for life in "abc":
+            assert [turn for name, turn in order if name == life] == list(range(6))
+    assert order_of_turns(7) == order_of_turns(7)
+
+
+def test_turns_that_are_not_shuffled_come_as_they_were_made():
+    assert order_of_turns(3, shuffled=False)[:3] == [("a", 0), ("b", 0), ("c", 0)]
 
 
 def test_sets_of_tasks_are_walked_in_the_same_order_in_every_process():

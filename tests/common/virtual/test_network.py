@@ -4,13 +4,13 @@ import asyncio
 import contextvars
 
 from common.clock import Clock
-from common.errors import NoResponder, RequestLost
+from common.errors import NoResponder, RequestLost, RequestTimeout
 from common.messages import HoldRequest, MotionStatus, SceneUpdate
 from common.sources import drawn_from
 from common.topics import MOTION_HOLD, MOTION_STATUS, SCENE_OBJECT_UPDATES
 from common.transport.bus import Bus
 from common.virtual.loop import VirtualLoop
-from common.virtual.network import FAIR, FOUL, VirtualNetwork
+from common.virtual.network import FAIR, FOUL, VirtualNetwork, Weather
 
 
 class Net:
@@ -151,3 +151,75 @@ def test_who_asks_over_a_link_that_is_cut_hears_that_it_is_lost():
 
     kind, ended = run(main)
     assert kind is RequestLost and ended < 3.0
+
+
+def test_link_that_is_stalled_loses_nothing():
+    async def main(net):
+        writer, reader = net.bus("a").writer(SCENE_OBJECT_UPDATES), net.bus("b").reader(SCENE_OBJECT_UPDATES)
+        came = []
+        reading = asyncio.create_task(read_all(reader, came))
+        net.network.stall(net.sessions["b"], 1.5)
+        for number in range(10):
+            writer.put(SceneUpdate(data=f"remove:{number}"))
+        await asyncio.sleep(1.5)
+        before = len(came)
+        await asyncio.sleep(1.0)
+        reading.cancel()
+        return before, [update.data for update in came]
+
+    assert run(main) == (0, [f"remove:{number}" for number in range(10)])
+
+
+async def ask_twice(net, late):
+    """What a server was asked and when [s], by a client that asks again after a second; `late` says what is late."""
+    server, bus, served = net.bus("server"), net.bus("client"), []
+    client = bus.client(MOTION_HOLD)
+
+    async def hold(request):
+        served.append(net.loop.time() - began)
+        return MotionStatus()
+
+    server.serve(MOTION_HOLD, hold)
+    await server.ready()
+    await client.wait_available(5.0)
+    ends = net.sessions["client"], net.sessions["server"]
+    net.network.hold_up(*(ends if late == "request" else reversed(ends)), "test/motion/hold", 2.5)
+    began = net.loop.time()
+    try:
+        await client.call(HoldRequest(hold=True), timeout=1.0)
+    except RequestTimeout:
+        await client.call(HoldRequest(hold=True), timeout=4.0)
+    return served
+
+
+def test_request_whose_answer_is_late_is_done_and_asked_again():
+    async def main(net):
+        return await ask_twice(net, "answer")
+
+    first, again = run(main)
+    assert first < 0.1 and 1.0 <= again < 1.1
+
+
+def test_request_that_is_late_is_not_overtaken_by_the_next_under_its_key():
+    async def main(net):
+        return await ask_twice(net, "request")
+
+    first, again = run(main)
+    assert 2.5 <= first <= again < 2.6
+
+
+def test_requests_are_late_in_such_weather():
+    async def main(net):
+        client, server = net.bus("client").client(MOTION_HOLD), net.bus("server")
+
+        async def hold(request):
+            return MotionStatus()
+
+        server.serve(MOTION_HOLD, hold)
+        await server.ready()
+        await client.wait_available(5.0)
+        for _ in range(100):
+            await client.call(HoldRequest(hold=True), timeout=10.0)
+        return net.network.counted
+
+    assert 5 <= run(main, Weather(late=0.1))["late"] <= 50
