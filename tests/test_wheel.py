@@ -159,9 +159,9 @@ def test_cell_runs_from_an_empty_folder_and_no_module_has_two_names(
         environment["PYTHONPATH"] += f":{ROOT}"
     else:
         assert "panda" in installation.run(empty, "cells").stdout
-    done = installation.run(empty, "run", "panda", "--no-viewer", "--speed", "10", "--domain", str(DOMAIN), "--record",
-                            str(tmp_path / "run.mcap"), **environment)
-    assert "DONE, 7 of 7 placed" in done.stdout, done.stdout + done.stderr
+    done = installation.run(empty, "run", "panda", "--no-viewer", "--speed", "10", "--set", "world.count=1",
+                            "--domain", str(DOMAIN), "--record", str(tmp_path / "run.mcap"), **environment)
+    assert "DONE, 1 of 1 placed" in done.stdout, done.stdout + done.stderr
     assert list(empty.iterdir()) == []
     told = mains(tmp_path, installation)
     assert {"services.router", "services.motion_planner", "services.trajectory_executor", "cli.main"} <= told

@@ -78,6 +78,7 @@ def test_balls_that_are_moved_added_and_taken_away_end_up_where_they_should() ->
     assert summary["rejected"] == []
 
 
+@pytest.mark.slow
 def test_what_can_not_be_taken_is_reported_and_the_run_ends_done() -> None:
     places = {  # by how the reason begins
         "": [(0.40, -0.30), (0.52, -0.30), (0.62, -0.25), (0.40, -0.17), (0.52, -0.17), (0.64, -0.13), (0.40, -0.04)],
