@@ -14,6 +14,7 @@ pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that
 
 @pytest.mark.parametrize(("cell", "overrides", "seed"), [
     ("panda", ["world.count=2"], 1), pytest.param("ur5", [], 2, marks=pytest.mark.slow),
+    pytest.param("ur5", [], 22, marks=pytest.mark.slow),  # stopped where it cannot go up any further
 ])
 def test_cell_ends_well_whatever_goes_wrong(cell, overrides, seed):
     outcome = Simulation(load_cell(cell, overrides), seed, faults=True).run()

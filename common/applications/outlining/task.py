@@ -58,6 +58,7 @@ class Outline(Task[OutlineView]):
         self._returned = False  # home was reached and not left since
         self._error = ""  # what went wrong, while the arm is brought home
         self._forgotten = 0  # motions since the last that ended well
+        self._up: Move | None = None  # the first motion of the way home from anywhere
         self._excused: tuple[str, str] | None = None  # contact from which the arm has to be freed
 
     # --- what to do next -------------------------------------------------------------------------------------
@@ -151,7 +152,7 @@ class Outline(Task[OutlineView]):
         if stage.name == "trace":
             self._traced, self.status.closed = True, self.status.fraction >= 1
         elif stage.name == "home":
-            self._returned = True
+            self._returned, self._excused = True, None
 
     def forgotten(self, stage: Stage, view: OutlineView) -> None:
         """Decide anew, from home: the controller was started again, and what it was asked for was no mistake."""
@@ -168,16 +169,16 @@ class Outline(Task[OutlineView]):
     # --- failure ---------------------------------------------------------------------------------------------
 
     def plan_failed(self, move: Move, response: m.PlanResponse, view: OutlineView) -> None:
-        """End, or leave out what cannot be on the way home."""
-        if not self._error:
-            subject = self.status.subject
-            self.fail(f"{subject}: {response.message}" if subject else response.message, view)
-        elif move.name == "retreat" and response.colliding and self._excused is None:
+        """End, or leave out what cannot be on the way home: the arm may stand as high as it reaches."""
+        if move is self._up and response.colliding and self._excused is None:
             self._excused = response.colliding  # free the arm from what it stands against
             self._recover(view)
-        elif move.name == "retreat":
+        elif move is self._up:
             self.clear()
             self.row += [self._legs.home(self._cycle), Look()]
+        elif not self._error:
+            subject = self.status.subject
+            self.fail(f"{subject}: {response.message}" if subject else response.message, view)
         else:
             self._give_up(f"{self._error}; the arm stays where it is: {response.message}")
 
@@ -200,7 +201,7 @@ class Outline(Task[OutlineView]):
     def _recover(self, view: OutlineView) -> None:
         """Up and home, from wherever the arm is."""
         self.clear()
-        up = self.retreat(view, self._excused, self.p.approach_clearance)
+        up = self._up = self.retreat(view, self._excused, self.p.approach_clearance)
         up.state, up.cycle, up.whole = "RETREATING", self._cycle, True
         self.row += [up, self._legs.home(self._cycle), Look()]
 

@@ -279,6 +279,18 @@ def test_arm_that_is_not_at_home_at_the_start_goes_there_first() -> None:
     assert cell.moves() == ["retreat", "home", *WHOLE]
 
 
+@pytest.mark.parametrize("colliding", [None, ("base", "Object_2")])
+def test_arm_that_can_not_go_up_from_where_it_is_found_goes_home_nevertheless(
+    colliding: tuple[str, str] | None,
+) -> None:
+    cell = OutlineDouble()
+    cell.q, cell.colliding = list(AWAY), colliding
+    cell.unplannable = lambda r: "no_ik" if r.stage == "retreat" and not cell.moves() else ""
+    cell.until("DONE")
+    assert cell.moves() == ["home", *WHOLE]
+    assert cell.status.failures == 0
+
+
 def test_motion_of_a_task_before_this_one_is_let_finish() -> None:
     cell = OutlineDouble()
     cell.motion = m.MotionStatus(id="other", state="active")
