@@ -59,10 +59,6 @@ class Clock:
         """Cell time now [s]."""
         return self.now_ns() * 1e-9
 
-    def wall_seconds(self, cell_seconds: float) -> float:
-        """Wall time [s] in which this much cell time passes."""
-        return cell_seconds / self.speed
-
     def wall_rate(self, cell_rate: float, most: float) -> float:
         """Rate on the wall clock [Hz] for a rate in cell time, at most `most`."""
         return min(cell_rate * self.speed, most)

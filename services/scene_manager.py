@@ -6,12 +6,11 @@ import asyncio
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from common import topics
 from common.applications.pick_place.perceived import PerceivedScene
 from common.applications.pick_place.tracks import SceneParameters
-from common.applications.pick_place.views import Seen, ViewName, Views
+from common.applications.pick_place.views import Seen, Views, ViewsParameters
 from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError
 from common.process.service import main
@@ -19,13 +18,11 @@ from common.robot.model import RobotModel
 from common.transport.bus import Bus
 
 
-class Config(SceneParameters):
+class Config(ViewsParameters, SceneParameters):
     """Parameters of the tracking and the sections that it needs."""
 
     robot: RobotConfig
     world: Surroundings
-    views: list[ViewName] = Field([], description="names of several detectors' views, as left: left/detected_objects, "
-                                                  "left/camera/camera_info")
 
 
 async def run(bus: Bus, config: Config) -> None:

@@ -13,7 +13,7 @@ from common.applications.pick_place.topics import (
     WORKSPACE_MARKERS,
 )
 from common.applications.pick_place.validation import Validation
-from common.applications.pick_place.views import Seen, ViewName, Views
+from common.applications.pick_place.views import Seen, Views, ViewsParameters
 from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
 from common.process.service import main
@@ -25,14 +25,12 @@ WORLD = "world"
 PATIENCE = 0.008  # wall time for which a frame with new places waits for their inverse kinematics [s]
 
 
-class Config(WorkspaceBounds):
+class Config(ViewsParameters, WorkspaceBounds):
     """Bounds of the workspace."""
 
     world: Surroundings
     robot: RobotConfig
     grasp: Grasp
-    views: list[ViewName] = Field([], description="names of several detectors' views, as left: left/detected_objects, "
-                                                  "left/camera/camera_info")
     forget_after: Tunable[float] = Field(
         2.0, ge=0, le=3600, description="a rejection is told again once its place was empty for so long [s, cell time]"
     )

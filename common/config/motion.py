@@ -37,6 +37,10 @@ class Grasp(Section):
     lift_height: float = Field(0.15, ge=0.05, le=0.5, description="lift above the grasp [m]")
     drop_z: float = Field(0.25, ge=0.18, le=0.6, description="height of release above the container [m]")
 
+    def height(self, z: float) -> float:
+        """Of the tool centre point at the grasp of what has its centre at z [m]."""
+        return max(z + self.grasp_clearance, self.min_grasp_z)
+
 
 class PlannerEntry(Section):
     """A planner of the pipeline: a module of common/planning/planners, or a dotted module of your own."""

@@ -94,7 +94,7 @@ def chain_reason(robot: RobotModel, position: Sequence[float], grasp: Grasp, bou
     The stages: pre-grasp above it, the straight line down, the grasp, the straight lift; tool down, from home.
     """
     furthest, worst = -1, ""
-    for yaw in _yaws(bounds.yaw_count):
+    for yaw in yaw_candidates(bounds.yaw_count):
         stage, reason = _chain(robot, position, yaw, grasp, bounds)
         if not reason:
             return ""
@@ -181,10 +181,9 @@ def _effort(bounds: WorkspaceBounds) -> tuple[float, ...]:
     return bounds.yaw_count, bounds.line_step, bounds.max_joint_step
 
 
-def _yaws(count: int) -> list[float]:
-    """Yaws in (-pi/2, pi/2] [rad], the smallest turn first: a parallel gripper repeats after half a turn."""
-    steps = sorted(range(-((count - 1) // 2), count // 2 + 1), key=abs)
-    return [k * math.pi / count for k in steps]
+def yaw_candidates(count: int) -> list[float]:
+    """Yaws [rad] in (-pi/2, pi/2], from the smallest turn to the largest; a parallel gripper repeats after pi."""
+    return [k * math.pi / count for k in sorted(range(-((count - 1) // 2), count // 2 + 1), key=lambda k: (abs(k), -k))]
 
 
 def _chain(
@@ -196,7 +195,7 @@ def _chain(
     one found from home. So the line must be there twice: downwards from the pre-grasp, upwards from the grasp.
     """
     x, y, z = position
-    low = max(z + grasp.grasp_clearance, grasp.min_grasp_z)
+    low = grasp.height(z)
     above, top = low + grasp.approach_clearance, low + grasp.lift_height
     turned = f"with any of {bounds.yaw_count} hand orientations"
     home = robot.named("home")

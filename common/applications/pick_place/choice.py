@@ -14,6 +14,7 @@ from common import messages as m
 from common.applications.pick_place.parameters import Config, HandShape
 from common.config import Container
 from common.robot.transforms import matrix_to_rpy, pose_to_matrix
+from common.scene.workspace import yaw_candidates
 from common.tasks.engine import appeared
 from common.tasks.stages import Cycle, Place, View, place_of
 
@@ -206,13 +207,6 @@ class Choice:
 def same_place(a: Place, b: Place, radius: float) -> bool:
     """Whether two places are of one ball: two balls are never closer than their diameter."""
     return math.dist(a[:2], b[:2]) < radius
-
-
-def yaw_candidates(count: int) -> list[float]:
-    """Yaws [rad] in (-pi/2, pi/2], from the smallest turn to the largest; a parallel gripper repeats after pi."""
-    step = math.pi / count
-    yaws = [k * step if k * step <= math.pi / 2 + 1e-9 else k * step - math.pi for k in range(count)]
-    return sorted(yaws, key=lambda yaw: (abs(yaw), -yaw))
 
 
 def finger_clearance(

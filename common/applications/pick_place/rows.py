@@ -84,7 +84,7 @@ class Rows:
         """Height of the tool centre point at the grasp of what lies with its centre at z [m]: a cup takes its top."""
         if self.gripper.cup is not None:
             return 2 * z - self.p.world.table_height
-        return max(z + self.p.grasp.grasp_clearance, self.p.grasp.min_grasp_z)
+        return self.p.grasp.height(z)
 
     def _region(self, at: Place, yaw: float, side: float | None = None) -> m.PoseGoal:
         """Above a place with the tool pointing down, as far as it matters."""

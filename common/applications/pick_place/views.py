@@ -13,6 +13,7 @@ from pydantic import Field
 
 from common import topics
 from common.applications.pick_place.topics import DETECTED_OBJECTS
+from common.config import Parameters
 from common.messages import Marker, MarkerArray
 from common.perception.intake import Cameras, LeftOut, Unusable
 from common.perception.pinhole import Pinhole
@@ -21,6 +22,13 @@ from common.transport.bus import Bus
 OLDEST = 0.5  # [s, cell time] behind the newest: a camera that is so late says nothing of how things are now
 
 ViewName = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*$")]
+
+
+class ViewsParameters(Parameters):
+    """Whose detections are looked at."""
+
+    views: list[ViewName] = Field([], description="names of several detectors' views, as left: left/detected_objects, "
+                                                  "left/camera/camera_info")
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.applications.pick_place.choice import Target, finger_clearance, grasp_yaws, yaw_candidates, yaws_of
+from common.applications.pick_place.choice import Target, finger_clearance, grasp_yaws, yaws_of
 from common.applications.pick_place.parameters import Config, HandShape
 from common.config import Container, load_cell, service_config
 from common.robot.transforms import tool_down
+from common.scene.workspace import yaw_candidates
 
 HAND = HandShape()
 
