@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Annotated, Any
 
 import typer
@@ -22,7 +23,7 @@ ChaosRate = Annotated[
 ]
 
 
-def run(
+def _operation(
     cell: options.CellArgument,
     overrides: options.Overrides = None,
     world: options.WorldName = None,
@@ -43,47 +44,35 @@ def run(
     record: Record = None,
     chaos: ChaosSeed = None,
     chaos_rate: ChaosRate = None,
-    **of_applications: Any,
-) -> None:
-    """Bring a cell up, run its task to the end, print a summary and shut down; exit 0 only if the task is DONE."""
-    securing.choose(secure)
-    before = verbs.before_run(cell, overrides, world, of_applications)
-    operation = Operation(cell, before.overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json,
-                          hosts.Share(listen, link, only, without))
-    operation.serve_page(viewer_host, viewer_port)
-    operation.record_to(record)
-    operation.disturb(chaos, chaos_rate, until_ended=True)
-    operation.first = before.first
-    raise typer.Exit(operation.run_to_end())
-
-
-def up(
-    cell: options.CellArgument,
-    overrides: options.Overrides = None,
-    world: options.WorldName = None,
-    seed: options.Seed = None,
-    speed: Speed = "1",
-    domain: options.Domain = None,
-    connect: options.Connect = None,
-    listen: options.Listen = None,
-    link: options.Link = None,
-    only: options.Only = None,
-    without: options.Without = None,
-    secure: options.Secure = None,
-    no_viewer: NoViewer = False,
-    viewer_host: viewing.Host = None,
-    viewer_port: viewing.Port = None,
-    summary: SummaryFile = None,
-    log_json: LogJson = False,
-    record: Record = None,
-    chaos: ChaosSeed = None,
-    chaos_rate: ChaosRate = None,
-) -> None:
-    """Bring a cell up and stay until Ctrl-C; the task starts by itself unless the cell says `autostart: false`."""
+    *,
+    until_ended: bool,
+) -> Operation:
+    """What is asked for with the options of `run` and `up`, which are these."""
     securing.choose(secure)
     operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json,
                           hosts.Share(listen, link, only, without))
     operation.serve_page(viewer_host, viewer_port)
     operation.record_to(record)
-    operation.disturb(chaos, chaos_rate, until_ended=False)
-    raise typer.Exit(operation.stay())
+    operation.disturb(chaos, chaos_rate, until_ended=until_ended)
+    return operation
+
+
+def run(**given: Any) -> None:
+    """Bring a cell up, run its task to the end, print a summary and shut down; exit 0 only if the task is DONE."""
+    of_applications = {name: given.pop(name) for name in given.keys() - _OPTIONS}
+    before = verbs.before_run(given["cell"], given["overrides"], given["world"], of_applications)
+    operation = _operation(**{**given, "overrides": before.overrides}, until_ended=True)
+    operation.first = before.first
+    raise typer.Exit(operation.run_to_end())
+
+
+def up(**given: Any) -> None:
+    """Bring a cell up and stay until Ctrl-C; the task starts by itself unless the cell says `autostart: false`."""
+    raise typer.Exit(_operation(**given, until_ended=False).stay())
+
+
+_ASKED = inspect.signature(_operation, eval_str=True)
+_OPTIONS = _ASKED.parameters.keys() - {"until_ended"}
+for verb in (run, up):
+    verb.__signature__ = _ASKED.replace(  # type: ignore[attr-defined]
+        parameters=[p for p in _ASKED.parameters.values() if p.name in _OPTIONS], return_annotation=None)

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import json
-from collections.abc import AsyncIterator
-from contextlib import aclosing
+from collections.abc import AsyncGenerator
 from typing import TYPE_CHECKING
 
-import typer
-
-from cli import options
 from common.errors import RequestFailed
 
 if TYPE_CHECKING:
     from cli.measuring import DelayFigures
-    from common.clock import Clock
     from common.transport.bus import Bus
 
 PERIOD = 1.0  # [s] between figures
@@ -29,48 +23,21 @@ class NoStamp(RequestFailed):
         super().__init__(f"{key}: its messages have no header with a stamp, so nothing says how old they are")
 
 
-def delay(
-    key: options.PublishedKey,
-    cell: options.CellName = None,
-    count: options.Count = None,
-    as_json: options.Json = False,
-    domain: options.Domain = None,
-    connect: options.Connect = None,
-) -> None:
-    """Show how old messages are when they come, until Ctrl-C or N lines: wall time since the stamp in the header."""
-    from cli.inspection import cell_clock
-    from cli.topic import published_or_foreign, visit_topic
-
-    most = options.whole("--count", count, 1)
-    topic = published_or_foreign(key)
-
-    async def visit(bus: Bus) -> None:
-        clock = await cell_clock(bus)
-        shown = 0
-        async for figures in windows(bus, key, clock, foreign=topic is None):
-            typer.echo(json.dumps({"key": key, **figures}) if as_json else describe(figures))
-            shown += 1
-            if shown == most:
-                return
-
-    visit_topic(visit, topic, key, cell, domain, connect)
-
-
-async def windows(bus: Bus, key: str, clock: Clock, *, foreign: bool = False) -> AsyncIterator[DelayFigures]:
-    """The figures of a key of the cell, each second.
+async def delays(bus: Bus, key: str, foreign: bool) -> AsyncGenerator[tuple[DelayFigures, str], None]:
+    """The figures of a key of the cell, each second, and as a line for people.
 
     Raises:
         NoStamp: something came that has no stamp.
         SilentKey: nothing came on a foreign key.
     """
-    from cli.foreign import samples
+    from cli.foreign import require_heard
+    from cli.inspection import cell_clock
     from cli.measuring import Hearing
 
     full = f"{bus.cell}/{key}"
+    hearing = Hearing(await cell_clock(bus))
     if foreign:
-        async with aclosing(samples(bus, key)) as coming:
-            await anext(coming)  # somebody writes it
-    hearing = Hearing(clock)
+        await require_heard(bus, key)
     for sample in await bus.raw_get(full, ASK_TIMEOUT):
         hearing.know(sample)
     subscribed = bus.raw_subscriber(full, hearing.arrive)
@@ -79,7 +46,8 @@ async def windows(bus: Bus, key: str, clock: Clock, *, foreign: bool = False) ->
             await asyncio.sleep(PERIOD)
             if hearing.unstamped:
                 raise NoStamp(key)
-            yield hearing.delays()
+            figures = hearing.delays()
+            yield figures, describe(figures)
     finally:
         subscribed.undeclare()
 

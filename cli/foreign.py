@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator
+from contextlib import aclosing
 from typing import TYPE_CHECKING
 
 from common.errors import UnknownName
@@ -55,3 +56,13 @@ async def samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:
     finally:
         following.cancel()  # which closes what it waits for
         await asyncio.wait({following})
+
+
+async def require_heard(bus: Bus, key: str) -> None:
+    """Return when something came on a key: somebody writes it.
+
+    Raises:
+        SilentKey: nothing did in the first moments.
+    """
+    async with aclosing(samples(bus, key)) as coming:
+        await anext(coming)

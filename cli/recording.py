@@ -187,15 +187,12 @@ async def _require_heard(bus: Bus, selection: Selection) -> None:
     Raises:
         SilentKey: nothing came on one of them.
     """
-    from contextlib import aclosing
-
-    from cli.foreign import samples
+    from cli.foreign import require_heard
     from common.application import all_topics
 
     for key in selection.keys:
         if key not in all_topics() and "*" not in key:
-            async with aclosing(samples(bus, key)) as coming:
-                await anext(coming)
+            await require_heard(bus, key)
 
 
 async def _until_ended(

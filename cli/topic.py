@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from contextlib import aclosing
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -155,58 +156,50 @@ def visit_topic(
         raise
 
 
-@app.command()
-def hz(
-    key: options.PublishedKey,
-    cell: options.CellName = None,
-    count: options.Count = None,
-    as_json: options.Json = False,
-    domain: options.Domain = None,
-    connect: options.Connect = None,
-) -> None:
-    """Show how many messages come each second, until Ctrl-C or N lines."""
-    _measure(key, cell, count, as_json, domain, connect, in_bytes=False)
+def _measured(name: str, doc: str, visiting: Callable[[Bus, str, bool], AsyncGenerator[tuple[Any, str], None]]) -> None:
+    """Add a verb that shows figures of a topic, each as a mapping and as a line for people.
+
+    Args:
+        name: of the verb.
+        doc: what it shows.
+        visiting: yields the figures, given a bus in the cell, the key, and whether it is none of the project's.
+    """
+    def verb(
+        key: options.PublishedKey, cell: options.CellName = None, count: options.Count = None,
+        as_json: options.Json = False, domain: options.Domain = None, connect: options.Connect = None,
+    ) -> None:
+        most = options.whole("--count", count, 1)
+        topic = published_or_foreign(key)
+
+        async def visit(bus: Bus) -> None:
+            shown = 0
+            async for figures, line in visiting(bus, key, topic is None):
+                typer.echo(json.dumps({"key": key, **figures}) if as_json else line)
+                shown += 1
+                if shown == most:
+                    return
+
+        visit_topic(visit, topic, key, cell, domain, connect)
+
+    verb.__doc__ = doc
+    app.command(name)(verb)
 
 
-@app.command()
-def bw(
-    key: options.PublishedKey,
-    cell: options.CellName = None,
-    count: options.Count = None,
-    as_json: options.Json = False,
-    domain: options.Domain = None,
-    connect: options.Connect = None,
-) -> None:
-    """Show how many bytes come each second, until Ctrl-C or N lines."""
-    _measure(key, cell, count, as_json, domain, connect, in_bytes=True)
-
-
-def _measure(
-    key: str, cell: str | None, count: str | None, as_json: bool, domain: str | None, connect: str | None,
-    *, in_bytes: bool,
-) -> None:
-    from cli.foreign import samples
+async def _rates(bus: Bus, key: str, foreign: bool, *, in_bytes: bool) -> AsyncGenerator[tuple[Any, str], None]:
+    from cli.foreign import require_heard
     from cli.measuring import describe, windows
 
-    most = options.whole("--count", count, 1)
-    topic = published_or_foreign(key)
-
-    async def visit(bus: Bus) -> None:
-        if topic is None:
-            async with aclosing(samples(bus, key)) as coming:
-                await anext(coming)  # somebody writes it
-        shown = 0
-        async for figures in windows(bus, f"{bus.cell}/{key}"):
-            typer.echo(json.dumps({"key": key, **figures}) if as_json else describe(figures, in_bytes=in_bytes))
-            shown += 1
-            if shown == most:
-                return
-
-    visit_topic(visit, topic, key, cell, domain, connect)
+    if foreign:
+        await require_heard(bus, key)
+    async for figures in windows(bus, f"{bus.cell}/{key}"):
+        yield figures, describe(figures, in_bytes=in_bytes)
 
 
+_measured("hz", "Show how many messages come each second, until Ctrl-C or N lines.", partial(_rates, in_bytes=False))
+_measured("bw", "Show how many bytes come each second, until Ctrl-C or N lines.", partial(_rates, in_bytes=True))
 app.command()(publishing.pub)
-app.command()(delay.delay)
+_measured("delay", "Show how old messages are when they come, until Ctrl-C or N lines: wall time since the stamp in "
+                   "the header.", delay.delays)
 
 
 def topic_of(key: str) -> AnyTopic:
