@@ -13,7 +13,8 @@ import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+import msgpack
+from pydantic import BaseModel, ConfigDict
 
 from common.sim.interface import StandingObject
 
@@ -55,14 +56,14 @@ class StateFile:
             if number <= self._number or _checksum(number, body) != checksum:
                 continue
             try:
-                newest, self._number = Standing.model_validate_json(body), number
-            except ValidationError:  # of another version
+                newest, self._number = Standing.model_validate(msgpack.unpackb(body)), number
+            except ValueError:  # of another version
                 continue
         return newest
 
     def save(self, state: Standing) -> None:
         """Write a state, which outlives this process at once, but not the machine."""
-        body = state.model_dump_json().encode()
+        body = msgpack.packb(state, default=vars)
         self._number += 1
         place = SLOT * (self._number % 2)
         os.pwrite(self._descriptor, _HEAD.pack(self._number, len(body), _checksum(self._number, body)) + body, place)
