@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -50,28 +52,32 @@ class LinkFrames:
 
     def fixed(self, stamp: int) -> list[TransformStamped]:
         """Links that are fixed to the one they hang on, such as the tool centre point."""
-        return self._transforms(self._fixed, self._robot.named("home"), None, stamp)
+        transforms = self._transforms(self._fixed, self._robot.named("home"), None, stamp)
+        return TFMessage.model_validate({"transforms": transforms}).transforms
 
-    def moving(self, state: JointState) -> list[TransformStamped]:
-        """Links that a joint moves, at that joint state; empty when a joint of the arm is missing in it."""
+    def moving(self, state: JointState) -> TFMessage | None:
+        """Links that a joint moves, at that joint state; None when a joint of the arm is missing in it.
+
+        Only to be sent: its numbers are our own, so that it is not checked, and holds no messages but their fields.
+        """
         q = self._robot.order(state.name, state.position)
         if q is None:
-            return []
+            return None
         others = {name: value for name, value in zip(state.name, state.position, strict=True)
                   if name in self._robot.config.locked_joints}
-        return self._transforms(self._moving, q, others, state.header.stamp)
+        unchecked: dict[str, Any] = {"transforms": self._transforms(self._moving, q, others, state.header.stamp)}
+        return TFMessage.model_construct(**unchecked)
 
     def _transforms(
         self, links: list[str], q: NDArray[np.float64], others: dict[str, float] | None, stamp: int
-    ) -> list[TransformStamped]:
+    ) -> list[dict[str, object]]:
         poses = self._robot.poses_in_parents(links, q, others)
-        transforms = [
+        return [
             _fields(self._robot.link_parents[link], link, {
                 "position": {"x": px, "y": py, "z": pz}, "orientation": {"x": x, "y": y, "z": z, "w": w},
             }, stamp)
             for link, (px, py, pz, x, y, z, w) in zip(links, poses, strict=True)
         ]
-        return TFMessage.model_validate({"transforms": transforms}).transforms  # checked as a whole
 
 
 async def run(bus: Bus, config: Config) -> None:
@@ -96,11 +102,11 @@ async def run(bus: Bus, config: Config) -> None:
             continue
         newest = state.header.stamp
         transforms = frames.moving(state)
-        if transforms:
-            tf.put(TFMessage(transforms=transforms))
+        if transforms is not None:
+            tf.put(transforms)
         elif not told:
             bus.log.warning("joint_states has %s: a joint of the arm is missing", ", ".join(state.name))
-        told = not transforms
+        told = transforms is None
 
 
 if __name__ == "__main__":
