@@ -37,6 +37,10 @@ class PerceivedScene:
         self.p, self._tracks = parameters, Tracks(parameters)
         self._fixed = fixed_objects(around)
         self._slots = slot_positions(around.container, around.ball_radius, around.table_height).reshape(-1, 3)
+        self._in_slots = [
+            self._ball(f"slot_{k}", "contained", m.Pose(position=m.Vector3(x=x, y=y, z=z)))
+            for k, (x, y, z) in enumerate(self._slots.tolist(), 1)
+        ]
         self._occupied: dict[int, tuple[int, set[int]]] = {}  # stamp and slots by view
         self._beside_slots: dict[int, list[Sighting]] = {}  # what else lies in the container, by view
         self._held: m.AttachedObject | None = None
@@ -109,11 +113,7 @@ class PerceivedScene:
     def scene(self) -> m.PlanningScene:
         """What is believed now; its stamp is that of the newest frame in it."""
         table = [_object(t.id, "target", t.sighting, _pose(t)) for t in self._tracks.confirmed()]
-        contained = [
-            self._ball(f"slot_{k + 1}", "contained", m.Pose(position=m.Vector3(
-                x=float(self._slots[k, 0]), y=float(self._slots[k, 1]), z=float(self._slots[k, 2]))))
-            for k in sorted(self._occupied_slots())
-        ]
+        contained = [self._in_slots[k] for k in sorted(self._occupied_slots())]
         beside: list[Sighting] = []
         for things in self._beside_slots.values():
             beside = things if len(things) > len(beside) else beside
