@@ -40,7 +40,9 @@ class _Goal:
         """Positions [rad] and their change per second of the trajectory (dof,), blended from where the robot was."""
         q, dq = self.trajectory.at(time)
         blend = min(BLEND_TIME, self.trajectory.duration)
-        u = min(time / blend, 1.0)
+        if time >= blend:
+            return q, dq
+        u = time / blend
         left, slope = 1 - u**3 * (10 - 15 * u + 6 * u**2), -30 * u**2 * (1 - u) ** 2 / blend
         return q + left * self.offset, dq + slope * self.offset
 

@@ -251,5 +251,5 @@ class ControlCycle:
 
 def _same(told: Message, state: Message, *but: str) -> bool:
     """Whether all fields are as they were told, but for those named."""
-    was = told.__dict__
-    return all(value == was[name] for name, value in state if name not in but)
+    now = vars(state)
+    return vars(told) | {name: now[name] for name in but} == now

@@ -166,14 +166,14 @@ class KinematicWorld:
 
     def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
         """Move on to a time: see `common.sim.interface`."""
-        held, T_world_tcp = self.held, T_world_tcp @ self._T_tcp_closing
+        held = self.held
         if not held and gripping and self._between:
             held = min(self._between,
                        key=lambda n: float(np.linalg.norm(self._bodies[n].T[:3, 3] - T_world_tcp[:3, 3])))
-            self._grasp(self._bodies[held], T_world_tcp, now)
+            self._grasp(self._bodies[held], T_world_tcp @ self._T_tcp_closing, now)
         if held:
             body = self._bodies[held]
-            self._carry(body, T_world_tcp)
+            self._carry(body, T_world_tcp @ self._T_tcp_closing)
             if width > body.width + self._tolerances.release:
                 self._release(body, now)
         for body in self._bodies.values():
