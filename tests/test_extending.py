@@ -198,7 +198,6 @@ def planners(summary: dict[str, object]) -> set[str]:
     return {plan["planner"] for plan in plans}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("line", HERE)
 def test_cell_of_the_clone_runs_with_one_part_of_ours(line: str, folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "summary.json"
