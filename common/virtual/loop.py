@@ -80,7 +80,7 @@ class VirtualLoop(base_events.BaseEventLoop):
 
     # Of asyncio's own loop, whose turns it takes:
     _ready: deque[Any]
-    _scheduled: list[Any]
+    _scheduled: list[Any]  # when and timer: numbers are compared sooner than timers
     _timer_cancelled_count: int
     _stopping: bool
 
@@ -122,18 +122,18 @@ class VirtualLoop(base_events.BaseEventLoop):
         """Take all turns that are due; when there are none, let time pass up to the next one."""
         scheduled, ready = self._scheduled, self._ready
         if self._timer_cancelled_count > 100 + len(scheduled) // 2:
-            scheduled[:] = [timer for timer in scheduled if not timer._cancelled]
+            scheduled[:] = [entry for entry in scheduled if not entry[1]._cancelled]
             heapq.heapify(scheduled)
             self._timer_cancelled_count = 0
-        while scheduled and scheduled[0]._cancelled:
+        while scheduled and scheduled[0][1]._cancelled:
             self._timer_cancelled_count -= 1
             heapq.heappop(scheduled)
         if not ready and not self._stopping:
             if not scheduled:
                 raise Deadlock(f"nothing will ever happen after {self._now:.3f} s")
-            self._now = max(self._now, scheduled[0]._when)
-        while scheduled and scheduled[0]._when <= self._now:
-            timer = heapq.heappop(scheduled)
+            self._now = max(self._now, scheduled[0][0])
+        while scheduled and scheduled[0][0] <= self._now:
+            _, timer = heapq.heappop(scheduled)
             timer._scheduled = False
             if not timer._cancelled:
                 ready.append(timer)
@@ -188,7 +188,7 @@ class VirtualLoop(base_events.BaseEventLoop):
         life = timer._context.get(_life)
         if life is not None and life.over:
             return timer
-        heapq.heappush(self._scheduled, timer)
+        heapq.heappush(self._scheduled, (when, timer))
         timer._scheduled = True
         return timer
 
@@ -199,7 +199,7 @@ class VirtualLoop(base_events.BaseEventLoop):
             if not handle._cancelled:
                 life.left.append((handle._callback, handle._args, handle._context))
                 handle.cancel()
-        for timer in [timer for timer in self._scheduled if timer._context.get(_life) is life]:
+        for timer in [timer for _, timer in self._scheduled if timer._context.get(_life) is life]:
             timer.cancel()
 
     def revive(self, life: Life) -> None:
