@@ -13,7 +13,8 @@ where `start` is the pose at which a simulated arm begins; a real arm is where i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from functools import cached_property
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,14 +42,13 @@ class Limits:
     acceleration: Vector
     deceleration: Vector | None = None
 
-    @property
+    @cached_property
     def braking(self) -> Vector:
         """Largest change of velocity for a hold or a stop (dof,) [rad/s^2]."""
         return self.acceleration if self.deceleration is None else np.maximum(self.acceleration, self.deceleration)
 
 
-@dataclass(frozen=True)
-class GripperReading:
+class GripperReading(NamedTuple):
     """State of the fingers: `width` between their inner faces [m], its rate [m/s], `effort` they press with [N]."""
 
     width: float

@@ -6,12 +6,10 @@ Callbacks may come on any thread and must return at once.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 
-@dataclass(frozen=True, slots=True)
-class RawSample:
+class RawSample(NamedTuple):
     """A published value or a reply as it came, with its full key."""
 
     key: str
@@ -20,8 +18,7 @@ class RawSample:
     attachment: bytes | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class RawReply:
+class RawReply(NamedTuple):
     """A reply to a `get`: a sample, or the payload of an error."""
 
     sample: RawSample | None
