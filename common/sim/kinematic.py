@@ -6,7 +6,6 @@ stay where it falls appears at the nearest place where it can.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -15,21 +14,20 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import GripperConfig, ObjectConfig, SuctionCup, World
+from common.config import GripperConfig, ObjectConfig, World
 from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Header, Pose, SceneUpdate, Vector3, WorldEdit, WorldObject, WorldObjects
 from common.robot.finger_joints import closing_frame
-from common.robot.transforms import invert, matrix_to_pose, matrix_to_quaternion, quaternion_to_matrix, transform
+from common.robot.transforms import invert, matrix_to_pose, transform
+from common.sim.bodies import Body, Rest, restored
+from common.sim.gripping import felt
 from common.sim.interface import GraspTolerances, StandingObject
-from common.sim.objects import Solid, pose_of, prism, round_one, solid_of, solid_of_message, sphere
-from common.sim.resting import Body, Ground, Rest
+from common.sim.objects import Solid, pose_of, shaped, solid_of, solid_of_message
+from common.sim.resting import Ground
 
 Array = NDArray[np.float64]
 
 GRAVITY = 9.81  # [m/s^2]
-TOUCH = 1e-6  # [m]
-LIP_POINTS = 8  # on the ring of a suction cup
-LINES = 5  # across a finger pad, along which it is felt what is between the fingers
 
 
 def create(
@@ -83,13 +81,8 @@ class KinematicWorld:
     def standing(self) -> dict[str, StandingObject]:
         """Everything as it is, for `restore`."""
         if self._kept is None or self._kept[0] != self.version:
-            self._kept = self.version, self._standing()
+            self._kept = self.version, {name: body.standing() for name, body in self._bodies.items()}
         return self._kept[1]
-
-    def _standing(self) -> dict[str, StandingObject]:
-        for body in self._bodies.values():
-            body.kept = body.kept or _standing(body)
-        return {name: body.kept for name, body in self._bodies.items() if body.kept is not None}
 
     def restore(self, objects: Mapping[str, StandingObject]) -> None:
         """Put everything where it was; what is of a shape that there is not is passed over."""
@@ -106,16 +99,7 @@ class KinematicWorld:
             solid, color = self._solids[first.id], first.color
         else:
             return None
-        d: dict[str, Any] = kept.details
-        body = Body(
-            name, solid, color, _matrix(kept.pose), d["state"], d["container"], _slot(d["slot"]),
-            None if d["grip"] is None else _matrix(d["grip"]), d["width"], d["dropped"], d["since"],
-            added=d["added"], like=kept.like,
-        )
-        if d["rest"] is not None:
-            T, state, container, slot = d["rest"]
-            body.rest = Rest(_matrix(T), state, container, _slot(slot))
-        return body
+        return restored(name, kept, solid, color)
 
     # --- the hand ---
 
@@ -126,43 +110,12 @@ class KinematicWorld:
         found: dict[str, tuple[float, float]] = {}
         T_world_hand = T_world_tcp @ self._T_tcp_closing
         for name, body in self._bodies.items():
-            if body.state in ("table", "contained") and (ends := self._felt(body, T_world_hand, width)):
+            if body.state in ("table", "contained") and (
+                ends := felt(self._gripper, self._tolerances, body, T_world_hand, width, self._between.get(name))
+            ):
                 found[name] = ends
         self._between = found
         return max((high - low for low, high in found.values()), default=0.0)
-
-    def _felt(self, body: Body, T_world_tcp: Array, width: float) -> tuple[float, float] | None:
-        """The ends along tool y [m] of what the pads would press on; None when the body is not between them.
-
-        Once clear of both fingers a thing stays between them: the closing finger pushes it to the middle.
-        """
-        if self._gripper is not None and self._gripper.cup is not None:
-            half = self._gripper.held_width / 2
-            return (-half, half) if lies_on(self._gripper.cup, body.solid, invert(T_world_tcp) @ body.T) else None
-        allowed, solid = self._tolerances, body.solid
-        reach = allowed.across + allowed.along + max(width / 2, solid.reach) + solid.reach
-        if abs(body.T[2, 3] - T_world_tcp[2, 3]) > reach:
-            return None
-        away = body.T[:3, 3] - T_world_tcp[:3, 3]
-        if math.hypot(*away.tolist()) > reach:
-            return None
-        if solid.shape == "sphere":
-            x, y, z = T_world_tcp[:3, :3].T @ away
-            if abs(x) > allowed.across or abs(z) > allowed.along:
-                return None
-            low, high, half = float(y - solid.radius), float(y + solid.radius), solid.radius
-            fits, near = abs(y) <= width / 2 - half + allowed.sideways, abs(y) < max(width / 2, half)
-        else:
-            ends = _pressed(solid, invert(T_world_tcp) @ body.T, width, allowed)
-            if ends is None:
-                return None
-            before = self._between.get(body.name, ends)  # the closing finger may hide an end by pushing it
-            low, high = ends if ends[1] - ends[0] >= before[1] - before[0] else before
-            half = (high - low) / 2
-            fits = low >= -width / 2 - allowed.sideways and high <= width / 2 + allowed.sideways
-            near = abs(low + high) / 2 < max(width / 2, half)
-        enters = width / 2 >= half and fits
-        return (low, high) if enters or (body.name in self._between and near) else None
 
     def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
         """Move on to a time: see `common.sim.interface`."""
@@ -186,7 +139,7 @@ class KinematicWorld:
         body.grip[1, 3] -= (low + high) / 2  # the fingers centre it
         is_cupped = self._gripper is not None and self._gripper.cup is not None
         body.width = 2 * body.solid.radius if body.solid.shape == "sphere" and not is_cupped else high - low
-        slot, block = body.slot_taken, self._ground.block(body)
+        slot, block = body.slot_taken, body.block()
         body.state, body.container, body.slot = "held", "", None
         body.changed()
         self._between = {}
@@ -246,7 +199,7 @@ class KinematicWorld:
     def _lose(self, gone: Any, now: float) -> None:
         """Let what lay on something fall, which is no longer there."""
         for body in self._ground.carries_nothing_any_more(gone, self._bodies):
-            block = self._ground.block(body)
+            block = body.block()
             self._say("remove", body)
             self._release(body, now)
             self._lose(block, now)
@@ -273,7 +226,7 @@ class KinematicWorld:
                 raise Refused("no_position", f"position: {request.op} needs one, for example {{x: 0.5, y: 0.0}}")
             rest = self._ground.put(body, request.position.x, request.position.y, request.yaw, self._bodies)
         lay, slot = old is not None and old.state in ("table", "contained"), body.slot_taken
-        block = self._ground.block(body) if lay else None
+        block = body.block() if lay else None
         if lay:
             self._say("remove", body)
         if rest is not None:
@@ -371,96 +324,19 @@ class KinematicWorld:
         self.version += 1
 
 
-def lies_on(cup: SuctionCup, solid: Solid, T_tcp_object: Array) -> bool:
-    """Whether the whole lip of a cup lies on a solid: middle and ring meet it, no further away than the lip gives."""
-    around = np.linspace(0.0, 2 * math.pi, LIP_POINTS, endpoint=False)
-    lip = np.vstack([(0.0, 0.0), cup.lip_radius * np.column_stack([np.cos(around), np.sin(around)])])
-    if solid.shape == "sphere":
-        x, y, z = T_tcp_object[:3, 3]
-        inside = solid.radius**2 - ((lip - (x, y)) ** 2).sum(axis=1)
-        if (inside <= 0).any():
-            return False
-        near = z - np.sqrt(inside)
-    else:
-        # Seen along the tool's z axis, which is the y axis of lines through (x, -y).
-        T_along_tcp = np.eye(4)
-        T_along_tcp[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
-        spans = solid.spans(T_along_tcp @ T_tcp_object, lip * (1.0, -1.0))[: len(lip)]
-        if any(not len(span) for span in spans):
-            return False
-        near = np.array([span[:, 0].min() for span in spans])
-    return bool((np.abs(near) <= cup.give).all())
-
-
-def _pressed(
-    solid: Solid, T_tcp_object: Array, width: float, allowed: GraspTolerances
-) -> tuple[float, float] | None:
-    """The ends along tool y [m] of what of a solid is between the pads; None when the line between their middles
-    meets nothing of it."""
-    x, z = (np.linspace(-half, half, LINES) for half in (allowed.across, allowed.along))
-    lines = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
-    spans = solid.spans(T_tcp_object, lines)
-    middle = spans[len(lines) // 2]
-    if not (np.abs(middle).min(axis=1) < width / 2).any() and not ((middle[:, 0] < 0) & (middle[:, 1] > 0)).any():
-        return None
-    parts = sorted(tuple(span) for found in spans for span in found.tolist())
-    merged: list[list[float]] = []
-    for low, high in parts:
-        if merged and low <= merged[-1][1] + 1e-4:
-            merged[-1][1] = max(merged[-1][1], high)
-        else:
-            merged.append([low, high])
-    inside = [part for part in merged if part[0] <= width / 2 + TOUCH and part[1] >= -width / 2 - TOUCH]
-    return (inside[0][0], inside[-1][1]) if inside else None
-
-
 def _requested(request: WorldEdit) -> Solid:
     """The shape that a request describes. Raises Refused when something of it is missing."""
     size = request.size
-    if size is None or size.x <= 0 or (request.shape != "sphere" and size.z <= 0):
+    if request.shape is None or size is None or size.x <= 0 or (request.shape != "sphere" and size.z <= 0):
         raise Refused("no_size", f"size: a {request.shape} needs one, for example {{x: 0.04, y: 0.04, z: 0.04}}")
-    if request.shape == "sphere":
-        return sphere(size.x / 2)
-    if request.shape in ("cylinder", "ring"):
-        inner = request.inner_radius or 0.0
-        if request.shape == "ring" and not 0 < inner < size.x / 2:
-            raise Refused("no_size", f"inner_radius: a ring needs one below {size.x / 2:g} m")
-        return round_one(request.shape, size.x / 2, inner, size.z)
-    if request.shape == "box":
-        x, y = size.x / 2, size.y / 2
-        if y <= 0:
-            raise Refused("no_size", "size: a box needs x, y and z")
-        return prism("box", np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), size.z)
-    if len(request.polygon) < 3:
+    inner = request.inner_radius or 0.0
+    if request.shape == "ring" and not 0 < inner < size.x / 2:
+        raise Refused("no_size", f"inner_radius: a ring needs one below {size.x / 2:g} m")
+    if request.shape == "box" and size.y <= 0:
+        raise Refused("no_size", "size: a box needs x, y and z")
+    if request.shape == "prism" and len(request.polygon) < 3:
         raise Refused("no_size", "polygon: a prism needs at least 3 corners")
-    return prism("prism", np.array(request.polygon), size.z)
-
-
-def _standing(body: Body) -> StandingObject:
-    """A body as it is, for `restore`."""
-    rest = body.rest
-    return StandingObject(
-        pose=_numbers(body.T), like=body.like, made=body.message() if body.added and not body.like else None,
-        details={
-            "state": body.state, "container": body.container, "slot": body.slot, "dropped": body.dropped,
-            "since": body.since, "width": body.width, "grip": None if body.grip is None else _numbers(body.grip),
-            "added": body.added,
-            "rest": None if rest is None else [_numbers(rest.T), rest.state, rest.container, rest.slot],
-        },
-    )
-
-
-def _numbers(T: Array) -> tuple[float, ...]:
-    return (*T[:3, 3].tolist(), *matrix_to_quaternion(T[:3, :3]))
-
-
-def _matrix(numbers: Sequence[float]) -> Array:
-    x, y, z, *q = numbers
-    return transform(quaternion_to_matrix(*q), (x, y, z))
-
-
-def _slot(value: Any) -> tuple[int, int] | None:
-    return None if value is None else (int(value[0]), int(value[1]))
+    return shaped(request.shape, size, inner, request.polygon)
 
 
 __all__ = ["GraspTolerances", "KinematicWorld", "WorldObject", "create"]

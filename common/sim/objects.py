@@ -164,17 +164,11 @@ def solid_of(thing: ObjectConfig) -> Solid:
     Raises:
         ConfigError: the file of a mesh cannot be read.
     """
-    height = thing.height or 0.0
-    if thing.shape == "sphere":
-        return sphere(thing.radius or 0.0)
-    if thing.shape == "box" and thing.size is not None:
-        x, y = thing.size[0] / 2, thing.size[1] / 2
-        return prism("box", np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), height)
-    if thing.shape in ("cylinder", "ring"):
-        return round_one(thing.shape, thing.radius or 0.0, thing.inner_radius or 0.0, height)
     if thing.shape == "mesh":
         return mesh(load_mesh(thing.id, Path(thing.mesh), thing.scale))
-    return prism("prism", np.array(thing.polygon), height)
+    across = 2 * (thing.radius or 0.0)
+    x, y = thing.size or (across, across)
+    return shaped(thing.shape, Vector3(x=x, y=y, z=thing.height or 0.0), thing.inner_radius or 0.0, thing.polygon)
 
 
 def sphere(radius: float) -> Solid:
@@ -263,17 +257,19 @@ def world_object(thing: ObjectConfig) -> WorldObject:
 
 def solid_of_message(thing: WorldObject) -> Solid:
     """The shape that a message describes."""
-    size = thing.size
-    if thing.shape == "sphere":
-        return sphere(size.x / 2)
-    if thing.shape in ("cylinder", "ring"):
-        return round_one(thing.shape, size.x / 2, thing.inner_radius, size.z)
-    if thing.shape == "box":
-        x, y = size.x / 2, size.y / 2
-        return prism("box", np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), size.z)
     if thing.shape == "mesh":
         return mesh(np.array(thing.vertices, float)[np.array(thing.triangles, int)].reshape(-1, 3, 3))
-    return prism("prism", np.array(thing.polygon), size.z)
+    return shaped(thing.shape, thing.size, thing.inner_radius, thing.polygon)
+
+
+def shaped(shape: Shape, size: Vector3, inner_radius: float, polygon: Sequence[tuple[float, float]]) -> Solid:
+    """A solid that is no mesh, by the size of the box about it, and what else its shape needs."""
+    if shape == "sphere":
+        return sphere(size.x / 2)
+    if shape in ("cylinder", "ring"):
+        return round_one(shape, size.x / 2, inner_radius, size.z)
+    x, y = size.x / 2, size.y / 2
+    return prism(shape, np.array([(-x, -y), (x, -y), (x, y), (-x, y)] if shape == "box" else polygon), size.z)
 
 
 def look_of(thing: WorldObject) -> tuple[object, ...]:

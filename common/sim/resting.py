@@ -9,109 +9,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.config import Container, World
 from common.errors import Refused
-from common.messages import WorldObject
 from common.robot.transforms import rpy_to_matrix, transform
-from common.sim.footprints import covers_point, footprint, heights, overlap, within
-from common.sim.interface import StandingObject
-from common.sim.objects import Solid, message_of
+from common.sim.bodies import Block, Body, Rest, State
+from common.sim.footprints import covers_point, footprint, heights, within
 from common.sim.places import Slot, Slots, Table, is_inside, is_over, tables
 
 Array = NDArray[np.float64]
-State = Literal["table", "held", "falling", "contained", "elsewhere"]
 
 FLOOR_BELOW_TABLE = 0.75  # what falls off the table lies this far below its surface [m]
 LEVEL = 1e-3  # [m] tops so near to each other are one surface
 LIFTED = 0.02  # [m] what was let go so little below the top of something is put on it
 STEP = 5e-3  # [m] of the search for a place
 FARTHEST = 0.6  # [m] from where it fell
-
-
-@dataclass(frozen=True)
-class Rest:
-    """Where a body lies: its pose (4, 4) in world, and the container and slot if it lies in one."""
-
-    T: Array
-    state: State = "table"
-    container: str = ""
-    slot: Slot | None = None
-
-
-@dataclass(eq=False)
-class Body:
-    """A solid and what is done to it. Held: `grip` is its pose in the TCP frame. Falling: it is to lie at `rest`."""
-
-    name: str
-    solid: Solid
-    color: tuple[float, float, float]
-    T: Array
-    state: State = "table"
-    container: str = ""
-    slot: Slot | None = None
-    grip: Array | None = None
-    width: float = 0.0  # between the fingers that hold it [m]
-    dropped: float = 0.0  # height at which it began to fall [m]
-    since: float = 0.0  # when [s]
-    rest: Rest | None = None
-    added: bool = False  # by a person
-    like: str = ""  # the object of the first layout whose shape it has
-    told: WorldObject | None = None  # the message about it, while it is as it was
-    kept: StandingObject | None = None  # the same of how it stands
-
-    def lie(self, rest: Rest) -> None:
-        """Be at rest there."""
-        self.T, self.state, self.container, self.slot = rest.T, rest.state, rest.container, rest.slot
-        self.rest, self.grip = None, None
-        self.changed()
-
-    def changed(self) -> None:
-        """Forget what was said about it: it is not as it was."""
-        self.told = self.kept = None
-
-    @property
-    def lying(self) -> Array:
-        """Its pose (4, 4), or that to which it falls."""
-        return self.T if self.rest is None else self.rest.T
-
-    @property
-    def slot_taken(self) -> tuple[str, Slot] | None:
-        """The container and slot in which it lies or will lie."""
-        slot = self.slot if self.rest is None else self.rest.slot
-        return None if slot is None else (self.container if self.rest is None else self.rest.container, slot)
-
-    @property
-    def bottom(self) -> float:
-        """Height of its lowest point where it lies or will lie [m]."""
-        return float(self.lying[2, 3]) + self.solid.lowest(self.lying[:3, :3])
-
-    def message(self) -> WorldObject:
-        """What there is to say about it."""
-        if self.told is None:
-            self.told = message_of(self.name, self.solid, self.T, self.color, state=self.state,
-                                   container=self.container)
-        return self.told
-
-
-@dataclass(frozen=True, eq=False)
-class Block:
-    """Something that is in the way or carries: its outline (N, 2) [m] and between which heights [m] it is."""
-
-    id: str
-    outline: Array
-    low: float
-    high: float
-    flat: bool  # its top carries things
-
-    def reaches(self, outline: Array) -> bool:
-        """Whether it covers some of an area seen from above."""
-        return overlap(outline, self.outline)
 
 
 class Ground:
@@ -155,13 +70,9 @@ class Ground:
         """Bodies that lay on something that is no longer there, lowest first."""
         return sorted(
             (b for b in bodies.values() if b.state in ("table", "contained") and b.slot is None
-             and abs(b.bottom - gone.high) < 2 * LEVEL and gone.reaches(self._block(b).outline)),
+             and abs(b.bottom - gone.high) < 2 * LEVEL and gone.reaches(b.block().outline)),
             key=lambda b: b.bottom,
         )
-
-    def block(self, body: Body) -> Block:
-        """What others can lie on."""
-        return self._block(body)
 
     def slot_position(self, container: str, radius: float, slot: Slot) -> Array:
         """Centre (3,) [m] of a sphere in a slot."""
@@ -172,16 +83,16 @@ class Ground:
         if not self._in_slots(box, body, bodies):
             return None
         slots = self._slots_of(box, body.solid.radius)
-        others = [b for b in bodies.values() if b.name != body.name and _container(b) == box.id]
-        slot = slots.choose(x, y, [taken for b in others if (taken := _slot_of(b)) is not None])
+        others = [b for b in bodies.values() if b.name != body.name and b.container_taken == box.id]
+        slot = slots.choose(x, y, [taken for b in others if (taken := b.slot_in) is not None])
         if slot is None:
             return None
         return Rest(transform(body.T[:3, :3], slots.position(slot)), "contained", box.id, slot)
 
     def _in_slots(self, box: Container, body: Body, bodies: Mapping[str, Body]) -> bool:
         """Whether all that lies in a container are spheres of one size in their slots."""
-        others = [b for b in bodies.values() if b.name != body.name and _container(b) == box.id]
-        return all(_slot_of(b) is not None and b.solid.radius == body.solid.radius for b in others)
+        others = [b for b in bodies.values() if b.name != body.name and b.container_taken == box.id]
+        return all(b.slot_in is not None and b.solid.radius == body.solid.radius for b in others)
 
     def _roll(self, body: Body, x: float, y: float, bodies: Mapping[str, Body]) -> Rest:
         """A sphere on the table, at the nearest place that is free; beside the table it is out of sight."""
@@ -191,7 +102,9 @@ class Ground:
             spheres = [(at, r) for _, at, r in self._spheres(body, bodies) if at[2] > table.height]
             others = np.array([at[:2] for at, _ in spheres]).reshape(-1, 2)
             apart = [2 * radius if r == radius else 2 * math.sqrt(radius * r) for _, r in spheres]
-            place = table.nearest_free(x, y, others, apart=apart, outlines=self._outlines(body, bodies))
+            place = table.nearest_free(
+                x, y, others, apart=apart, outlines=[block.outline for block in self._blocks_of(body, bodies)]
+            )
         if place is None:
             below = self._world.table_height - FLOOR_BELOW_TABLE + radius
             return Rest(transform(body.T[:3, :3], (x, y, below)), "elsewhere")
@@ -301,7 +214,7 @@ class Ground:
                                        f"{across:.3g} x {along:.3g} m: {' or '.join(extents)}")
         low = level + LEVEL
         high = level + body.solid.highest(rotation) - body.solid.lowest(rotation) - LEVEL
-        for block in [*self._fixtures, *self._panels, *(self._block(b) for b in self._resting(body, bodies))]:
+        for block in [*self._fixtures, *self._panels, *(b.block() for b in self._resting(body, bodies))]:
             if block.low < high and block.high > low and block.reaches(outline):
                 raise Refused("occupied", f"{body.name} at ({at[0]:g}, {at[1]:g}) would reach into {block.id}")
 
@@ -338,42 +251,24 @@ class Ground:
     def _spheres(self, but: Body, bodies: Mapping[str, Body]) -> list[tuple[str, Array, float]]:
         """Centres (3,) and radii of spheres on the table, of those that fall to it, and of what is held."""
         return [(b.name, b.lying[:3, 3], b.solid.radius) for b in bodies.values()
-                if b.name != but.name and b.solid.shape == "sphere" and not _container(b)]
+                if b.name != but.name and b.solid.shape == "sphere" and not b.container_taken]
 
     def _resting(self, but: Body, bodies: Mapping[str, Body]) -> Iterable[Body]:
         return (b for b in bodies.values() if b.name != but.name and b.state not in ("held", "elsewhere"))
 
     def _blocks_of(self, but: Body, bodies: Mapping[str, Body]) -> list[Block]:
         """What lies on the table and is no sphere, outside of containers."""
-        return [self._block(b) for b in self._resting(but, bodies)
-                if b.solid.shape != "sphere" and not _container(b) and b.bottom < self._world.table_height + 0.2]
-
-    def _outlines(self, but: Body, bodies: Mapping[str, Body]) -> list[Array]:
-        return [block.outline for block in self._blocks_of(but, bodies)]
+        return [b.block() for b in self._resting(but, bodies)
+                if b.solid.shape != "sphere" and not b.container_taken and b.bottom < self._world.table_height + 0.2]
 
     def _blocks(self, but: Body, bodies: Mapping[str, Body]) -> list[Block]:
-        return [*self._fixtures, *self._panels, *(self._block(b) for b in self._resting(but, bodies))]
-
-    def _block(self, body: Body) -> Block:
-        T = body.lying
-        outline = body.solid.footprint(T[:3, :3]) + T[:2, 3]
-        z = float(T[2, 3])
-        low, high = z + body.solid.lowest(T[:3, :3]), z + body.solid.highest(T[:3, :3])
-        return Block(body.name, outline, low, high, flat=body.solid.shape != "sphere")
+        return [*self._fixtures, *self._panels, *(b.block() for b in self._resting(but, bodies))]
 
 
 def _centred(outline: Array) -> tuple[Array, Array]:
     """An outline (N, 2) about the middle (2,) of the box around it, and that middle [m]."""
     middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
     return outline - middle, middle
-
-
-def _container(body: Body) -> str:
-    return body.rest.container if body.rest is not None else body.container
-
-
-def _slot_of(body: Body) -> Slot | None:
-    return body.slot_taken[1] if body.slot_taken else None
 
 
 def _panels(box: Container, table_height: float) -> list[Block]:

@@ -12,7 +12,8 @@ from common.config import GripperConfig, ObjectConfig, SuctionCup, World
 from common.hardware.fingers import Fingers
 from common.robot.finger_joints import finger_positions
 from common.robot.transforms import tool_down
-from common.sim.kinematic import KinematicWorld, lies_on
+from common.sim.gripping import lies_on
+from common.sim.kinematic import KinematicWorld
 from common.sim.objects import solid_of
 
 CUP = GripperConfig(cup=SuctionCup(), links=["cup"])
