@@ -167,7 +167,7 @@ def solid_of(thing: ObjectConfig) -> Solid:
     if thing.shape == "mesh":
         return mesh(load_mesh(thing.id, Path(thing.mesh), thing.scale))
     across = 2 * (thing.radius or 0.0)
-    x, y = thing.size or (across, across)
+    x, y = (thing.size or (across, across))[:2]
     return shaped(thing.shape, Vector3(x=x, y=y, z=thing.height or 0.0), thing.inner_radius or 0.0, thing.polygon)
 
 
