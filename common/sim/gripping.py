@@ -91,6 +91,8 @@ def _pressed(
 ) -> tuple[float, float] | None:
     """The ends along tool y [m] of what of a solid is between the pads; None when the line between their middles
     meets nothing of it."""
+    if not solid.may_meet(T_tcp_object):
+        return None
     x, z = (np.linspace(-half, half, LINES) for half in (allowed.across, allowed.along))
     lines = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
     spans = solid.spans(T_tcp_object, lines)

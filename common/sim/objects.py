@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 MOST_TRIANGLES = 2000  # of a mesh: it travels in every message about it
 LEVEL = 1 - 1e-9  # cosine of the tilt from which on something does not stand upright
+NEAR = 1e-6  # [m] beyond the box about it something may still be said to meet a solid
 _OFF = np.array([1.234e-7, 2.345e-7])  # [m] lines are shifted by it: they meet no edge of a shape in round numbers
 _NONE = np.empty((0, 2))
 
@@ -105,6 +106,13 @@ class Solid:
         upright_one = rotation + (cross + cross @ cross / (1.0 + up[2])) @ rotation
         upright_one[2], upright_one[:, axis] = side, (0.0, 0.0, side[axis])
         return np.asarray(upright_one)
+
+    def may_meet(self, T_tool_object: Array) -> bool:
+        """Whether the tool's y axis meets the box about it, by the slab method; else it meets nothing of the solid."""
+        way, origin = T_tool_object[1, :3], -T_tool_object[:3, 3] @ T_tool_object[:3, :3]
+        way = np.where(np.abs(way) < 1e-12, 1e-12, way)
+        first, second = (self.low - NEAR - origin) / way, (self.high + NEAR - origin) / way
+        return bool(np.minimum(first, second).max() <= np.maximum(first, second).min())
 
     def spans(self, T_tool_object: Array, lines: Array) -> list[Array]:
         """Where lines along the tool's y axis, through (k, 2) places x, z [m], run within it: (n, 2) y [m] of each.
