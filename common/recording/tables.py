@@ -13,7 +13,6 @@ from common.recording.decoding import Decoder
 from common.recording.reading import Recording, Wanted
 
 NOT_TABLES = (Image, PointCloud2)
-TIMES = ("time", "stamp")  # of arrival, and of the header [s since the Unix epoch]
 OTHER_NAMES = ("Image", "PointCloud2")
 
 

@@ -42,11 +42,6 @@ class Life:
 _life: ContextVar[Life | None] = ContextVar("life", default=None)
 
 
-def current_life() -> Life | None:
-    """What runs now belongs to it; None for the simulation itself."""
-    return _life.get()
-
-
 def context_of(life: Life) -> Context:
     """A context of its own for what belongs to a life; whatever is started in it does too."""
     context = Context()

@@ -47,14 +47,12 @@ class Blob:
     """One connected region.
 
     Attributes:
-        contour: (n, 1, 2) integer pixels of its outer edge, as OpenCV gives them.
-        area: inside the contour [px^2].
+        area: inside its outer edge [px^2].
         centroid: (2,) of its area [px].
         outline: of the regions of the finer mask within it, holes included.
         border: (m, 2) its pixels at the border of the picture [px].
     """
 
-    contour: Contour
     area: float
     centroid: Array
     outline: Outline
@@ -86,7 +84,7 @@ def find_blobs(closed: Mask, fine: Mask, camera: Pinhole, min_area: float) -> li
         centroid = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
         flat = contour.reshape(-1, 2).astype(float)
         border = flat[~_off_border(flat, camera)]
-        blobs.append(Blob(contour, area, centroid, outline, border))
+        blobs.append(Blob(area, centroid, outline, border))
     return blobs
 
 

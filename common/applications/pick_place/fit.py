@@ -30,13 +30,11 @@ class Fit:
         centers: (k, 3) relative to the optical centre [m].
         offset: of the outline from the silhouettes, positive outside [m].
         owner: (n,) index of the sphere that each point of the outline belongs to, -1 for none.
-        residuals: (n,) distance of each point outside of the offset silhouette nearest to it [m]; infinite for none.
     """
 
     centers: Array
     offset: float
     owner: npt.NDArray[np.intp]
-    residuals: Array
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ def fit_spheres(
     beyond = _compare(outline, c, radius + delta).beyond
     nearest = np.argmin(np.abs(beyond), axis=1)
     residual = beyond[every, nearest]
-    return Fit(c, delta, np.where(np.abs(residual) < gates[-1], nearest, -1), residual)
+    return Fit(c, delta, np.where(np.abs(residual) < gates[-1], nearest, -1))
 
 
 def fit_each(
