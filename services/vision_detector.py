@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 
 from common import topics
 from common.applications.pick_place.annotation import annotate
 from common.applications.pick_place.detector import Detection, Detector, DetectorOptions
 from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE
+from common.applications.pick_place.tracks import Place
 from common.config import Surroundings
+from common.config.basics import Rgb
 from common.messages import Color, Header, Marker, MarkerArray, Pose, Vector3
 from common.perception.image import array_to_image
 from common.perception.intake import Cameras, LeftOut, Unusable, picture_of
@@ -26,23 +30,24 @@ class Config(DetectorOptions):
 
 def markers(detections: list[Detection], around: Surroundings, stamp: int) -> MarkerArray:
     """The message of what was found in the frame that was exposed at `stamp`."""
-    size = 2 * around.ball_radius
-    r, g, b = around.ball_color
     return MarkerArray(
         header=Header(stamp=stamp, frame_id=WORLD),
         markers=[
-            Marker(
-                ns="ball",
-                id=index,
-                type="sphere",
-                pose=Pose(position=Vector3(x=d.position[0], y=d.position[1], z=d.position[2])),
-                scale=Vector3(x=size, y=size, z=size),
-                color=Color(r=r, g=g, b=b),
-                pixel=d.pixel,
-                partial=d.partial,
-            )
+            _marker(index, d.position, d.pixel, d.partial, around.ball_radius, around.ball_color)
             for index, d in enumerate(detections)
         ],
+    )
+
+
+@lru_cache(maxsize=64)  # what lies still is described once
+def _marker(
+    index: int, position: Place, pixel: tuple[float, float], partial: bool, radius: float, color: Rgb
+) -> Marker:
+    x, y, z = position
+    return Marker(
+        ns="ball", id=index, type="sphere", pose=Pose(position=Vector3(x=x, y=y, z=z)),
+        scale=Vector3(x=2 * radius, y=2 * radius, z=2 * radius), color=Color(r=color[0], g=color[1], b=color[2]),
+        pixel=pixel, partial=partial,
     )
 
 

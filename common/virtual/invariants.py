@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,6 +35,8 @@ from common.transport.codec import decode
 from common.transport.local import intersects
 from common.transport.session import RawSample
 from common.virtual.process import Requests
+
+Place = tuple[float, float, float]  # x, y, z [m]
 
 GOALS = (ExecuteRequest, GripperCommand)
 WITH_ID = (*GOALS, PlanRequest)
@@ -98,7 +101,7 @@ class Invariants:
         self._ids: list[str] = []  # what there is
         self._edits = 0  # of the world, that were asked for and not answered yet
         self._edited = False  # and nothing was said of what there is since
-        self._lying: dict[str, tuple[str, Vector]] = {}  # by object: state and place
+        self._lying: dict[str, tuple[str, Place]] = {}  # by object: state and place
         self._held_since: float | None = None  # cell time
         self._last: tuple[Vector, Vector, float] | None = None  # newest set-points and when
         self._decided: dict[str, float] = {}  # by goal: when it was asked for first
@@ -174,17 +177,17 @@ class Invariants:
             self._ids = ids
         if self._broke(ids == self._ids and len(set(ids)) == len(ids), OBJECTS):
             self._tell(OBJECTS, f"{ids} instead of {self._ids}")
-        things: dict[str, tuple[str, Vector]] = {}
+        things: dict[str, tuple[str, Place]] = {}
         for thing in objects:
             place = thing["pose"]["position"]
-            things[thing["id"]] = thing["state"], np.array([place["x"], place["y"], place["z"]])
+            things[thing["id"]] = thing["state"], (place["x"], place["y"], place["z"])
         held = [name for name, (state, _) in things.items() if state in CARRIED[:1]]
         if self._broke(len(held) <= 1, OBJECTS):
             self._tell(OBJECTS, f"{held} are held at once")
         for name, (state, place) in things.items():
             was, there = self._lying.get(name, (state, place))
             self._lying[name] = state, place
-            way = 0.0 if state in CARRIED else float(np.linalg.norm(place - there))
+            way = 0.0 if state in CARRIED else math.dist(place, there)
             legal = touched or state in CARRIED or was in CARRIED or (state == was and way < MOVED)
             if self._broke(legal and state != LOST, OBJECTS):
                 self._tell(OBJECTS, f"{name} went from {was} to {state} by itself, {way:.3f} m")
