@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import logging
 import multiprocessing
 import os
 import signal
@@ -95,7 +94,6 @@ def _begin(cell: Cell, faults: bool, limit: float) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # who began us ends us
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    logging.disable(logging.CRITICAL)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     _work[:] = [(cell, faults, limit)]
 

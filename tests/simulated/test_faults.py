@@ -4,8 +4,9 @@ import pytest
 
 from common.config import load_cell
 from common.errors import ConfigError
+from common.virtual.campaign import run_seeds
 from common.virtual.faults import SKEW, SPEEDS, make_plan
-from common.virtual.simulation import Simulation
+from common.virtual.simulation import LIMIT, Simulation
 from common.virtual.watched_arm import with_watched_arm
 from tests.simulated.known_bugs import BUGS, found_within
 
@@ -28,6 +29,14 @@ def test_same_seed_is_the_same_run_with_faults_too():
     cell = load_cell("panda", ["world.count=1"])
     first, second = (Simulation(cell, 5, faults=True, digest=True).run() for _ in range(2))
     assert first.digest == second.digest and first.faults == second.faults
+
+
+def test_run_of_a_campaign_is_repeated_by_its_seed():
+    cell = load_cell("panda", ["world.count=1"])
+    [among_others] = run_seeds(cell, [6], True, 1, LIMIT)
+    alone = Simulation(cell, 6, faults=True).run()
+    assert (among_others.messages, among_others.seconds, among_others.requests, among_others.faults) == (
+        alone.messages, alone.seconds, alone.requests, alone.faults)
 
 
 AT_ONCE = ["what is not newer is read", "the task reads the truth", "a request that waits without end"]
