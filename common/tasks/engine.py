@@ -82,9 +82,7 @@ class Task(Deciding[V]):
         stage, self.running = self.running.stage, None
         # What somebody else asked for, or that it came too late, is no failure: it is decided anew.
         if isinstance(answer, m.MotionStatus) and answer.error in ANEW:
-            self.clear()
-            self.look_after = view.now
-            self.status.message = f"{stage.name} has to wait: {answer.message}"
+            self._decide_anew(f"{stage.name} has to wait: {answer.message}", view)
             return
         # A robot that is not where the plan began only needs a new plan.
         stale = isinstance(answer, m.MotionStatus) and answer.error == "start_mismatch"
@@ -155,12 +153,19 @@ class Task(Deciding[V]):
             return stop
         return []
 
+    def _decide_anew(self, message: str, view: V) -> None:
+        self.clear()
+        self.look_after = view.now
+        self.status.message = message
+
     def _ended(self, stage: Stage, reported: Report, view: V) -> None:
         holds = stage.holds if isinstance(stage, Grip) else None
         if reported.state == "cancelled" and isinstance(stage, Move):
             self.clear()
             self.status.paused = True
             self.status.message = f"{stage.name} was stopped from outside ({reported.message}); resume to go on"
+        elif reported.state == "cancelled":  # somebody else told the fingers something: no failure either
+            self._decide_anew(f"{stage.name} was cancelled: {reported.message}", view)
         elif reported.state != "succeeded":
             self.fail(f"{stage.name} {reported.state}: {reported.message}", view)
         elif isinstance(stage, Grip) and holds and not view.holding:
@@ -220,6 +225,8 @@ class Task(Deciding[V]):
         if stage.cycle is not None:
             stage.cycle.begun = True
         self.running = Execution(stage, command, view.now)
+        assert view.motion is not None and view.gripper is not None
+        self.running.before = self.running.report(view.motion, view.gripper).id
         self.status.state, self.status.stage = stage.state, stage.name
         self.status.subject = stage.cycle.subject if stage.cycle else ""
         return command

@@ -12,6 +12,8 @@ Goal = m.JointGoal | m.PoseGoal | m.PathGoal | m.ArcGoal | m.SequenceGoal
 Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
 Report = m.MotionStatus | m.GripperState
 
+OVER = ("succeeded", "aborted", "cancelled")
+
 
 @dataclass(eq=False)
 class Cycle:
@@ -81,9 +83,11 @@ class Execution:
     stage: Stage
     command: m.ExecuteRequest | m.GripperCommand
     counted: float  # up to when; from the begin on
+    before: str = ""  # id of the goal that its controller told of then
     moving: float = 0.0  # in motion so far
     spent: float = 0.0  # as if the motion were at full speed: what time-outs go by
     accepted: int | None = None  # stamp of the answer that accepted it
+    over: Report | None = None  # the answer, when it told of the end already: it was asked for more than once
 
     @property
     def moves_arm(self) -> bool:
@@ -102,19 +106,22 @@ class Execution:
         """Take in the answer to the command: whether it was accepted."""
         if answer.state != "rejected":
             self.accepted = answer.header.stamp
+        if answer.state in OVER:
+            self.over = answer
         return answer.state != "rejected"
 
     def outcome(self, motion: m.MotionStatus, gripper: m.GripperState) -> Literal["running", "ended", "forgotten"]:
         """What the controllers say of it; forgotten once they accepted it and tell of another goal."""
         reported = self.report(motion, gripper)
         if reported.id == self.command.id:
-            return "ended" if reported.state in ("succeeded", "aborted", "cancelled") else "running"
+            return "ended" if reported.state in OVER else "running"
         later = self.accepted is not None and reported.header.stamp > self.accepted
         return "forgotten" if later else "running"
 
     def report(self, motion: m.MotionStatus, gripper: m.GripperState) -> Report:
-        """The report of the controller that the command went to."""
-        return motion if self.moves_arm else gripper
+        """The report of the controller that the command went to; its answer, when it tells of a later goal already."""
+        reported = motion if self.moves_arm else gripper
+        return self.over if self.over is not None and reported.id not in (self.command.id, self.before) else reported
 
 
 @dataclass

@@ -174,6 +174,51 @@ def test_failure_sends_the_arm_home_and_too_many_in_a_row_are_an_error() -> None
     cell.until("reach")
 
 
+def late_answer(cell: Cell, state: str) -> None:
+    """The fingers were told something else by another; who asks for the goal again hears what became of it."""
+    running = cell.task.running
+    assert running is not None
+    cell.gripper = m.GripperState(
+        header=m.Header(stamp=int(cell.now * 1e9)), id="another", state="succeeded", width=0.0, holding=True)
+    cell.now += 1.0
+    cell.task.on_goal(m.GripperState(
+        header=m.Header(stamp=int(cell.now * 1e9)), id=running.command.id, state=state, holding=True), cell.view)
+
+
+def test_grip_that_another_replaced_is_decided_anew_and_no_failure() -> None:
+    cell = Cell()
+    cell.until("close")
+    late_answer(cell, "cancelled")
+    cell.step()
+    assert cell.task.running is None and cell.task.status.message.startswith("close was cancelled")
+    cell.step()
+    assert cell.task.status.state == "DONE" and cell.task.status.failures == 0
+
+
+def test_grip_that_succeeded_before_its_answer_came_is_followed_by_the_next_stage() -> None:
+    cell = Cell()
+    cell.until("close")
+    late_answer(cell, "succeeded")
+    cell.step()
+    assert cell.task.running is not None and cell.task.running.stage.name == "lift"
+
+
+def test_answer_that_is_ahead_of_what_the_controller_tells_waits_for_it() -> None:
+    cell = Cell()
+    cell.until("close")
+    running = cell.task.running
+    assert running is not None
+    done = m.GripperState(
+        header=m.Header(stamp=int(cell.now * 1e9)), id=running.command.id, state="succeeded", width=0.0, holding=True)
+    cell.gripper = m.GripperState(width=0.08)  # as it was before the grip
+    cell.task.on_goal(done, cell.view)
+    cell.step()
+    assert cell.task.running is running
+    cell.gripper = done
+    cell.step()
+    assert cell.task.running is not None and cell.task.running.stage.name == "lift"
+
+
 def test_failures_between_which_something_was_done_are_not_in_a_row() -> None:
     cell = Cell()
     for k in range(30):
