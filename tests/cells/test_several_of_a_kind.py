@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from common.transport.connect import connect
-from tests.harness import RunningCell, command_line, environment, free_domain
+from tests.harness import Place, RunningCell
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow]
 
@@ -18,35 +18,29 @@ SERVICES = ["motion_planner", "robot_state_publisher", "trajectory_executor", "l
             "left_detector", "right_detector", "workspace_validator", "scene_manager", "smart_pick_place"]
 
 
-async def test_a_cell_that_is_up_knows_them_by_their_names(tmp_path: Path) -> None:
+async def until_all_are_up(cell: RunningCell) -> None:
+    async with connect(cell="two_cameras", service="watcher", endpoint=cell.endpoint, timeout=60.0) as bus:
+        await bus.alive.wait(SERVICES[-1], 60.0)
+
+
+def test_a_cell_that_is_up_knows_them_by_their_names(tmp_path: Path) -> None:
     with RunningCell(tmp_path, "up", CELL, "--set", "autostart=false") as cell:
-        async with connect(cell="two_cameras", service="watcher", endpoint=cell.endpoint, timeout=60.0) as bus:
-            await bus.alive.wait(SERVICES[-1], 60.0)
-        listed = cell.tell("node", "list").stdout.split()
+        asyncio.run(until_all_are_up(cell))
+        place = Place(tmp_path, cell.domain)
+        listed = place.ask("node", "list").stdout.split()
         assert {f"two_cameras/{name}" for name in SERVICES} <= set(listed)
-        told = json.loads(cell.tell("topic", "info", "left/camera/image_raw", "--json").stdout)
+        told = json.loads(place.ask("topic", "info", "left/camera/image_raw", "--json").stdout)
         assert (told["writer"], told["message"], told["kind"]) == ("left_camera", "Image", "stream")
-        listed = [json.loads(line) for line in cell.tell("topic", "list", "--json").stdout.splitlines()]
+        listed = [json.loads(line) for line in place.ask("topic", "list", "--json").stdout.splitlines()]
         own = {one["key"]: (one["writer"], one["message"], one["kind"]) for one in listed}
         assert own["right/camera/camera_info"] == ("right_camera", "CameraInfo", "state")
-        assert cell.tell("param", "set", "services.right_camera.rate=5").returncode == 0
-        rates = [cell.tell("param", "get", f"services.{name}.rate").stdout.strip() for name in
+        assert place.ask("param", "set", "services.right_camera.rate=5").returncode == 0
+        rates = [place.ask("param", "get", f"services.{name}.rate").stdout.strip() for name in
                  ("left_camera", "right_camera")]
         assert [float(rate) for rate in rates] == [10.0, 5.0]
-        info = json.loads(cell.tell("topic", "echo", "left/camera/camera_info", "-n", "1", "--json").stdout)
+        info = json.loads(place.ask("topic", "echo", "left/camera/camera_info", "-n", "1", "--json").stdout)
         assert info["header"]["frame_id"] == "left_optical_frame"
         # One more of what is there is refused, also when a person starts it.
         twice = cell.tell("service", "left_camera", "--cell", CELL)
         assert twice.returncode == 2
         assert "another left_camera is up, which has left/camera/camera_info already" in twice.stderr.splitlines()[-1]
-
-
-def test_two_cameras_on_one_key_end_the_start_with_one_line() -> None:
-    line = command_line("run", CELL, "--no-viewer", "--domain", str(free_domain()), "--set",
-                        "services.right_camera.topics={camera/*: left/camera/*}")
-    done = subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 2
-    assert done.stderr.splitlines()[-1] == (
-        "zencell: services.right_camera: left_camera has left/camera/camera_info already, and a key is written or "
-        "served by one service: give right_camera or left_camera keys of its own, as in topics: "
-        "{camera/*: right_camera/*}")

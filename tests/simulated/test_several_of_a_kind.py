@@ -33,6 +33,15 @@ def test_one_camera_alone_leaves_what_it_does_not_see() -> None:
     assert (outcome.state, outcome.done) == ("DONE", 2), outcome  # the third lies where only the right one looks
 
 
+def test_two_cameras_on_one_key_end_the_start_with_one_line() -> None:
+    outcome = Simulation(load_cell(CELL, ["services.right_camera.topics={camera/*: left/camera/*}"]), 1).run()
+    assert outcome.state == "NOT STARTED"
+    assert outcome.message == (
+        "services.right_camera: left_camera has left/camera/camera_info already, and a key is written or "
+        "served by one service: give right_camera or left_camera keys of its own, as in topics: "
+        "{camera/*: right_camera/*}")
+
+
 async def test_keys_and_owners_follow_from_the_cell() -> None:
     cell = load_cell(CELL)
     wirings = {entry.name: await wiring_of(cell, entry) for entry in cell.services.values()}
