@@ -3,68 +3,29 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import threading
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from common import topics
-from common.application import all_topics, bring_in
 from common.errors import DecodeError
 from common.messages import SupervisorStatus
+from common.recording.own import Own
 from common.recording.sample import Sample, message_of
 from common.recording.stamps import Sequences
-from common.recording.writing import RUN
-from common.remapping import Remapping
+from common.recording.writing import RUN, run_of
 from common.transport.codec import decode, decode_attachment
 from common.transport.credentials import secure_folder
 from common.transport.keys import owns_key
 from common.transport.ownership import Owner
 
 if TYPE_CHECKING:
-    from common.config import Cell
     from common.recording.selection import Selection
     from common.recording.sink import Sink
-    from common.topics import AnyTopic
     from common.transport.bus import Bus
     from common.transport.session import Declared, RawSample
 
 ASK_TIMEOUT = 1.0  # [s] for the values of states
-
-
-@dataclass(frozen=True)
-class Own:
-    """What a cell has that does not come with the project: modules of a person's own, and keys under other names."""
-
-    modules: tuple[str, ...] = ()
-    renamed: tuple[Mapping[str, str], ...] = ()  # as common/remapping.py has it, by service
-
-    @classmethod
-    def of(cls, cell: Cell) -> Own:
-        """That of a cell file."""
-        services = cell.services.values()
-        named = dict.fromkeys([cell.application, *(entry.module for entry in services)])
-        own = (name for name in named if "." in name and not name.startswith("services."))
-        return cls(tuple(own), tuple(entry.topics for entry in services if entry.topics))
-
-    @classmethod
-    def read(cls, text: str) -> Own:
-        """What `str` wrote."""
-        return cls(*(tuple(part) for part in json.loads(text)))
-
-    def __str__(self) -> str:
-        return json.dumps([self.modules, self.renamed])
-
-    def topics(self) -> dict[str, AnyTopic]:
-        """Every topic by its key before it is renamed; the messages of all modules are known from now on."""
-        return {**all_topics(), **bring_in(self.modules)}
-
-    def kinds(self, known: Mapping[str, AnyTopic]) -> dict[str, str]:
-        """Kinds of topics by key in the cell."""
-        kinds = {key: str(topic.kind) for key, topic in known.items()}
-        return kinds | {Remapping(table).key(key): kind for table in self.renamed for key, kind in kinds.items()}
 
 
 class Capture:
@@ -147,11 +108,6 @@ class Capture:
             return  # somebody else's
         self._run_known = True
         self._sink.describe(RUN, run_of(status))
-
-
-def run_of(status: SupervisorStatus) -> dict[str, Any]:
-    """What a recording says of the run, from what the supervisor says."""
-    return status.model_dump(include={"speed", "epoch", "seed", "world", "overrides"})
 
 
 def _origin(raw: RawSample) -> tuple[str, int, str]:

@@ -118,8 +118,8 @@ class Operation:
         """
         if file is None:
             return
-        from cli.capturing import Own
         from cli.recording import NAME, require_new
+        from common.recording.own import Own
         from common.supervision.launch import python_module
 
         path = Path(file).absolute()

@@ -18,7 +18,7 @@ from common.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from cli.capturing import Own
+    from common.recording.own import Own
     from common.recording.selection import Selection
     from common.recording.sink import Figures, Sink
     from common.supervision.interrupts import Interrupts
@@ -52,9 +52,9 @@ def record(
     own: Annotated[str, typer.Option("--own", hidden=True, help="under a supervisor: what is in the cell's file")] = "",
 ) -> None:
     """Record what travels in a cell, all keys if none are given, until Ctrl-C."""
-    from cli.capturing import Own
     from cli.inspection import inspect
     from common.config import load_cell
+    from common.recording.own import Own
     from common.recording.selection import Selection
     from common.transport.credentials import identity_of_listener
 

@@ -81,13 +81,14 @@ def seeds_of(text: str) -> range:
 def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float) -> int:
     """Run one seed and tell of all that happened; the exit code."""
     from cli.recording import about, require_new
+    from common.recording.own import Own
     from common.virtual.simulation import Simulation
     from common.virtual.trace import Trace
 
     trace = None
     if file is not None:
         require_new(Path(file), "--trace")
-        trace = Trace(Path(file), about(cell.name))
+        trace = Trace(Path(file), about(cell.name), Own.of(cell))
     simulation = Simulation(cell, seed, faults=faults, limit=limit, digest=True, trace=trace, tell=typer.echo)
     try:
         outcome = simulation.run()

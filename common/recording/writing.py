@@ -12,6 +12,7 @@ from typing import Any
 import msgpack
 from mcap.writer import CompressionType, Writer
 
+from common.messages import SupervisorStatus
 from common.recording.decoding import schema_of
 from common.recording.sample import RecordingError, Sample
 from common.recording.stamps import stamp_of
@@ -27,6 +28,11 @@ _TRACES = {
     "properties": {"traces": {"type": "array", "items": {"type": "array"}}},
 }
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk takes no more
+
+
+def run_of(status: SupervisorStatus) -> dict[str, Any]:
+    """What a recording says of the run, from what the supervisor says."""
+    return status.model_dump(include={"speed", "epoch", "seed", "world", "overrides"})
 
 
 class WritingFailed(RecordingError):

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from common import topics
-from common.application import all_topics
 from common.messages import SupervisorStatus
+from common.recording.own import Own
 from common.recording.sample import Sample, message_of
-from common.recording.writing import RUN, RecordingWriter
+from common.recording.writing import RUN, RecordingWriter, run_of
 from common.transport.codec import decode, decode_attachment
 from common.transport.reader import Newness
 from common.transport.session import RawSample
@@ -21,14 +21,19 @@ FLUSH_NS = 800_000_000  # of virtual time
 class Trace:
     """Writes every message once, at its virtual time."""
 
-    def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, about: Mapping[str, Any], own: Own) -> None:
         """Create the file.
+
+        Args:
+            path: of the file.
+            about: what is recorded.
+            own: what there is in the cell beside what comes with the project.
 
         Raises:
             RecordingError: it is there already, or cannot be written.
         """
         self._writer = RecordingWriter(path, about)
-        self._kinds = {topic.key: str(topic.kind) for topic in all_topics().values()}
+        self._kinds = own.kinds(own.topics())
         self._newness: dict[str, Newness] = {}
         self._run_known = False
         self._flushed = 0
@@ -47,7 +52,7 @@ class Trace:
         if topic == topics.SUPERVISOR_STATUS.key and not self._run_known:
             self._run_known = True
             status = decode(SupervisorStatus, raw.payload)
-            self._writer.describe(RUN, status.model_dump(include={"speed", "epoch", "seed", "world", "overrides"}))
+            self._writer.describe(RUN, run_of(status))
         self._writer.add(Sample(
             raw.key, raw.payload, now, message=message_of(raw.encoding), kind=self._kinds.get(topic, "stream"),
             writer=origin.writer, sequence=origin.sequence, trace=origin.trace,

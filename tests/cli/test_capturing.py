@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from cli.capturing import Capture, Own
+from cli.capturing import Capture
 from common import messages as m
 from common import topics
 from common.clock import Clock
 from common.config import load_cell
 from common.recording.decoding import schema_of
+from common.recording.own import Own
 from common.recording.sample import Sample
 from common.recording.selection import Selection
 from common.transport.bus import Bus

@@ -13,16 +13,26 @@ from common.config import load_cell, service_config
 from common.errors import ConfigError
 from common.process.in_process import running_service
 from common.process.wiring import owned_in, require_one_owner, wiring_of
+from common.recording.own import Own
+from common.recording.reading import Recording
 from common.transport import ownership
 from common.transport.local import LocalNetwork
 from common.virtual.simulation import Simulation
+from common.virtual.trace import Trace
 from services import camera_simulator
 
 CELL = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")
 
 
-def test_two_cameras_two_detectors_and_one_scene_clear_a_table_that_neither_camera_sees_wholly() -> None:
-    outcome = Simulation(load_cell(CELL), 1).run()
+def test_two_cameras_two_detectors_and_one_scene_clear_a_table_that_neither_camera_sees_wholly(tmp_path: Path) -> None:
+    cell = load_cell(CELL)
+    trace = Trace(tmp_path / "run.mcap", {"cell": cell.name}, Own.of(cell))
+    outcome = Simulation(cell, 1, trace=trace).run()
+    trace.close("simulated")
+    with Recording(tmp_path / "run.mcap") as recording:
+        kinds = {topic: kind for topic, (_, kind) in recording.topics().items()}
+    assert {kinds[f"{side}/camera/camera_info"] for side in ("left", "right")} == {"state"}
+    assert {kinds[f"{side}/camera/image_raw"] for side in ("left", "right")} == {"stream"}
     assert (outcome.state, outcome.done, outcome.total) == ("DONE", 3, 3), outcome
     assert outcome.crashes == [] and outcome.restarts == {}
 

@@ -19,6 +19,7 @@ from common import topics
 from common.application import find_application
 from common.config import Cell, load_cell
 from common.messages import TaskCommand
+from common.recording.own import Own
 from common.reporting.fold import Fold
 from common.reporting.summary import describe
 from common.supervision.collector import Collector
@@ -55,7 +56,7 @@ class SimulatedCell:
         self._visit = visit
         self._fold = Fold(loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
                           containers=list(loaded.world.containers))
-        trace = None if record is None else Trace(record, {"cell": loaded.name})
+        trace = None if record is None else Trace(record, {"cell": loaded.name}, Own.of(loaded))
         self._simulation = Simulation(loaded, seed, limit=limit, trace=trace, tell=self.lines.append, visit=self._look)
         self.outcome: Outcome = self._simulation.run()
         if trace is not None:
