@@ -63,8 +63,8 @@ class LinkFrames:
         q = self._robot.order(state.name, state.position)
         if q is None:
             return None
-        others = {name: value for name, value in zip(state.name, state.position, strict=True)
-                  if name in self._robot.config.locked_joints}
+        locked = self._robot.config.locked_joints
+        others = {name: value for name, value in zip(state.name, state.position, strict=True) if name in locked}
         unchecked: dict[str, Any] = {"transforms": self._transforms(self._moving, q, others, state.header.stamp)}
         return TFMessage.model_construct(**unchecked)
 

@@ -187,9 +187,10 @@ class RobotModel:
     def order(self, names: Sequence[str], values: Sequence[float]) -> Array | None:
         """Values of the group's joints (dof,) picked from named ones; None when one is missing."""
         found = dict(zip(names, values, strict=True))
-        if any(name not in found for name in self.joint_names):
+        try:
+            return np.array([found[name] for name in self.joint_names], dtype=float)
+        except KeyError:
             return None
-        return np.array([found[name] for name in self.joint_names], dtype=float)
 
     def _checked(self, q: ArrayLike) -> Array:
         array = np.asarray(q, dtype=float)
