@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common import messages as m
-from common.applications.pick_place.resting import inside_container
+from common.applications.pick_place.resting import Resting
 from common.applications.pick_place.tracks import SceneParameters, Sighting, Track, Tracks
 from common.config import GripperConfig, Surroundings
 from common.perception.pinhole import Pinhole
@@ -35,7 +35,7 @@ class PerceivedScene:
         """
         self.around, self.gripper, self.tcp_link = around, gripper, tcp_link
         self.p, self._tracks = parameters, Tracks(parameters)
-        self._fixed = fixed_objects(around)
+        self._fixed, self._resting = fixed_objects(around), Resting.of(around)
         self._slots = slot_positions(around.container, around.ball_radius, around.table_height).reshape(-1, 3)
         self._in_slots = [
             self._ball(f"slot_{k}", "contained", m.Pose(position=m.Vector3(x=x, y=y, z=z)))
@@ -68,7 +68,7 @@ class PerceivedScene:
             if thing is None:
                 continue
             pixel = marker.pixel or tuple(camera.project(list(thing.position)))
-            if inside_container(camera, pixel, self.around):
+            if self._resting.shows_container(camera, pixel):
                 if thing.shape == "sphere":
                     in_container.append((pixel[0], pixel[1]))
                 else:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from common.applications.pick_place.resting import inside_container
+from common.applications.pick_place.resting import Resting
 from common.config import Surroundings
 from common.messages import Marker, MarkerArray, Rejection, Vector3
 from common.perception.pinhole import Pinhole
@@ -52,7 +52,7 @@ class Validation:
             forget_after: a place that was empty for so long is told again [s, cell time]; may be changed.
             same_place: detections within this are at the same place [m]; less than balls are apart.
         """
-        self._around = around
+        self._resting = Resting.of(around)
         self._reach = reach
         self.forget_after = forget_after
         self._same_place = same_place
@@ -96,7 +96,7 @@ class Validation:
         """Where a detection is, and why it is no target: empty when it is one, None when that is not known yet."""
         place = (marker.pose.position.x, marker.pose.position.y, marker.pose.position.z)
         pixel = marker.pixel if marker.pixel is not None else camera.project(place)
-        if inside_container(camera, pixel, self._around):
+        if self._resting.shows_container(camera, pixel):
             return place, INSIDE_CONTAINER
         return place, PARTLY_OUT_OF_VIEW if marker.partial else self._reach.known(place)
 
