@@ -34,19 +34,17 @@ class _Entry:
         self.session = session
         self._network = session.network
         self._table = table
+        self.declared = True  # as long as it stands in the table
         with self._network.lock:
             table.append(self)
             self._network.forget_matches()
 
     def undeclare(self) -> None:
         with self._network.lock:
-            if self in self._table:
+            if self.declared:
+                self.declared = False
                 self._table.remove(self)
                 self._network.forget_matches()
-
-    @property
-    def declared(self) -> bool:
-        return self in self._table
 
 
 class _Token(_Entry):

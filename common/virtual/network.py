@@ -227,7 +227,9 @@ class VirtualNetwork(LocalNetwork):
         session.detached = True
         self._lose(session)
         for table in (self.publishers, self.subscribers, self.queryables, self.tokens, self.watchers):
-            table[:] = [entry for entry in table if entry.session is not session]
+            for entry in table:
+                entry.declared = entry.session is not session
+            table[:] = [entry for entry in table if entry.declared]
         self.forget_matches()
         self._sessions.remove(session)
         self._arrival = {link: due for link, due in self._arrival.items() if session not in link[:2]}
