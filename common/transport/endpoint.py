@@ -164,21 +164,15 @@ def router_settings(
     first, most = LINK_RETRY_MS
     secure = {"transport__link__tls": credentials.tls(listens=True)} if credentials else {}
     controlled = {"access_control": access} if access else {}
-    # A message that must arrive waits for room (`block`), and small ones share a batch where they have to.
+    # Small messages share a batch where they have to wait. They do wait (`block`): `block_first`, which keeps a reader
+    # that takes nothing from holding up the router, drops each message whose predecessor's thread was not scheduled
+    # within the time that a stream waits, on an idle machine one of some 20,000.
     shared = {
         "messages": ["put"], "flows": ["egress"], "qos": {"congestion_control": "block"},
         "overwrite": {"express": False},
     }
-    # What comes again by itself waits apart (`block_first`), so that a reader that takes nothing does not hold up the
-    # router and with it all that comes from the writer. It costs what events cannot pay: where the thread of the one
-    # before was not scheduled within the time that a stream waits, the next is dropped, on an idle machine one of some
-    # 20,000, on a busy one of 300.
-    apart = {
-        **shared, "key_exprs": [f"*/{key}" for key in _said_again()],
-        "overwrite": {"congestion_control": "block_first", "express": False},
-    }
     return _settings(
-        qos__network=[apart, shared],
+        qos__network=[shared],
         transport__link__tx__queue__congestion_control__block__wait_before_close=ROUTER_STUCK_MS * 1000,
         transport__link__tx__queue__size__data_high=STATE_BATCHES,
         mode="router", listen__endpoints=list(endpoints), connect__endpoints=list(links),
@@ -199,14 +193,6 @@ def size_limit(more: Sequence[str] = ()) -> dict[str, Any]:
         "key_exprs": sorted(f"*/{key.replace('<service>', '*')}" for key in (*small_keys(), *more)),
         "size_limit": MOST_BYTES_BESIDES,
     }
-
-
-def _said_again() -> list[str]:
-    """Keys of what is repeated each second, so that one that is lost does not matter for long."""
-    from common import topics
-    from common.application import all_topics
-
-    return sorted(key for key, topic in all_topics().items() if topic.kind == "state" or topic == topics.COUNTERS)
 
 
 def small_keys() -> list[str]:

@@ -95,7 +95,7 @@ async def test_events_come_all_and_in_order(new_bus, until) -> None:
 
 @pytest.fixture
 def busy_cores() -> Iterator[None]:
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3 * (os.cpu_count() or 1))]
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 * (os.cpu_count() or 1))]
     yield
     for process in busy:
         process.kill()
@@ -104,15 +104,15 @@ def busy_cores() -> Iterator[None]:
 
 async def test_no_event_is_lost_while_every_core_is_busy(new_bus, until, busy_cores) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
-    reader, writer = receiver.reader(topics.LOG, size=3000), sender.writer(topics.LOG)
+    reader, writer = receiver.reader(topics.LOG, size=1500), sender.writer(topics.LOG)
     await matched(writer, until)
-    for number in range(3000):
+    for number in range(1500):
         writer.put(event(number))
     got: list[int] = []
     with suppress(TimeoutError):
-        while len(got) < 3000:
+        while len(got) < 1500:
             got.append(int((await next_of(reader)).message))
-    assert got == list(range(3000))
+    assert got == list(range(1500))
 
 
 async def test_events_that_overflow_are_counted_and_reported(new_bus, until, caplog) -> None:
