@@ -20,6 +20,9 @@ run: setup  ## clear the table into the box, print a summary
 up: setup  ## the same, and stay until Ctrl-C
 	$(BIN)/zencell up panda
 
+# Hundreds of processes are started: each compiles the sources again where nothing may keep what was compiled.
+test test-all: export PYTHONDONTWRITEBYTECODE =
+
 test: setup
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
