@@ -13,6 +13,7 @@ import typer
 
 from cli import options
 from common.errors import ConfigError, UnknownName
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.perception.calibration import IntrinsicCalibration, ViewResidual
@@ -58,7 +59,7 @@ def board_command(
     except OSError as error:
         raise ConfigError("--output", output, f"cannot be written: {error.strerror}") from None
     width, height = (1e3 * pixels / density for pixels in reversed(page.shape))
-    typer.echo(f"{output}: {board.options}; {width:.1f} x {height:.1f} mm. Print it at 100 %, measure the line on it, "
+    echo(f"{output}: {board.options}; {width:.1f} x {height:.1f} mm. Print it at 100 %, measure the line on it, "
                "fix it to something flat.")
 
 
@@ -86,7 +87,7 @@ def intrinsics(
         reason = collector.add(picture, name)
         if terminal:
             part, unseen = collector.coverage()
-            typer.echo(f"{name}: {reason or f'view {len(collector.views)}'}; {100 * part:.0f} % of the picture covered"
+            echo(f"{name}: {reason or f'view {len(collector.views)}'}; {100 * part:.0f} % of the picture covered"
                        + (f", nothing {unseen[0]}" if unseen else ""), err=True)
         if collector.complete:
             break
@@ -95,10 +96,10 @@ def intrinsics(
     camera = _camera_of(found, source, str(collector.board.options))
     old = Path(output).expanduser()
     if old.is_file() and "position:" in old.read_text(encoding="utf-8", errors="replace"):
-        typer.echo(f"{output} had a pose, which was found with other intrinsics and is gone: calibrate it again")
+        echo(f"{output} had a pose, which was found with other intrinsics and is gone: calibrate it again")
     camera.save(output)
-    typer.echo(_told(found))
-    typer.echo(f"{output} holds the intrinsics; next: zencell calibrate pose SOURCE --intrinsics {output} ...")
+    echo(_told(found))
+    echo(f"{output} holds the intrinsics; next: zencell calibrate pose SOURCE --intrinsics {output} ...")
 
 
 @app.command()
@@ -162,8 +163,8 @@ def pose(
                                        "calibration": {**camera.calibration, "pose": record}})
     file = output or intrinsics_file
     camera.save(file)
-    typer.echo(_pose_told(result))
-    typer.echo(f"{file} holds intrinsics and pose; a cell takes both with --set world.camera={file}")
+    echo(_pose_told(result))
+    echo(f"{file} holds intrinsics and pose; a cell takes both with --set world.camera={file}")
 
 
 def board_of(squares: str, square: str, marker: str, dictionary: str) -> Board:

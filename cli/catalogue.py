@@ -11,6 +11,7 @@ import typer
 
 from cli import completion, options
 from common.errors import UnknownName
+from common.terminal import echo
 
 
 def cells() -> None:
@@ -19,7 +20,7 @@ def cells() -> None:
 
     for name in names_of("cells"):
         first = (config_root() / "cells" / f"{name}.yaml").read_text(encoding="utf-8").partition("\n")[0]
-        typer.echo(f"{name:<12}  {first.lstrip('# ') if first.startswith('#') else ''}".rstrip())
+        echo(f"{name:<12}  {first.lstrip('# ') if first.startswith('#') else ''}".rstrip())
 
 
 def services() -> None:
@@ -29,7 +30,7 @@ def services() -> None:
 
     folder = Path(next(iter(package.__path__)))
     for name in service_names():
-        typer.echo(f"{name:<22}  {_first_line(folder / f'{name}.py')}".rstrip())
+        echo(f"{name:<22}  {_first_line(folder / f'{name}.py')}".rstrip())
 
 
 def _first_line(path: Path) -> str:

@@ -9,6 +9,7 @@ import typer
 
 from cli import completion, options
 from common.errors import ConfigError, UnknownName
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.messages import Message, TaskCommand, WorldEdit
@@ -79,7 +80,7 @@ def send(
         answer: Message = await bus.client(request).call(message, timeout)
         return answer
 
-    typer.echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
+    echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
 
 
 # --- task -------------------------------------------------------------------------------------------------------
@@ -137,7 +138,7 @@ def home(
         bus.clock = await cell_clock(bus)  # requests to move say when they were decided
         return await OperatorMotion(bus).move(JointGoal(named="home"), planner=planner)
 
-    typer.echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
+    echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
 
 
 # --- world ------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import typer
 
 from cli.recording import Exclude, File, in_bytes, require_new
 from common.errors import ConfigError
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.recording.decoding import Decoder
@@ -57,7 +58,7 @@ def export(
         if video:
             _video(recording, Path(video), selection, decoder)
     for topic, count in sorted(decoder.skipped.items()):
-        typer.echo(f"{topic}: {count} messages left out, which are none that this version knows", err=True)
+        echo(f"{topic}: {count} messages left out, which are none that this version knows", err=True)
 
 
 def _require_video(path: Path) -> None:
@@ -80,14 +81,14 @@ def _foxglove(recording: Recording, target: Path, selection: Selection, decoder:
     from common.recording.foxglove import export as export_foxglove
 
     count = export_foxglove(recording, target, selection.wants, decoder)
-    typer.echo(f"{target}: {count:,} messages, {in_bytes(target.stat().st_size)}, for Foxglove")
+    echo(f"{target}: {count:,} messages, {in_bytes(target.stat().st_size)}, for Foxglove")
 
 
 def _tables(recording: Recording, folder: Path, selection: Selection, decoder: Decoder) -> None:
     from common.recording.tables import export as export_tables
 
     for name, count in export_tables(recording, folder, selection.wants, decoder).items():
-        typer.echo(f"{folder / name}: {count:,} rows")
+        echo(f"{folder / name}: {count:,} rows")
 
 
 def _images(recording: Recording, folder: Path, selection: Selection, decoder: Decoder) -> None:
@@ -96,7 +97,7 @@ def _images(recording: Recording, folder: Path, selection: Selection, decoder: D
     if not image_topics(recording, selection.wants):
         raise ConfigError("--images", str(recording.path), "has no pictures among what is to be exported")
     for topic, count in export_images(recording, folder, selection.wants, decoder).items():
-        typer.echo(f"{folder / topic.replace('/', '_')}: {count:,} pictures")
+        echo(f"{folder / topic.replace('/', '_')}: {count:,} pictures")
 
 
 def _video(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:
@@ -107,4 +108,4 @@ def _video(recording: Recording, target: Path, selection: Selection, decoder: De
         named = ", ".join(choices) or "none"
         raise ConfigError("--video", str(target), f"needs one topic with pictures, by --topics KEY; choices: {named}")
     count, rate = export_video(recording, target, choices[0], decoder)
-    typer.echo(f"{target}: {count:,} pictures of {choices[0]} at {rate:g} Hz")
+    echo(f"{target}: {count:,} pictures of {choices[0]} at {rate:g} Hz")

@@ -12,6 +12,7 @@ import typer
 
 from cli import completion, options
 from common.errors import ConfigError
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from cli.wired import Wired
@@ -64,13 +65,13 @@ def graph(
     made = graph_of(loaded.name, services, presence.ready if presence else None)
     text = write(made)
     if path is None:
-        typer.echo(text, nl=False)
+        echo(text, nl=False)
         return
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise ConfigError("--output", output, f"cannot be written: {error.strerror or error}") from None
-    typer.echo(f"{path}: {len(made.services)} services, {len(made.kinds)} keys"
+    echo(f"{path}: {len(made.services)} services, {len(made.kinds)} keys"
                f"{'' if made.alive is None else f', {sum(map(made.is_lit, names(made)))} services alive'}")
 
 
@@ -95,7 +96,7 @@ def _wired_services(cell: Cell) -> list[Wired]:
         try:
             found.append(wired(cell, entry))
         except Unwired as error:
-            typer.echo(f"zencell: {error}", err=True)
+            echo(f"zencell: {error}", err=True)
             found.append(Wired(entry.name, ""))
     return found
 

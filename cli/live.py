@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cli.screens import Content
+from common.terminal import printable
 
 STATE_STYLES = {"ready": "green", "starting": "cyan", "waiting": "dim", "restarting": "yellow", "failed": "bold red"}
 REFRESHES = 4  # [1/s]
@@ -34,12 +35,12 @@ class LiveScreen:
 
     def line(self, service: str, text: str) -> None:
         """Show one line that a process wrote, above the table."""
-        named = text if f" {service}: " in text[:80] else f"{service}: {text}"
+        named = printable(text if f" {service}: " in text[:80] else f"{service}: {text}")
         self._live.console.print(Text(named, style=_style_of(named)))
 
     def note(self, text: str) -> None:
         """Show a line for the person in front of it, above the table."""
-        self._live.console.print(Text(text), soft_wrap=True)
+        self._live.console.print(Text(printable(text, keep="\n")), soft_wrap=True)
 
     def progress(self, text: str) -> None:
         """The table shows it anyway."""
@@ -63,11 +64,11 @@ def render(content: Content) -> Group:
     for status in content.services:
         key, rate = content.rates.get(status.name, ("", 0.0))
         table.add_row(
-            status.name,
-            Text(status.state, style=STATE_STYLES.get(status.state, "")),
+            Text(printable(status.name)),
+            Text(printable(status.state), style=STATE_STYLES.get(status.state, "")),
             str(status.pid or ""),
             Text(str(status.restarts), style="yellow" if status.restarts else "dim"),
-            Text(key, style="dim"),
+            Text(printable(key), style="dim"),
             f"{rate:.1f}" if key else "",
         )
-    return Group(table, Text(content.progress, style="bold"))
+    return Group(table, Text(printable(content.progress), style="bold"))

@@ -38,6 +38,7 @@ from cli import (
     verbs,
 )
 from common.errors import RequestFailed, ZencellError
+from common.terminal import echo, printable
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
@@ -78,7 +79,7 @@ def _with_choices(error: typer.TyperException) -> str:
 
 
 def _fail(message: str, code: int) -> int:
-    typer.echo(f"zencell: {message}", err=True)
+    echo(f"zencell: {printable(message)}", err=True)
     return code
 
 

@@ -9,6 +9,7 @@ import typer
 
 from cli import completion, options
 from common.errors import UnknownName
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -44,7 +45,7 @@ def list_(
     if not shown:
         raise NoResponder(f"{cell or '*'}/alive/*")
     for name, service in shown:
-        typer.echo(json.dumps({"cell": name, "service": service}) if as_json else f"{name}/{service}")
+        echo(json.dumps({"cell": name, "service": service}) if as_json else f"{name}/{service}")
 
 
 ASK_TIMEOUT = 2.0  # [s]
@@ -75,10 +76,10 @@ def info(
     parameters = _parameters(found, loaded, presence, domain, connect)
     described = _described(loaded, found, presence, parameters)
     if as_json:
-        typer.echo(json.dumps(described))
+        echo(json.dumps(described))
         return
     for line in _lines(described, found.topics):
-        typer.echo(line)
+        echo(line)
 
 
 def _find(service: str, cell: str | None, cells: dict[str, Presence]) -> tuple[Cell, ServiceEntry]:
@@ -123,7 +124,7 @@ def _parameters(
         try:
             return inspect(visit, cell=cell.name, domain=domain, connect=connect).parameters
         except RequestFailed as error:
-            typer.echo(f"zencell: {error}; what follows is from the cell file", err=True)
+            echo(f"zencell: {error}; what follows is from the cell file", err=True)
     return describe(found.config, found.name)
 
 

@@ -14,9 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-import typer
-
 from cli import hosts, options, securing, viewing
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from cli.screens import Content, Screen
@@ -182,7 +181,7 @@ class Operation:
             raise
         self._write_summary()
         for line in describe(self.summary.as_dict(), self.fold.figures):
-            typer.echo(line)
+            echo(line)
         return code
 
     def stay(self) -> int:

@@ -14,6 +14,7 @@ import typer
 
 from cli import completion, options
 from common.errors import ConfigError, NoResponder, RemoteError, RequestFailed, UnknownName, ZencellError
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.messages import Parameter
@@ -59,13 +60,13 @@ def list_(
     width = max((len(parameter.path) for _, parameter in rows), default=0)
     for name, parameter in rows:
         if as_json:
-            typer.echo(to_json({"service": name, **parameter.model_dump()}))
+            echo(to_json({"service": name, **parameter.model_dump()}))
             continue
         value = yaml_line(parameter.value)
         value = value if len(value) <= LONGEST_VALUE else f"{value[: LONGEST_VALUE - 3]}..."
         how = "live" if parameter.runtime else "restart"
         meaning = "; ".join(text for text in (range_of(parameter), parameter.description) if text)
-        typer.echo(f"{parameter.path:<{width}}  {value:<{LONGEST_VALUE}}  {how:<7}  {meaning}".rstrip())
+        echo(f"{parameter.path:<{width}}  {value:<{LONGEST_VALUE}}  {how:<7}  {meaning}".rstrip())
     found.raise_first()
 
 
@@ -86,7 +87,7 @@ def get(
         return (await look_up(bus, [path]))[path]
 
     service, parameter = inspect(visit, cell=cell, domain=domain, connect=connect)
-    typer.echo(to_json({"service": service, **parameter.model_dump()}) if as_json else yaml_line(parameter.value))
+    echo(to_json({"service": service, **parameter.model_dump()}) if as_json else yaml_line(parameter.value))
 
 
 @app.command("set", context_settings={"ignore_unknown_options": True})
@@ -110,7 +111,7 @@ def set_(
         wanted: dict[str, dict[str, Any]] = {}
         for path, (service, parameter) in found.items():
             if parameter.value == values[path]:
-                typer.echo(f"{parameter.path}: is {_line(parameter.value)} already")
+                echo(f"{parameter.path}: is {_line(parameter.value)} already")
             else:
                 wanted.setdefault(service, {})[parameter.path] = values[path]
         before = {parameter.path: parameter.value for _, parameter in found.values()}
@@ -119,7 +120,7 @@ def set_(
         for service, changes in wanted.items():
             after = {parameter.path: parameter.value for parameter in await ask(bus, service, changes)}
             for path in changes:
-                typer.echo(f"{path}: {_line(before[path])} -> {_line(after[path])}")
+                echo(f"{path}: {_line(before[path])} -> {_line(after[path])}")
 
     inspect(visit, cell=cell, domain=domain, connect=connect)
 
@@ -150,7 +151,7 @@ def dump(
     text = f"# Parameters of {name}; read back with: zencell up {name} --set @FILE\n"
     text += yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
     if not output:
-        typer.echo(text, nl=False)
+        echo(text, nl=False)
         return
     try:
         Path(output).expanduser().write_text(text, encoding="utf-8")

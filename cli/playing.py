@@ -20,6 +20,7 @@ import typer
 from cli import options
 from cli.recording import Exclude, File
 from common.errors import ConfigError
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from cli.player import Player
@@ -167,7 +168,7 @@ async def _play(
                 if terminal.on_terminal:
                     sys.stderr.write("\r\x1b[K")
                     sys.stderr.flush()
-        typer.echo(f"played {player.published:,} messages")
+        echo(f"played {player.published:,} messages")
         if own and player.heard:
             with suppress(TimeoutError):
                 async with asyncio.timeout(LINGER):
@@ -206,11 +207,11 @@ async def _wait_and_run(player: Player, bus: Bus, wait: list[str]) -> None:
 
 def _greet(player: Player, recording: Recording, cell: str, endpoint: str, *, own: bool, live: bool) -> None:
     where = f"{endpoint}{', a router of its own' if own else ''}"
-    typer.echo(f"playing {recording.path} ({recording.seconds:.1f} s) as {cell} at {where}")
+    echo(f"playing {recording.path} ({recording.seconds:.1f} s) as {cell} at {where}")
     if live:
-        typer.echo(HELP)
+        echo(HELP)
     if not recording.finished:
-        typer.echo(f"it is not finished; zencell recover {recording.path} makes it whole", err=True)
+        echo(f"it is not finished; zencell recover {recording.path} makes it whole", err=True)
 
 
 async def _warn_of_others(bus: Bus, played: list[str]) -> None:
@@ -218,7 +219,7 @@ async def _warn_of_others(bus: Bus, played: list[str]) -> None:
     owners = await bus.owners()
     for topic in played:
         for name in [owner.service for owner in owners if owner.key == topic]:
-            typer.echo(f"{name} is up and writes {topic} too: whoever reads it hears both", err=True)
+            echo(f"{name} is up and writes {topic} too: whoever reads it hears both", err=True)
 
 
 async def _show(player: Player, recording: Recording) -> None:

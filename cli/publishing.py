@@ -12,6 +12,7 @@ import typer
 
 from cli import options
 from common.errors import ConfigError
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.clock import Clock
@@ -166,4 +167,4 @@ async def _others(bus: Bus, key: str) -> list[str]:
 
 def _warn_of_writers(services: list[str], key: str) -> None:
     if services:
-        typer.echo(f"zencell: {', '.join(services)} writes {key} too: readers get both", err=True)
+        echo(f"zencell: {', '.join(services)} writes {key} too: readers get both", err=True)

@@ -14,6 +14,7 @@ import typer
 
 from cli import completion, options
 from common.errors import ConfigError
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -158,7 +159,7 @@ async def _record(bus: Bus, selection: Selection, asked: _Asked) -> None:
     reason = "interrupted"
     try:
         await capture.begin()
-        typer.echo(f"recording {bus.cell} to {path}")
+        echo(f"recording {bus.cell} to {path}")
         if asked.gate:
             await bus.ready()
         if await _until_ended(interrupts, asked.seconds, sink, lambda: sum(capture.sequences.missed.values())):
@@ -167,7 +168,7 @@ async def _record(bus: Bus, selection: Selection, asked: _Asked) -> None:
         capture.end()
         figures = await asyncio.to_thread(sink.close, {"reason": reason, "missed": dict(capture.sequences.missed)})
     for line in outcome([str(file) for file in writer.files], figures, dict(capture.sequences.missed)):
-        typer.echo(line)
+        echo(line)
 
 
 def _end_with_stdin(interrupts: Interrupts) -> None:
@@ -267,20 +268,20 @@ def info(file: File, as_json: options.Json = False) -> None:
     with Recording(Path(file)) as recording:
         summary = summarise(recording)
     if as_json:
-        typer.echo(json.dumps(summary.as_dict()))
+        echo(json.dumps(summary.as_dict()))
         return
     when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(summary.start * 1e-9)) if summary.messages else "never"
-    typer.echo(f"{file}: {summary.about.get('cell', '')}, {summary.seconds:.1f} s from {when}, "
+    echo(f"{file}: {summary.about.get('cell', '')}, {summary.seconds:.1f} s from {when}, "
                f"{summary.messages:,} messages, {in_bytes(summary.size)}")
     if summary.run:
-        typer.echo("  " + ", ".join(f"{key} {value}" for key, value in summary.run.items() if value and key != "epoch"))
+        echo("  " + ", ".join(f"{key} {value}" for key, value in summary.run.items() if value and key != "epoch"))
     if not summary.finished:
-        typer.echo(f"  not finished: the recorder was killed or still records. Make it whole: zencell recover {file}")
-    typer.echo(f"{'topic':<30} {'type':<16} {'messages':>9} {'Hz':>8} {'payload':>10}")
+        echo(f"  not finished: the recorder was killed or still records. Make it whole: zencell recover {file}")
+    echo(f"{'topic':<30} {'type':<16} {'messages':>9} {'Hz':>8} {'payload':>10}")
     for name, topic in summary.topics.items():
         rate = f"{topic.hz:8.2f}" if topic.messages > 1 else " " * 8
         lost = f"  {topic.dropped + topic.missed} lost" if topic.dropped + topic.missed else ""
-        typer.echo(f"{name:<30} {topic.type:<16} {topic.messages:>9,} {rate} {in_bytes(topic.bytes):>10}{lost}")
+        echo(f"{name:<30} {topic.type:<16} {topic.messages:>9,} {rate} {in_bytes(topic.bytes):>10}{lost}")
 
 
 def recover(
@@ -298,5 +299,5 @@ def recover(
     saved = recover_file(source, target)
     lost = [f"{in_bytes(saved.lost_bytes)} after the cut"] if saved.lost_bytes else []
     lost += [f"{saved.damaged_chunks} damaged chunks"] if saved.damaged_chunks else []
-    typer.echo(f"saved {saved.messages:,} messages, {saved.seconds:.1f} s: {target}; "
+    echo(f"saved {saved.messages:,} messages, {saved.seconds:.1f} s: {target}; "
                f"lost {' and '.join(lost) or 'nothing'}")

@@ -10,6 +10,7 @@ import typer
 
 from cli.recording import File
 from common.errors import ConfigError, ZencellError
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.application import Application
@@ -41,12 +42,12 @@ def report(
     with Recording(path) as recording:
         text = page_of(recording, cell)
         if not recording.finished:
-            typer.echo(f"zencell: {_cut(recording)}", err=True)
+            echo(f"zencell: {_cut(recording)}", err=True)
     try:
         page_path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise ConfigError("--output", str(page_path), f"cannot be written: {error.strerror}") from None
-    typer.echo(f"{page_path}: {len(text) / 1e6:.1f} MB")
+    echo(f"{page_path}: {len(text) / 1e6:.1f} MB")
 
 
 def page_of(recording: Recording, cell: str | None = None) -> str:

@@ -10,6 +10,7 @@ import typer
 
 from cli import completion, options
 from common.errors import ConfigError
+from common.terminal import echo
 
 app = typer.Typer(help="Prepare a robot.", no_args_is_help=True)
 
@@ -48,12 +49,12 @@ def collisions(
     pairs = disabled_pairs(model, samples=count or 1, margin=distance, rng=np.random.default_rng(number))
     text = srdf(model, pairs)
     if not output:
-        typer.echo(text, nl=False)
+        echo(text, nl=False)
         return
     try:
         Path(output).expanduser().write_text(text, encoding="utf-8")
     except OSError as error:
         raise ConfigError("--output", output, f"cannot be written: {error.strerror}") from None
     found = Counter(pair.reason for pair in pairs)
-    typer.echo(f"{output}: {len(pairs)} pairs need no check "
+    echo(f"{output}: {len(pairs)} pairs need no check "
                f"({', '.join(f'{found[reason]} {reason.lower()}' for reason in sorted(found))})")

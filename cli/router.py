@@ -9,6 +9,7 @@ import typer
 
 from cli import options, securing
 from cli.hosts import Share
+from common.terminal import echo
 
 app = typer.Typer(help="What a cell's router is told.", no_args_is_help=True)
 
@@ -50,4 +51,4 @@ def config(
     else:
         require_valid(folder, [ROUTER_NAME], f"zencell secure init {folder} --renew")
         settings = router_settings(endpoints, credentials_of(ROUTER_NAME, folder), read_access(folder), launch.link)
-    typer.echo(HEAD + json.dumps(settings, indent=1))
+    echo(HEAD + json.dumps(settings, indent=1))

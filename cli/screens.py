@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from common.messages import ServiceStatus
+from common.terminal import printable
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,11 @@ class PlainScreen:
 
     def line(self, service: str, text: str) -> None:
         """Show one line that a process wrote."""
-        _write(text if f" {service}: " in text[:80] else f"{service}: {text}")
+        _write(printable(text if f" {service}: " in text[:80] else f"{service}: {text}"))
 
     def note(self, text: str) -> None:
         """Show a line for the person in front of it."""
-        sys.stdout.write(text + "\n")
+        sys.stdout.write(printable(text, keep="\n") + "\n")
         sys.stdout.flush()
 
     def progress(self, text: str) -> None:

@@ -15,6 +15,7 @@ from cli.hosts import Share
 from cli.viewing import VIEWER
 from cli.wired import Unwired
 from common.errors import ZencellError
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.config import Cell
@@ -77,9 +78,9 @@ def init(
         authority.issue(name, [], valid, place / f"{name}.pem", place / f"{name}.key")
     text = ACCESS_HEAD + json.dumps(access_control(rights), indent=1) + "\n"
     (place / ACCESS).write_text(text, encoding="utf-8")
-    typer.echo(f"{len(names) + 1} certificates, valid for {valid} days, and {ACCESS} in {folder}")
-    typer.echo(f"keep {key} elsewhere: nothing but another `secure init --renew` needs it")
-    typer.echo(f"next: zencell up {(cells or names_of('cells'))[0]} --secure {folder}")
+    echo(f"{len(names) + 1} certificates, valid for {valid} days, and {ACCESS} in {folder}")
+    echo(f"keep {key} elsewhere: nothing but another `secure init --renew` needs it")
+    echo(f"next: zencell up {(cells or names_of('cells'))[0]} --secure {folder}")
 
 
 @app.command()
@@ -99,12 +100,12 @@ def show(folder: Folder, as_json: options.Json = False) -> None:
             raise ConfigError("DIR", str(file), "cannot be read by this user") from None
         rights = {kind: sorted(keys) for kind, keys in allowed.get(name, {}).items() if kind in SHOWN}
         if as_json:
-            typer.echo(json.dumps({"name": name, "valid_until": until, **rights}))
+            echo(json.dumps({"name": name, "valid_until": until, **rights}))
             continue
-        typer.echo(f"{name}: {f'valid until {until}' if until else 'its certificate is not here'}")
+        echo(f"{name}: {f'valid until {until}' if until else 'its certificate is not here'}")
         for kind, keys in rights.items():
             cell = name.partition(".")[0]
-            typer.echo(f"  {kind:<8} {', '.join(key.removeprefix(f'{cell}/') for key in keys)}")
+            echo(f"  {kind:<8} {', '.join(key.removeprefix(f'{cell}/') for key in keys)}")
 
 
 @app.command()
@@ -136,7 +137,7 @@ def check(
             names = [ROUTER_NAME, *([] if only else [OPERATOR]), *(common_name(cell.name, one) for one in processes)]
             require_valid(place, names, again)
         require_current(place, read_access(place), cell.name, rights, again)
-        typer.echo(f"{cell.name}: {len(rights)} processes, certificates and rules are as they need them")
+        echo(f"{cell.name}: {len(rights)} processes, certificates and rules are as they need them")
 
 
 def renewal(folder: str, cell: str) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
+from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.config import Cell
@@ -89,16 +90,16 @@ def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float)
     if file is not None:
         require_new(Path(file), "--trace")
         trace = Trace(Path(file), about(cell.name), Own.of(cell))
-    simulation = Simulation(cell, seed, faults=faults, limit=limit, digest=True, trace=trace, tell=typer.echo)
+    simulation = Simulation(cell, seed, faults=faults, limit=limit, digest=True, trace=trace, tell=echo)
     try:
         outcome = simulation.run()
     finally:
         if trace is not None:
             trace.close("simulated")
     for line in told(outcome):
-        typer.echo(line)
+        echo(line)
     if trace is not None:
-        typer.echo(f"recorded {trace.messages:,} messages: {file}")
+        echo(f"recorded {trace.messages:,} messages: {file}")
     return 0 if outcome.ok and not outcome.crashes else 1
 
 
@@ -145,7 +146,7 @@ def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: 
     if tally.outcomes:
         Console(soft_wrap=True).print(table(cell.name, tally, faults))
     if interrupted:
-        typer.echo(f"interrupted after {len(tally.outcomes)} of {len(seeds)} seeds", err=True)
+        echo(f"interrupted after {len(tally.outcomes)} of {len(seeds)} seeds", err=True)
         return 130
     return 0 if tally.passed else 1
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import options
+from common import terminal
 from common.errors import RequestFailed, ZencellError
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def echo(
             shown = 0
             while True:
                 figures = pose_figures(frames.tree, target, source)
-                typer.echo(json.dumps(figures) if as_json else describe(figures))
+                terminal.echo(json.dumps(figures) if as_json else describe(figures))
                 shown += 1
                 if shown == most:
                     return
@@ -84,9 +85,9 @@ def frames(
             parent = found.tree.parent_of(name)
             moves = name in found.moving
             if as_json:
-                typer.echo(json.dumps({"frame": name, "parent": parent, "moves": moves}))
+                terminal.echo(json.dumps({"frame": name, "parent": parent, "moves": moves}))
             else:
-                typer.echo(f"{'  ' * depth}{name}{'  (moves)' if moves else ''}")
+                terminal.echo(f"{'  ' * depth}{name}{'  (moves)' if moves else ''}")
 
     inspect(visit, cell=cell, domain=domain, connect=connect)
 

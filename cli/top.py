@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
+from common.terminal import echo, printable
 
 if TYPE_CHECKING:
     from rich.console import Console, Group
@@ -64,7 +65,7 @@ def top(
 def _opened(*, live: bool, as_json: bool) -> tuple[Callable[[View], None], Callable[[], None]]:
     """What shows a view, and what leaves the terminal as it was."""
     if as_json:
-        return lambda view: typer.echo(json.dumps(view.as_dict())), lambda: None
+        return lambda view: echo(json.dumps(view.as_dict())), lambda: None
     from rich.console import Console
 
     console = Console(width=None if sys.stdout.isatty() else PLAIN_WIDTH)
@@ -89,7 +90,7 @@ def render(view: View) -> Group:
 
     lost = "" if view.connected else "; the router is lost"
     head = f"{view.cell} at speed {view.speed:g}; this tool takes {view.own_cpu:.1f} %{lost}"
-    return Group(Text(head, style="bold" if view.connected else "bold red"), Text(),
+    return Group(Text(printable(head), style="bold" if view.connected else "bold red"), Text(),
                  services_table(view.services), Text(), topics_table(view.topics))
 
 
@@ -103,19 +104,22 @@ def services_table(rows: list[ServiceRow]) -> Table:
                    text=2)
     for row in rows:
         table.add_row(
-            row.service, Text(row.state, style=STATE_STYLES.get(row.state, "")), _number(row.pid),
-            _number(row.cpu, 1), _number(row.memory), _alarming(row.restarts, "yellow"), _number(row.received, 1),
-            _number(row.dropped), _alarming(row.invalid, "red"), _alarming(row.overflow, "red"),
+            Text(printable(row.service)), Text(printable(row.state), style=STATE_STYLES.get(row.state, "")),
+            _number(row.pid), _number(row.cpu, 1), _number(row.memory), _alarming(row.restarts, "yellow"),
+            _number(row.received, 1), _number(row.dropped), _alarming(row.invalid, "red"),
+            _alarming(row.overflow, "red"),
         )
     return table
 
 
 def topics_table(rows: list[TopicRow]) -> Table:
     """A row for each key that carries something."""
+    from rich.text import Text
+
     table = _table("topic", "Hz", "kB/s", "messages", "age p50 ms", "age p99 ms", text=1)
     for row in rows:
         rate = None if row.bytes_per_second is None else row.bytes_per_second / 1e3
-        table.add_row(row.topic, _number(row.hz, 2), _number(rate, 1), _number(row.messages),
+        table.add_row(Text(printable(row.topic)), _number(row.hz, 2), _number(rate, 1), _number(row.messages),
                       _number(row.p50, 1), _number(row.p99, 1))
     return table
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import completion, delay, options, publishing
+from common import terminal
 from common.errors import UnknownName
 
 if TYPE_CHECKING:
@@ -40,9 +41,9 @@ def list_(
         kind, message, doc = (topic.kind, topic.message.__name__, topic.doc) if topic else ("", "", "")
         if as_json:
             described = {"key": known.key, "kind": kind, "message": message, "writer": known.writer, "doc": doc}
-            typer.echo(json.dumps(described))
+            terminal.echo(json.dumps(described))
         else:
-            typer.echo(f"{known.key:<20} {kind:<8} {message:<17} {known.writer:<22} {doc}".rstrip())
+            terminal.echo(f"{known.key:<20} {kind:<8} {message:<17} {known.writer:<22} {doc}".rstrip())
 
 
 @app.command()
@@ -70,18 +71,18 @@ def info(
         if answer:
             described |= {"answer": answer.__name__, "answer_schema": answer.model_json_schema()}
             described["example"] = example_of(topic.message)
-        typer.echo(json.dumps(described))
+        terminal.echo(json.dumps(described))
         return
-    typer.echo(f"{topic.key}: {topic.doc}\nkind: {topic.kind}")
-    typer.echo(f"{'served' if answer else 'written'} by: {writer or 'nobody here'}")
-    typer.echo(f"message: {topic.message.__name__}")
+    terminal.echo(f"{topic.key}: {topic.doc}\nkind: {topic.kind}")
+    terminal.echo(f"{'served' if answer else 'written'} by: {writer or 'nobody here'}")
+    terminal.echo(f"message: {topic.message.__name__}")
     for line in fields_of(topic.message):
-        typer.echo(f"  {line}")
+        terminal.echo(f"  {line}")
     if answer:
-        typer.echo(f"answer: {answer.__name__}")
+        terminal.echo(f"answer: {answer.__name__}")
         for line in fields_of(answer):
-            typer.echo(f"  {line}")
-        typer.echo(f"example: zencell call {topic.key} '{json.dumps(example_of(topic.message))}'")
+            terminal.echo(f"  {line}")
+        terminal.echo(f"example: zencell call {topic.key} '{json.dumps(example_of(topic.message))}'")
 
 
 @app.command()
@@ -106,7 +107,7 @@ def echo(
         lines = _messages(bus, found, as_json) if isinstance(found, Topic) else _foreign_messages(bus, key, as_json)
         async with aclosing(lines):
             async for line in lines:
-                typer.echo(line)
+                terminal.echo(line)
                 shown += 1
                 if shown == most:
                     return
@@ -174,7 +175,7 @@ def _measured(name: str, doc: str, visiting: Callable[[Bus, str, bool], AsyncGen
         async def visit(bus: Bus) -> None:
             shown = 0
             async for figures, line in visiting(bus, key, topic is None):
-                typer.echo(json.dumps({"key": key, **figures}) if as_json else line)
+                terminal.echo(json.dumps({"key": key, **figures}) if as_json else line)
                 shown += 1
                 if shown == most:
                     return

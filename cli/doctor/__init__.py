@@ -10,6 +10,7 @@ import typer
 
 from cli import options
 from cli.doctor.finding import Finding
+from common.terminal import echo
 
 
 def doctor(
@@ -22,9 +23,9 @@ def doctor(
     failed = False
     for finding in examine(endpoint):
         if as_json:
-            typer.echo(json.dumps(asdict(finding)))
+            echo(json.dumps(asdict(finding)))
         else:
-            typer.echo(f"{finding.level:<4}  {finding.what}{f': {finding.remedy}' if finding.remedy else ''}")
+            echo(f"{finding.level:<4}  {finding.what}{f': {finding.remedy}' if finding.remedy else ''}")
         failed |= finding.level == "fail"
     if failed:
         raise typer.Exit(1)

@@ -6,10 +6,11 @@ import asyncio
 import json
 import logging
 import threading
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 from common import topics
 from common.messages import LogLine
+from common.terminal import printable
 from common.transport.bus import Bus
 from common.transport.handoff import call_on_loop
 
@@ -17,6 +18,12 @@ from common.transport.handoff import call_on_loop
 class _Human(logging.Formatter):
     def __init__(self, service: str) -> None:
         super().__init__(f"%(levelname)s {service}: %(message)s")
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802, D102
+        return printable(super().formatMessage(record).rstrip())
+
+    def formatException(self, ei: Any) -> str:  # noqa: N802, D102
+        return printable(super().formatException(ei), keep="\n\t")
 
 
 class _Json(logging.Formatter):

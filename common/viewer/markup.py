@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from html import escape
 
+from common.terminal import printable
+
 GOOD, BUSY, BAD, OFF = "good", "busy", "bad", "off"  # how something is, as a colour beside the word
 
 STYLE = """<style>
@@ -33,8 +35,8 @@ STYLE = """<style>
 
 
 def text(value: object) -> str:
-    """The value as text that HTML cannot mistake for anything else."""
-    return escape(str(value), quote=True)
+    """The value as text that HTML cannot mistake for anything else, without control characters."""
+    return escape(printable(value, keep="\n"), quote=True)
 
 
 def span(value: object, kind: str) -> str:

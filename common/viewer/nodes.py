@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from common.messages import CollisionObject, Color, MarkerArray, Pose, Quaternion, Vector3
 from common.robot.transforms import matrix_to_quaternion
+from common.terminal import printable
 
 Array = NDArray[np.float64]
 Position = tuple[float, float, float]
@@ -151,7 +152,7 @@ class Markers:
             return self._scene.add_box(name, dimensions=size, flat_shading=False, **look, **place)
         if marker.type == "sphere":
             return self._scene.add_icosphere(name, size[0] / 2, **look, **place)
-        return self._scene.add_label(name, marker.text, **place)
+        return self._scene.add_label(name, printable(marker.text, keep="\n"), **place)
 
 
 def tube(radius: float, height: float) -> tuple[Array, NDArray[np.int64], Array]:

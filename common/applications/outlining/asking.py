@@ -16,6 +16,7 @@ from common.errors import ConfigError, RemoteError, ZencellError
 from common.perception.depth import depth_of
 from common.perception.image import image_to_array
 from common.perception.intake import colour_picture
+from common.terminal import printable
 
 if TYPE_CHECKING:
     from common.messages import Image
@@ -67,7 +68,7 @@ async def ask_person(bus: Bus, folder: Path) -> None:
 
 def say(text: str, end: str = "\n") -> None:
     """Show a text to the person."""
-    sys.stdout.write(text + end)
+    sys.stdout.write(printable(text) + end)
     sys.stdout.flush()
 
 

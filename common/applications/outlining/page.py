@@ -14,6 +14,7 @@ from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE
 from common.config import Fixture
 from common.messages import CollisionObject, MotionStatus, TaskStatus
 from common.perception.pinhole import CameraError, Pinhole
+from common.terminal import printable
 from common.topics import Topic
 from common.viewer.layers import Layer
 from common.viewer.nodes import FLAT, add_line, points_of, rgb_of
@@ -174,7 +175,7 @@ class ContourChoice(Layer):
             console.put(lambda: choose(console, choice))
 
         label = self.scene.add_label(
-            f"{name}_label", f"{contour.index}: {contour.label}", position=(x, y, height + 4 * _PIN),
+            f"{name}_label", printable(f"{contour.index}: {contour.label}"), position=(x, y, height + 4 * _PIN),
             anchor="bottom-center", font_screen_scale=0.8,
         )
         self.nodes += [line, pin, label]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from common.errors import ConfigError
+from common.terminal import echo
 from common.verbs import BeforeRun
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def snapshot(
 
     shell: Shell = context.obj
     visit = partial(store, folder=Path(folder), wanted=parse_choice(select))
-    typer.echo(shell.visit(visit, cell, overrides, world, seed, domain, connect))
+    echo(shell.visit(visit, cell, overrides, world, seed, domain, connect))
 
 
 def outline(
@@ -139,12 +140,12 @@ def _stages(shell: Shell, cell: Cell, place: Path, wanted: OutlineSelect, *, kee
         cleared, label = stage_files.read_coordinates(place / stage_files.CLEARED), stage_files.CLEARED
     else:
         stage_files.write_points(place / stage_files.CLEARED, cleared)
-    typer.echo(f"{found.label}: {len(found.pixels)} pixels, {len(cleared)} points to trace; the stages are in {place}")
+    echo(f"{found.label}: {len(found.pixels)} pixels, {len(cleared)} points to trace; the stages are in {place}")
     parameters = shell.parameters(cell, "contour_tracer")
     assert parameters.robot.gripper is not None  # the tracer needs one as well
     pipeline = PlanningPipeline(RobotModel.load(cell.robot), cell.motion, cell.pipeline, seed=cell.run.seed)
     scene = planning_scene(around, found.solids, 1)
     legs = Legs(parameters, parameters.robot.gripper)
     for leg, response in plan_outline(pipeline, legs, cleared, label, scene, given=keep):
-        typer.echo(f"  {leg.name:<8} {leg.seconds:6.2f} s by {response.planner}, planned in "
+        echo(f"  {leg.name:<8} {leg.seconds:6.2f} s by {response.planner}, planned in "
                    f"{1e3 * response.seconds:.0f} ms, fraction {response.fraction:.2f}")

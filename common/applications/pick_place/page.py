@@ -15,6 +15,7 @@ from common.applications.pick_place.topics import (
     WORKSPACE_MARKERS,
 )
 from common.messages import MarkerArray, PoseArray, Rejections, TaskStatus
+from common.terminal import printable
 from common.topics import Topic
 from common.viewer.layers import Layer
 from common.viewer.nodes import FLAT, Markers, Position, points_of, position_of, ring
@@ -121,7 +122,9 @@ class Rejected(Layer):
         name = f"{self.root}/{self._count}"
         return [
             self.scene.add_mesh_simple(f"{name}_ring", *self._ring, color=REJECTED, position=at, **FLAT),
-            self.scene.add_label(f"{name}_reason", reason, position=at, anchor="bottom-center", font_screen_scale=0.75),
+            self.scene.add_label(
+                f"{name}_reason", printable(reason), position=at, anchor="bottom-center", font_screen_scale=0.75
+            ),
         ]
 
     def _drop(self, gone: list[_Known]) -> None:

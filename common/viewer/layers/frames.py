@@ -10,6 +10,7 @@ import viser
 
 from common import topics
 from common.messages import CameraInfo, TransformStamped
+from common.terminal import printable
 from common.topics import Topic
 from common.viewer.layers import Layer
 from common.viewer.nodes import FLAT, matrix_wxyz, position_of, wxyz_of
@@ -109,7 +110,7 @@ class Frames(Layer):
             self._forget(name)
         node = f"{above}/{name.replace('/', '_')}"
         self._nodes[name] = self.scene.add_frame(node, axes_length=_AXIS, axes_radius=0.04 * _AXIS)
-        self.scene.add_label(f"{node}/name of {len(self._nodes)}", name, font_screen_scale=0.6)
+        self.scene.add_label(f"{node}/name of {len(self._nodes)}", printable(name), font_screen_scale=0.6)
         self._parents[name] = parent
         for waiting in [w for w in self._waiting.values() if w.header.frame_id == name]:
             if self._waiting.pop(waiting.child_frame_id, None) is not None:

@@ -1,0 +1,79 @@
+"""What comes over the wire cannot steer a terminal or the page, wherever it is shown."""
+
+import json
+import logging
+import re
+from collections.abc import Callable
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from cli.live import render
+from cli.screens import Content, PlainScreen
+from cli.top import services_table, topics_table
+from cli.watching import ServiceRow, TopicRow
+from common.messages import ServiceStatus
+from common.process.log import log_to_stderr
+from common.terminal import echo, printable
+from common.viewer import markup
+
+ROOT = Path(__file__).parents[2]
+EVIL = "a\x1b]0;owned\x07\r\x9b2J\u202eb\u2028\x7f\ud800[/x][red]\nERROR router: forged"
+STEERING = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u202e\ud800]")
+
+
+def drawn(table: object) -> str:
+    console = Console(file=StringIO(), width=400)
+    console.print(table)
+    return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
+
+
+def test_what_steers_a_terminal_is_written_as_json_does() -> None:
+    assert printable("a\x1b[2J\nb") == "a\\u001b[2J\\u000ab"
+    assert json.loads(f'"{printable(EVIL)}"') == EVIL
+    assert printable("Ω ü 球 – [x]") == "Ω ü 球 – [x]"
+
+
+@pytest.mark.parametrize("show", [
+    lambda: drawn(services_table([ServiceRow(EVIL, "ready", restarts=0)])),
+    lambda: drawn(topics_table([TopicRow(EVIL, 1.0, 1.0, 1, None, None)])),
+    lambda: drawn(render(Content([ServiceStatus(name="camera", state="ready")], {"camera": (EVIL, 1.0)}, EVIL))),
+    lambda: markup.text(EVIL),
+], ids=["top: a service", "top: a topic", "the live table", "the page"])
+def test_text_from_the_wire_is_shown_and_steers_nothing(show: Callable[[], str]) -> None:
+    text = show()
+    assert not STEERING.search(text)
+    assert "[/x][red]" in text
+
+
+def test_a_line_from_a_process_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    PlainScreen().line("camera", EVIL)
+    PlainScreen().progress(EVIL)
+    echo(EVIL, err=True)
+    lines = capsys.readouterr().err.splitlines()
+    assert not STEERING.search("".join(lines))
+    assert [line.startswith("ERROR") for line in lines] == [False, False, False, True], "an own text may have lines"
+
+
+def test_a_line_of_the_log_cannot_be_forged(capsys: pytest.CaptureFixture[str]) -> None:
+    root = logging.getLogger()
+    before = root.handlers[:], root.level
+    try:
+        log_to_stderr("planner", as_json=False)
+        try:
+            raise ValueError(EVIL)
+        except ValueError:
+            logging.getLogger("test").exception("refused: %s", EVIL)
+    finally:
+        root.handlers[:], root.level = before
+        logging.captureWarnings(False)
+    said = capsys.readouterr().err
+    assert not STEERING.search(said)
+    assert "ERROR router" not in said.splitlines()[1]
+
+
+def test_everything_that_is_shown_goes_through_here() -> None:
+    files = [path for folder in ("cli", "common", "services") for path in (ROOT / folder).rglob("*.py")]
+    assert [p.name for p in files if re.search(r"\b(typer|click)\.s?echo\(", p.read_text())] == ["terminal.py"]
