@@ -83,6 +83,7 @@ async def test_a_service_whose_loop_is_stuck_tells_where_and_is_started_again(up
     assert {service.name: service.restarts for service in status.services if service.restarts} == {"stuck": 1}
 
 
+@pytest.mark.slow  # `make test` does it with tiny services, in tests/cli/test_bring_up.py
 async def test_nothing_is_left_of_a_cell_whose_supervisor_is_killed_not_even_what_is_frozen(up: RunningCell) -> None:
     async with up.listen() as bus:
         task = bus.client(topics.TASK_COMMAND)

@@ -97,11 +97,11 @@ def test_the_process_ends_with_the_exit_code_and_without_a_traceback(tmp_path: P
     assert line.startswith("zencell: unknown cell 'pnada' (did you mean 'panda'?); choices: ")
 
 
+@pytest.mark.slow  # `make test` does it with tiny services, in test_bring_up.py
 @pytest.mark.parametrize(
     ("override", "wanted"),
     [
-        pytest.param("robot.urdf=package://example-robot-data/robots/nobody/nobody.urdf", "nobody.urdf",
-                     marks=pytest.mark.slow, id="a file"),
+        pytest.param("robot.urdf=package://example-robot-data/robots/nobody/nobody.urdf", "nobody.urdf", id="a file"),
         ("services.vision_detector.min_aera=3", "services.vision_detector.min_aera"),
     ],
 )

@@ -17,7 +17,7 @@ from tests.simulated.visited import SimulatedCell
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
 
-BALLS = 3
+BALLS = 2
 
 
 async def keys_in(cell: Cell) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -16,30 +15,17 @@ from common.applications.outlining.verbs import before_run
 from common.messages import TaskCommand
 from common.transport.bus import Bus
 from tests.harness import until
+from tests.simulated.outlined import assert_cube_outlined, assert_good
 from tests.simulated.visited import SimulatedCell
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
 
 
-def assert_good(summary: dict[str, Any]) -> None:
-    outline = summary["outline"]
-    assert summary["state"] == "DONE"
-    assert outline["fraction"] == 1.0 and outline["closed"]
-    assert outline["deviation_mm"]["max"] < 0.5 and outline["deviation_mm"]["mean"] < 0.2
-    assert outline["tracking_mm"]["max"] < 0.15
-    assert summary["failures"] == 0
-
-
+@pytest.mark.slow  # `make test` asks it of a trace that was paused, in test_pausing.py
 def test_the_cube_is_outlined_and_every_figure_is_told() -> None:
     summary = SimulatedCell("ur5", world="w2").summary
-    assert_good(summary)
-    outline = summary["outline"]
-    assert set(outline) == {"object", "points", "fraction", "length_m", "closed", "deviation_mm", "tracking_mm"}
-    assert outline["length_m"] == pytest.approx(0.4, abs=0.002)
-    assert 4 <= outline["points"] < 1000
-    assert [plan["fraction"] for plan in summary["plans"]] == [1.0] * 5, "one for each stage"
+    assert_cube_outlined(summary)
     assert 0 < summary["seconds"]["moving"] <= summary["seconds"]["task"]
-    assert summary["restarts"] == {}
 
 
 def test_the_object_that_was_chosen_is_outlined() -> None:
