@@ -248,18 +248,12 @@ def test_service_of_ours_joins_a_cell_and_its_topic_is_shown(folder: Path) -> No
     assert (service.returncode, cell.returncode) == (0, 0)
 
 
-@pytest.mark.cell
-def test_task_of_one_file_moves_a_cube_and_ends_the_run_with_a_status_and_figures_of_its_own(
-    folder: Path, tmp_path: Path
-) -> None:
-    assert len(FILES["my_pkg/move_cube.py"].splitlines()) < 120
-    file, recording = tmp_path / "summary.json", tmp_path / "run.mcap"
-    ran = tell(f"{CUBE} --speed 5 --no-viewer --summary {file} --record {recording}", folder)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
+def assert_cube_moved(file: Path, said: str, recording: Path, folder: Path, elsewhere: Path) -> None:
+    """What a run told, and what its recording tells where the task's module is not found."""
     summary = json.loads(file.read_text(encoding="utf-8"))
     assert (summary["state"], summary["placed"], summary["targets"], summary["failures"]) == ("DONE", 1, 1, 0)
     assert set(summary["figures"]) == {"off_mm"} and summary["figures"]["off_mm"] < 5
-    assert "off_mm" in ran.stdout
+    assert "off_mm" in said
     with Recording(recording) as kept:
         states = list(kept.samples(lambda topic: topic == "move_cube_status"))
         assert {(sample.kind, json.loads(sample.schema)["title"]) for sample in states} == {("state", "MoveCubeStatus")}
@@ -269,7 +263,6 @@ def test_task_of_one_file_moves_a_cube_and_ends_the_run_with_a_status_and_figure
     assert (status.state, status.figures) == ("DONE", summary["figures"])
     place = decode(m.WorldObjects, newest["scene_objects"]).objects[0].pose.position
     assert (place.x, place.y) == pytest.approx((0.52, 0.1), abs=0.005), "where it really is"
-    elsewhere = tmp_path / "elsewhere"  # where its module is not found
     elsewhere.mkdir()
     exported = tell(f"zencell export {recording} --csv tables --topics move_cube_status", elsewhere)
     assert exported.returncode == 0 and not exported.stderr, exported.stderr
@@ -280,9 +273,28 @@ def test_task_of_one_file_moves_a_cube_and_ends_the_run_with_a_status_and_figure
     assert reported.returncode == 0 and "off_mm" in (elsewhere / "run.html").read_text(encoding="utf-8")
 
 
-def test_task_of_one_file_runs_on_a_virtual_clock_and_breaks_nothing(folder: Path) -> None:
-    simulated = tell(next(line for line in COMMANDS if line.startswith("zencell simulate")), folder)
+@pytest.mark.slow
+@pytest.mark.cell
+def test_task_of_one_file_moves_a_cube_as_processes(folder: Path, tmp_path: Path) -> None:
+    file, recording = tmp_path / "summary.json", tmp_path / "run.mcap"
+    ran = tell(f"{CUBE} --speed 5 --no-viewer --summary {file} --record {recording}", folder)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert_cube_moved(file, ran.stdout, recording, folder, tmp_path / "elsewhere")
+
+
+def test_task_of_one_file_moves_a_cube_and_ends_the_run_with_a_status_and_figures_of_its_own(
+    folder: Path, tmp_path: Path
+) -> None:
+    assert len(FILES["my_pkg/move_cube.py"].splitlines()) < 120
+    file, recording = tmp_path / "summary.json", tmp_path / "run.mcap"
+    with no_processes():
+        ran = ask(folder, *shlex.split(CUBE)[1:], "--summary", str(file), "--domain", str(free_domain()))
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    line = next(line for line in COMMANDS if line.startswith("zencell simulate"))
+    places = shlex.split(CUBE)[3:]  # of the same run
+    simulated = ask(folder, *shlex.split(line)[1:], *places, "--trace", str(recording))
     assert simulated.returncode == 0 and "seed 1: DONE" in simulated.stdout, simulated.stdout + simulated.stderr
+    assert_cube_moved(file, ran.stdout, recording, folder, tmp_path / "elsewhere")
 
 
 def test_task_of_one_file_goes_on_with_what_is_in_the_hand(folder: Path) -> None:
