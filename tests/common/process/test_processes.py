@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import json
 import os
@@ -15,12 +16,14 @@ import pytest
 
 from common import topics
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
-from common.errors import NoResponder, NoRouter, RemoteError, RequestLost, RequestTimeout
+from common.errors import NoResponder, NoRouter, RemoteError, RequestLost, RequestTimeout, ZencellError
 from common.messages import TaskCommand
+from common.process.service import add_options, prepare
 from common.transport.bus import Bus, Client
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of, port_of
 from common.transport.zenoh_session import wait_router
+from tests.common.process.toy import Config
 
 PATIENCE = 20.0  # only ever waited for by a test that fails
 CELL = str(Path(__file__).with_name("toy_cell.yaml"))
@@ -91,30 +94,32 @@ async def available(bus: Bus) -> Client:
 # --- the ends of a request ----------------------------------------------------------------------------------------
 
 
-async def test_request_to_another_process_is_answered_or_refused(stage: Stage, bus: Bus) -> None:
-    stage.toy("--set", "services.toy.placed=5")
+async def test_request_is_answered_or_refused_and_a_handler_with_a_bug_ends_the_process(
+    stage: Stage, bus: Bus
+) -> None:
+    toy = stage.toy("--set", "services.toy.placed=5")
     client = await available(bus)
     assert (await client.call(START)).stage == "5"
     with pytest.raises(RemoteError, match="not now"):
         await client.call(TaskCommand(command="stop"))
+    with pytest.raises(RemoteError, match="the handler has a bug") as caught:
+        await client.call(TaskCommand(command="resume"))
+    assert caught.value.code == "internal"
+    assert await stage.ended(toy) == 1
+    assert "Traceback" in stage.output(toy)
 
 
-async def test_killed_responder_is_no_responder(stage: Stage, bus: Bus) -> None:
+async def test_responder_killed_in_the_middle_loses_the_request_and_is_none_then(stage: Stage, bus: Bus) -> None:
     toy = stage.toy()
     client = await available(bus)
-    toy.kill()
-    await stage.until(lambda: not client.available)
-    with pytest.raises(NoResponder):
-        await client.call(START)
-
-
-async def test_responder_killed_in_the_middle_loses_the_request(stage: Stage, bus: Bus) -> None:
-    toy = stage.toy()
-    waiting = asyncio.create_task((await available(bus)).call(HOLD, timeout=PATIENCE))
+    waiting = asyncio.create_task(client.call(HOLD, timeout=PATIENCE))
     await stage.said(toy, "holding")
     toy.kill()
     with pytest.raises(RequestLost):
         await waiting
+    await stage.until(lambda: not client.available)
+    with pytest.raises(NoResponder):
+        await client.call(START)
 
 
 async def test_frozen_responder_is_a_time_out_then_lost_then_gone_and_serves_again_when_it_thaws(
@@ -158,16 +163,6 @@ async def test_router_frozen_in_the_middle_loses_the_request(stage: Stage, bus: 
         await client.call(START, timeout=0.1)
     with pytest.raises(RequestLost):
         await waiting
-
-
-async def test_handler_with_a_bug_ends_the_process_with_its_traceback(stage: Stage, bus: Bus) -> None:
-    toy = stage.toy()
-    client = await available(bus)
-    with pytest.raises(RemoteError, match="the handler has a bug") as caught:
-        await client.call(TaskCommand(command="resume"))
-    assert caught.value.code == "internal"
-    assert await stage.ended(toy) == 1
-    assert "Traceback" in stage.output(toy)
 
 
 async def test_all_heals_when_the_router_is_restarted(stage: Stage, bus: Bus) -> None:
@@ -279,11 +274,7 @@ async def test_router_ends_on_signals_and_with_its_supervisor(processes, domain:
     ("arguments", "reason"),
     [
         (["--domain", "233"], "--domain: '233' must be a whole number from 0 to 232"),
-        (["--cell", "pandaa"], "unknown cell 'pandaa' (did you mean 'panda'?)"),
-        (["--set", "services.toy.mood=1"], "services.toy.mood"),
         (["--set", "services.toy.mode=idle"], "services.toy.mode: 'idle' must be"),
-        (["--speed", "50"], "50 is not within 0.1 to 10"),
-        (["--connect", "nowhere"], "--connect: 'nowhere' must be an endpoint"),
         (["--sped", "5"], "unrecognized arguments: --sped 5"),
     ],
 )
@@ -295,15 +286,33 @@ async def test_bad_start_is_one_line_and_exit_code_2(stage: Stage, arguments: li
     assert len(output.splitlines()) == 1
 
 
-@pytest.mark.parametrize(("mode", "code"), [("crash", 1), ("bad_config", 2), ("end", 0)])
-async def test_exit_code_tells_how_run_ended(stage: Stage, bus: Bus, mode: str, code: int) -> None:
-    toy = stage.toy("--log-json", mode=mode)
-    assert await stage.ended(toy) == code
-    lines = [json.loads(line) for line in stage.output(toy).splitlines()]
-    assert {line["service"] for line in lines} == {"toy"}
-    crashes = [line["message"] for line in lines if "RuntimeError: the service has a bug" in line.get("traceback", "")]
-    assert crashes == (["crashed"] if mode == "crash" else [])
-    assert ("services.toy.mode: 'bad_config' cannot be used" in stage.output(toy)) == (mode == "bad_config")
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--cell", "pandaa"], "unknown cell 'pandaa' (did you mean 'panda'?)"),
+        (["--set", "services.toy.mood=1"], "services.toy.mood"),
+        (["--speed", "50"], "50 is not within 0.1 to 10"),
+        (["--connect", "nowhere"], "--connect: 'nowhere' must be an endpoint"),
+    ],
+)
+def test_what_a_service_can_not_start_with_is_one_line(arguments: list[str], reason: str) -> None:
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    options = parser.parse_args(["--cell", CELL, "--domain", "1", *arguments])
+    with pytest.raises(ZencellError) as caught:
+        prepare("toy", Config, options)
+    assert reason in str(caught.value) and "\n" not in str(caught.value)
+
+
+async def test_exit_code_tells_how_run_ended(stage: Stage, bus: Bus) -> None:
+    for mode, code in (("crash", 1), ("bad_config", 2), ("end", 0)):
+        toy = stage.toy("--log-json", mode=mode)
+        assert await stage.ended(toy) == code
+        lines = [json.loads(line) for line in stage.output(toy).splitlines()]
+        assert {line["service"] for line in lines} == {"toy"}
+        bugs = [line["message"] for line in lines if "RuntimeError: the service has a bug" in line.get("traceback", "")]
+        assert bugs == (["crashed"] if mode == "crash" else [])
+        assert ("services.toy.mode: 'bad_config' cannot be used" in stage.output(toy)) == (mode == "bad_config")
 
 
 async def test_second_router_names_the_process_that_holds_the_port(stage: Stage) -> None:
