@@ -191,14 +191,29 @@ class Operation:
         return 0 if self.summary.ready is not None else code
 
     async def _operate(self, work: Callable[[Bus], Awaitable[int]]) -> int:
-        """Exit code of the work, done in the cell. What is simulated stays as it is through restarts, until the end."""
-        from common.sim.standing import STATE_VARIABLE
+        """Exit code of the work, done in the cell.
 
-        if STATE_VARIABLE in os.environ:
+        What is simulated stays as it is through restarts, until the end; what persons decided outlives that.
+        """
+        from common.control.record_file import lasting_folder
+        from common.sim.standing import STANDING_VARIABLE, STATE_VARIABLE
+        from common.transport.endpoint import DEFAULT_DOMAIN
+
+        if os.environ.get(STATE_VARIABLE):
             return await self._in_cell(work)
+        kept = lasting_folder()
+        if self._simulated and not self.launch.connect and self.launch.domain != DEFAULT_DOMAIN:
+            kept /= f"domain-{self.launch.domain}"  # there may be many of a simulated robot
         with tempfile.TemporaryDirectory(prefix="zencell-") as folder:
-            self.launch = replace(self.launch, extra={**self.launch.extra, STATE_VARIABLE: folder})
+            extra = {**self.launch.extra, STATE_VARIABLE: str(kept), STANDING_VARIABLE: folder}
+            self.launch = replace(self.launch, extra=extra)
             return await self._in_cell(work)
+
+    @property
+    def _simulated(self) -> bool:
+        from common.hardware.loading import find_backend
+
+        return find_backend(self.cell.robot).simulated
 
     async def _in_cell(self, work: Callable[[Bus], Awaitable[int]]) -> int:
         from common.supervision.interrupts import Interrupts

@@ -6,6 +6,7 @@ With simulated hardware the true world lives here too, because whether a grasp s
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 
 import numpy as np
@@ -16,6 +17,8 @@ from common.application import find_application
 from common.config import Grasp, Members, Parameters, Reach, RobotConfig, Run, Tunable, World
 from common.control.checks import Tolerances
 from common.control.cycle import ControlCycle
+from common.control.inhibits import SOMEBODY, Inhibits, Speed, speed_of
+from common.control.record_file import RecordFile, record_file
 from common.control.requester import Alone, WhenAlone, objection
 from common.hardware.interface import Limits
 from common.hardware.loading import find_backend, load_hardware
@@ -67,7 +70,39 @@ class Config(Parameters):
     grasp_tolerances: GraspTolerances = Field(GraspTolerances(), description="simulated hardware only")
 
 
-def make_cycle(config: Config, simulated: bool, kept: Standing | None, now: float) -> ControlCycle:
+class Decisions:
+    """What persons decided, in memory and in its file."""
+
+    def __init__(self, file: RecordFile, log: logging.Logger) -> None:
+        """Begin with what the file says."""
+        self._file, self._log, self._writing = file, log, asyncio.Lock()
+        self._written, problem = file.load()
+        self.inhibits = Inhibits(self._written)
+        if problem:
+            log.error("%s; the robot counts as stopped: look at the cell, then `zencell task start`", problem)
+        for inhibit in self.inhibits.all:
+            log.warning("%s: `zencell task %s` lets it go", inhibit.told,
+                        "start" if inhibit.kind == "stopped" else "resume")
+
+    async def keep(self) -> str:
+        """What is wrong, once all that was decided so far is written; empty when it is."""
+        async with self._writing:
+            record = self.inhibits.record
+            if record == self._written:
+                return ""
+            try:
+                await asyncio.to_thread(self._file.save, record)
+            except OSError as error:
+                told = f"{self._file.path} cannot be written ({error.strerror}): this does not outlive the executor"
+                self._log.error("%s", told)
+                return told
+            self._written = record
+            return ""
+
+
+def make_cycle(
+    config: Config, simulated: bool, kept: Standing | None, now: float, inhibits: Inhibits | None = None
+) -> ControlCycle:
     """The controller with its hardware at the home pose and, when simulated, everything laid out.
 
     Simulated hardware is found as it was `kept`, if that was of the same world.
@@ -91,7 +126,7 @@ def make_cycle(config: Config, simulated: bool, kept: Standing | None, now: floa
     cycle = ControlCycle(
         load_hardware(config.robot, limits, start), limits, start,
         tolerances=config.tolerances, gripper=config.robot.gripper, controller=config.robot.controller,
-        kinematics=robot, world=world,
+        kinematics=robot, world=world, inhibits=inhibits,
     )
     if kept is not None:
         cycle.restore(kept, now)
@@ -128,11 +163,29 @@ async def run(bus: Bus, config: Config) -> None:
         return status.model_copy(update={"header": bus.header()})
 
     async def stop(request: StopRequest) -> MotionStatus:
-        return cycle.stop(request, bus.clock.now()).model_copy(update={"header": bus.header()})
+        if request.by == "person":
+            bus.log.info("stopped by %s: %s", request.owner or SOMEBODY, request.reason)
+        return await kept_answer(cycle.stop(request, bus.clock.now()))
 
     async def hold(request: HoldRequest) -> MotionStatus:
-        bus.log.info("held: %s" if request.hold else "let go: %s", request.reason or "asked to")
-        return cycle.hold(request).model_copy(update={"header": bus.header()})
+        status, let_go = cycle.hold(request)
+        who = (request.owner or SOMEBODY) if request.by == "person" else request.by
+        bus.log.info("held by %s: %s" if request.hold else "let go by %s: %s", who, request.reason or "asked to")
+        for inhibit in let_go:
+            if inhibit.by != who:
+                bus.log.warning("%s let go of what another said: %s", who, inhibit.told)
+        return await kept_answer(status)
+
+    async def kept_answer(status: MotionStatus) -> MotionStatus:
+        """The answer, which is given once what was decided outlives us."""
+        if problem := await decisions.keep():
+            status = status.model_copy(update={"message": f"{status.message}; {problem}".removeprefix("; ")})
+        return status.model_copy(update={"header": bus.header()})
+
+    async def keep_speed() -> None:
+        if config.speed_scaling != (inhibits.speed.scaling if inhibits.speed else configured):
+            inhibits.speed = Speed(scaling=config.speed_scaling, configured=configured)
+            await decisions.keep()
 
     async def command(request: GripperCommand) -> GripperState:
         return cycle.command(request, bus.clock.now()).model_copy(update={"header": bus.header()})
@@ -140,6 +193,16 @@ async def run(bus: Bus, config: Config) -> None:
     async def edit(request: WorldEdit) -> WorldEditReply:
         return cycle.edit(request, bus.clock.now())
 
+    file = record_file(bus.cell)
+    if not bus.declares_only:
+        file.require_writable()
+    decisions = Decisions(file, bus.log)
+    inhibits, configured = decisions.inhibits, config.speed_scaling
+    config.speed_scaling = speed_of(inhibits.speed, configured)
+    if config.speed_scaling != configured:
+        bus.log.warning("speed is at %.0f %%, as it was set while the cell ran: `zencell param set "
+                        "trajectory_executor.speed_scaling` changes it", 100 * config.speed_scaling)
+    bus.keep_parameters = keep_speed
     bus.serve(topics.MOTION_EXECUTE, execute)
     bus.serve(topics.MOTION_STOP, stop)
     bus.serve(topics.MOTION_HOLD, hold)
@@ -149,7 +212,7 @@ async def run(bus: Bus, config: Config) -> None:
         bus.serve(topics.WORLD_EDIT, edit)
     memory = state_file(bus.cell) if simulated else None
     kept = memory.load() if memory else None
-    cycle = await asyncio.to_thread(make_cycle, config, simulated, kept, bus.clock.now())
+    cycle = await asyncio.to_thread(make_cycle, config, simulated, kept, bus.clock.now(), inhibits)
     if kept is not None:
         bus.log.info("the arm and what is about it are as they were")
     alone, task = Alone(), config.members.task

@@ -1,4 +1,9 @@
+import os
+import shutil
 import signal
+import tempfile
+from itertools import count
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -13,9 +18,26 @@ settings.register_profile("thorough", deadline=None)
 settings.register_profile("quick", deadline=None, max_examples=25, derandomize=True, database=None)
 
 
+# What persons decide in a cell outlives every process, but not the test: no folder of one's own is ever touched.
+KEPT = Path(tempfile.gettempdir()) / f"zencell-tests-{os.getpid()}"
+_number = count()
+
+
+@pytest.fixture(autouse=True)
+def _kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(KEPT / str(next(_number))))
+    monkeypatch.delenv("ZENCELL_STATE", raising=False)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """`make test-all` looks for examples that nobody has tried."""
+    os.environ["XDG_STATE_HOME"] = str(KEPT / "shared")
     settings.load_profile("quick" if "not slow" in config.option.markexpr else "thorough")
+
+
+def pytest_unconfigure() -> None:
+    """Leave nothing behind."""
+    shutil.rmtree(KEPT, ignore_errors=True)
 
 
 LAST = "tests/common/"  # many short ones

@@ -83,10 +83,10 @@ def command_line(*arguments: str) -> list[str]:
     return [sys.executable, "-P", "-m", "cli.main", *arguments]
 
 
-def environment() -> dict[str, str]:
-    """An environment in which zencell is found and told nothing."""
+def environment(folder: Path | None = None) -> dict[str, str]:
+    """An environment in which zencell is found and told nothing; what persons decide is kept in the folder."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("ZENCELL_")}
-    return {**kept, "PYTHONPATH": str(ROOT)}
+    return {**kept, "PYTHONPATH": str(ROOT)} | ({"XDG_STATE_HOME": str(folder / "state")} if folder else {})
 
 
 def end_in_order() -> None:
@@ -119,8 +119,8 @@ class RunningCell:
         command = command_line(verb, cell, *arguments, "--domain", str(self.domain), "--summary", str(folder / SUMMARY))
         with (folder / LOG).open("wb") as log:
             self.process = subprocess.Popen(
-                command, cwd=folder, env={**environment(), **(secrets or {})}, stdin=subprocess.DEVNULL, stdout=log,
-                stderr=subprocess.STDOUT, start_new_session=True,
+                command, cwd=folder, env={**environment(folder), **(secrets or {})}, stdin=subprocess.DEVNULL,
+                stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
             )
 
     def __enter__(self) -> RunningCell:
@@ -185,7 +185,7 @@ class Zencell:
         self.lines: list[str] = []
         self._new: queue.Queue[str] = queue.Queue()
         self.process = subprocess.Popen(
-            command_line(*arguments, "--domain", str(domain)), cwd=folder, env=environment(),
+            command_line(*arguments, "--domain", str(domain)), cwd=folder, env=environment(folder),
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
         )
         self._reading = threading.Thread(target=self._read, daemon=True)

@@ -16,7 +16,7 @@ from common.control.goals import REMEMBERED, GoalMemory
 from common.control.trajectory import Trajectory, next_rate, way
 from common.errors import Refused
 from common.hardware.interface import Limits, Vector
-from common.messages import GoalState, Holder, JointTrajectory, MotionStatus
+from common.messages import GoalState, Holder, Inhibit, JointTrajectory, MotionStatus
 
 LARGEST_STEP = 0.1  # cell time [s]: after a stall of the loop a trajectory goes on where it was, instead of jumping
 BLEND_TIME = 0.3  # the difference between the robot's and the trajectory's start fades in this time [s]
@@ -76,6 +76,7 @@ class TrajectoryController:
         self._holds: dict[Holder, str] = {}  # the reasons, by who holds the robot
         self._status = MotionStatus()
         self.speed_scaling = 1.0
+        self.inhibits: list[Inhibit] = []  # that reports tell of
 
     @property
     def status(self) -> MotionStatus:
@@ -90,6 +91,7 @@ class TrajectoryController:
     def _as_of_now(self, status: MotionStatus) -> MotionStatus:
         now: dict[str, object] = {
             "held": bool(self._holds), "held_by": sorted(self._holds), "speed_scaling": self.speed_scaling,
+            "inhibits": self.inhibits,
         }
         if self._holds and status.state != "active" and not status.message:
             now["message"] = _told("held", self._holds.values())
@@ -157,6 +159,10 @@ class TrajectoryController:
         if self._goal is not None and not self._goal.stopping:
             return self._report("active", message=self._holding(self._goal))
         return self.status
+
+    def knows(self, goal: str) -> bool:
+        """Whether a goal was heard of."""
+        return self._memory.get(goal) is not None
 
     def _holding(self, goal: _Goal) -> str:
         """What there is to say of a goal about being held."""

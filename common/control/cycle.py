@@ -12,6 +12,7 @@ from common.config import GripperConfig
 from common.control.checks import Tolerances
 from common.control.controller import TrajectoryController
 from common.control.gripper_controller import GripperController
+from common.control.inhibits import Inhibits
 from common.errors import ConfigError, Refused
 from common.hardware.interface import Hardware, HardwareFault, Limits, SimulatedGripper, Vector
 from common.messages import (
@@ -20,6 +21,7 @@ from common.messages import (
     GripperState,
     Header,
     HoldRequest,
+    Inhibit,
     JointState,
     Message,
     MotionStatus,
@@ -69,8 +71,9 @@ class ControlCycle:
         controller: str = "controller",
         kinematics: Kinematics | None = None,
         world: SimulatedWorld | None = None,
+        inhibits: Inhibits | None = None,
     ) -> None:
-        """Control this hardware; `world` and `kinematics` with simulated hardware only.
+        """Control this hardware, unless `inhibits` keep it; `world` and `kinematics` with simulated hardware only.
 
         Raises:
             ConfigError: the backend's gripper cannot feel the simulated world, or it has none.
@@ -98,6 +101,8 @@ class ControlCycle:
         self._told_version = -1
         self._kept: object = None
         self._waits = False  # held by ourselves
+        self._inhibits = inhibits or Inhibits()
+        self._inhibit()
 
     def step(self, header: Header) -> Report:
         """Do one cycle at the header's time and say what is new."""
@@ -149,21 +154,52 @@ class ControlCycle:
 
     def execute(self, request: ExecuteRequest, now: float, objection: Refused | None = None) -> MotionStatus:
         """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
-        return self._arm.accept(request.id, request.trajectory, now, self._q, objection)
+        inhibited = self._inhibits.objection(request.id, request.owner, request.heard)
+        return self._arm.accept(request.id, request.trajectory, now, self._q, inhibited or objection)
 
     def stop(self, request: StopRequest, now: float) -> MotionStatus:
-        """The state of the goal, which is being brought to rest if it was moving the robot."""
-        return self._arm.cancel(request.id, request.reason, now)
+        """The state of the goal, which is being brought to rest if it was moving the robot.
 
-    def hold(self, request: HoldRequest) -> MotionStatus:
-        """The status, with the arm being brought to rest on its path, or going on; the fingers finish their motion."""
-        return self._arm.hold(request.hold, request.reason, request.by)
+        A person's stop keeps every other motion from beginning, until it is let go of.
+        """
+        running, known = self._arm.goal, not request.id or self._arm.knows(request.id)
+        if request.by == "person":
+            self._inhibits.stop(request)
+            if running:
+                self._arm.cancel(running, request.reason, now)
+        stopped = [goal for goal in (running if request.by == "person" or not request.id else "", request.id) if goal]
+        # One that runs must not come to life again should its request come once more after a restart.
+        self._inhibits.never(goal for goal in stopped if goal == running or not self._arm.knows(goal))
+        self._inhibit()
+        status = self._arm.cancel(request.id, request.reason, now)
+        if known:
+            return status
+        return status.model_copy(update={"message": f"{status.message}; it is refused if it comes"})
+
+    def hold(self, request: HoldRequest) -> tuple[MotionStatus, list[Inhibit]]:
+        """The status, and what was let go of.
+
+        The arm is being brought to rest on its path, or goes on when nobody holds it; the fingers finish their motion.
+        """
+        let_go = self._inhibits.hold(request)
+        if request.by != "person":
+            self._arm.hold(request.hold, request.reason, request.by)
+        self._inhibit()
+        return self._arm.status, let_go
 
     def wait(self, wait: bool, reason: str = "") -> None:
         """Bring the arm to rest on its path of our own accord, or let it go on."""
         if wait != self._waits:
             self._waits = wait
+            self._inhibits.hold_ourselves("controller", wait, reason)
             self._arm.hold(wait, reason, "controller")
+            self._inhibit()
+
+    def _inhibit(self) -> None:
+        """Have the arm held as persons say, and told of all who keep it."""
+        reasons = [hold.reason for hold in self._inhibits.holds]
+        self._arm.inhibits = self._inhibits.all
+        self._arm.hold(bool(reasons), "; ".join(filter(None, reasons)), "person")
 
     @property
     def goal(self) -> str:
@@ -187,7 +223,7 @@ class ControlCycle:
         """
         if self._gripper is None:
             raise Refused("no_gripper", "this robot has no gripper")
-        return self._gripper.command(request, now)
+        return self._gripper.command(request, now, self._inhibits.objection(request.id))
 
     def edit(self, request: WorldEdit, now: float) -> WorldEditReply:
         """What was changed in the simulated world.

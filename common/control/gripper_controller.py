@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from common.config import GripperConfig
 from common.control.goals import REMEMBERED, GoalMemory
+from common.errors import Refused
 from common.hardware.interface import Gripper, GripperReading
 from common.messages import GripperCommand, GripperState
 from common.robot.finger_joints import driven_position
@@ -22,20 +23,28 @@ class GripperController:
         self._target = 0.0
         self.state = GripperState(source=config.controller)
 
-    def command(self, request: GripperCommand, now: float) -> GripperState:
-        """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
+    def command(self, request: GripperCommand, now: float, objection: Refused | None = None) -> GripperState:
+        """The state of the goal: active, or rejected with the reason; for a known id what became of it.
+
+        Args:
+            request: for the fingers.
+            now: cell time [s].
+            objection: what speaks against a new goal from the start.
+        """
         known = self._memory.get(request.id)
         if known is not None:
             return known
         reading = self.state.model_dump(include={"width", "position", "effort", "holding", "moving", "source"})
-        message = ""
-        if request.width > self._config.max_width:
+        message, code = "", ""
+        if objection is not None:
+            message, code = str(objection), objection.code
+        elif request.width > self._config.max_width:
             message = f"width {request.width:g} m is more than the fingers open ({self._config.max_width:g} m)"
         elif request.effort > self._config.max_effort:
             message = f"effort {request.effort:g} N is more than the fingers have ({self._config.max_effort:g} N)"
         if message:
             rejected = GripperState.model_validate(
-                {**reading, "id": request.id, "state": "rejected", "message": message})
+                {**reading, "id": request.id, "state": "rejected", "error": code, "message": message})
             return self._memory.put(request.id, rejected)
         if self.state.state == "active":
             replaced = {"state": "cancelled", "message": f"replaced by {request.id!r}"}

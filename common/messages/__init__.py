@@ -17,6 +17,7 @@ from common.messages.execution import (
     GripperState,
     Holder,
     HoldRequest,
+    Inhibit,
     MotionStatus,
     StopRequest,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -11,6 +12,9 @@ from common.messages.robot import JointTrajectory
 
 GoalState = Literal["none", "rejected", "active", "succeeded", "aborted", "cancelled"]
 Holder = Literal["person", "watchdog", "controller"]
+Who = Annotated[str, Field(max_length=120)]
+Since = Annotated[int, Field(ge=0, lt=2**63)]
+MOST_INHIBITS = 32  # that are told of
 
 
 class ExecuteRequest(Message):
@@ -22,23 +26,56 @@ class ExecuteRequest(Message):
     header: Header = Header()
     id: Name
     trajectory: JointTrajectory
+    owner: Who = Field("", description="the person who asks for it, whom a stop of their own does not keep from moving "
+                                       "the robot; empty for a task")
+    heard: Since | None = Field(None, description="`since` of the newest inhibit that this person had heard of")
 
 
 class StopRequest(Message):
-    """Bring the robot to rest. An empty id stops whatever runs."""
+    """Bring the robot to rest. An empty id stops whatever runs.
+
+    By a person it stops whatever runs, whichever id it names, and no motion begins until one is asked for again: that
+    outlives every process. By the requester it ends its goal only. A goal that is named and comes later is refused.
+    """
 
     id: str = ""
     reason: str = "asked to"
+    by: Literal["person", "requester"] = "person"
+    owner: Who = Field("", description="name of the person")
 
 
 class HoldRequest(Message):
-    """Bring the robot to rest on its path and keep it there, or let it go on. The goal stays active meanwhile."""
+    """Bring the robot to rest on its path and keep it there, or let it go on. The goal stays active meanwhile.
+
+    A person's hold outlives every process. Who gave no name holds for everybody, and everybody lets go of that.
+    """
 
     hold: bool
     reason: str = ""
     by: Literal["person", "watchdog"] = Field(
         "person", description="each lets go only of its own hold; the robot moves when nobody holds it"
     )
+    owner: Who = Field("", description="name of the person: holds of others stay")
+    stops: bool = Field(False, description="lets go of stops too, whoever said so: a person starts the task")
+    override: bool = Field(False, description="lets go of all that any person said; is logged")
+    into_stop: bool = Field(False, description="the holds that it lets go of become stops of the same time: the person "
+                                               "moves the robot, and nobody else does")
+    heard: Since | None = Field(None, description="lets go of nothing later: `since` of the newest inhibit known")
+
+
+class Inhibit(Message):
+    """Why the robot does not move: it was stopped, and no motion begins, or is held on its path."""
+
+    kind: Literal["stopped", "held"]
+    by: Who = Field(description="name of a person; watchdog; controller")
+    reason: Annotated[str, Field(max_length=500)] = ""
+    since: Since = Field(description="when that was said last [ns since the Unix epoch], later than all before it")
+
+    @property
+    def told(self) -> str:
+        """In words, for a line."""
+        when = datetime.fromtimestamp(self.since * 1e-9, UTC)
+        return f"{self.kind} since {when:%Y-%m-%d %H:%M:%S} UTC by {self.by}{self.reason and f' ({self.reason})'}"
 
 
 class MotionStatus(Message):
@@ -54,6 +91,18 @@ class MotionStatus(Message):
     held: bool = Field(False, description="kept at rest on its path until let go; no new goal begins to move")
     held_by: list[Holder] = []
     speed_scaling: Fraction = Field(1.0, description="trajectories are followed at this share of their speed")
+    inhibits: Annotated[list[Inhibit], Field(max_length=MOST_INHIBITS)] = Field(
+        [], description="who stopped or holds the robot")
+
+    @property
+    def stopped(self) -> str:
+        """By whom and since when no motion begins, in words; empty when one may."""
+        return "; ".join(inhibit.told for inhibit in self.inhibits if inhibit.kind == "stopped")
+
+    @property
+    def newest(self) -> int:
+        """`since` of the newest inhibit; 0 when there is none."""
+        return max((inhibit.since for inhibit in self.inhibits), default=0)
 
     @property
     def paused(self) -> bool:
@@ -80,5 +129,6 @@ class GripperState(Message):
     moving: bool = False
     id: str = ""
     state: GoalState = "none"
+    error: Annotated[str, Field(max_length=120)] = Field("", description="code of a refusal, such as stopped")
     message: str = ""
     source: str = Field("", description="name of the gripper's controller")

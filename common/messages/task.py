@@ -8,12 +8,15 @@ from pydantic import Field
 
 from common.messages.basics import Finite, Header, Message
 from common.messages.camera import Rejection
+from common.messages.execution import Who
 
 
 class TaskCommand(Message):
-    """What a person may tell the task."""
+    """What a person may tell the task. Who gives no name has none of their own holds."""
 
     command: Literal["start", "pause", "resume", "stop"]
+    by: Who = Field("", description="name of the person")
+    override: bool = Field(False, description="start or resume although another person holds the robot; is logged")
 
 
 class PlanFigure(Message):

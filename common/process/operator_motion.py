@@ -28,6 +28,7 @@ REQUEST_TIMEOUT = 2.0  # [s] wall
 PATIENCE = 10.0  # [s] wall without progress, unless the robot is held
 FIRST_WORD = 0.5  # [s] wall in which a state that there is has arrived
 COME_TO_REST = 1.0  # [s] wall: for a motion that is being stopped
+SOMEBODY, OURSELVES = "person", ("watchdog", "controller")  # who gave no name; who lets go by itself
 AT_REST = ("IDLE", "DONE", "ERROR")  # states in which a task does not move the robot
 
 A = TypeVar("A", bound=m.Message)
@@ -48,13 +49,15 @@ class MotionFailed(ZencellError):
 class OperatorMotion:
     """Moves the robot for a person; any number of these may live in a cell, the executor follows one goal at a time."""
 
-    def __init__(self, bus: Bus, tasks: Sequence[Reader[Any]] | None = None) -> None:
+    def __init__(self, bus: Bus, tasks: Sequence[Reader[Any]] | None = None, owner: str = SOMEBODY) -> None:
         """Declare what is asked and heard.
 
         Args:
             bus: in the cell.
             tasks: readers of what the cell's tasks say of themselves (a `TaskStatus`); all that there may be if None.
+            owner: name of the person, whose own stops and holds, and nobody else's, do not keep the robot.
         """
+        self._owner = owner
         self._bus = bus
         self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
         self._stop, self._hold = bus.client(topics.MOTION_STOP), bus.client(topics.MOTION_HOLD)
@@ -94,18 +97,23 @@ class OperatorMotion:
             MotionFailed: a task has the robot, there is no way, or the motion ended otherwise.
             RequestFailed: planner or executor do not answer.
         """
-        await self._require_free()
+        before = await self._require_free()
         response = await self.plan(goal, planner=planner, straight=straight)
         if not response.ok or response.trajectory is None:
             raise MotionFailed(response.error, response.message)
-        return await self.follow(response.trajectory, timeout=timeout)
+        return await self._follow(response.trajectory, timeout, before.newest)
 
     async def follow(self, trajectory: m.JointTrajectory, *, timeout: float = PATIENCE) -> m.MotionStatus:
         """The last status of following a trajectory that was planned before; as `move` otherwise."""
-        held = (await self._require_free()).held
-        if held:  # with nothing under way, letting go moves nothing
-            await self._hold.call(m.HoldRequest(hold=False, reason="a person moves the robot"), REQUEST_TIMEOUT)
-        request = m.ExecuteRequest(header=self._bus.header(), id=_mint(), trajectory=trajectory)
+        return await self._follow(trajectory, timeout, (await self._require_free()).newest)
+
+    async def _follow(self, trajectory: m.JointTrajectory, timeout: float, heard: int) -> m.MotionStatus:
+        """As `follow`; what was said later than `heard`, when the motion was asked for, keeps the robot."""
+        if (await self._require_free()).held:  # with nothing under way, letting go moves nothing, nor does it later
+            await self._hold.call(m.HoldRequest(hold=False, reason="a person moves the robot", owner=self._owner,
+                                                into_stop=True, heard=heard), REQUEST_TIMEOUT)
+        request = m.ExecuteRequest(
+            header=self._bus.header(), id=_mint(), trajectory=trajectory, owner=self._owner, heard=heard)
         try:
             answer = await self._execute.call(request, REQUEST_TIMEOUT)
             if answer.state == "rejected":
@@ -120,6 +128,9 @@ class OperatorMotion:
         """The motion status, when nothing and nobody moves the robot."""
         status = await self._known()
         self._require_no_task()
+        for inhibit in status.inhibits:
+            if inhibit.by not in (self._owner, SOMEBODY, *OURSELVES):
+                raise MotionFailed(inhibit.kind, f"the robot is {inhibit.told}")
         try:
             async with asyncio.timeout(COME_TO_REST):
                 while status.state == "active":
@@ -169,7 +180,8 @@ class OperatorMotion:
 
     async def _bring_to_rest(self, goal: str) -> None:
         try:
-            await self._stop.call(m.StopRequest(id=goal, reason="the person who asked for it gave up"), REQUEST_TIMEOUT)
+            gave_up = m.StopRequest(id=goal, reason="the person who asked for it gave up", by="requester")
+            await self._stop.call(gave_up, REQUEST_TIMEOUT)
         except RequestFailed as error:
             log.warning("the robot may still move: %s", error)
 

@@ -9,7 +9,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from common import messages as m
 from common import topics
-from common.errors import RemoteError
+from common.errors import Refused, RemoteError
 from common.process.persist import persist
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
@@ -31,6 +31,9 @@ GOAL_TIMEOUT = 1.0  # [s] wall: for a goal to be accepted
 PLAN_OVERTIME = 5.0  # [s] wall: that a plan may take beyond its planning time
 LONGEST_STEP = LOOK_PERIOD  # [s] wall: time passes too
 WAITS = "the arm waits: "
+SOMEBODY = ("", "person", "watchdog", "controller")  # whose holds are nobody's own
+
+LETS_GO = "lets go"  # of what a person said
 
 C = TypeVar("C", bound=TaskConfig)
 S = TypeVar("S", bound=m.TaskStatus)
@@ -127,6 +130,9 @@ class TaskRunner(Generic[V]):
         self._woken = asyncio.Event()
         self._told: list[Command] = []
         self._asking: dict[str, asyncio.Task[None]] = {}  # the newest of each kind
+        self._keeping: set[asyncio.Task[None]] = set()  # a person's stops and holds that were not answered yet
+        self._ended: dict[int, asyncio.Event] = {}  # by the identity of a command: whether it was answered, or is void
+        self._newest = 0  # `since` of the newest inhibit that we were answered with
         self._before: m.TaskStatus | None = None
         bus.serve(topics.TASK_COMMAND, self._obey)
 
@@ -157,14 +163,41 @@ class TaskRunner(Generic[V]):
         return holds
 
     async def _obey(self, command: m.TaskCommand) -> m.TaskStatus:
-        self._bus.log.info("told to %s", command.command)
-        self._told += self._task.command(command.command, self._look())
+        self._bus.log.info("told to %s%s", command.command, f" by {command.by}" if command.by else "")
+        view = self._look()
+        _require_allowed(command, view.motion if view else None)
+        asked = self._task.command(command.command, view)
+        for request in asked:
+            if isinstance(request, m.HoldRequest | m.StopRequest) and request.by == "person":
+                request.owner = command.by
+            if isinstance(request, m.HoldRequest):
+                request.override = command.override and not request.hold
+        self._told += asked
         self._woken.set()
         now = self._task.status
+        if not await self._carried_out(asked):
+            now.message = "trajectory_executor has not answered yet"
         return m.TaskStatus(
             header=self._bus.header(), state=now.state, paused=now.paused, started=now.started, stage=now.stage,
             message=now.message,
         )
+
+    async def _carried_out(self, asked: list[Command]) -> bool:
+        """Whether that was answered, or could not be because nobody is there to answer."""
+        if not self._hold.available or not asked:
+            return True
+        events = {id(command): asyncio.Event() for command in asked}
+        self._ended |= events
+        try:
+            async with asyncio.timeout(GOAL_TIMEOUT):
+                for event in events.values():
+                    await event.wait()
+            return True
+        except TimeoutError:
+            return False
+        finally:
+            for number in events:
+                self._ended.pop(number, None)
 
     def _tell(self) -> None:
         """Publish the status when more of it has changed than the time."""
@@ -195,13 +228,27 @@ class TaskRunner(Generic[V]):
         """Send a command; what it makes void is not asked for again, should it still be without an answer."""
         if isinstance(command, m.ExecuteRequest):
             command.header = self._bus.header()  # of the decision, however often it is sent
-        void = self._asking.pop(_voided(command), None)
-        if void is not None:
-            void.cancel()
-        self._asking[_kind(command)] = group.create_task(self._do(command))
+        keeps = {keeping for keeping in self._keeping if not keeping.done()}
+        lets_go = isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold
+        for kind in _voided(command):
+            void = self._asking.pop(kind, None)
+            if void is not None:
+                void.cancel()
+        doing = self._asking[_kind(command)] = group.create_task(self._do(command, keeps if lets_go else set()))
+        if not lets_go and isinstance(command, m.HoldRequest | m.StopRequest) and command.by == "person":
+            self._keeping = {*keeps, doing}
 
-    async def _do(self, command: Command) -> None:
-        """Send what a command stands for; what is refused is an answer too."""
+    async def _do(self, command: Command, before: set[asyncio.Task[None]]) -> None:
+        """Send what a command stands for, after what was said before it; what is refused is an answer too."""
+        try:
+            if before:  # what lets go must not be overtaken by what it lets go of
+                await asyncio.wait(before)
+            await self._send(command)
+        finally:
+            if ended := self._ended.get(id(command)):
+                ended.set()
+
+    async def _send(self, command: Command) -> None:
         if isinstance(command, m.PlanRequest):
             seconds = self._planning_time() + PLAN_OVERTIME
             await self._ask(self._plan, command, seconds, self._planned, lambda error: m.PlanResponse(
@@ -213,11 +260,22 @@ class TaskRunner(Generic[V]):
             await self._ask(self._execute, command, GOAL_TIMEOUT, self._answered, lambda error: m.MotionStatus(
                 id=command.id, state="rejected", error=error.code, message=error.message))
         elif isinstance(command, m.HoldRequest):
-            await self._ask(self._hold, command, GOAL_TIMEOUT, lambda _: None, lambda error: m.MotionStatus(
+            if command.by == "person" and not command.hold:
+                command.heard = self._heard_of()
+            await self._ask(self._hold, command, GOAL_TIMEOUT, self._kept, lambda error: m.MotionStatus(
                 message=error.message))
         else:
-            await self._ask(self._stop, command, GOAL_TIMEOUT, lambda _: None, lambda error: m.MotionStatus(
+            await self._ask(self._stop, command, GOAL_TIMEOUT, self._kept, lambda error: m.MotionStatus(
                 message=error.message))
+
+    def _kept(self, answer: m.MotionStatus) -> None:
+        self._newest = max(self._newest, answer.newest)
+
+    def _heard_of(self) -> int | None:
+        """`since` of the newest inhibit that we know of; None when we know nothing of the robot."""
+        view = self._look()
+        motion = view.motion if view else None
+        return self._newest or None if motion is None else max(self._newest, motion.newest)
 
     async def _ask(
         self, client: Client[Q, A], request: Q, timeout: float, then: Callable[[A], None],
@@ -235,11 +293,34 @@ class TaskRunner(Generic[V]):
 
 def _kind(command: Command) -> str:
     """What a command is of which only the newest counts; a watchdog's hold is not a person's."""
+    if isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold:
+        return LETS_GO
     return f"{type(command).__name__} {command.by if isinstance(command, m.HoldRequest) else ''}"
 
 
-def _voided(command: Command) -> str:
-    """The kind of command that is void from now on: by a stop the motion before it, by a hold the one before it."""
+def _voided(command: Command) -> tuple[str, ...]:
+    """The kinds of command that are void from now on.
+
+    By a stop the motion before it, by a person's also what was to let go; by a hold the one before it.
+    """
     if isinstance(command, m.StopRequest):
-        return f"{m.ExecuteRequest.__name__} "
-    return _kind(command) if isinstance(command, m.HoldRequest) else ""
+        return f"{m.ExecuteRequest.__name__} ", *((LETS_GO,) if command.by == "person" else ())
+    if not isinstance(command, m.HoldRequest):
+        return ()
+    return _kind(command), *((LETS_GO,) if command.by == "person" else ())
+
+
+def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None) -> None:
+    """Return when a person may say that.
+
+    Raises:
+        Refused: another person holds the robot, or it was stopped and can only be started.
+    """
+    if motion is None or command.override or command.command not in ("start", "resume"):
+        return
+    others = [inhibit.told for inhibit in motion.inhibits
+              if inhibit.kind == "held" and inhibit.by not in (*SOMEBODY, command.by)]
+    if others:
+        raise Refused("held", f"the robot is {'; '.join(others)}: only they let go of it, or you with --override")
+    if command.command == "resume" and motion.stopped:
+        raise Refused("stopped", f"the robot is {motion.stopped}: start the task to go on")

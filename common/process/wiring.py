@@ -71,6 +71,8 @@ def require_one_owner(wirings: Mapping[str, Wiring]) -> None:
 class Recorder(Bus):
     """A bus on a network of its own that notes what is declared, and never gets past `ready`."""
 
+    declares_only = True
+
     def __init__(self, service: str = "recorded", topics: Mapping[str, str] | None = None) -> None:
         super().__init__(LocalNetwork().session(), service=service, cell="recorded", clock=Clock(), topics=topics)
         self.wiring = Wiring()

@@ -18,7 +18,8 @@ from pydantic import BaseModel, ConfigDict
 
 from common.sim.interface import StandingObject
 
-STATE_VARIABLE = "ZENCELL_STATE"  # folder for it; without one nothing is kept
+STATE_VARIABLE = "ZENCELL_STATE"  # folder for what is kept, this and what persons decided
+STANDING_VARIABLE = "ZENCELL_STANDING"  # folder for this alone; without both nothing is kept
 SLOT = 256 * 1024  # [bytes] for each of the two newest states
 _HEAD = struct.Struct("<QII")  # number of the state, its length and checksum
 
@@ -83,5 +84,5 @@ def state_file(cell: str, environ: Mapping[str, str] = os.environ) -> StateFile 
 
     Its name has that of the host: a container that is started again has the same one, a new one has not.
     """
-    folder = environ.get(STATE_VARIABLE)
+    folder = environ.get(STANDING_VARIABLE) or environ.get(STATE_VARIABLE)
     return StateFile(Path(folder) / f"{cell}-{socket.gethostname()}.state") if folder else None

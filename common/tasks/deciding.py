@@ -220,7 +220,7 @@ class Deciding(Generic[V]):
         self.row.clear()
         self._planning = None
 
-    def stop(self, view: V, reason: str) -> list[Command]:
+    def stop(self, view: V, reason: str, by: Literal["person", "requester"] = "requester") -> list[Command]:
         """Throw the row away and bring the arm to rest; fingers finish what they began."""
         self.clear()
         self.look_after = view.now
@@ -228,7 +228,7 @@ class Deciding(Generic[V]):
             return []
         running, self.running, self._stopping = self.running, None, True
         self.status.moving_seconds += running.moving
-        return [m.StopRequest(id=running.command.id, reason=reason)]
+        return [m.StopRequest(id=running.command.id, reason=reason, by=by)]
 
     def mint(self) -> str:
         """An id that nobody else has."""

@@ -17,7 +17,8 @@ from common import messages as m
 from common.tasks.deciding import Deciding, V
 from common.tasks.stages import Command, Execution, Grip, Look, Move, Report, Stage
 
-ANEW = ("busy", "stale_request", "clock_ahead")  # refusals of a motion that have nothing to do with the motion
+ANEW = ("busy", "stale_request", "clock_ahead", "stopped")  # refusals that have nothing to do with the motion
+START = ": start to go on"
 FOUND_HELD = "the robot was found held; resume or start to go on"
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 
@@ -46,9 +47,9 @@ class Task(Deciding[V]):
                 status.state, status.message = "IDLE", ""
                 self._began, self._failures_in_a_row = None, 0
                 self.began_anew()
-            return [m.HoldRequest(hold=False, reason=reason)]
+            return [m.HoldRequest(hold=False, reason=reason, stops=command == "start")]
         status.paused = status.started = False
-        return self.stop(view, reason) or [m.StopRequest(reason=reason)]
+        return self.stop(view, reason, "person") or [m.StopRequest(reason=reason)]
 
     # --- answers ---------------------------------------------------------------------------------------------
 
@@ -81,7 +82,7 @@ class Task(Deciding[V]):
             return
         stage, self.running = self.running.stage, None
         # What somebody else asked for, or that it came too late, is no failure: it is decided anew.
-        if isinstance(answer, m.MotionStatus) and answer.error in ANEW:
+        if answer.error in ANEW:
             self._decide_anew(f"{stage.name} has to wait: {answer.message}", view)
             return
         # A robot that is not where the plan began only needs a new plan.
@@ -100,13 +101,16 @@ class Task(Deciding[V]):
         if not self._found:
             self._found, status.paused = True, view.motion.paused
             if view.motion.paused:
-                status.message = FOUND_HELD
+                status.message = FOUND_HELD + "".join(f"; {one.told}" for one in view.motion.inhibits)
+            if view.motion.stopped:  # by a person, whom no restart makes a liar of
+                status.started = status.paused = False
+        self._tell_stopped(view.motion.stopped)
         if self._began is None and status.started:
             self._began = view.now
         commands = self._watch(view)
         self._stopping = self._stopping and view.motion.state == "active"
         waits = status.paused or view.motion.held or not status.started or status.state == "ERROR"
-        if waits or commands or self._stopping:
+        if waits or view.motion.stopped or commands or self._stopping:
             self._count(view)
             return commands
         while self.running is None and self.row and isinstance(self.row[0], Look):
@@ -126,6 +130,12 @@ class Task(Deciding[V]):
         if self.status.done > self._done_before:
             self._failures_in_a_row = 0
         self._done_before = self.status.done
+
+    def _tell_stopped(self, stopped: str) -> None:
+        if stopped and self.status.state not in ("DONE", "ERROR"):
+            self.status.message = stopped + START
+        elif self.status.message.endswith(START):
+            self.status.message = ""
 
     def _watch(self, view: V) -> list[Command]:
         """Follow the stage that runs: its end, its failure, and what falls out of the hand."""
@@ -162,6 +172,9 @@ class Task(Deciding[V]):
         holds = stage.holds if isinstance(stage, Grip) else None
         if reported.state == "cancelled" and isinstance(stage, Move):
             self.clear()
+            if view.motion is not None and view.motion.stopped:  # by a person who did not reach us
+                self.status.started = False
+                return
             self.status.paused = True
             self.status.message = f"{stage.name} was stopped from outside ({reported.message}); resume to go on"
         elif reported.state == "cancelled":  # somebody else told the fingers something: no failure either

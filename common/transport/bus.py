@@ -39,11 +39,16 @@ _SETTLE_SECONDS = 0.05  # after which a session knows about what it has just rep
 _END_SECONDS = 1.0  # for a cancelled service to end
 
 
+async def _keep_nothing() -> None:
+    """Return at once."""
+
+
 class Bus:
     """A service's place in its cell. Made on a running loop and used on it; writers may put from any thread."""
 
     make_reader: type[Reader[Any]] = Reader  # a simulation has its own, which look on
     make_client: type[Client[Any, Any]] = Client
+    declares_only = False  # whether a service is only to say what it reads and writes, and to do nothing
 
     def __init__(
         self, session: Session, *, service: str, cell: str, clock: Clock, limit: int = DEFAULT_LIMIT,
@@ -79,6 +84,7 @@ class Bus:
         self._watches: dict[str, TokenWatch] = {}
         self._heard: dict[Reader[Any], Declared] = {}  # readers that are subscribed
         self._retuned: list[Callable[[], None]] = []
+        self.keep_parameters: Callable[[], Awaitable[None]] = _keep_nothing  # before a change of them is answered
         self._alive: Alive | None = None
         self._counters: Writer[ServiceCounters] | None = None
         self._beat: asyncio.TimerHandle | None = None

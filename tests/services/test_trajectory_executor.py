@@ -19,6 +19,7 @@ from common.messages import (
     HoldRequest,
     JointTrajectory,
     JointTrajectoryPoint,
+    ParameterRequest,
     StopRequest,
     Vector3,
     WorldEdit,
@@ -29,7 +30,7 @@ from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.scene.workspace import reach_reason
-from common.sim.standing import STATE_VARIABLE
+from common.sim.standing import STANDING_VARIABLE, STATE_VARIABLE
 from common.transport.local import LocalNetwork
 from services import trajectory_executor
 from services.trajectory_executor import Config
@@ -205,11 +206,71 @@ async def test_held_arm_stands_still_whoever_asked_for_it_and_goes_on_when_let_g
         assert (await person.see(person.motion, lambda m: m.state != "active")).state == "succeeded"
 
 
-async def test_restarted_executor_holds_nothing() -> None:
+async def test_restarted_executor_holds_what_a_person_held_and_not_what_a_watchdog_did() -> None:
     async with executor() as person:
-        assert (await person.hold.call(HoldRequest(hold=True))).held
+        await person.hold.call(HoldRequest(hold=True, by="watchdog"))
+        assert (await person.hold.call(HoldRequest(hold=True, owner="anna"))).held
     async with executor() as person:
-        assert not (await person.see(person.motion, lambda m: True)).held
+        found = await person.see(person.motion, lambda m: True)
+        assert found.held_by == ["person"] and [hold.by for hold in found.inhibits] == ["anna"]
+        assert (await person.hold.call(HoldRequest(hold=False, owner="bert"))).held
+        assert not (await person.hold.call(HoldRequest(hold=False, owner="anna"))).held
+    async with executor() as person:
+        assert not (await person.see(person.motion, lambda m: True)).inhibits
+
+
+async def test_stopped_arm_and_fingers_stay_so_through_restarts_until_somebody_starts_them(robot: RobotModel) -> None:
+    home = robot.named("home")
+    there = move(robot, home, home + 0.2)
+    async with executor() as person:
+        stop = StopRequest(owner="anna", reason="smoke")
+        assert (await person.stop.call(stop)).stopped.endswith("UTC by anna (smoke)")
+    async with executor() as person:
+        refused = await person.execute.call(person.asks(id="a", trajectory=there))
+        assert (refused.state, refused.error) == ("rejected", "stopped") and "by anna (smoke)" in refused.message
+        fingers = await person.command.call(GripperCommand(id="g", width=0.02))
+        assert (fingers.state, fingers.error) == ("rejected", "stopped")
+        await person.hold.call(HoldRequest(hold=False, owner="bert", stops=True))
+        assert (await person.execute.call(person.asks(id="a", trajectory=there))).state == "rejected", "as before"
+        assert (await person.follow("b", there)).state == "succeeded"
+        assert (await person.grip("h", 0.02)).state == "succeeded"
+
+
+async def test_goal_that_is_stopped_before_it_comes_never_moves_also_after_a_restart(robot: RobotModel) -> None:
+    home = robot.named("home")
+    there = move(robot, home, home + 0.2)
+    async with executor() as person:
+        early = await person.stop.call(StopRequest(id="a", by="requester"))
+        assert early.error == "unknown_goal" and "refused if it comes" in early.message and not early.inhibits
+        await person.execute.call(person.asks(id="b", trajectory=move(robot, home, home + 0.5, 0.02)))
+        await person.see(person.motion, lambda m: m.progress > 0.1)
+        await person.stop.call(StopRequest(id="b", by="requester"))
+    async with executor() as person:
+        for goal in ("a", "b"):
+            refused = await person.execute.call(person.asks(id=goal, trajectory=there))
+            assert (refused.state, refused.error) == ("rejected", "stopped")
+        assert (await person.follow("c", there)).state == "succeeded"
+
+
+async def test_speed_that_was_set_live_is_found_again(robot: RobotModel) -> None:
+    path = "services.trajectory_executor.speed_scaling"
+    for set_to, found in ((0.05, 1.0), (1.0, 0.05), (None, 1.0)):
+        async with executor() as person:
+            assert (await person.see(person.motion, lambda m: True)).speed_scaling == found
+            if set_to is not None:
+                client = person.bus.client(topics.parameters_of("trajectory_executor"))
+                await client.call(ParameterRequest(set={path: set_to}, by="anna"))
+
+
+async def test_executor_that_cannot_keep_what_persons_decide_does_not_start(
+    tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv(STATE_VARIABLE, str(tmp_path / "file"))
+    monkeypatch.setenv(STANDING_VARIABLE, str(tmp_path))
+    with pytest.raises(ConfigError, match=r"ZENCELL_STATE: .* cannot be written"):
+        async with executor():
+            pass
 
 
 async def test_speed_scaling_that_is_set_while_it_moves_slows_the_arm_down(robot: RobotModel) -> None:

@@ -153,6 +153,33 @@ async def test_robot_that_is_held_with_nothing_to_do_is_let_go_first(cell: Cell,
     assert not cell.status.held
 
 
+def said(kind: str, by: str, since: int) -> m.Inhibit:
+    return m.Inhibit.model_validate({"kind": kind, "by": by, "since": since})
+
+
+@pytest.mark.parametrize("kind", ["held", "stopped"])
+async def test_robot_that_another_person_holds_or_stopped_is_left_alone(cell: Cell, kind: str) -> None:
+    cell.say(held=kind == "held", inhibits=[said(kind, "anna", 7)])
+    with pytest.raises(MotionFailed, match=rf"the robot is {kind} since .* by anna"):
+        await OperatorMotion(cell.bus, owner="bert").move(HOME)
+    assert cell.asked == []
+
+
+async def test_what_is_said_while_a_motion_is_planned_is_not_known_to_who_asked_for_it_before(cell: Cell) -> None:
+    cell.say(held=True, inhibits=[said("held", "anna", 7)])
+    answer = cell.plan
+
+    async def stopped(request: m.PlanRequest) -> m.PlanResponse:
+        cell.say(held=True, inhibits=[said("held", "anna", 7), said("stopped", "anna", 8)])
+        return await answer(request)
+
+    next(s for s in cell.bus._servers if s.topic is topics.MOTION_PLAN)._handler = stopped
+    await OperatorMotion(cell.bus, owner="anna").move(HOME)
+    _, hold, execute = cell.asked
+    assert isinstance(hold, m.HoldRequest) and (hold.owner, hold.into_stop, hold.heard) == ("anna", True, 7)
+    assert isinstance(execute, m.ExecuteRequest) and (execute.owner, execute.heard) == ("anna", 7)
+
+
 async def test_motion_of_somebody_else_is_not_touched(
     cell: Cell, person: OperatorMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,164 @@
+"""What a person decided about motion: stops, holds, goals that must never move, and the speed. No clock, no file.
+
+Those of persons are part of a record, which outlives this process; what the watchdog and the controller hold is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from common.errors import Refused
+from common.messages import HoldRequest, Inhibit, StopRequest
+from common.sources import wall_ns
+
+SOMEBODY = "person"  # who gave no name: everybody lets go of that hold
+OTHERS = "others"  # share one entry when there are too many
+MOST = 16  # entries of persons
+MOST_REASON = 300  # characters
+MOST_GOALS = 200  # ids of goals that were stopped
+SLOWEST = 0.05  # share of the speed when nobody knows what it was set to
+STOPPED = "stopped"
+
+
+class Speed(BaseModel):
+    """The share of their speed at which trajectories are followed, as it was set while the cell ran."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    scaling: float = Field(ge=0, le=1)
+    configured: float | None = Field(None, ge=0, le=1)  # that it was set instead of
+
+
+class Record(BaseModel):
+    """What outlives the process."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    version: Literal[1] = 1
+    inhibits: list[Inhibit] = []
+    goals: list[str] = []
+    speed: Speed | None = None
+    newest: int = 0  # `since` of the newest inhibit there ever was
+
+
+class Inhibits:
+    """Says whether the robot may move, and remembers who said that it may not."""
+
+    def __init__(self, record: Record | None = None, now: Callable[[], int] = wall_ns) -> None:
+        """Begin with what was recorded; `now` is the time since the Unix epoch [ns]."""
+        record = record or Record()
+        self._persons = {(inhibit.kind, inhibit.by): inhibit for inhibit in record.inhibits}
+        self._own: dict[str, Inhibit] = {}  # watchdog and controller
+        self._goals = dict.fromkeys(record.goals)
+        self._newest = record.newest
+        self._now = now
+        self.speed = record.speed
+
+    @property
+    def record(self) -> Record:
+        """What has to outlive the process."""
+        return Record(inhibits=[*self._persons.values()], goals=[*self._goals], speed=self.speed, newest=self._newest)
+
+    @property
+    def all(self) -> list[Inhibit]:
+        """All that keeps the robot from moving."""
+        return [*self._persons.values(), *self._own.values()]
+
+    @property
+    def holds(self) -> list[Inhibit]:
+        """What persons hold."""
+        return [inhibit for inhibit in self._persons.values() if inhibit.kind == "held"]
+
+    @property
+    def stops(self) -> list[Inhibit]:
+        """What persons stopped."""
+        return [inhibit for inhibit in self._persons.values() if inhibit.kind == "stopped"]
+
+    def stop(self, request: StopRequest) -> None:
+        """Take note that a person stopped the robot."""
+        self._put("stopped", request.owner, request.reason)
+
+    def hold(self, request: HoldRequest) -> list[Inhibit]:
+        """Take note that somebody holds the robot, or what that request lets go of: of none that is another's."""
+        if request.by != "person":
+            self.hold_ourselves(request.by, request.hold, request.reason)
+            return []
+        if request.hold:
+            self._put("held", request.owner, request.reason)
+            return []
+        let_go = [inhibit for inhibit in self._persons.values() if _lets_go(request, inhibit)]
+        for inhibit in let_go:
+            del self._persons[inhibit.kind, inhibit.by]
+            if request.into_stop and ("stopped", inhibit.by) not in self._persons:
+                self._persons["stopped", inhibit.by] = inhibit.model_copy(update={"kind": "stopped"})
+        return let_go
+
+    def hold_ourselves(self, holder: str, hold: bool, reason: str) -> None:
+        """Take note that watchdog or controller holds the robot or lets it go."""
+        if hold:
+            self._own[holder] = self._made("held", holder, reason)
+        else:
+            self._own.pop(holder, None)
+
+    def never(self, goals: Iterable[str]) -> None:
+        """Remember goals that must not move the robot any more, should they come, or come again."""
+        for goal in goals:
+            self._goals.pop(goal, None)
+            self._goals[goal] = None
+        while len(self._goals) > MOST_GOALS:
+            del self._goals[next(iter(self._goals))]
+
+    def objection(self, goal: str, owner: str = "", heard: int | None = None) -> Refused | None:
+        """What speaks against a motion of arm or fingers, or None.
+
+        Args:
+            goal: its id.
+            owner: the person who asks for it. The stops of this person, and of nobody else, do not speak against it
+                when they were heard of before it was asked for.
+            heard: `since` of the newest inhibit that this person had heard of.
+        """
+        if goal in self._goals:
+            return Refused(STOPPED, f"goal {goal!r} was stopped before")
+        passes = (owner, SOMEBODY) if owner and heard is not None else ()
+        stops = [stop for stop in self.stops if stop.by not in passes or stop.since > (heard or 0)]
+        return Refused(STOPPED, "; ".join(stop.told for stop in stops)) if stops else None
+
+    def _put(self, kind: Literal["stopped", "held"], owner: str, reason: str) -> None:
+        by = owner or SOMEBODY
+        if (kind, by) not in self._persons and len(self._persons) >= MOST:
+            by = OTHERS
+        self._persons[kind, by] = self._made(kind, by, reason)
+
+    def _made(self, kind: Literal["stopped", "held"], by: str, reason: str) -> Inhibit:
+        self._newest = max(self._newest + 1, self._now())
+        return Inhibit(kind=kind, by=by, reason=reason[:MOST_REASON], since=self._newest)
+
+
+def _lets_go(request: HoldRequest, inhibit: Inhibit) -> bool:
+    if request.heard is not None and inhibit.since > request.heard:
+        return False  # was said after that request was decided
+    if request.override:
+        return True
+    if inhibit.kind == "stopped":
+        return request.stops
+    return inhibit.by in (request.owner, SOMEBODY)
+
+
+def speed_of(kept: Speed | None, configured: float) -> float:
+    """The share at which trajectories are followed: the kept one, unless another one was configured since.
+
+    Then it is the slower of the two.
+    """
+    if kept is None:
+        return configured
+    return kept.scaling if kept.configured == configured else min(kept.scaling, configured)
+
+
+def damaged(why: str) -> Record:
+    """A record in the place of one that cannot be read: stopped, and slow."""
+    reason = f"what persons decided cannot be read: {why}. Look at the cell before you start it"
+    stop = Inhibit(kind="stopped", by="trajectory_executor", reason=reason[:MOST_REASON], since=wall_ns())
+    return Record(inhibits=[stop], speed=Speed(scaling=SLOWEST), newest=stop.since)

@@ -1,0 +1,93 @@
+"""The file in which what persons decided outlives the executor, the supervisor and the machine."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from common.control.inhibits import Record, damaged
+from common.errors import ConfigError
+from common.sim.standing import STATE_VARIABLE
+
+LARGEST = 1_000_000  # [bytes]
+
+
+def lasting_folder(environ: Mapping[str, str] = os.environ) -> Path:
+    """The folder for what is kept: ZENCELL_STATE, else one in the person's home.
+
+    Raises:
+        ConfigError: there is no home.
+    """
+    if told := environ.get(STATE_VARIABLE):
+        return Path(told)
+    try:
+        return Path(environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "zencell"
+    except RuntimeError:
+        raise ConfigError(STATE_VARIABLE, ..., "must name a folder to keep stops in: this user has no home") from None
+
+
+class RecordFile:
+    """A record that is always whole: a new file takes the place of the old one."""
+
+    def __init__(self, path: Path) -> None:
+        """Use this file, which need not be there yet."""
+        self.path = path
+        self._new = path.with_name(f"{path.name}.new")
+
+    def require_writable(self) -> None:
+        """Return when the file can be written.
+
+        Raises:
+            ConfigError: it cannot.
+        """
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(self._new, os.O_WRONLY | os.O_CREAT, 0o600)
+            os.close(descriptor)
+        except OSError as error:
+            told = f"cannot be written ({error.strerror}): stops and holds would not outlive a restart"
+            raise ConfigError(STATE_VARIABLE, str(self.path.parent), told) from None
+
+    def load(self) -> tuple[Record, str]:
+        """The record, and what is wrong with the file: then the record is one that keeps the robot from moving."""
+        try:
+            with self.path.open("rb") as file:
+                return Record.model_validate_json(file.read(LARGEST)), ""
+        except FileNotFoundError:
+            return Record(), ""
+        except (OSError, ValidationError) as error:
+            why = error.strerror if isinstance(error, OSError) else "it is damaged, or of another version"
+            return damaged(f"{self.path}: {why}"), f"{self.path} cannot be read: {why}"
+
+    def save(self, record: Record) -> None:
+        """Write a record so that it is there, or the one before it, whatever happens to the machine.
+
+        Raises:
+            OSError: it could not be written.
+        """
+        descriptor = os.open(self._new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        try:
+            text = record.model_dump_json(indent=1).encode()
+            while text:
+                text = text[os.write(descriptor, text):]
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        self._new.replace(self.path)
+        folder = os.open(self.path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def record_file(cell: str, environ: Mapping[str, str] = os.environ) -> RecordFile:
+    """The file of a cell: of the same name wherever its executor runs.
+
+    Raises:
+        ConfigError: there is no home to keep it in.
+    """
+    return RecordFile(lasting_folder(environ) / f"{cell}.inhibits.json")

@@ -1,0 +1,177 @@
+"""What a person decided: who lets go of what, what outlives the process, and a record that nobody can read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.control.inhibits import MOST, MOST_GOALS, SLOWEST, Inhibits, Record, Speed, speed_of
+from common.control.record_file import RecordFile, lasting_folder, record_file
+from common.errors import ConfigError
+from common.messages import HoldRequest, StopRequest
+
+T0 = 1_700_000_000_000_000_000
+
+
+def at(*times: int) -> Callable[[], int]:
+    left = list(times)
+    return lambda: left.pop(0) if len(left) > 1 else left[0]
+
+
+def made(record: Record | None = None) -> Inhibits:
+    return Inhibits(record, at(T0))
+
+
+def held(inhibits: Inhibits) -> list[str]:
+    return sorted(hold.by for hold in inhibits.holds)
+
+
+def test_a_hold_is_let_go_by_its_owner_only_and_one_without_a_name_by_everybody() -> None:
+    inhibits = made()
+    for owner in ("anna", "bert", ""):
+        inhibits.hold(HoldRequest(hold=True, owner=owner, reason="lunch"))
+    assert held(inhibits) == ["anna", "bert", "person"]
+    assert [gone.by for gone in inhibits.hold(HoldRequest(hold=False, owner="bert"))] == ["bert", "person"]
+    inhibits.hold(HoldRequest(hold=False))
+    inhibits.hold(HoldRequest(hold=False, owner="bert", stops=True))
+    assert held(inhibits) == ["anna"]
+    assert [gone.by for gone in inhibits.hold(HoldRequest(hold=False, owner="bert", override=True))] == ["anna"]
+    assert inhibits.all == []
+
+
+def test_a_stop_is_let_go_by_a_start_of_anybody_and_not_by_a_resume_of_its_owner() -> None:
+    inhibits = made()
+    inhibits.stop(StopRequest(owner="anna", reason="fire"))
+    inhibits.hold(HoldRequest(hold=False, owner="anna"))
+    refused = inhibits.objection("a")
+    assert refused is not None and refused.code == "stopped"
+    assert str(refused) == "stopped since 2023-11-14 22:13:20 UTC by anna (fire)"
+    inhibits.hold(HoldRequest(hold=False, owner="bert", stops=True))
+    assert inhibits.objection("a") is None
+
+
+def test_what_was_decided_before_a_stop_neither_lets_go_of_it_nor_moves() -> None:
+    inhibits = made()
+    inhibits.stop(StopRequest(owner="anna"))
+    heard = inhibits.stops[0].since
+    assert inhibits.objection("go there", "anna", heard) is None, "who stopped it moves it, knowing that"
+    assert inhibits.objection("go there", "bert", heard) and inhibits.objection("go there", "", heard)
+    inhibits.stop(StopRequest(owner="anna"))
+    inhibits.hold(HoldRequest(hold=False, stops=True, override=True, heard=heard))
+    assert inhibits.objection("go there", "anna", heard) and inhibits.objection("go there", "anna")
+    inhibits.hold(HoldRequest(hold=False, stops=True, heard=inhibits.stops[0].since))
+    assert inhibits.objection("task") is None
+
+
+def test_hold_that_its_owner_turns_into_a_stop_still_keeps_everybody_else() -> None:
+    inhibits = made()
+    inhibits.hold(HoldRequest(hold=True, owner="anna"))
+    since = inhibits.holds[0].since
+    inhibits.hold(HoldRequest(hold=False, owner="anna", into_stop=True, heard=since))
+    assert not inhibits.holds and inhibits.objection("task")
+    assert inhibits.objection("go there", "anna", since) is None
+
+
+@given(times=st.lists(st.integers(0, 2 * T0), min_size=2, max_size=8))
+def test_a_later_word_has_a_later_time_whatever_the_clock_does_also_after_a_restart(times: list[int]) -> None:
+    inhibits, seen = Inhibits(None, at(*times)), []
+    for number in range(len(times)):
+        inhibits.stop(StopRequest(owner=f"{number % 3}"))
+        seen.append(max(stop.since for stop in inhibits.stops))
+        inhibits.hold(HoldRequest(hold=False, stops=True))
+        inhibits = Inhibits(Record.model_validate_json(inhibits.record.model_dump_json()), at(*times[number:]))
+    assert seen == sorted(set(seen))
+
+
+def test_holds_of_watchdog_and_controller_are_no_part_of_the_record() -> None:
+    inhibits = made()
+    inhibits.hold(HoldRequest(hold=True, by="watchdog", reason="no joint states"))
+    inhibits.hold_ourselves("controller", True, "the task is gone")
+    inhibits.hold(HoldRequest(hold=True, owner="watchdog"))
+    assert [one.by for one in inhibits.all] == ["watchdog", "watchdog", "controller"]
+    assert [one.by for one in made(inhibits.record).all] == ["watchdog"]
+    inhibits.hold(HoldRequest(hold=False, by="watchdog"))
+    assert held(inhibits) == ["watchdog"], "a person who calls himself so"
+
+
+def test_goals_that_were_stopped_never_move_and_are_not_remembered_without_end() -> None:
+    inhibits = made()
+    inhibits.never(str(number) for number in range(MOST_GOALS + 5))
+    again = made(inhibits.record)
+    assert again.objection("5") and again.objection(str(MOST_GOALS + 4)) and not again.objection("4")
+
+
+def test_so_many_persons_that_they_share_an_entry_still_hold_the_robot() -> None:
+    inhibits = made()
+    for number in range(MOST + 9):
+        inhibits.hold(HoldRequest(hold=True, owner=f"{number}", reason="x" * 1000))
+    assert len(inhibits.all) == MOST + 1
+    for number in range(MOST + 9):
+        inhibits.hold(HoldRequest(hold=False, owner=f"{number}"))
+    assert held(inhibits) == ["others"]
+    assert inhibits.hold(HoldRequest(hold=False, override=True)) and not inhibits.all
+
+
+@pytest.mark.parametrize(("kept", "configured", "now"), [
+    (None, 0.5, 0.5), (Speed(scaling=0.05, configured=1.0), 1.0, 0.05), (Speed(scaling=1.0, configured=0.2), 0.2, 1.0),
+    (Speed(scaling=1.0, configured=1.0), 0.2, 0.2), (Speed(scaling=0.05, configured=1.0), 0.2, 0.05),
+])
+def test_speed_that_was_set_is_kept_and_the_slower_when_another_was_configured_since(
+    kept: Speed | None, configured: float, now: float
+) -> None:
+    assert speed_of(kept, configured) == now
+
+
+# --- the file ---
+
+
+def test_what_was_saved_is_found_again(tmp_path: Path) -> None:
+    inhibits = made()
+    inhibits.stop(StopRequest(owner="anna", reason="fire"))
+    inhibits.never(["a"])
+    inhibits.speed = Speed(scaling=0.05, configured=1.0)
+    file = record_file("panda", {"ZENCELL_STATE": str(tmp_path / "new" / "folder")})
+    file.require_writable()
+    assert file.load() == (Record(), "")
+    file.save(inhibits.record)
+    assert file.load() == (inhibits.record, "")
+
+
+def test_save_that_is_cut_off_anywhere_leaves_the_record_before_it(tmp_path: Path) -> None:
+    file, inhibits = RecordFile(tmp_path / "r"), made()
+    inhibits.stop(StopRequest(owner="anna"))
+    file.save(inhibits.record)
+    for size in (0, 10, 200):
+        (tmp_path / "r.new").write_bytes((tmp_path / "r").read_bytes()[:size])
+        assert file.load() == (inhibits.record, "")
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff" * 99, b'{"version": 2}', b'{"version": 1, "inhibits": [{}]}'])
+def test_record_that_cannot_be_read_counts_as_stopped_and_slow(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "r"
+    path.write_bytes(content)
+    record, problem = RecordFile(path).load()
+    assert problem.startswith(f"{path} cannot be read: ")
+    inhibits = Inhibits(record)
+    refused = inhibits.objection("a")
+    assert refused is not None and str(path) in str(refused) and speed_of(inhibits.speed, 1.0) == SLOWEST
+    inhibits.hold(HoldRequest(hold=False, stops=True))
+    assert inhibits.objection("a") is None
+
+
+def test_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(ConfigError, match=r"^ZENCELL_STATE: '.*' cannot be written \(.*\): stops") as caught:
+            RecordFile(folder / "r").require_writable()
+        assert "\n" not in str(caught.value)
+
+
+def test_the_folder_is_the_one_that_was_named_or_one_that_lasts() -> None:
+    assert lasting_folder({"ZENCELL_STATE": "/data", "XDG_STATE_HOME": "/x"}) == Path("/data")
+    assert lasting_folder({"ZENCELL_STATE": "", "XDG_STATE_HOME": "/x"}) == Path("/x/zencell")
+    assert lasting_folder({}) == Path.home() / ".local" / "state" / "zencell"
