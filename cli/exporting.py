@@ -9,7 +9,7 @@ import typer
 
 from cli.recording import Exclude, File, in_bytes, require_new
 from common.errors import ConfigError
-from common.terminal import echo
+from common.terminal import echo, printable
 
 if TYPE_CHECKING:
     from common.recording.decoding import Decoder
@@ -58,7 +58,7 @@ def export(
         if video:
             _video(recording, Path(video), selection, decoder)
     for topic, count in sorted(decoder.skipped.items()):
-        echo(f"{topic}: {count} messages left out, which are none that this version knows", err=True)
+        echo(f"{printable(topic)}: {count} messages left out, which are none that this version knows", err=True)
 
 
 def _require_video(path: Path) -> None:
@@ -92,12 +92,14 @@ def _tables(recording: Recording, folder: Path, selection: Selection, decoder: D
 
 
 def _images(recording: Recording, folder: Path, selection: Selection, decoder: Decoder) -> None:
+    from common.recording.names import file_names
     from common.recording.pictures import export_images, image_topics
 
     if not image_topics(recording, selection.wants):
         raise ConfigError("--images", str(recording.path), "has no pictures among what is to be exported")
+    names = file_names(image_topics(recording, selection.wants))
     for topic, count in export_images(recording, folder, selection.wants, decoder).items():
-        echo(f"{folder / topic.replace('/', '_')}: {count:,} pictures")
+        echo(f"{folder / names[topic]}: {count:,} pictures")
 
 
 def _video(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:

@@ -58,8 +58,8 @@ class Player:
         self._to_picture = False
         self._jumped = False
         self._changed = asyncio.Event()
-        run = recording.metadata("run")
-        self._speed, self._epoch = float(run.get("speed") or 1.0), int(run.get("epoch") or 0)
+        run = recording.run
+        self._speed, self._epoch = run.speed, run.epoch
 
     @property
     def position(self) -> float:
@@ -144,8 +144,9 @@ class Player:
 
     def _publish(self, sample: Sample) -> None:
         payload = restamp(sample.payload, self._present) if self._stamp_now else sample.payload
-        self._writers[sample.topic].put(payload, sample.trace)
-        self.published += 1
+        if writer := self._writers.get(sample.topic):  # the index of a file may leave one out
+            writer.put(payload, sample.trace)
+            self.published += 1
 
     def _present(self, stamp: int) -> int:
         """The stamp [ns] that belongs to a recorded one: from cell time to wall time, and from then to now."""

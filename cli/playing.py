@@ -120,12 +120,19 @@ def _played(recording: Recording, selection: Selection) -> Topics:
 
     Raises:
         ConfigError: one is not in the recording, or there is none.
+        RecordingError: one is no key.
     """
+    from common.recording.sample import RecordingError
+    from common.remapping import is_key
+
     every = recording.topics()
     for key in selection.keys:
         if "*" not in key and key not in every:
             raise ConfigError("KEY", key, f"is not in {recording.path}; choices: {', '.join(sorted(every)) or 'none'}")
     wanted = {topic: what for topic, what in every.items() if selection.wants(topic)}
+    for topic in wanted:
+        if not is_key(topic):
+            raise RecordingError(f"{recording.path}: has messages of {topic[:60]!r}, which is no key to publish under")
     if not wanted:
         raise ConfigError(str(recording.path), ..., "has no message that is to be played")
     return wanted

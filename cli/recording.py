@@ -14,7 +14,7 @@ import typer
 
 from cli import completion, options
 from common.errors import ConfigError
-from common.terminal import echo
+from common.terminal import echo, printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 NAME = "recorder"
 SHOW_PERIOD = 0.5  # [s]
+MOST_SHOWN = 200  # [characters] of what a recording tells
 LEAST_FILE = 1.0  # [MB] of a recording that is split
 
 File = Annotated[str, typer.Argument(metavar="FILE.mcap", help="a recording")]
@@ -271,17 +272,19 @@ def info(file: File, as_json: options.Json = False) -> None:
         echo(json.dumps(summary.as_dict()))
         return
     when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(summary.start * 1e-9)) if summary.messages else "never"
-    echo(f"{file}: {summary.about.get('cell', '')}, {summary.seconds:.1f} s from {when}, "
+    echo(f"{file}: {recording.cell}, {summary.seconds:.1f} s from {when}, "
                f"{summary.messages:,} messages, {in_bytes(summary.size)}")
     if summary.run:
-        echo("  " + ", ".join(f"{key} {value}" for key, value in summary.run.items() if value and key != "epoch"))
+        told = {key: printable(value)[:MOST_SHOWN] for key, value in summary.run.items() if value and key != "epoch"}
+        echo("  " + ", ".join(f"{printable(key)} {value}" for key, value in told.items()))
     if not summary.finished:
         echo(f"  not finished: the recorder was killed or still records. Make it whole: zencell recover {file}")
     echo(f"{'topic':<30} {'type':<16} {'messages':>9} {'Hz':>8} {'payload':>10}")
     for name, topic in summary.topics.items():
         rate = f"{topic.hz:8.2f}" if topic.messages > 1 else " " * 8
         lost = f"  {topic.dropped + topic.missed} lost" if topic.dropped + topic.missed else ""
-        echo(f"{name:<30} {topic.type:<16} {topic.messages:>9,} {rate} {in_bytes(topic.bytes):>10}{lost}")
+        named = f"{printable(name):<30} {printable(topic.type):<16}"
+        echo(f"{named} {topic.messages:>9,} {rate} {in_bytes(topic.bytes):>10}{lost}")
 
 
 def recover(

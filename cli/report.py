@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import re
 import time
+import warnings
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from cli.recording import File
-from common.errors import ConfigError, ZencellError
+from common.errors import ConfigError, UnknownName, ZencellError
 from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.application import Application
     from common.config import Cell
     from common.messages import JointState
-    from common.recording.reading import Recording
+    from common.recording.reading import Recording, Run
     from common.reporting.gathering import Gathering
     from common.robot.model import RobotModel
 
+# An override that a recording tells and that is taken: numbers or one word, which names no file and no module.
+HARMLESS = re.compile(r"[\w.]{1,100}=([A-Za-z_]\w{0,60}|[-+0-9.eE, \[\]]{1,100})", re.ASCII)
+CANNOT_BE_SHOWN = (ArithmeticError, ValueError, LookupError, TypeError)  # what numbers that no run has lead to
 TOOL_PERIOD = 0.05  # [s] between places of the tool that are shown
 
 
@@ -32,6 +38,7 @@ def report(
 ) -> None:
     """Write one page about a recorded run: timeline, plans, latency, joints, what was seen, and what went wrong."""
     from common.recording.reading import Recording
+    from common.recording.sample import RecordingError
 
     path = Path(file)
     page_path = Path(output).expanduser() if output else path.with_suffix(".html")
@@ -40,7 +47,11 @@ def report(
     if not page_path.absolute().parent.is_dir():
         raise ConfigError("--output", output, "cannot be written: the folder does not exist")
     with Recording(path) as recording:
-        text = page_of(recording, cell)
+        try:
+            with warnings.catch_warnings(action="ignore"):  # of numbers that no picture can show
+                text = page_of(recording, cell)
+        except CANNOT_BE_SHOWN as error:
+            raise RecordingError(f"{path}: has values that cannot be shown: {type(error).__name__}: {error}") from error
         if not recording.finished:
             echo(f"zencell: {_cut(recording)}", err=True)
     try:
@@ -59,20 +70,19 @@ def page_of(recording: Recording, cell: str | None = None) -> str:
     """
     from common.recording.decoding import Decoder
     from common.recording.sample import RecordingError
-    from common.recording.writing import ABOUT, ENDED, RUN
+    from common.recording.writing import ABOUT
     from common.reporting.fold import Fold
     from common.reporting.gathering import Gathering
     from common.reporting.page import Report, page
 
-    about, run = recording.metadata(ABOUT), recording.metadata(RUN)
+    about, run = recording.metadata(ABOUT), recording.run
     notes: list[str] = []
     resolved = _cell_of(recording, cell, run, notes)
     robot = _robot_of(resolved, notes)
-    speed, epoch = float(run.get("speed") or 1.0), int(run.get("epoch") or 0)
     gathered = Gathering()
     fold = Fold(
         recording.cell, _application_of(recording, resolved), robot=resolved.robot if resolved and robot else None,
-        seed=int(run.get("seed") or 0), speed=speed, gathering=gathered,
+        seed=run.seed or 0, speed=run.speed, gathering=gathered,
         containers=list(resolved.world.containers) if resolved else (),
     )
     wanted = {topic.key: topic for topic in fold.topics}
@@ -80,8 +90,8 @@ def page_of(recording: Recording, cell: str | None = None) -> str:
     for sample in recording.samples(lambda topic: topic in wanted):
         message = decoder.message(sample)
         if isinstance(message, wanted[sample.topic].message):
-            since = epoch or sample.log_time
-            now_ns = since + round((sample.log_time - since) * speed)
+            since = run.epoch or sample.log_time
+            now_ns = since + round((sample.log_time - since) * run.speed)
             fold.on(sample.topic, message, (sample.log_time - recording.start) * 1e-9, now_ns)
     if not (fold.status or gathered.joint_states or gathered.services):
         raise RecordingError(f"{recording.path}: says nothing about a run; "
@@ -93,11 +103,7 @@ def page_of(recording: Recording, cell: str | None = None) -> str:
         notes.append("Not understood: " + ", ".join(f"{n} x {topic}" for topic, n in decoder.skipped.items()))
     fold.summary.restarts = {name: service.restarts for name, service in gathered.services.items() if service.restarts}
     names = robot.joint_names if robot else _arm_joints(gathered)
-    ended = recording.metadata(ENDED)
-    lost: dict[str, int] = {}
-    for kind in ("dropped", "missed"):
-        for key, count in (ended.get(kind) or {}).items():
-            lost[key.partition("/")[2]] = lost.get(key.partition("/")[2], 0) + count
+    lost = dict(Counter(recording.lost("dropped")) + Counter(recording.lost("missed")))
     return page(Report(
         recording.path.name, _facts(recording, about, run), fold.summary.as_dict(), gathered, _limits(robot),
         list(names), fold.figures, _tool(gathered, robot), notes, lost,
@@ -117,20 +123,28 @@ def _cut(recording: Recording) -> str:
             "of it that others can read")
 
 
-def _cell_of(recording: Recording, given: str | None, run: dict[str, Any], notes: list[str]) -> Cell | None:
-    """The cell that was recorded, as far as its files are here."""
-    from common.config import load_cell
+def _cell_of(recording: Recording, given: str | None, run: Run, notes: list[str]) -> Cell | None:
+    """The cell that was recorded, as far as its files are here: none is read that only the recording names."""
+    from common.config import load_cell, names_of
 
     if given is not None:
         return load_cell(given)
-    world, overrides = run.get("world") or None, tuple(run.get("overrides") or ())
+    first: object = None
+    if run.world and run.world not in names_of("worlds"):
+        first = f"no file is read that a recording names, as world {run.world!r}"
+    elif foreign := next((text for text in run.overrides if not HARMLESS.fullmatch(text)), None):
+        first = f"no file is read that a recording names, as {foreign!r} may do"
+    elif recording.cell in names_of("cells"):
+        try:
+            return load_cell(recording.cell, run.overrides, world=run.world or None)
+        except ZencellError as error:
+            first = error
     try:
-        return load_cell(recording.cell, overrides, world=world)
-    except ZencellError as error:
-        first = error
-    try:
+        if recording.cell not in names_of("cells"):
+            raise UnknownName("cell", recording.cell, names_of("cells"))
         found = load_cell(recording.cell)
-    except ZencellError:
+    except ZencellError as error:
+        first = first or error
         notes.append(f"Limits and the way of the tool are not shown, since the cell is not here ({first}); "
                      "name it with --cell.")
         return None
@@ -178,14 +192,14 @@ def _tool(run: Gathering, robot: RobotModel | None) -> Any:
     return np.array(places).reshape(-1, 3)
 
 
-def _facts(recording: Recording, about: dict[str, Any], run: dict[str, Any]) -> dict[str, str]:
+def _facts(recording: Recording, about: dict[str, Any], run: Run) -> dict[str, str]:
     when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(recording.start * 1e-9))
-    facts = {"recorded": f"{when}, {recording.seconds:.1f} s", "seed": str(run.get("seed", "not told")),
-             "speed": f"{float(run.get('speed') or 1.0):g}"}
-    if run.get("world"):
-        facts["world"] = str(run["world"])
-    if run.get("overrides"):
-        facts["set"] = ", ".join(str(text) for text in run["overrides"])
+    facts = {"recorded": f"{when}, {recording.seconds:.1f} s", "speed": f"{run.speed:g}",
+             "seed": "not told" if run.seed is None else str(run.seed)}
+    if run.world:
+        facts["world"] = run.world
+    if run.overrides:
+        facts["set"] = ", ".join(run.overrides)
     versions = about.get("versions")
     if isinstance(versions, dict) and "zencell" in versions:
         facts["zencell"] = str(versions["zencell"])

@@ -19,6 +19,11 @@ _KEY = re.compile(r"[^\s/*$?#|]+(/[^\s/*$?#|]+)*")
 _BEGINNING = re.compile(r"([^\s/*$?#|]+/?)*\*")
 
 
+def is_key(text: str) -> bool:
+    """Whether a text is one key, without the cell, and stands for no others."""
+    return _KEY.fullmatch(text) is not None and text.isprintable() and ".." not in text.split("/")
+
+
 class Remapping:
     """The keys of one service in its cell. Unknown to it are the keys that the service has: see `unused`."""
 

@@ -34,9 +34,9 @@ class Decoder:
     def message(self, sample: Sample) -> Message | None:
         """The message that a sample holds, or None for one that cannot be told."""
         known = self._own.get(sample.message) or message_class(sample.message)
-        model = known or (_told(sample.message) if sample.schema else None)
-        if model is not None:
+        if known is not None or sample.schema:
             try:
+                model = known or _told(sample.message)
                 values = msgpack.unpackb(sample.payload, raw=False, strict_map_key=True)
                 # A field that the class has no more does not make the rest of an old recording worthless.
                 return model.model_validate(values, extra="ignore" if known else "allow")

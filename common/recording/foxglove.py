@@ -17,6 +17,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from common.application import applications
+from common.errors import ZencellError
 from common.messages import (
     CameraInfo,
     Image,
@@ -41,6 +42,7 @@ from common.recording.writing import AppendedFile
 JPEG_QUALITY = 90
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "critical": 5}
 FLOAT32, UINT8 = 7, 1
+CANNOT_BE_CONVERTED = (ZencellError, ArithmeticError, ValueError, LookupError, TypeError, cv2.error)
 CHUNK_BYTES = 1024 * 1024
 
 
@@ -63,7 +65,11 @@ def export(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) 
             message = decoder.message(sample)
             if message is None:
                 continue
-            name, value = convert(message)
+            try:
+                name, value = convert(message)
+            except CANNOT_BE_CONVERTED:
+                decoder.skipped[sample.topic] += 1
+                continue
             if name not in schemas:
                 text = json.dumps(SCHEMAS[name]).encode() if name in SCHEMAS else sample.schema or schema_of(name)
                 schemas[name] = writer.register_schema(name, "jsonschema", text)

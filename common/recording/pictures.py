@@ -15,6 +15,7 @@ import numpy.typing as npt
 from common.messages import Image
 from common.perception.image import ImageError, image_to_array
 from common.recording.decoding import Decoder
+from common.recording.names import file_names
 from common.recording.reading import Recording, Wanted
 from common.recording.sample import RecordingError
 
@@ -38,13 +39,14 @@ def export_images(recording: Recording, folder: Path, wants: Wanted, decoder: De
         RecordingError: the recording is damaged, or a file cannot be written.
     """
     topics = set(image_topics(recording, wants))
+    names = file_names(sorted(topics))
     counts: Counter[str] = Counter()
     for sample in recording.samples(lambda topic: topic in topics):
         pixels = _pixels(decoder.message(sample))
         if pixels is None:
             decoder.skipped[sample.topic] += 1
             continue
-        place = folder / sample.topic.replace("/", "_")
+        place = folder / names[sample.topic]
         place.mkdir(parents=True, exist_ok=True)
         counts[sample.topic] += 1
         path = place / f"{counts[sample.topic]:06d}_{sample.publish_time}.png"
@@ -58,7 +60,9 @@ def _pixels(message: Any) -> npt.NDArray[Any] | None:
         return None
     try:
         pixels = image_to_array(message)
-    except ImageError:
+    except (ImageError, ValueError, MemoryError):
+        return None
+    if not pixels.size:
         return None
     if message.encoding == "rgb8":
         return np.ascontiguousarray(pixels[:, :, ::-1])

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
+from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -13,9 +16,23 @@ from mcap.records import Channel, Message, Schema
 
 from common.recording.layout import DAMAGE, ChunkPlace, Layout, layout_of, records_of
 from common.recording.sample import RecordingError, Sample
-from common.recording.writing import ABOUT, TRACES_SCHEMA
+from common.recording.writing import ABOUT, ENDED, RUN, TRACES_SCHEMA
 
 Wanted = Callable[[str], bool]  # is given a topic: the key without the cell
+CELL_NAME = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
+MOST_SPEED = 1000.0
+MOST_TEXT = 1000  # [characters] of a value, or values of a list
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a recording tells of the run that it is of."""
+
+    speed: float  # cell seconds per wall second
+    epoch: int  # wall time at which cell time began [ns]; 0 where it is not told
+    seed: int | None
+    world: str  # that was given for the run; empty for that of the cell
+    overrides: tuple[str, ...]
 
 
 def _all(_topic: str) -> bool:
@@ -87,8 +104,55 @@ class Recording:
 
     @property
     def cell(self) -> str:
-        """Name of the cell, empty for a file that does not say."""
-        return str(self.metadata(ABOUT).get("cell", ""))
+        """Name of the cell, empty for a file that does not say.
+
+        Raises:
+            RecordingError: it is none.
+        """
+        found = self.metadata(ABOUT).get("cell", "")
+        if not found or (isinstance(found, str) and CELL_NAME.fullmatch(found)):
+            return str(found)
+        raise self._wrong("cell", found, "the name of a cell")
+
+    @property
+    def run(self) -> Run:
+        """What is told of the run.
+
+        Raises:
+            RecordingError: it cannot be so.
+        """
+        told = self.metadata(RUN)
+        speed, epoch, seed = told.get("speed") or 1.0, told.get("epoch") or 0, told.get("seed")
+        if not isinstance(speed, int | float) or not 0 < speed <= MOST_SPEED:
+            raise self._wrong("speed", speed, f"more than 0 and at most {MOST_SPEED:g}")
+        if not isinstance(epoch, int) or not 0 <= epoch < 2**63:
+            raise self._wrong("epoch", epoch, "a time in ns")
+        if seed is not None and not (isinstance(seed, int) and abs(seed) < 2**64):
+            raise self._wrong("seed", seed, "a whole number")
+        world, overrides = told.get("world") or "", told.get("overrides") or []
+        if not isinstance(world, str) or len(world) > MOST_TEXT:
+            raise self._wrong("world", world, "the name of a world")
+        short = isinstance(overrides, list) and len(overrides) <= MOST_TEXT
+        if not short or not all(isinstance(text, str) and len(text) <= MOST_TEXT for text in overrides):
+            raise self._wrong("overrides", overrides, "a list of PATH=VALUE")
+        return Run(float(speed), epoch, seed, world, tuple(overrides))
+
+    def lost(self, how: str) -> dict[str, int]:
+        """Messages that are not in it, by topic: those that the recorder `dropped`, or `missed` on the way to it.
+
+        Raises:
+            RecordingError: that is not what it tells.
+        """
+        told = self.metadata(ENDED).get(how) or {}
+        if not isinstance(told, dict) or not all(isinstance(n, int) and 0 <= n < 2**63 for n in told.values()):
+            raise self._wrong(how, told, "numbers of messages by key")
+        counts: Counter[str] = Counter()
+        for key, count in told.items():
+            counts[_topic(key)] += count
+        return dict(counts)
+
+    def _wrong(self, what: str, value: object, right: str) -> RecordingError:
+        return RecordingError(f"{self.path}: tells a {what} of {repr(value)[:60]}, which is not {right}")
 
     def topics(self) -> dict[str, tuple[str, str]]:
         """Message class and kind of each topic that has messages; reads all of a recording that is not finished.
@@ -99,6 +163,8 @@ class Recording:
         if not self.finished or not all(place.channels for place in self.layout.chunks):
             return {sample.topic: (sample.message, sample.kind) for sample in self.samples()}
         used = sorted(set().union(*(place.channels for place in self.layout.chunks)))
+        if not self._channels.keys() >= set(used):
+            raise RecordingError(f"{self.path}: has messages of channels that it does not describe")
         found = [(self._channels[i], self._name(i)) for i in used if self._name(i) != TRACES_SCHEMA]
         return {_topic(channel.topic): (name, channel.metadata.get("kind", "stream")) for channel, name in found}
 
@@ -192,9 +258,12 @@ def _topic(key: str) -> str:
 def _value(text: str) -> Any:
     try:
         return json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return text
 
 
 def _traces(data: bytes) -> dict[tuple[int, int], str]:
-    return {(channel, sequence): trace for channel, sequence, trace in msgpack.unpackb(data)["traces"]}
+    try:
+        return {(channel, sequence): str(trace) for channel, sequence, trace in msgpack.unpackb(data)["traces"]}
+    except (ValueError, TypeError, LookupError, msgpack.UnpackException, RecursionError):
+        return {}  # they tell where messages came from, which are there without them

@@ -56,7 +56,10 @@ def restamp(payload: bytes, moved: Callable[[int], int]) -> bytes:
         if isinstance(header, dict) and isinstance(header.get("stamp"), int) and header["stamp"]:
             header["stamp"] = max(0, moved(header["stamp"]))
             changed = True
-    packed: bytes = msgpack.packb(value, use_bin_type=True) if changed else payload
+    try:
+        packed: bytes = msgpack.packb(value, use_bin_type=True) if changed else payload
+    except (ValueError, OverflowError):  # a stamp that no clock shows
+        return payload
     return packed
 
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from common.recording.reading import Recording
-from common.recording.writing import ABOUT, ENDED, RUN
+from common.recording.writing import ABOUT, RUN
 
 
 @dataclass
@@ -70,10 +70,8 @@ def summarise(recording: Recording) -> Summary:
         topic.bytes += len(sample.payload)
         topic.last = sample.log_time
         topic.writers.add(sample.writer)
-    ended = recording.metadata(ENDED)
     for field_name in ("dropped", "missed"):
-        for key, count in (ended.get(field_name) or {}).items():
-            name = key.partition("/")[2]
+        for name, count in recording.lost(field_name).items():
             setattr(topics.setdefault(name, TopicSummary("", "")), field_name, count)
     return Summary(
         str(recording.path), recording.layout.size, recording.finished, recording.start, recording.seconds,

@@ -10,9 +10,12 @@ from typing import Any
 
 from common.messages import Image, JointState, Message, PointCloud2
 from common.recording.decoding import Decoder
+from common.recording.names import file_names
 from common.recording.reading import Recording, Wanted
+from common.recording.sample import RecordingError
 
 NOT_TABLES = (Image, PointCloud2)
+MOST_COLUMNS = 5000  # of a table
 OTHER_NAMES = ("Image", "PointCloud2")
 
 
@@ -28,15 +31,18 @@ def export(recording: Recording, folder: Path, wants: Wanted, decoder: Decoder) 
     folder.mkdir(parents=True, exist_ok=True)
     topics = [topic for topic, (name, _) in recording.topics().items() if name not in OTHER_NAMES and wants(topic)]
     counts: dict[str, int] = {}
-    for topic in sorted(topics):
+    names = file_names(sorted(topics))
+    for topic, name in names.items():
         # Twice over the topic: the columns are known only when every row was seen.
         columns: dict[str, None] = {}
         for row in _rows(recording, topic, Decoder()):
             columns |= dict.fromkeys(row)
+            if len(columns) > MOST_COLUMNS:
+                raise RecordingError(f"{recording.path}: {topic} has more than {MOST_COLUMNS:,} columns")
         if not columns:
             decoder.skipped[topic] += 1
             continue
-        path = folder / f"{topic.replace('/', '_')}.csv"
+        path = folder / f"{name}.csv"
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(columns))
             writer.writeheader()
@@ -64,7 +70,7 @@ def row_of(message: Message) -> dict[str, Any]:
         columns = {"position": message.position, "velocity": message.velocity, "effort": message.effort}
         return {
             f"{name}.{quantity}": values[i]
-            for quantity, values in columns.items() if values for i, name in enumerate(message.name)
+            for quantity, values in columns.items() if values for i, name in enumerate(message.name[: len(values)])
         }
     return _flat("", message.model_dump(mode="json"))
 

@@ -13,6 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from common.reporting import figures
 from common.reporting.application import Figures
 from common.reporting.gathering import MOST_LINES, Gathering
+from common.terminal import printable
 
 Array = npt.NDArray[np.float64]
 
@@ -58,7 +59,7 @@ def page(report: Report) -> str:
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template("page.html").render(
+    text = environment.get_template("page.html").render(
         vars(report), facts=report.application.facts(report.summary), most_lines=MOST_LINES,
         timeline=figures.timeline(run, report.application.STATE_COLORS),
         picture=report.application.picture(run, report.tool),
@@ -73,6 +74,7 @@ def page(report: Report) -> str:
         problems=_problems(run), services=_services(run), lost={k: n for k, n in report.lost.items() if n},
         log=[(event.time, event.level, event.what, event.note) for event in run.log],
     )
+    return printable(text, keep="\n\t")
 
 
 def _plans(plans: list[dict[str, Any]], trajectories: list[tuple[float, float]]) -> list[Row]:
