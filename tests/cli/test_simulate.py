@@ -32,7 +32,7 @@ def test_campaign_with_faults_tells_what_was_made_and_checked(capfd):
 
 
 def test_campaign_that_does_not_end_names_each_seed_and_fails(capfd):
-    code = app.execute(["simulate", *SMALL, "--seeds", "4-5", "--limit", "8"])
+    code = app.execute(["simulate", *SMALL, "--seeds", "4-5", "--limit", "3"])
     told = capfd.readouterr().out
     assert code == 1
     assert "seed 4" in told and "seed 5" in told and "NOT ENDED" in told

@@ -40,18 +40,14 @@ def test_panda_clears_the_table_without_any_time_passing():
 @pytest.mark.parametrize(("cell", "overrides"), [
     ("panda", ["world.count=1"]), pytest.param("ur5", [], marks=pytest.mark.slow),
 ])
-def test_same_seed_is_the_same_run_to_the_byte_in_any_process(cell, overrides):
+def test_same_seed_is_the_same_run_to_the_byte_in_any_process_and_another_is_not(cell, overrides):
     here = Simulation(load_cell(cell, overrides), 3, digest=True).run()
     assert here.messages > 1000
     assert digest_in_another_process(7, cell, "3", *overrides) == here.digest
-
-
-def test_another_seed_is_another_run():
-    cell = load_cell("panda", ["world.count=1"])
-    digests = {Simulation(cell, seed, digest=True).run().digest for seed in (1, 2)}
-    assert len(digests) == 2
+    other = Simulation(load_cell(cell, overrides), 4, digest=True).run()
+    assert other.digest != here.digest, "another seed is another run"
 
 
 def test_task_that_does_not_end_is_told_with_its_state():
-    outcome = Simulation(load_cell("panda", ["autostart=false", "world.count=1"]), 1, limit=12.0).run()
+    outcome = Simulation(load_cell("panda", ["autostart=false", "world.count=1"]), 1, limit=6.0).run()
     assert outcome.state == "NOT ENDED" and "IDLE" in outcome.message
