@@ -16,6 +16,7 @@ from common import topics
 from common.application import find_application
 from common.config import Grasp, Members, Parameters, Reach, RobotConfig, Run, Tunable, World
 from common.control.checks import Tolerances
+from common.control.controller import PERIOD
 from common.control.cycle import ControlCycle
 from common.control.inhibits import SOMEBODY, Inhibits, Speed, speed_of
 from common.control.record_file import RecordFile, record_file
@@ -101,16 +102,18 @@ class Decisions:
 
 
 def make_cycle(
-    config: Config, simulated: bool, kept: Standing | None, now: float, inhibits: Inhibits | None = None
+    config: Config, simulated: bool, kept: Standing | None, now: float, inhibits: Inhibits | None = None,
+    period: float = PERIOD,
 ) -> ControlCycle:
     """The controller with its hardware at the home pose and, when simulated, everything laid out.
 
-    Simulated hardware is found as it was `kept`, if that was of the same world.
+    Its cycles come every `period` of cell time [s]. Simulated hardware is found as it was `kept`, if that was of the
+    same world.
     """
     robot = RobotModel.load(config.robot)
     deceleration = np.array(config.robot.deceleration_limits) if config.robot.deceleration_limits else None
     limits = Limits(
-        tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration, deceleration
+        tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration, deceleration, robot.jerk
     )
     start = robot.named("home")
     world = None
@@ -126,7 +129,7 @@ def make_cycle(
     cycle = ControlCycle(
         load_hardware(config.robot, limits, start), limits, start,
         tolerances=config.tolerances, gripper=config.robot.gripper, controller=config.robot.controller,
-        kinematics=robot, world=world, inhibits=inhibits,
+        kinematics=robot, world=world, inhibits=inhibits, period=period,
     )
     if kept is not None:
         cycle.restore(kept, now)
@@ -212,12 +215,14 @@ async def run(bus: Bus, config: Config) -> None:
         bus.serve(topics.WORLD_EDIT, edit)
     memory = state_file(bus.cell) if simulated else None
     kept = memory.load() if memory else None
-    cycle = await asyncio.to_thread(make_cycle, config, simulated, kept, bus.clock.now(), inhibits)
+    period = 1 / bus.clock.wall_rate(config.joint_state_rate, MOST_CYCLES)
+    cycle = await asyncio.to_thread(
+        make_cycle, config, simulated, kept, bus.clock.now(), inhibits, period * bus.clock.speed
+    )
     if kept is not None:
         bus.log.info("the arm and what is about it are as they were")
     alone, task = Alone(), config.members.task
     loop = asyncio.get_running_loop()
-    period = 1 / bus.clock.wall_rate(config.joint_state_rate, MOST_CYCLES)
     try:
         await bus.ready()
         due = loop.time()

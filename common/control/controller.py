@@ -6,56 +6,119 @@ robot is held its goal stays active, at rest on its path; one that comes meanwhi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from common.control.checks import Tolerances, checked_trajectory
 from common.control.goals import REMEMBERED, GoalMemory
-from common.control.trajectory import Trajectory, next_rate, way
+from common.control.limiter import SLACK, Limiter
+from common.control.trajectory import Pace, Trajectory
 from common.errors import Refused
 from common.hardware.interface import Limits, Vector
 from common.messages import GoalState, Holder, Inhibit, JointTrajectory, MotionStatus
 
-LARGEST_STEP = 0.1  # cell time [s]: after a stall of the loop a trajectory goes on where it was, instead of jumping
+PERIOD = 0.01  # cell time between cycles, unless told otherwise [s]
+LATE = 2  # periods: a cycle that comes later is taken as so late, and motion is delayed instead of making up for it
+STALLED = 5  # periods, but at least LARGEST_STEP: after a cycle that comes later motion goes on from rest
+LARGEST_STEP = 0.1  # cell time [s]
 BLEND_TIME = 0.3  # the difference between the robot's and the trajectory's start fades in this time [s]
+BLEND_SHARE = 0.5  # of the limits is for that difference at most; else it takes longer
+BEHIND = 1e-3  # [rad] between path and set-point, at which the goal's time stands still
+ARRIVED = 1e-6  # [rad] nearer, the set-point is on the path
+SLOWEST = 0.01  # of its speed, at which a trajectory is refused instead of being followed so slowly
+MOST_SAMPLES = 20_000  # of a trajectory, when it is looked for how fast it can be followed
+
+
+V = TypeVar("V", float, Vector)
 
 
 @dataclass
 class _Goal:
-    """The goal that moves the robot. `time` is on the trajectory's own time axis [s], which passes at `rate`."""
+    """The goal that moves the robot. `time` is on the trajectory's own time axis [s], which passes at the pace's rate.
+
+    The difference `offset` to where the robot was fades in the time `blend` [s]. `share` is the speed at which the
+    limits can be kept, 1 for a trajectory that is as it should be.
+    """
 
     id: str
     trajectory: Trajectory
     offset: Vector
+    blend: float
     last: float  # cell time of the newest set-point
-    rate: float
+    pace: Pace
+    share: float = 1.0
     time: float = 0.0
+    behind: float = 0.0  # the newest set-point, of the path [rad]
     stopping: bool = False
     reason: str = ""
     ended: float | None = None  # cell time at which the set-points came to rest
 
+    @property
+    def duration(self) -> float:
+        """Time at which the trajectory is over, and the robot on it [s]."""
+        return max(self.trajectory.duration, self.blend)
+
     def at(self, time: float) -> tuple[Vector, Vector]:
         """Positions [rad] and their change per second of the trajectory (dof,), blended from where the robot was."""
         q, dq = self.trajectory.at(time)
-        blend = min(BLEND_TIME, self.trajectory.duration)
-        if time >= blend:
+        if time >= self.blend:
             return q, dq
-        u = time / blend
-        left, slope = 1 - u**3 * (10 - 15 * u + 6 * u**2), -30 * u**2 * (1 - u) ** 2 / blend
-        return q + left * self.offset, dq + slope * self.offset
+        u = time / self.blend
+        slope = -30 * u**2 * (1 - u) ** 2 / self.blend
+        return q + _left(u) * self.offset, dq + slope * self.offset
+
+    def positions_at(self, times: Vector) -> Vector:
+        """Positions (N, dof) at times (N,), blended as well."""
+        u = np.clip(times / self.blend, 0.0, 1.0) if self.blend > 0 else np.ones_like(times)
+        return self.trajectory.positions_at(times) + _left(u)[:, None] * self.offset
 
     @property
     def progress(self) -> float:
         """The share of the trajectory that is behind it."""
-        return min(self.time / self.trajectory.duration, 1.0)
+        return min(self.time / self.duration, 1.0)
 
-    def advance(self, seconds: float, target: float, acceleration: Vector) -> None:
-        """Move on by cell time [s], bringing the rate towards the target."""
-        rate = next_rate(self.at, self.time, self.rate, target, seconds, acceleration)
-        self.time += way(self.rate, rate, seconds)
-        self.rate = rate
+
+def _left(u: V) -> V:
+    return 1 - u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def blend_time(offset: Vector, duration: float, limits: Limits) -> float:
+    """Time [s] in which an offset (dof,) [rad] from a trajectory of this duration [s] fades; 0 when there is none."""
+    off = np.abs(offset)
+    if not off.any():
+        return 0.0
+    least = max(  # peaks of 1 - 10 u^3 + 15 u^4 - 6 u^5
+        float((1.875 * off / (BLEND_SHARE * limits.velocity)).max()),
+        float(np.sqrt(5.774 * off / (BLEND_SHARE * limits.acceleration)).max()),
+        float(np.cbrt(60 * off / (BLEND_SHARE * limits.jerks)).max()),
+    )
+    return max(min(BLEND_TIME, duration), least)
+
+
+def possible_share(goal: _Goal, limits: Limits, period: float) -> float:
+    """The share of its speed, at most 1, at which set-points of a goal every `period` [s] keep the limits.
+
+    Raises:
+        Refused: there is none that is worth the name.
+    """
+    share, most = 1.0, 1 + SLACK
+    while share >= SLOWEST:
+        step = share * period / 2  # of trajectory's time: differences over two, from every second one on
+        count = min(int(goal.duration / step) + 1, MOST_SAMPLES)
+        q = goal.positions_at(np.arange(-4.0, count + 4) * step)
+        v = (q[2:] - q[:-2]) / period
+        a = (v[2:] - v[:-2]) / period
+        over = max(float((np.abs(v) / limits.velocity).max()) / most,
+                   math.sqrt(float((np.abs(a) / limits.acceleration).max()) / most))
+        if over <= 1.0:
+            return share
+        share /= 1.01 * over
+    raise Refused("contradiction", "its points are too far apart for their times: it could only be followed at less "
+                                   f"than {SLOWEST:.0%} of its speed")
 
 
 class TrajectoryController:
@@ -63,13 +126,19 @@ class TrajectoryController:
 
     def __init__(
         self, limits: Limits, start: Vector, tolerances: Tolerances | None = None, remember: int = REMEMBERED,
-        name: str = "controller",
+        name: str = "controller", period: float = PERIOD,
     ) -> None:
-        """Hold at `start` (dof,) [rad]; `remember` so many goals by their ids; sign reports with the name."""
+        """Hold at `start` (dof,) [rad] in cycles of `period` [s].
+
+        Remember so many goals by their ids; sign reports with the name.
+        """
         self._name = name
         self._limits = limits
         self._tolerances = tolerances or Tolerances()
-        self._hold = start.copy()
+        self._hold = start.copy()  # where to be; the newest set-point is the limiter's position
+        self._limiter = Limiter(limits, start, period)
+        self._period = period
+        self._last: float | None = None  # cell time of the newest set-point
         self._goal: _Goal | None = None
         self._memory: GoalMemory[MotionStatus] = GoalMemory(remember)
         self._fault = ""
@@ -120,17 +189,29 @@ class TrajectoryController:
             if self._goal is not None:
                 raise Refused("busy", f"goal {self._goal.id!r} is still being followed")
             checked = checked_trajectory(trajectory, self._limits, measured, self._tolerances)
+            # Go on from the set-point, unless the arm was moved from outside since.
+            near = np.all(np.abs(self._hold - measured) <= self._tolerances.start)
+            taken = self._taken(goal, checked, self._hold if near else measured, now)
         except Refused as refusal:
             rejected = MotionStatus(
                 id=goal, state="rejected", error=refusal.code, message=str(refusal), source=self._name
             )
             return self._as_of_now(self._memory.put(goal, rejected))
-        # Go on from the set-point, unless the arm was moved from outside since.
-        near = np.all(np.abs(self._hold - measured) <= self._tolerances.start)
-        begin = self._hold if near else measured
-        rate = 0.0 if self._holds else self.speed_scaling
-        self._goal = _Goal(goal, checked, begin - checked.positions[0], now, rate)
-        return self._report("active", message=self._holding(self._goal))
+        if not near:
+            self._hold = measured.copy()
+            if self._limiter.at_rest:
+                self._limiter.rest(measured)
+        self._goal = taken
+        return self._report("active", message=self._holding(taken))
+
+    def _taken(self, goal: str, trajectory: Trajectory, begin: Vector, now: float) -> _Goal:
+        offset = begin - trajectory.positions[0]
+        blend = blend_time(offset, trajectory.duration, self._limits)
+        taken = _Goal(goal, trajectory, offset, blend, now, Pace(0.0, 0.0 * begin))
+        taken.share = possible_share(taken, self._limits, self._period)
+        if not self._holds and self._limiter.at_rest:
+            taken.pace.rate = self.speed_scaling * taken.share
+        return taken
 
     def cancel(self, goal: str, reason: str, now: float) -> MotionStatus:
         """Begin to bring the robot to rest along its path. An empty id means whatever runs.
@@ -168,7 +249,7 @@ class TrajectoryController:
         """What there is to say of a goal about being held."""
         if not self._holds:
             return ""
-        return _told("held" if goal.rate == 0.0 else "coming to rest", self._holds.values())
+        return _told("held" if goal.pace.rate == 0.0 else "coming to rest", self._holds.values())
 
     def update(self, now: float, measured: Vector, measured_velocity: Vector) -> tuple[Vector, Vector]:
         """The set-points (dof,) [rad], [rad/s] for now. `status` says what became of the goal.
@@ -180,21 +261,38 @@ class TrajectoryController:
         """
         if self._fault:  # the arm may have sagged meanwhile
             self._fault, self._hold = "", measured.copy()
+            self._limiter.rest(measured)
+        elapsed = self._period if self._last is None else max(now - self._last, 0.0)
+        self._last = now
         goal = self._goal
-        if goal is None:
-            return self._hold, 0.0 * self._hold
-        self._judge(goal, now, measured, measured_velocity)
-        if self._goal is None:
-            return self._hold, 0.0 * self._hold
-        elapsed = min(max(now - goal.last, 0.0), LARGEST_STEP)
-        goal.last = now
+        if elapsed > max(LARGEST_STEP, STALLED * self._period):  # the arm had no set-points meanwhile, and stands
+            elapsed = self._period
+            self._limiter.rest()
+            if goal is not None:
+                goal.last = now - elapsed
+                goal.pace.rest()
+        step = min(elapsed, LATE * self._period)
+        if goal is not None:
+            self._judge(goal, now, measured, measured_velocity)
+        if goal is None or self._goal is None:
+            return self._limiter.step(self._hold, 0.0 * self._hold, step, self.speed_scaling, braking=True)
         braking = goal.stopping or bool(self._holds)
-        goal.advance(elapsed, 0.0 if braking else self.speed_scaling,
-                     self._limits.braking if braking else self._limits.acceleration)
-        over = goal.time >= goal.trajectory.duration or (goal.stopping and goal.rate == 0.0)
-        if over and goal.ended is None:
-            goal.ended = now
+        share = max(self.speed_scaling, goal.pace.rate)
+        waiting = max(0.0, 1 - goal.behind / BEHIND)
+        goal.time = goal.pace.advance(
+            goal.at, goal.time, 0.0 if braking else self.speed_scaling * goal.share * waiting,
+            min(max(now - goal.last, 0.0), LATE * self._period),
+            self._limits.braking if braking else self._limits.acceleration, self._limits.jerks,
+        )
+        goal.last = now
         self._hold, change = goal.at(goal.time)
+        set_point, velocity = self._limiter.step(
+            self._hold, change * goal.pace.rate, step, max(share, goal.pace.rate), braking
+        )
+        goal.behind = float(np.abs(self._hold - set_point).max())
+        over = goal.time >= goal.duration or (goal.stopping and goal.pace.rate == 0.0)
+        if over and goal.ended is None and goal.behind <= ARRIVED:
+            goal.ended = now
         if not goal.stopping:
             message = self._holding(goal)
             if message == self._status.message:
@@ -202,7 +300,7 @@ class TrajectoryController:
                 self._memory.put(goal.id, self._status)
             else:
                 self._report("active", message=message)
-        return self._hold, change * goal.rate
+        return set_point, velocity
 
     def abort(self, error: str, message: str, measured: Vector | None = None, source: str = "") -> None:
         """End the running goal and hold where the robot is."""
@@ -219,7 +317,7 @@ class TrajectoryController:
     def _judge(self, goal: _Goal, now: float, measured: Vector, velocity: Vector) -> None:
         """End the goal when it is reached, or the robot is too far from the newest set-point."""
         allowed = self._tolerances
-        off = np.abs(measured - self._hold)
+        off = np.abs(measured - self._limiter.position)
         j = int(np.argmax(off))
         name = self._limits.names[j]
         if off[j] > allowed.path:

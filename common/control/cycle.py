@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from common.config import GripperConfig
 from common.control.checks import Tolerances
-from common.control.controller import TrajectoryController
+from common.control.controller import PERIOD, TrajectoryController
 from common.control.gripper_controller import GripperController
 from common.control.inhibits import Inhibits
 from common.errors import ConfigError, Refused
@@ -72,15 +72,18 @@ class ControlCycle:
         kinematics: Kinematics | None = None,
         world: SimulatedWorld | None = None,
         inhibits: Inhibits | None = None,
+        period: float = PERIOD,
     ) -> None:
-        """Control this hardware, unless `inhibits` keep it; `world` and `kinematics` with simulated hardware only.
+        """Control this hardware every `period` [s], unless `inhibits` keep it.
+
+        `world` and `kinematics` come with simulated hardware only.
 
         Raises:
             ConfigError: the backend's gripper cannot feel the simulated world, or it has none.
         """
         self._hardware, self._limits = hardware, limits
         self._kinematics, self._world = kinematics, world
-        self._arm = TrajectoryController(limits, start, tolerances, name=controller)
+        self._arm = TrajectoryController(limits, start, tolerances, name=controller, period=period)
         self._gripper: GripperController | None = None
         self._fingers = gripper
         self._obstructible: SimulatedGripper | None = None

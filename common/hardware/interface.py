@@ -30,9 +30,10 @@ class HardwareFault(ZencellError):
 
 @dataclass(frozen=True)
 class Limits:
-    """What the joints can do, in the order of `names`; arrays are (dof,) in [rad], [rad/s], [rad/s^2].
+    """What the joints can do, in the order of `names`; arrays are (dof,) in [rad], [rad/s], [rad/s^2], [rad/s^3].
 
-    `deceleration` is what they can do in addition when they are braked for a hold or a stop.
+    `deceleration` is what they can do in addition when they are braked for a hold or a stop. `jerk` holds for what the
+    controller adds to a trajectory; without it they reach their acceleration within 10 ms.
     """
 
     names: tuple[str, ...]
@@ -41,6 +42,12 @@ class Limits:
     velocity: Vector
     acceleration: Vector
     deceleration: Vector | None = None
+    jerk: Vector | None = None
+
+    @cached_property
+    def jerks(self) -> Vector:
+        """Largest change of acceleration (dof,) [rad/s^3]."""
+        return 100.0 * self.acceleration if self.jerk is None else self.jerk
 
     @cached_property
     def braking(self) -> Vector:

@@ -13,6 +13,7 @@ from common.applications.pick_place.perceived import PerceivedScene
 from common.config import load_cell
 from common.control.controller import TrajectoryController
 from common.control.goals import GoalMemory
+from common.control.limiter import Limiter
 from common.transport import requests
 from common.transport.reader import Newness
 from common.virtual.simulation import Simulation
@@ -43,7 +44,15 @@ def _hold_forgotten():
 
 
 def _hold_without_brakes():
-    return patch("common.control.controller.next_rate", lambda at, time, rate, target, seconds, acceleration: target)
+    """And without the last stage, which would brake."""
+    def step(self, target, velocity, *_):
+        self.position = target
+        return target, velocity
+
+    brakes = contextlib.ExitStack()
+    brakes.enter_context(patch("common.control.trajectory.next_rate", lambda path, time, pace, target, *_: target))
+    brakes.enter_context(patch.object(Limiter, "step", step))
+    return brakes
 
 
 def _two_goals():

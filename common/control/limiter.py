@@ -1,0 +1,128 @@
+"""The last stage before the hardware: set-points that no arm could follow are replaced by ones that it can.
+
+It judges what leaves the executor by differences between set-points, whatever made them, and knows nothing of goals.
+What is within limits passes unaltered. The rest is approached as fast as the limits allow (ruckig, a state to a state).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import ruckig
+
+from common.hardware.interface import Limits, Vector
+
+SLACK = 0.02  # share by which differences may exceed velocity and acceleration: as much as is accepted
+POSITION_SLACK = 1e-3  # [rad] the same of positions
+ROUNDING = 1e-9  # [rad/s] of a difference of positions: numbers are not exact
+RUCKIG_OK = (ruckig.Result.Working, ruckig.Result.Finished)
+
+
+class Limiter:
+    """Follows the set-points that it is given within limits, from rest.
+
+    Jerk: a change of acceleration in one cycle passes up to `jerk * cycle`, or when it is between two accelerations
+    that are allowed, since trajectories are planned without a limit of jerk. What this stage adds of its own, on the
+    way back to what it is given, holds the limits of jerk.
+
+    Attributes:
+        position: newest set-point (dof,) [rad].
+    """
+
+    def __init__(self, limits: Limits, start: Vector, period: float) -> None:
+        """Be at rest at `start` (dof,) [rad]; `period` of the cycles, cell time [s]."""
+        self._period = period
+        self._lower, self._upper = limits.lower - POSITION_SLACK, limits.upper + POSITION_SLACK
+        self._velocity = limits.velocity
+        self._acceleration, self._braking = limits.acceleration, limits.braking
+        self._jerk = limits.jerks
+        self.rest(start)
+
+    def rest(self, position: Vector | None = None) -> None:
+        """Go on from rest: where the set-point is, or at a position (dof,) [rad] where the arm was found."""
+        if position is not None:
+            self.position = position.copy()
+        self._step = self._period  # duration of the newest step [s]
+        self._way = 0.0 * self.position  # mean velocity in it
+        self._change = 0.0 * self.position  # mean acceleration up to the middle of it
+        self._kept: tuple[Vector, Vector] | None = None  # velocity and acceleration where a way back goes on
+        self._braked = False
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether nothing moved in the newest step."""
+        return not self._way.any()
+
+    def step(
+        self, target: Vector, velocity: Vector, seconds: float, share: float = 1.0, braking: bool = False
+    ) -> tuple[Vector, Vector]:
+        """The set-point after a step (dof,) [rad], [rad/s]: the target itself when that is within limits.
+
+        Args:
+            target: where to be (dof,) [rad].
+            velocity: with which velocity (dof,) [rad/s].
+            seconds: duration of the step, cell time.
+            share: of the velocity limits that is to be had, 0 to 1.
+            braking: whether the arm is being brought to rest, for which limits may be higher.
+        """
+        if seconds <= 0.0:
+            return self.position, self._way if self._way.any() else 0.0 * self._way
+        between = (self._step + seconds) / 2
+        way = (target - self.position) / seconds
+        change = (way - self._way) / between
+        most = self._braking if braking or self._braked else self._acceleration
+        self._braked = braking  # a difference of second order reaches one step further back
+        if self._passes(target, velocity, way, change, seconds, between, share, most):
+            self._kept = None
+        else:
+            target, velocity, acceleration = self._approach(target, velocity, seconds, share)
+            self._kept = velocity, acceleration
+            way = (target - self.position) / seconds
+            change = (way - self._way) / between
+        self.position, self._way, self._change, self._step = target, way, change, seconds
+        return target, velocity
+
+    def _passes(
+        self, target: Vector, velocity: Vector, way: Vector, change: Vector, seconds: float, between: float,
+        share: float, most: Vector,
+    ) -> bool:
+        room = ROUNDING / between
+        hardest = most * (1 + SLACK) + room
+        jump = np.abs(change - self._change)
+        goes_on = 1.0 if self._kept is None else 0.5  # what is caught up with is left no faster than it was reached
+        # With the velocity that it has it must be possible to stop before the end of the joint.
+        free = np.where(way > 0, self._upper - target, target - self._lower)
+        speed = np.abs(way)
+        return bool(
+            np.all(speed <= self._velocity * (share * (1 + SLACK)) + ROUNDING)
+            and np.all(np.abs(velocity - way) <= hardest * (seconds * goes_on) + ROUNDING)
+            and np.all(np.abs(change) <= hardest)
+            and np.all(jump <= np.maximum(self._jerk * between, 2 * hardest))
+            and np.all(speed * (seconds + speed / (2 * self._braking)) <= free + POSITION_SLACK)
+        )
+
+    def _approach(
+        self, target: Vector, velocity: Vector, seconds: float, share: float
+    ) -> tuple[Vector, Vector, Vector]:
+        """Positions, velocities and accelerations (dof,) after a step on the fastest way to a target."""
+        if self._kept is None:
+            self._kept = self._way + self._change * (self._step / 2), self._change
+        v0, a0 = self._kept
+        fastest, hardest = share * self._velocity, self._acceleration
+        target = np.clip(np.where(np.isfinite(target), target, self.position), self._lower, self._upper)
+        free = np.minimum(self._upper - target, target - self._lower)  # to come to that velocity, and to rest again
+        ending = np.minimum(fastest, np.sqrt(hardest * free))
+        velocity = np.clip(np.where(np.isfinite(velocity), velocity, 0.0), -ending, ending)
+        given = ruckig.InputParameter(len(v0))
+        given.synchronization = ruckig.Synchronization.No
+        given.current_position = self.position.tolist()
+        given.current_velocity, given.current_acceleration = v0.tolist(), a0.tolist()
+        given.target_position, given.target_velocity = target.tolist(), velocity.tolist()
+        given.max_velocity, given.max_acceleration = fastest.tolist(), hardest.tolist()
+        given.max_jerk = self._jerk.tolist()
+        otg, motion = ruckig.Ruckig(len(v0)), ruckig.Trajectory(len(v0))
+        if otg.calculate(given, motion) not in RUCKIG_OK:
+            given.control_interface = ruckig.ControlInterface.Velocity  # come to rest, which always has a solution
+            given.target_velocity = [0.0] * len(v0)
+            otg.calculate(given, motion)
+        q, dq, ddq = motion.at_time(seconds)
+        return np.array(q), np.array(dq), np.array(ddq)

@@ -1,0 +1,102 @@
+"""Whatever the last stage is given, what leaves it is within limits; and what was within them is unaltered."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.control.limiter import POSITION_SLACK, Limiter
+from common.hardware.interface import Limits
+
+PERIOD = 0.01
+LIMITS = Limits(
+    ("shoulder", "elbow"), np.array([-2.0, -1.0]), np.array([2.0, 3.0]), np.array([2.0, 3.0]), np.array([5.0, 15.0]),
+    np.array([10.0, 15.0]), np.array([500.0, 7500.0]),
+)
+STILL = np.zeros(2)
+
+
+def assert_within(positions, limits=LIMITS, share=1.0, acceleration=None, period=PERIOD):
+    """By differences, as an arm sees it."""
+    most = limits.acceleration if acceleration is None else acceleration
+    q = np.array(positions)
+    assert np.all(q >= limits.lower - 2.5 * POSITION_SLACK) and np.all(q <= limits.upper + 2.5 * POSITION_SLACK)
+    v = np.diff(q, axis=0) / period
+    a = np.diff(v, axis=0) / period
+    assert np.all(np.abs(v) <= share * limits.velocity * 1.021), np.abs(v).max(axis=0)
+    assert np.all(np.abs(a) <= most * 1.021 + 1e-6), np.abs(a).max(axis=0)
+    # Planned steps of acceleration, from one that is allowed to another, may be a cycle short.
+    assert np.all(np.abs(np.diff(a, axis=0)) <= np.maximum(limits.jerks * period, 2 * most) * 1.021 + 1e-6)
+
+
+def swing(times, share):
+    """Positions and velocities (2,) of both joints at times, within a share of the limits of acceleration."""
+    w = np.array([1.7, 2.3])
+    amplitude = share * np.minimum(LIMITS.acceleration / w**2, LIMITS.velocity / w) / 2
+    return [(amplitude * (1 - np.cos(w * t)), amplitude * w * np.sin(w * t)) for t in times]
+
+
+def test_set_points_within_limits_pass_unaltered():
+    limiter = Limiter(LIMITS, STILL, PERIOD)
+    for q, dq in swing(np.arange(1, 1000) * PERIOD, 0.7):
+        given, velocity = limiter.step(q, dq, PERIOD)
+        assert given is q and velocity is dq
+
+
+def test_full_acceleration_to_full_deceleration_within_a_cycle_passes():
+    limiter = Limiter(LIMITS, STILL, PERIOD)
+    a, top = 0.98 * LIMITS.acceleration, 0.15
+    for t in np.arange(1, 80) * PERIOD:
+        late = max(t - top, 0.0)
+        q = a * t**2 / 2 - a * late**2
+        v = a * t - 2 * a * late
+        if t > 2 * top:
+            q, v = a * top**2, STILL
+        assert limiter.step(q, v, PERIOD)[0] is q
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    jumps=st.lists(st.tuples(
+        st.integers(1, 40), st.lists(st.floats(-1e3, 1e3) | st.floats(-3, 3), min_size=2, max_size=2),
+        st.lists(st.floats(-30, 30), min_size=2, max_size=2),
+    ), min_size=1, max_size=12),
+    share=st.sampled_from([1.0, 0.3, 0.05]),
+)
+def test_whatever_is_asked_for_what_is_sent_is_within_limits(jumps, share):
+    limiter = Limiter(LIMITS, STILL, PERIOD)
+    sent = [STILL, STILL, STILL]
+    for count, target, velocity in jumps:
+        for _ in range(count):
+            sent.append(limiter.step(np.array(target), np.array(velocity), PERIOD, share)[0])
+    assert_within(sent, share=share)
+
+
+@pytest.mark.parametrize("strange", [np.nan, np.inf, -np.inf])
+def test_what_is_not_a_number_moves_nothing(strange):
+    limiter = Limiter(LIMITS, STILL, PERIOD)
+    for _ in range(20):
+        q, dq = limiter.step(np.array([strange, 0.0]), np.array([strange, 0.0]), PERIOD)
+        assert np.array_equal(q, STILL) and np.array_equal(dq, STILL)
+
+
+def test_what_was_left_is_caught_up_with_and_then_followed_exactly():
+    limiter = Limiter(LIMITS, STILL, PERIOD)
+    sent = [STILL, STILL, STILL]
+    for q, dq in swing(1.0 + np.arange(1, 1000) * PERIOD, 0.3):  # begins far away
+        sent.append(limiter.step(q, dq, PERIOD)[0])
+    assert np.array_equal(sent[-1], q)
+    assert_within(sent)
+
+
+def test_after_a_rest_it_goes_on_from_rest():
+    limiter = Limiter(LIMITS, STILL, PERIOD)
+    sent = []
+    for k in range(1, 30):
+        sent.append(limiter.step(STILL + 0.5 * 5 * (k * PERIOD) ** 2, STILL + 5 * k * PERIOD, PERIOD)[0])
+    limiter.rest()
+    assert limiter.at_rest
+    after = [limiter.position] * 3
+    for k in range(30, 100):
+        after.append(limiter.step(STILL + 5 * 0.29 ** 2 / 2 + 1.45 * (k - 29) * PERIOD, STILL + 1.45, PERIOD)[0])
+    assert_within(after)
