@@ -112,6 +112,10 @@ class Deciding(Generic[V]):
         """A controller that was started again knows nothing of a stage that it had begun."""
         self.fail(f"{stage.name} was forgotten by the controller", view)
 
+    def displaced(self, stage: Stage, view: V, problem: str) -> None:
+        """The robot is not where the plan began: by hand, or by a controller that has forgotten how it got there."""
+        self.fail(problem, view, go_home=False)  # all it needs is a new plan
+
     def plan_failed(self, move: Move, response: m.PlanResponse, view: V) -> None:
         """There is no way: free the arm from what it stands against, or go home and decide anew."""
         if self.stands_against(move, response):

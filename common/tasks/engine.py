@@ -85,9 +85,11 @@ class Task(Deciding[V]):
         if answer.error in ANEW:
             self._decide_anew(f"{stage.name} has to wait: {answer.message}", view)
             return
-        # A robot that is not where the plan began only needs a new plan.
-        stale = isinstance(answer, m.MotionStatus) and answer.error == "start_mismatch"
-        self.fail(f"{stage.name} was refused: {answer.message}", view, go_home=not stale)
+        problem = f"{stage.name} was refused: {answer.message}"
+        if isinstance(answer, m.MotionStatus) and answer.error == "start_mismatch":
+            self.displaced(stage, view, problem)
+        else:
+            self.fail(problem, view)
 
     # --- the step --------------------------------------------------------------------------------------------
 

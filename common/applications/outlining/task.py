@@ -156,8 +156,11 @@ class Outline(Task[OutlineView]):
 
     def forgotten(self, stage: Stage, view: OutlineView) -> None:
         """Decide anew, from home: the controller was started again, and what it was asked for was no mistake."""
+        self.displaced(stage, view, f"{stage.name} was forgotten by the controller")
+
+    def displaced(self, stage: Stage, view: OutlineView, problem: str) -> None:
+        """Decide anew, from home: nor is it one where the controller was started again before it could answer."""
         self._forgotten += 1
-        problem = f"{stage.name} was forgotten by the controller"
         if self._forgotten > MOST_FORGOTTEN:
             self.fail(problem, view)
             return

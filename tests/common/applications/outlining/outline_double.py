@@ -49,6 +49,7 @@ class OutlineDouble:
         self.fraction = 1.0
         self.abort = ""  # stage whose motion the controller gives up
         self.refuse = ""  # stage whose motion the controller does not begin
+        self.unanswered = ""  # stage in whose motion the controller is started again before it answers
         self.camera_on = True
         self.camera_ahead = 0.0  # [s] its clock
         self.late = 0  # motions that will reach the controller too late
@@ -110,6 +111,11 @@ class OutlineDouble:
         elif isinstance(request, m.ExecuteRequest) and self.late:
             self.late -= 1
             refused = m.MotionStatus(id=request.id, state="rejected", error="stale_request", message="it is 10 s old")
+            self.task.on_goal(refused, self.view())
+        elif isinstance(request, m.ExecuteRequest) and request.trajectory.header.frame_id == self.unanswered:
+            self.unanswered, self.q = "", [0.3, *HOME[1:]]  # it began, was started again, and is asked once more
+            self.restart_controller()
+            refused = m.MotionStatus(id=request.id, state="rejected", error="start_mismatch", message="it is elsewhere")
             self.task.on_goal(refused, self.view())
         elif isinstance(request, m.ExecuteRequest):
             self.motion = m.MotionStatus(header=header, id=request.id, state="active", held=self.motion.held)

@@ -135,6 +135,15 @@ def test_outline_is_traced_whole_although_the_controller_was_started_again(stage
     assert cell.q == HOME
 
 
+@pytest.mark.parametrize("stage", WHOLE)
+def test_outline_is_traced_whole_although_the_controller_was_started_again_before_it_answered(stage: str) -> None:
+    cell = OutlineDouble()
+    cell.unanswered = stage
+    cell.until("DONE")
+    assert cell.moves()[-len(WHOLE):] == WHOLE or stage in ("retreat", "home")
+    assert cell.status.closed and cell.status.failures == 1 and cell.q == HOME
+
+
 def test_controller_that_is_started_again_and_again_is_given_up() -> None:
     cell = OutlineDouble()
     for _ in range(100):
