@@ -49,9 +49,9 @@ PROCESSES = 2  # that write, and as many that read
 # How often a working cell says what [Hz], repetitions of states included; the rest once a second.
 RATES = {
     "joint_states": 100.0, "tf": 30.0, "planning_scene": 20.0, "detected_objects": 10.0, "validated_targets": 10.0,
-    "counters": 10.0, "scene_balls": 8.0, "motion/status": 8.0, "display_trajectory": 2.0, "pick_place_status": 2.0,
-    "gripper/state": 1.0, "supervisor/status": 1.0, "camera/camera_info": 1.0, "workspace_markers": 1.0,
-    "tf_static": 1.0, "log": 1.0,
+    topics.COUNTERS.key: 10.0, "scene_balls": 8.0, "motion/status": 8.0, "display_trajectory": 2.0,
+    "pick_place_status": 2.0, "gripper/state": 1.0, "supervisor/status": 1.0, "camera/camera_info": 1.0,
+    "workspace_markers": 1.0, "tf_static": 1.0, topics.LOG.key: 1.0,
 }
 SETTLE, MEASURED, REST = 3.0, 6.0, 0.5  # [s]
 CONNECT_MS = 60_000
@@ -82,7 +82,7 @@ async def gather(folder: Path) -> list[Spoken]:
         ) as bus:
             settled: float | None = None
             async for sample in bus.raw_reader(f"{CELL}/**"):
-                key = sample.key.removeprefix(f"{CELL}/")
+                key = topics.general_key(sample.key.removeprefix(f"{CELL}/"))
                 if key in RATES and len(sample.payload) > len(found.get(key, b"")):
                     found[key] = sample.payload
                 if settled is None and found.keys() == RATES.keys():
@@ -92,7 +92,9 @@ async def gather(folder: Path) -> list[Spoken]:
         cell.interrupt()
         await cell.ended(30.0)
     kinds = {key: topic.kind for key, topic in all_topics().items()}
-    return [Spoken(key, found[key], rate, kinds[key] != "stream") for key, rate in RATES.items()]
+    # What each service has for itself is said by one here.
+    return [Spoken(key.replace(topics.SERVICE, "all"), found[key], rate, kinds[key] != "stream")
+            for key, rate in RATES.items()]
 
 
 def picture(rate: float) -> Spoken:

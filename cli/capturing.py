@@ -91,7 +91,8 @@ class Capture:
                 return
             self._sink.offer(Sample(
                 raw.key, raw.payload, time.monotonic_ns() + self._ahead, message=message_of(raw.encoding),
-                kind=self._kinds.get(topic) or kind or "stream", writer=writer, sequence=sequence, trace=trace,
+                kind=self._kinds.get(topics.general_key(topic)) or kind or "stream", writer=writer, sequence=sequence,
+                trace=trace,
             ))
 
     def _on_owner(self, token: str) -> None:

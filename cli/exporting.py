@@ -71,9 +71,11 @@ def _require_video(path: Path) -> None:
 
 
 def _require_topics(recording: Recording, selection: Selection) -> None:
+    from common.recording.selection import covers
+
     every = recording.topics()
     for key in selection.keys:
-        if "*" not in key and key not in every:
+        if "*" not in key and not any(covers(key, topic) for topic in every):
             raise ConfigError("--topics", key, f"is not in {recording.path}; choices: {', '.join(sorted(every))}")
 
 

@@ -40,12 +40,12 @@ def known_keys(cell: str | None, domain: str | None, connect: str | None) -> dic
         connect: where, as given to `--connect`.
     """
     from common.application import all_topics
-    from common.topics import COUNTERS, LOG, PARAMETERS, SUPERVISOR_STATUS
+    from common.topics import COUNTERS, LOG, PARAMETERS, SUPERVISOR_STATUS, general_key
 
     shared = {LOG.key: EVERYONE, COUNTERS.key: EVERYONE, PARAMETERS.key: EVERYONE, SUPERVISOR_STATUS.key: SUPERVISOR}
     known = {key: Known(key, topic, [shared[key]] if key in shared else []) for key, topic in all_topics().items()}
     for key, topic, service in _live(cell, domain, connect) or _of_files(cell):
-        if not key.startswith("param/"):
+        if general_key(key) == key:
             services = known.setdefault(key, Known(key, topic)).services
             if service not in services:
                 services.append(service)

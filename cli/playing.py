@@ -123,11 +123,12 @@ def _played(recording: Recording, selection: Selection) -> Topics:
         RecordingError: one is no key.
     """
     from common.recording.sample import RecordingError
+    from common.recording.selection import covers
     from common.remapping import is_key
 
     every = recording.topics()
     for key in selection.keys:
-        if "*" not in key and key not in every:
+        if "*" not in key and not any(covers(key, topic) for topic in every):
             raise ConfigError("KEY", key, f"is not in {recording.path}; choices: {', '.join(sorted(every)) or 'none'}")
     wanted = {topic: what for topic, what in every.items() if selection.wants(topic)}
     for topic in wanted:

@@ -54,10 +54,14 @@ def pub(
 
     async def visit(bus: Bus) -> None:
         from cli.inspection import cell_clock
+        from common.topics import of_service
 
         bus.clock = await cell_clock(bus)
-        _warn_of_writers(await _others(bus, key), key)
-        await _publish(_putter(bus, topic, key, message), period, most)
+        # A signed one goes under the key of whoever it says that it is of.
+        written = of_service(topic, message.service) if topic is not None and topic.signed else topic
+        under = written.key if written is not None else key
+        _warn_of_writers(await _others(bus, under), under)
+        await _publish(_putter(bus, written, key, message), period, most)
         await asyncio.sleep(LINGER)
 
     inspect(visit, cell=cell, domain=domain, connect=connect)

@@ -119,10 +119,10 @@ def _positive(option: str, text: str | None) -> float | None:
 def _require_published(selection: Selection) -> None:
     """Return when no key is one that answers requests: these do not travel as messages that can be heard."""
     from cli.topic import published
-    from common.application import all_topics
+    from common.application import find_topic
 
     for key in selection.keys:
-        if key in all_topics():
+        if find_topic(key) is not None:
             published(key)
 
 
@@ -190,10 +190,10 @@ async def _require_heard(bus: Bus, selection: Selection) -> None:
         SilentKey: nothing came on one of them.
     """
     from cli.foreign import require_heard
-    from common.application import all_topics
+    from common.application import find_topic
 
     for key in selection.keys:
-        if key not in all_topics() and "*" not in key:
+        if find_topic(key) is None and "*" not in key:
             await require_heard(bus, key)
 
 

@@ -74,6 +74,7 @@ def page_of(recording: Recording, cell: str | None = None) -> str:
     from common.reporting.fold import Fold
     from common.reporting.gathering import Gathering
     from common.reporting.page import Report, page
+    from common.topics import general_key
 
     about, run = recording.metadata(ABOUT), recording.run
     notes: list[str] = []
@@ -87,9 +88,9 @@ def page_of(recording: Recording, cell: str | None = None) -> str:
     )
     wanted = {topic.key: topic for topic in fold.topics}
     decoder = Decoder(topic.message for topic in fold.topics)
-    for sample in recording.samples(lambda topic: topic in wanted):
+    for sample in recording.samples(lambda topic: general_key(topic) in wanted):
         message = decoder.message(sample)
-        if isinstance(message, wanted[sample.topic].message):
+        if isinstance(message, wanted[general_key(sample.topic)].message):
             since = run.epoch or sample.log_time
             now_ns = since + round((sample.log_time - since) * run.speed)
             fold.on(sample.topic, message, (sample.log_time - recording.start) * 1e-9, now_ns)

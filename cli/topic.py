@@ -57,11 +57,12 @@ def info(
     """
     from cli.owners import known_keys
     from cli.schema import example_of, fields_of
+    from common.topics import general_key
 
-    known = known_keys(cell, domain, connect).get(key)
-    topic = known.topic if known and known.topic else topic_of(key)
-    parameters = key.removeprefix("param/") if key.startswith("param/") else ""
-    writer = parameters or (known.writer if known else "")
+    known = known_keys(cell, domain, connect).get(general_key(key))
+    topic = known.topic if known and known.topic and known.topic.key == key else topic_of(key)
+    own = topic.key.partition("/")[2] if general_key(topic.key) != topic.key else ""
+    writer = own or (known.writer if known else "")
     answer = getattr(topic, "answer", None)
     if as_json:
         described: dict[str, Any] = {
@@ -174,7 +175,7 @@ def _measured(name: str, doc: str, visiting: Callable[[Bus, str, bool], AsyncGen
 
         async def visit(bus: Bus) -> None:
             shown = 0
-            async for figures, line in visiting(bus, key, topic is None):
+            async for figures, line in visiting(bus, topic.expression if topic else key, topic is None):
                 terminal.echo(json.dumps({"key": key, **figures}) if as_json else line)
                 shown += 1
                 if shown == most:

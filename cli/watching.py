@@ -95,12 +95,13 @@ class Watch:
         self._following: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Watch:
-        states = [key for key, topic in self._known.items() if topic.kind == "state"]
-        latched = await asyncio.gather(*(self._bus.raw_get(f"{self._bus.cell}/{key}", ASK_TIMEOUT) for key in states))
+        states = {key: topic.expression for key, topic in self._known.items() if topic.kind == "state"}
+        latched = await asyncio.gather(
+            *(self._bus.raw_get(f"{self._bus.cell}/{expression}", ASK_TIMEOUT) for expression in states.values()))
         said = dict(zip(states, latched, strict=True))
         for key, topic in self._known.items():
             if topic.kind != "request" and key not in self._on_demand:
-                self._listen(key)
+                self._listen(key, topic.expression)
                 for sample in said.get(key, ()):
                     self._hearing[key].know(sample)
         self._following = asyncio.create_task(self._follow_counters())
@@ -112,9 +113,9 @@ class Watch:
             self._following.cancel()
             await asyncio.wait({self._following})
 
-    def _listen(self, key: str) -> None:
+    def _listen(self, key: str, expression: str = "") -> None:
         hearing = self._hearing[key] = Hearing(self._clock)
-        self._bus.raw_subscriber(f"{self._bus.cell}/{key}", hearing.arrive)
+        self._bus.raw_subscriber(f"{self._bus.cell}/{expression or key}", hearing.arrive)
 
     async def _follow_counters(self) -> None:
         async for counters in self._counters:

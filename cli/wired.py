@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from common.config import Cell, Parameters, ServiceEntry
     from common.topics import Request, Topic
 
-UNWIRED = ("log", "counters")  # of everybody
-
 
 class Unwired(ZencellError):
     """A service that cannot say what it declares."""
@@ -69,7 +67,7 @@ def wired(cell: Cell, entry: ServiceEntry) -> Wired:
     except Exception as error:
         raise Unwired(entry.name, error) from error
     doc = (module.__doc__ or "").strip().partition("\n")[0]
-    sides = ([topic for topic in side if topic.key not in UNWIRED]
+    sides = ([topic for topic in side if not topic.signed]  # every service has those
              for side in (found.reads, found.writes, found.serves, found.calls))
     reads, writes, serves, calls = (_in_order(side) for side in sides)
     every: set[Topic[Any] | Request[Any, Any]] = {*found.reads, *found.writes, *found.serves, *found.calls}

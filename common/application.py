@@ -161,14 +161,11 @@ def all_topics() -> dict[str, AnyTopic]:
 
 
 def find_topic(key: str) -> Topic[Any] | Request[Any, Any] | None:
-    """The topic or request of a key, also of the parameters of a service; None for one that is not known."""
-    from common.remapping import SERVICE_NAME
-    from common.topics import parameters_of
+    """The topic or request of a key, also of one service's log or parameters; None for one that is not known."""
+    from common.topics import general_key, of_service
 
-    prefix, _, service = key.partition("/")
-    if prefix == "param" and SERVICE_NAME.fullmatch(service):
-        return parameters_of(service)
-    return all_topics().get(key)
+    topic, service = all_topics().get(general_key(key)), key.partition("/")[2]
+    return topic if topic is None or not service.isidentifier() else of_service(topic, service)
 
 
 def bring_in(modules: Iterable[str]) -> dict[str, AnyTopic]:

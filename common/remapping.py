@@ -12,8 +12,7 @@ from typing import Any
 
 from common.errors import ConfigError
 
-SHARED = ("log", "counters")
-PARAMETERS = "param/"  # followed by the name of a service
+OF_EACH = ("log", "counters", "param")  # first parts of keys that each service has for itself
 SERVICE_NAME = re.compile(r"[A-Za-z_]\w*")
 _KEY = re.compile(r"[^\s/*$?#|]+(/[^\s/*$?#|]+)*")
 _BEGINNING = re.compile(r"([^\s/*$?#|]+/?)*\*")
@@ -35,7 +34,7 @@ class Remapping:
 
     def key(self, own: str) -> str:
         """The key in the cell of a key in the service's own words."""
-        if own in SHARED or own.startswith(PARAMETERS):
+        if own.partition("/")[0] in OF_EACH:
             return own
         self._asked.add(own)
         found = _pattern(self._table, own)
@@ -81,6 +80,6 @@ def _checked(field: str, given: Mapping[Any, Any]) -> Iterator[tuple[str, str]]:
                 raise ConfigError(field, text, "is no key such as camera/image_raw, nor a beginning such as camera/*")
         if own.endswith("*") != key.endswith("*"):
             raise ConfigError(field, {own: key}, "must have * at both ends or at none")
-        if own in SHARED or own.startswith(PARAMETERS):
+        if own.partition("/")[0] in OF_EACH:
             raise ConfigError(field, own, "is a key of all services, which keeps its name")
         yield own, key

@@ -1,7 +1,7 @@
 """Every key that the platform knows, said once: its message and its kind. Applications add their own.
 
 A key on the wire is `<cell>/<topic>`, for example `cell/camera/image_raw`. Who writes it follows from
-the services of the cell: `zencell topic info`.
+the services of the cell: `zencell topic info`. What ends in `<service>` each service has for itself.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ PublishedKind = Literal["stream", "event", "state"]
 M = TypeVar("M", bound=m.Message)
 Q = TypeVar("Q", bound=m.Message)
 A = TypeVar("A", bound=m.Message)
+T = TypeVar("T", bound="Topic[Any] | Request[Any, Any]")
+
+SERVICE = "<service>"  # in a key: the name of whoever writes or serves it
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,8 @@ class Topic(Generic[M]):
     """A key that is published.
 
     stream: the newest counts, older ones are dropped and counted; event: every one counts, in order; state: the
-    last value can be asked for at any time and is repeated each second.
+    last value can be asked for at any time and is repeated each second. A signed one has a key for each service, and
+    `service` of its message says whose it is: readers read all of them and refuse what comes under another's key.
     """
 
     key: str
@@ -33,6 +37,12 @@ class Topic(Generic[M]):
     kind: PublishedKind
     doc: str
     former: InitVar[str | None] = None
+    signed: bool = field(default=False, kw_only=True)
+
+    @property
+    def expression(self) -> str:
+        """Key expression that covers it, without the cell; of a signed one also the plain key that it had before."""
+        return self.key.replace(f"/{SERVICE}", "/**")
 
     def __post_init__(self, former: str | None) -> None:
         _leave_out_writer(self, former)
@@ -48,6 +58,12 @@ class Request(Generic[Q, A]):
     doc: str
     former: InitVar[str | None] = None
     kind: Literal["request"] = field(default="request", init=False)
+    signed: Literal[False] = field(default=False, init=False)
+
+    @property
+    def expression(self) -> str:
+        """Key expression that covers it, without the cell."""
+        return self.key.replace(SERVICE, "*")
 
     def __post_init__(self, former: str | None) -> None:
         _leave_out_writer(self, former)
@@ -82,9 +98,9 @@ DEPTH_CAMERA_POINTS = Topic("depth_camera/points", m.PointCloud2, "stream",
                             "coloured points, only while somebody listens")
 DEPTH_CAMERA_INFO = Topic("depth_camera/camera_info", m.CameraInfo, "state", "intrinsics")
 SUPERVISOR_STATUS = Topic("supervisor/status", m.SupervisorStatus, "state", "all processes")
-LOG = Topic("log", m.LogLine, "event", "log lines")
-COUNTERS = Topic("counters", m.ServiceCounters, "event",
-                 "received, dropped and refused messages of each service, each second")
+LOG = Topic(f"log/{SERVICE}", m.LogLine, "event", "log lines of a service; all of them: `topic echo log`", signed=True)
+COUNTERS = Topic(f"counters/{SERVICE}", m.ServiceCounters, "state",
+                 "received, dropped and refused messages of a service, each second", signed=True)
 
 MOTION_PLAN = Request("motion/plan", m.PlanRequest, m.PlanResponse, "plan a trajectory")
 MOTION_EXECUTE = Request("motion/execute", m.ExecuteRequest, m.MotionStatus,
@@ -95,7 +111,7 @@ GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState,
                           "move the fingers; the result appears on gripper/state")
 WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "add, move, remove, reset; simulated hardware only")
 TASK_COMMAND = Request("task/command", m.TaskCommand, m.TaskStatus, "start, pause, resume or stop the task")
-PARAMETERS = Request("param/<service>", m.ParameterRequest, m.ParameterReply,
+PARAMETERS = Request(f"param/{SERVICE}", m.ParameterRequest, m.ParameterReply,
                      "parameters of a service: what there is, and changing it while it runs")
 
 AnyTopic = Topic[m.Message] | Request[m.Message, m.Message]
@@ -103,7 +119,24 @@ AnyTopic = Topic[m.Message] | Request[m.Message, m.Message]
 
 def parameters_of(service: str) -> Request[m.ParameterRequest, m.ParameterReply]:
     """The request that a service answers for its own parameters."""
-    return replace(PARAMETERS, key=f"param/{service}")
+    return of_service(PARAMETERS, service)
+
+
+def of_service(topic: T, service: str) -> T:
+    """A topic or request under the key of one service; as it is where all have the same."""
+    return replace(topic, key=topic.key.replace(SERVICE, service)) if SERVICE in topic.key else topic
+
+
+def general_key(key: str) -> str:
+    """`log/<service>` for that of a service, or for plain `log`, as it was called before; other keys as they are."""
+    first, _, service = key.partition("/")
+    found = _OF_EACH.get(first)
+    return found.key if found is not None and (service.isidentifier() or (found.signed and not service)) else key
+
+
+_OF_EACH: dict[str, Topic[Any] | Request[Any, Any]] = {
+    topic.key.partition("/")[0]: topic for topic in (LOG, COUNTERS, PARAMETERS)
+}
 
 
 def platform_topics() -> dict[str, AnyTopic]:

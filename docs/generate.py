@@ -144,7 +144,7 @@ def service_table(cell_name: str) -> str:
     for number, name in enumerate(cell.services, 1):
         module = importlib.import_module(f"services.{name}")
         wired = asyncio.run(wiring(module.run, c.service_config(cell, name, module.Config)))
-        keys = [", ".join(sorted({f"`{shown_key(t)}`" for t in side if t.key not in ("log", "counters")}))
+        keys = [", ".join(sorted({f"`{shown_key(t)}`" for t in side if not t.signed}))
                 for side in (wired.reads, wired.writes, wired.serves, wired.calls)]
         lines.append(f"| {number} | {name} | {first_line(module.__doc__)} | {' | '.join(keys)} |")
     return "\n".join(lines)

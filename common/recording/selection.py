@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 from common.errors import ConfigError
 
+OF_EACH = ("log", "counters")  # said of those that each service has for itself, they mean all of them
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -36,7 +38,7 @@ class Selection:
         """Key expressions, without the cell, that cover what is wanted, and little else."""
         if not self.keys or self.regex is not None:
             return ("**",)
-        return tuple(dict.fromkeys(_expression(key) for key in self.keys))
+        return tuple(dict.fromkeys(_expression(f"{key}/**" if key in OF_EACH else key) for key in self.keys))
 
     def wants(self, topic: str) -> bool:
         """Whether a topic (key without the cell) is meant."""
@@ -46,7 +48,7 @@ class Selection:
             return True
         if self.regex is not None and self.regex.search(topic):
             return True
-        return any(topic == key or ("*" in key and _pattern(key).fullmatch(topic)) for key in self.keys)
+        return any(covers(key, topic) for key in self.keys)
 
 
 def _compiled(option: str, text: str | None) -> re.Pattern[str] | None:
@@ -56,6 +58,13 @@ def _compiled(option: str, text: str | None) -> re.Pattern[str] | None:
         return re.compile(text)
     except re.error as error:
         raise ConfigError(option, text, f"is not a regular expression: {error}") from None
+
+
+def covers(key: str, topic: str) -> bool:
+    """Whether a topic is one of those that a key stands for."""
+    if key in OF_EACH and topic.startswith(f"{key}/"):
+        return True
+    return topic == key or ("*" in key and _pattern(key).fullmatch(topic) is not None)
 
 
 def _expression(key: str) -> str:

@@ -91,7 +91,7 @@ class Fold:
             now_ns: cell time at which it came [ns].
         """
         self._now_ns = now_ns
-        for listener in self._listeners.get(key, ()):
+        for listener in self._listeners.get(t.general_key(key), ()):
             listener(time, message)
 
     @property

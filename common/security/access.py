@@ -7,12 +7,12 @@ it leaves it (egress), and a process is known by the common name of its certific
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from common.application import all_topics
-from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, parameters_of
-from common.transport.credentials import OBSERVER, OPERATOR, ROUTER_NAME, common_name
+from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, general_key, of_service, parameters_of
+from common.transport.credentials import OBSERVER, OPERATOR, RECORDER, ROUTER_NAME, SUPERVISOR, common_name
 from common.transport.keys import alive_key, owns_key, serves_key
 
 MESSAGES = [
@@ -44,27 +44,34 @@ class Rights:
 
 def rights_of(service: str, declared: Declares) -> Rights:
     """What a service may do: what it declares, and what every service does."""
-    rights = Rights(write={LOG.key, COUNTERS.key}, serve={parameters_of(service).key})
+    rights = _rights_of_each(service)
+    rights.serve.add(parameters_of(service).key)
     for topic in declared.writes:
         (rights.keep if topic.kind == "state" else rights.write).add(topic.key)
     for topic in declared.reads:
-        rights.read.add(topic.key)
+        rights.read.add(topic.expression)
         if topic.kind == "state":
-            rights.get.add(topic.key)
+            rights.get.add(topic.expression)
     rights.serve |= {request.key for request in declared.serves}
     for request in declared.calls:
-        rights.call.add(request.key.replace("<service>", "*"))
+        rights.call.add(request.expression)
     return rights
+
+
+def _rights_of_each(service: str) -> Rights:
+    """What every process may do, under keys of its own."""
+    return Rights(write={of_service(LOG, service).key}, keep={of_service(COUNTERS, service).key})
 
 
 def rights_of_supervisor() -> Rights:
     """What the supervisor of a cell may do: it writes the summary from all that it hears."""
-    return Rights(write={LOG.key, COUNTERS.key}, keep={SUPERVISOR_STATUS.key}, read={"**"}, get={"**"}, call={"**"})
+    rights = _rights_of_each(SUPERVISOR)
+    return replace(rights, keep={*rights.keep, SUPERVISOR_STATUS.key}, read={"**"}, get={"**"}, call={"**"})
 
 
 def rights_of_recorder(services: Iterable[Rights] = ()) -> Rights:
     """What the recorder of a cell with these services may do: it hears everything and commands nothing."""
-    return Rights(write={LOG.key, COUNTERS.key}, read={"**"}, get=_states(services))
+    return replace(_rights_of_each(RECORDER), read={"**"}, get=_states(services))
 
 
 def rights_of_tools(services: Iterable[Rights] = ()) -> dict[str, Rights]:
@@ -77,8 +84,8 @@ def rights_of_tools(services: Iterable[Rights] = ()) -> dict[str, Rights]:
 
 def _states(services: Iterable[Rights]) -> set[str]:
     # Not `**`: who may ask for every key may call every request, since both are the same to the router.
-    known = {topic.key for topic in all_topics().values() if topic.kind == "state"}
-    return known.union(*(rights.keep for rights in services))
+    known = {topic.expression for topic in all_topics().values() if topic.kind == "state"}
+    return known.union(key for rights in services for key in rights.keep if general_key(key) == key)
 
 
 def access_control(cells: Mapping[str, Mapping[str, Rights]]) -> dict[str, Any]:
@@ -114,13 +121,15 @@ def access_control(cells: Mapping[str, Mapping[str, Rights]]) -> dict[str, Any]:
 def _rules(cell: str, process: str, rights: Rights) -> Iterable[dict[str, Any]]:
     in_cell = {kind: sorted(f"{cell}/{key}" for key in getattr(rights, kind)) for kind in Rights.__dataclass_fields__}
     written, answered = in_cell["write"] + in_cell["keep"], in_cell["keep"] + in_cell["serve"]
+    # The router passes a subscription on as it was made: who reads the logs of all is not heard of under that of one.
+    heard = [*written, *(f"{cell}/{topic.expression}" for topic in (LOG, COUNTERS) if rights.write)]
     asked = sorted({*in_cell["get"], *in_cell["call"]})
     own = [alive_key(cell, process), *(serves_key(cell, key, process) for key in sorted(rights.serve))]
     own += [owns_key(cell, key, service=process) for key in sorted({*rights.write, *rights.keep, *rights.serve})]
     everyone = [f"{cell}/alive/*", f"{cell}/serves/**", f"{cell}/owns/**"]
     for name, flow, messages, keys in (
         ("writes", "ingress", ["put", "delete"], written),
-        ("hears of readers", "egress", ["declare_subscriber"], written),
+        ("hears of readers", "egress", ["declare_subscriber"], heard),
         ("answers", "ingress", ["declare_queryable", "reply"], answered),
         ("is asked", "egress", ["query"], answered),
         ("reads", "ingress", ["declare_subscriber"], in_cell["read"]),

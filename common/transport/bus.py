@@ -15,7 +15,7 @@ from common.clock import Clock
 from common.messages import Header, Message, ServiceCounters
 from common.remapping import Remapping
 from common.sources import new_id
-from common.topics import PublishedKind, Request, Topic
+from common.topics import PublishedKind, Request, Topic, of_service
 from common.transport.codec import DEFAULT_LIMIT
 from common.transport.handoff import Doorbell, call_on_loop
 from common.transport.keys import alive_key, owns_key, serves_key
@@ -116,7 +116,7 @@ class Bus:
             return
         if reader in self._heard:
             return
-        key = f"{self.cell}/{topic.key}"
+        key = f"{self.cell}/{topic.expression}"
         self._heard[reader] = self._session.subscriber(key, reader.arrive)
         if topic.kind == "state":  # subscribed first: nothing can fall between the two
 
@@ -128,6 +128,7 @@ class Bus:
 
     def writer(self, topic: Topic[M]) -> Writer[M]:
         """A writer of the topic."""
+        topic = of_service(topic, self.service)
         written = self._in_cell(topic)
         writer = Writer(self._session, self.cell, self.service, written)
         self._own(written.key, topic.key)
@@ -179,10 +180,12 @@ class Bus:
             ConfigError: somebody else writes or serves the same, or a key was to be renamed that the service has not.
         """
         self._remapping.require_used(self.service)
+        counters = of_service(topics.COUNTERS, self.service)
+        self._own(counters.key, counters.key)
         for owner in self._owned.values():
             self._declare_token(f"{self.cell}{owner.token}")
         await require_only(self._owned, self.owners)
-        self._counters = Writer(self._session, self.cell, self.service, topics.COUNTERS)
+        self._counters = Writer(self._session, self.cell, self.service, counters)
         for server in self._servers:
             self._declare_token(serves_key(self.cell, server.topic.key, self.service))
         self.ready_event.set()
@@ -221,7 +224,7 @@ class Bus:
 
     async def owners(self) -> list[Owner]:
         """Who writes or serves what in the cell now: services that are ready or just become so."""
-        found = [Owner.of(token) for token in await self.raw_tokens(owns_key(self.cell))]
+        found = {Owner.of(token) for token in await self.raw_tokens(owns_key(self.cell))}  # a token of ours comes twice
         return sorted(found, key=lambda owner: (owner.service, owner.key))
 
     def header(self, frame_id: str = "") -> Header:
@@ -230,7 +233,7 @@ class Bus:
 
     def counters(self) -> ServiceCounters:
         """What was received, dropped and refused so far, by key."""
-        writes = [writer.topic.key for writer in self._writers if writer.topic.key not in SHARED]
+        writes = [w.topic.key for w in self._writers if not w.topic.signed and w.topic.key not in SHARED]
         counted = ServiceCounters(header=self.header(), service=self.service, writes=writes)
         sources: list[Reader[Any] | Server[Any, Any]] = [*self._readers, *self._servers]
         for source in sources:
@@ -336,7 +339,7 @@ class Bus:
                 writer.repeat()
         for raw in self._raw_states:
             raw.repeat()
-        if self._counters is not None and self._counters.matched:
+        if self._counters is not None:
             self._counters.put(self.counters())
 
     def _look_at_connection_soon(self) -> None:

@@ -190,7 +190,7 @@ def size_limit(more: Sequence[str] = ()) -> dict[str, Any]:
     """What the router drops, because it is larger than any message of its topic ever is; `more` keys beside our own."""
     return {
         "id": "no pictures", "flows": ["ingress"], "messages": ["put", "query", "reply"],
-        "key_exprs": sorted(f"*/{key.replace('<service>', '*')}" for key in (*small_keys(), *more)),
+        "key_exprs": sorted(f"*/{key}" for key in (*small_keys(), *more)),
         "size_limit": MOST_BYTES_BESIDES,
     }
 
@@ -200,7 +200,7 @@ def small_keys() -> list[str]:
     from common.application import all_topics
     from common.messages import Image, PointCloud2
 
-    return [topic.key for topic in all_topics().values() if topic.message not in (Image, PointCloud2)]
+    return [topic.expression for topic in all_topics().values() if topic.message not in (Image, PointCloud2)]
 
 
 def small_keys_renamed(tables: Iterable[Mapping[str, str]]) -> list[str]:

@@ -7,10 +7,11 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 
 from common.errors import ConfigError
+from common.topics import general_key
 from common.transport.keys import owns_key
 
-# What several processes of a cell say under one key; the readers tell them apart.
-SHARED = ("log", "counters", "supervisor/status")
+# What the supervisors of linked hosts say under one key; the readers tell them apart.
+SHARED = ("log/supervisor", "counters/supervisor", "supervisor/status")
 GIVE_UP = 3.0  # [s] longer than a link that was cut stands: the one before may be gone and its tokens not yet
 LOOK_PERIOD = 0.2  # [s]
 
@@ -52,7 +53,7 @@ async def require_only(mine: Mapping[str, Owner], look: Callable[[], Awaitable[l
         if not others:
             return
         if asyncio.get_running_loop().time() > deadline:
-            other = min(others, key=lambda each: (each.service, each.key))
+            other = min(others, key=lambda each: (general_key(each.key) != each.key, each.service, each.key))
             raise ConfigError(f"services.{mine[other.key].service}", ..., refusal(mine[other.key], other))
         await asyncio.sleep(LOOK_PERIOD)
 

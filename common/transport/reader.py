@@ -100,8 +100,10 @@ class Reader(Generic[M]):
         self._lock = threading.Lock()
         self._changed = asyncio.Event()
         self._doorbell = Doorbell(loop, self._wake)
-        self._queue: _Newest[M] | _InOrder[M] = _InOrder(size) if topic.kind == "event" else _Newest()
+        self._queue: _Newest[M] | _NewestOfEach[M] | _InOrder[M] = (
+            _InOrder(size) if topic.kind == "event" else _NewestOfEach() if topic.signed else _Newest())
         self._overflow_logged = 0
+        self._plain = False  # whether something came under the plain key of a signed topic
 
     @property
     def invalid(self) -> int:
@@ -113,6 +115,8 @@ class Reader(Generic[M]):
         attachment = None
         try:
             attachment = decode_attachment(sample.attachment)
+            if attachment is not None and self.topic.signed:  # numbered apart: nobody counts for another
+                attachment = attachment._replace(writer=f"{attachment.writer} under {sample.key}")
             require_whole(attachment, sample.key, sample.payload)
         except DecodeError as error:
             with self._lock:
@@ -140,12 +144,30 @@ class Reader(Generic[M]):
         """Whether the message is one; it is decoded then."""
         if arrived.message is None:
             try:
-                arrived.message = decode(self.topic.message, arrived.sample.payload, self._limit)
+                message = decode(self.topic.message, arrived.sample.payload, self._limit)
+                if self.topic.signed:
+                    self._require_own(arrived.sample.key, message)
+                arrived.message = message
             except DecodeError as error:
                 sender = arrived.attachment.writer if arrived.attachment else NO_SENDER
                 self._refusals.add(sender, error)
                 return False
         return True
+
+    def _require_own(self, key: str, message: M) -> None:
+        """Return when a message came under the key of the service that it says, or under the plain one of before.
+
+        Raises:
+            DecodeError: it came under another service's.
+        """
+        said, (_, plain, *under) = getattr(message, "service", ""), key.split("/")
+        if not under:
+            if not self._plain:
+                self._plain = True
+                self._log.warning("%s: somebody writes %s, which nobody reads any more from the next version on",
+                                  self.topic.key, plain)
+        elif "/".join(under) != said:
+            raise DecodeError(f"{type(message).__name__}.service: must be {under[-1]!r} under {key}, not {said!r}")
 
     @property
     def latest(self) -> M | None:
@@ -228,6 +250,37 @@ class _Newest(Generic[M]):
             return lost, None
         self._returned = True
         return lost, self._read
+
+
+class _NewestOfEach(Generic[M]):
+    """The newest message of each key that is not read yet, so that nobody displaces what another said."""
+
+    def __init__(self) -> None:
+        self.reported = False
+        self._unread: OrderedDict[str, _Arrived[M]] = OrderedDict()
+        self._last: _Arrived[M] | None = None
+
+    def add(self, arrived: _Arrived[M]) -> int:
+        lost = self._unread.pop(arrived.sample.key, None) is not None
+        self._unread[arrived.sample.key] = arrived
+        if len(self._unread) > _MOST_SENDERS:
+            self._unread.popitem(last=False)
+            lost = True
+        return int(lost)
+
+    def peek(self, decode_one: _Decode[M]) -> tuple[int, M | None]:
+        for key in reversed(self._unread):
+            if decode_one(self._unread[key]):
+                return 0, self._unread[key].message
+        return 0, self._last.message if self._last is not None else None
+
+    def take(self, decode_one: _Decode[M]) -> tuple[int, _Arrived[M] | None]:
+        while self._unread:
+            _, arrived = self._unread.popitem(last=False)
+            if decode_one(arrived):
+                self._last = arrived
+                return 0, arrived
+        return 0, None
 
 
 class _InOrder(Generic[M]):

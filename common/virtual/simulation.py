@@ -165,7 +165,8 @@ class Simulation:
         session = self._network.attach(contextvars.copy_context(), SUPERVISOR)
         bus = VirtualBus(session, SUPERVISOR, self.cell.name, clock, host.requests)
         supervisor = Supervisor(self.cell, launch, lambda name, line: self._say(line), make_child=make_child)
-        bus.raw_subscriber(f"{self.cell.name}/{topics.LOG.key}", lambda sample: None)  # put only while somebody listens
+        # Which is put only while somebody listens.
+        bus.raw_subscriber(f"{self.cell.name}/{topics.LOG.expression}", lambda sample: None)
         supervisor.begin()
         working = asyncio.create_task(supervise(bus, self.cell, launch, supervisor, self._work, host=HOST))
         try:

@@ -53,8 +53,9 @@ class Trace:
             self._run_known = True
             status = decode(SupervisorStatus, raw.payload)
             self._writer.describe(RUN, run_of(status))
+        kind = self._kinds.get(topics.general_key(topic), "stream")
         self._writer.add(Sample(
-            raw.key, raw.payload, now, message=message_of(raw.encoding), kind=self._kinds.get(topic, "stream"),
+            raw.key, raw.payload, now, message=message_of(raw.encoding), kind=kind,
             writer=origin.writer, sequence=origin.sequence, trace=origin.trace,
         ))
         if now - self._flushed > FLUSH_NS:

@@ -62,10 +62,10 @@ class Losses:
         self._prefix = f"{bus.cell}/"
         self.of: dict[str, Arrivals] = {topic.key: Arrivals() for topic in WATCHED}
         # On the network's thread, so that a busy loop of the watcher is not taken for a loss.
-        self._declared = [bus.raw_subscriber(self._prefix + key, self._arrive) for key in self.of]
+        self._declared = [bus.raw_subscriber(self._prefix + topic.expression, self._arrive) for topic in WATCHED]
 
     def _arrive(self, sample: RawSample) -> None:
-        self.of[sample.key.removeprefix(self._prefix)].add(sample)
+        self.of[topics.general_key(sample.key.removeprefix(self._prefix))].add(sample)
 
     def stop(self) -> None:
         """Listen no more."""

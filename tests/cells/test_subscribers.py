@@ -47,7 +47,8 @@ async def test_a_slow_and_a_frozen_subscriber_keep_nobody_from_anything(tmp_path
     assert summary["truth"] == {"in_box": 2, "on_table": 0, "elsewhere": 0, "containers": {"box": 2}}
     assert not any(summary["restarts"].values())
     came = {key: one for key, one in losses.of.items() if one.came}
-    assert came.keys() >= {"scene_object_updates", "planning_scene", "motion/status", "gripper/state", "counters"}
+    assert came.keys() >= {"scene_object_updates", "planning_scene", "motion/status", "gripper/state",
+                           topics.COUNTERS.key}
     # On a machine that is too busy a state may be replaced on its way by the next one; `make soak` counts those too.
     assert not {key: one.lost for key, one in came.items() if one.lost and losses.kind(key) == "event"}
     overflow = sum((Counter(counters.overflow) for counters in told.values()), Counter())

@@ -125,7 +125,7 @@ def test_zenoh_cli_reads_the_line_that_up_prints(place: Place) -> None:
         for line in listening.stdout:
             key, _, value = line.rstrip().partition(" ")
             seen[key] = value
-            if {"talk/camera/image_raw", "talk/supervisor/status", "talk/counters"} <= seen.keys():
+            if {"talk/camera/image_raw", "talk/supervisor/status", "talk/counters/supervisor"} <= seen.keys():
                 break
     finally:
         listening.kill()

@@ -45,7 +45,8 @@ def test_one_seed_is_told_in_full_and_leaves_a_recording_that_opens(tmp_path: Pa
     assert "FAULT crash" in told and "seed 7: DONE" in told and "digest" in told
     with Recording(file) as recording:
         keys = {sample.key for sample in recording.samples()}
-    assert {"panda/joint_states", "panda/pick_place_status", "panda/camera/image_raw", "panda/log"} <= keys
+    assert {"panda/joint_states", "panda/pick_place_status", "panda/camera/image_raw",
+            "panda/log/smart_pick_place"} <= keys
     assert app.execute(["info", str(file), "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["messages"] > 1000
     assert app.execute(["report", str(file), "-o", str(tmp_path / "seed.html")]) == 0

@@ -189,7 +189,7 @@ def test_a_camera_can_not_command(secured: Secured) -> None:
         heard.wait_for("panda/camera/camera_info", MARK)
         assert [key for key, payload in heard.samples if payload == MARK] == ["panda/camera/camera_info"]
         assert heard.keys.isdisjoint(f"panda/{key}" for key in commands)
-        told = operator.hear("panda/counters")
+        told = operator.hear("panda/counters/*")
         told.wait(lambda samples: any(one.service == "trajectory_executor" for one in _counters(samples)))
         counted = [one for one in _counters(told.samples) if one.service == "trajectory_executor"][-1].received
         assert [key for key in commands if counted.get(key)] == []
@@ -277,6 +277,23 @@ def test_an_observer_sees_everything_and_commands_nothing(secured: Secured) -> N
         assert operator.ask("panda/motion/stop", stop)
 
 
+@pytest.mark.usefixtures("same_processes")
+def test_nobody_says_for_another_that_it_lives(secured: Secured) -> None:
+    forged = encode(m.ServiceCounters(service="vision_detector", received={"by the camera": 1}))
+    with secured.holder("panda.camera_simulator") as camera, secured.holder("operator") as operator:
+        told = operator.hear("panda/counters/**")
+        told.wait_for("panda/counters/vision_detector")
+
+        def refused(samples: list[tuple[str, bytes]]) -> bool:
+            for key in ("counters/vision_detector", "counters", "counters/camera_simulator"):  # the last is its own
+                camera.put(f"panda/{key}", forged)
+            return any(one.service == "supervisor" and one.invalid.get(topics.COUNTERS.key)
+                       for one in _counters(samples))
+
+        told.wait(refused)
+        assert {key for key, payload in told.samples if payload == forged} == {"panda/counters/camera_simulator"}
+
+
 # --- who does what it may, in a way that harms -----------------------------------------------------------------------
 
 
@@ -289,7 +306,7 @@ def test_a_flood_starves_nobody(secured: Secured) -> None:
         answered = 0
         for _ in range(20):
             for _ in range(1000):
-                camera.put("panda/log", MARK)
+                camera.put("panda/log/camera_simulator", MARK)
                 camera.put("panda/camera/image_raw", bytes(100))
             before = len(joints.samples)
             answered += len(operator.ask("panda/motion/status", timeout=20.0))

@@ -41,10 +41,11 @@ def allowed(**declared: Declared) -> dict[str, dict[str, set[str]]]:
 
 def test_a_service_may_do_exactly_what_it_declares() -> None:
     camera = allowed(camera=CAMERA)["panda.camera"]
-    assert camera["writes"] == {"panda/camera/image_raw", "panda/camera/camera_info", "panda/log", "panda/counters"}
-    assert camera["answers"] == {"panda/camera/camera_info", "panda/param/camera"}
+    assert camera["writes"] == {"panda/camera/image_raw", "panda/camera/camera_info", "panda/log/camera",
+                                "panda/counters/camera"}
+    assert camera["answers"] == {"panda/camera/camera_info", "panda/param/camera", "panda/counters/camera"}
     assert camera["reads"] == camera["asks"] == {"panda/scene_balls"}
-    owned = ("camera|image_raw", "camera|camera_info", "log", "counters", "param|camera")
+    owned = ("camera|image_raw", "camera|camera_info", "log|camera", "counters|camera", "param|camera")
     assert camera["is there"] == {"panda/alive/camera", "panda/serves/param/camera/camera",
                                   *(f"panda/owns/{key}/*/camera/*" for key in owned)}
 
@@ -52,8 +53,9 @@ def test_a_service_may_do_exactly_what_it_declares() -> None:
 def test_who_calls_may_ask_and_who_serves_may_answer() -> None:
     both = allowed(task=TASK, executor=EXECUTOR)
     assert both["panda.task"]["asks"] == {"panda/gripper/command", "panda/gripper/state", "panda/param/*"}
-    assert both["panda.task"]["answers"] == {"panda/param/task"}
-    assert both["panda.executor"]["answers"] == {"panda/gripper/command", "panda/gripper/state", "panda/param/executor"}
+    assert both["panda.task"]["answers"] == {"panda/param/task", "panda/counters/task"}
+    assert both["panda.executor"]["answers"] == {"panda/gripper/command", "panda/gripper/state", "panda/param/executor",
+                                                 "panda/counters/executor"}
     assert "asks" not in both["panda.executor"]
 
 
@@ -70,7 +72,7 @@ def test_everything_else_is_denied_and_every_rule_names_its_cell() -> None:
 def test_who_only_listens_can_ask_for_states_and_for_no_request(name: str) -> None:
     asks = allowances(access_control({"panda": {"recorder": rights_of_recorder()}}))[name]["asks"]
     keys = {key.partition("/")[2] for key in asks}
-    assert keys == {topic.key for topic in all_topics().values() if topic.kind == "state"}
+    assert keys == {topic.expression for topic in all_topics().values() if topic.kind == "state"}
 
 
 def test_rules_that_are_those_of_the_services_are_current() -> None:

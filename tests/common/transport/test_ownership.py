@@ -49,18 +49,20 @@ async def test_second_server_is_refused_and_so_is_a_second_process_of_one_name(n
         await second.ready()
 
 
-async def test_what_all_services_write_has_no_owner_and_readers_are_none(new_bus: NewBus) -> None:
+async def test_what_all_services_write_each_owns_for_itself_and_readers_own_nothing(new_bus: NewBus) -> None:
     writer, reader = await new_bus("writer"), await new_bus("reader")
     for bus in (writer, reader):
-        for shared in (topics.LOG, topics.COUNTERS, topics.SUPERVISOR_STATUS):
-            bus.writer(shared)
+        for each in (topics.LOG, topics.SUPERVISOR_STATUS):
+            bus.writer(each)
     writer.writer(topics.CAMERA_IMAGE)
     reader.reader(topics.CAMERA_IMAGE)
     await writer.ready()
     await reader.ready()
     found = await reader.owners()
     assert [(owner.key, owner.own, owner.service) for owner in found] == [
-        ("camera/image_raw", "camera/image_raw", "writer")]
+        ("counters/reader", "counters/reader", "reader"), ("log/reader", "log/reader", "reader"),
+        ("camera/image_raw", "camera/image_raw", "writer"), ("counters/writer", "counters/writer", "writer"),
+        ("log/writer", "log/writer", "writer")]
 
 
 async def test_second_writer_waits_for_the_first_to_go(new_bus: NewBus, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,7 +101,8 @@ async def test_keys_are_told_under_the_name_in_the_cell_with_the_own_word() -> N
     await camera.ready()
     camera.writer(topics.CAMERA_INFO)  # later, as few do
     assert {(owner.key, owner.own) for owner in await net.bus("tool").owners()} == {
-        ("left/camera/image_raw", "camera/image_raw"), ("left/camera/camera_info", "camera/camera_info")}
+        ("left/camera/image_raw", "camera/image_raw"), ("left/camera/camera_info", "camera/camera_info"),
+        ("counters/left", "counters/left")}
 
 
 def test_token_says_who_holds_it() -> None:

@@ -20,6 +20,7 @@ from common.transport.bus import Bus, Reader, Writer
 from common.transport.codec import Attachment, checksum_of, encode, encode_attachment
 
 PATIENCE = 20.0
+LINES = topics.Topic("lines", LogLine, "event", "lines")
 
 
 def image(number: int) -> Image:
@@ -83,7 +84,7 @@ async def test_stream_message_is_returned_once(new_bus, until) -> None:
 
 async def test_events_come_all_and_in_order(new_bus, until) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
-    reader, writer = receiver.reader(topics.LOG), sender.writer(topics.LOG)
+    reader, writer = receiver.reader(LINES), sender.writer(LINES)
     await matched(writer, until)
     for number in range(500):
         writer.put(event(number))
@@ -104,7 +105,7 @@ def busy_cores() -> Iterator[None]:
 
 async def test_no_event_is_lost_while_every_core_is_busy(new_bus, until, busy_cores) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
-    reader, writer = receiver.reader(topics.LOG, size=1500), sender.writer(topics.LOG)
+    reader, writer = receiver.reader(LINES, size=1500), sender.writer(LINES)
     await matched(writer, until)
     for number in range(1500):
         writer.put(event(number))
@@ -117,7 +118,7 @@ async def test_no_event_is_lost_while_every_core_is_busy(new_bus, until, busy_co
 
 async def test_events_that_overflow_are_counted_and_reported(new_bus, until, caplog) -> None:
     sender, receiver = await new_bus("sender"), await new_bus("receiver")
-    reader, writer = receiver.reader(topics.LOG, size=10), sender.writer(topics.LOG)
+    reader, writer = receiver.reader(LINES, size=10), sender.writer(LINES)
     await matched(writer, until)
     for number in range(25):
         writer.put(event(number))
@@ -182,10 +183,10 @@ async def test_restarted_writer_is_heard_though_it_counts_from_the_start(new_bus
 
 async def test_message_that_is_not_newer_is_dropped(new_bus, until) -> None:
     bus = await new_bus()
-    reader = bus.reader(topics.LOG)
-    await matched(bus.writer(topics.LOG), until)
+    reader = bus.reader(LINES)
+    await matched(bus.writer(LINES), until)
     for sequence, number in ((5, 1), (5, 2), (4, 3), (6, 4)):
-        put_raw(bus, topics.LOG, encode(event(number)), encode_attachment(Attachment("w", sequence)))
+        put_raw(bus, LINES, encode(event(number)), encode_attachment(Attachment("w", sequence)))
     assert (await next_of(reader)).message == "1"
     assert (await next_of(reader)).message == "4"
     assert reader.received == 2
@@ -193,10 +194,10 @@ async def test_message_that_is_not_newer_is_dropped(new_bus, until) -> None:
 
 async def test_plain_put_without_attachment_is_accepted_every_time(new_bus, until) -> None:
     bus = await new_bus()
-    reader = bus.reader(topics.LOG)
-    await matched(bus.writer(topics.LOG), until)
-    put_raw(bus, topics.LOG, encode(event(1)))
-    put_raw(bus, topics.LOG, encode(event(1)))
+    reader = bus.reader(LINES)
+    await matched(bus.writer(LINES), until)
+    put_raw(bus, LINES, encode(event(1)))
+    put_raw(bus, LINES, encode(event(1)))
     assert (await next_of(reader)) == (await next_of(reader)) == event(1)
 
 
@@ -205,19 +206,19 @@ BAD = [b"garbage", b"", encode(event(1))[:-3], encode(status(1)), msgpack.packb(
 
 async def test_bad_payloads_are_dropped_counted_and_reported_once(new_bus, until, caplog) -> None:
     bus = await new_bus()
-    reader, writer = bus.reader(topics.LOG), bus.writer(topics.LOG)
+    reader, writer = bus.reader(LINES), bus.writer(LINES)
     await matched(writer, until)
     for payload in BAD:
-        put_raw(bus, topics.LOG, payload)
-    put_raw(bus, topics.LOG, encode(event(1)), b"no attachment of ours")
+        put_raw(bus, LINES, payload)
+    put_raw(bus, LINES, encode(event(1)), b"no attachment of ours")
     for sequence in (1, 2):
-        put_raw(bus, topics.LOG, b"garbage", encode_attachment(Attachment("somebody", sequence)))
+        put_raw(bus, LINES, b"garbage", encode_attachment(Attachment("somebody", sequence)))
     writer.put(event(7))
     assert (await next_of(reader)).message == "7"
     assert reader.invalid == len(BAD) + 3
     await until(lambda: "somebody" in caplog.text)
     assert len([r for r in caplog.records if r.levelno == logging.WARNING]) == 2
-    assert bus.counters().invalid == {"log": len(BAD) + 3}
+    assert bus.counters().invalid == {"lines": len(BAD) + 3}
 
 
 async def test_a_message_that_was_damaged_on_its_way_is_refused_and_the_next_real_one_is_not(new_bus, until) -> None:
@@ -265,7 +266,7 @@ async def test_put_of_another_message_is_a_bug_that_shows(new_bus) -> None:
 
 async def test_trace_rides_from_what_was_read_to_what_is_put(new_bus, until) -> None:
     sender, middle, end = await new_bus("sender"), await new_bus("middle"), await new_bus("end")
-    images, log = sender.writer(topics.CAMERA_IMAGE), middle.writer(topics.LOG)
+    images, log = sender.writer(topics.CAMERA_IMAGE), middle.writer(LINES)
     reader = middle.reader(topics.CAMERA_IMAGE)
     seen = {}
 
@@ -282,7 +283,7 @@ async def test_trace_rides_from_what_was_read_to_what_is_put(new_bus, until) -> 
     await matched(log, until)
     images.put(image(1))
     await until(lambda: len(seen) == 2)
-    assert seen["log"] == seen["image_raw"] != ""
+    assert seen["lines"] == seen["image_raw"] != ""
     watching.cancel()
     await forwarding
 

@@ -1,0 +1,107 @@
+"""What every service says of itself goes under a key of its own: nobody says it for another."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from common import messages as m
+from common import topics
+from common.application import find_topic
+from common.transport.bus import Bus
+from common.transport.codec import Attachment, encode, encode_attachment
+from common.transport.local import LocalNetwork
+
+NewBus = Callable[..., Awaitable[Bus]]
+PATIENCE = 20.0
+
+
+def line(service: str, message: str = "") -> m.LogLine:
+    return m.LogLine(service=service, level="info", message=message)
+
+
+def counted(service: str, number: int = 0) -> m.ServiceCounters:
+    return m.ServiceCounters(service=service, received={"tf": number})
+
+
+def put(bus: Bus, key: str, message: m.Message, writer: str = "", sequence: int = 1) -> None:
+    attachment = encode_attachment(Attachment(writer, sequence)) if writer else b""
+    bus._session.publisher(f"{bus.cell}/{key}", "", reliable=True).put(encode(message), attachment)
+
+
+async def next_of(reader):
+    return await asyncio.wait_for(reader.next(), PATIENCE)
+
+
+async def test_each_writes_under_its_own_name_and_a_reader_hears_all(new_bus: NewBus, until) -> None:
+    camera, arm, tool = await new_bus("camera"), await new_bus("arm"), await new_bus("tool")
+    reader, writers = tool.reader(topics.LOG), [bus.writer(topics.LOG) for bus in (camera, arm)]
+    assert [writer.topic.key for writer in writers] == ["log/camera", "log/arm"]
+    await until(lambda: all(writer.matched for writer in writers))
+    for service, writer in zip(("camera", "arm"), writers, strict=True):
+        writer.put(line(service))
+    assert {(await next_of(reader)).service for _ in writers} == {"camera", "arm"}
+
+
+@pytest.mark.parametrize(("topic", "made"), [(topics.LOG, line), (topics.COUNTERS, counted)])
+async def test_who_says_that_he_is_another_is_refused_and_counted(new_bus: NewBus, until, caplog, topic, made) -> None:
+    camera, tool = await new_bus("camera"), await new_bus("tool")
+    reader = tool.reader(topic)
+    plain = topic.key.partition("/")[0]
+    await until(lambda: camera.writer(topic).matched)
+    put(camera, f"{plain}/camera", made("arm"), "arm.1")
+    put(camera, f"{plain}/camera/arm", made("arm"))
+    put(camera, f"{plain}/arm", made("arm"), "arm.1")
+    assert await next_of(reader) == made("arm")
+    assert reader.invalid == 2 and tool.counters().invalid == {topic.key: 2}
+    await until(lambda: "service: must be 'camera' under" in caplog.text)
+    assert f"/{plain}/camera, not 'arm'" in caplog.text
+
+
+async def test_nobody_uses_up_the_numbers_of_another(new_bus: NewBus, until) -> None:
+    camera, tool = await new_bus("camera"), await new_bus("tool")
+    reader = tool.reader(topics.LOG)
+    await until(lambda: camera.writer(topics.LOG).matched)
+    put(camera, "log/camera", line("camera"), "arm.1", 1000)  # which is what the arm's own writer calls itself
+    put(camera, "log/arm", line("arm"), "arm.1", 1)
+    assert [(await next_of(reader)).service for _ in range(2)] == ["camera", "arm"]
+
+
+async def test_a_flood_of_one_displaces_no_counters_of_another() -> None:
+    net = LocalNetwork()
+    reader, bus = net.bus("tool").reader(topics.COUNTERS), net.bus("camera")
+    put(bus, "counters/arm", counted("arm", 7))
+    for number in range(5000):
+        put(bus, "counters/camera", counted("camera", number))
+    assert [await next_of(reader), await next_of(reader)] == [counted("arm", 7), counted("camera", 4999)]
+    assert reader.latest == counted("camera", 4999) and reader.dropped == 4999
+
+
+async def test_counters_of_all_are_there_at_once_for_who_comes_late(new_bus: NewBus, until) -> None:
+    services = [await new_bus(name) for name in ("camera", "arm")]
+    for bus in services:
+        await bus.ready()
+    await until(lambda: all(bus._counters._raw._last for bus in services))
+    reader = (await new_bus("tool")).reader(topics.COUNTERS)
+    assert {(await next_of(reader)).service for _ in services} == {"camera", "arm"}
+
+
+async def test_plain_key_of_before_is_still_read_with_one_warning(new_bus: NewBus, until, caplog) -> None:
+    old, tool = await new_bus("old"), await new_bus("tool")
+    reader = tool.reader(topics.LOG)
+    await until(lambda: old.writer(topics.LOG).matched)
+    for number in ("1", "2"):
+        put(old, "log", line("any", number))
+    assert [(await next_of(reader)).message for _ in range(2)] == ["1", "2"]
+    assert caplog.text.count("somebody writes log, which nobody reads any more from the next version on") == 1
+
+
+def test_plain_word_stands_for_all_and_a_name_for_one() -> None:
+    assert find_topic("log") is topics.LOG is find_topic("log/<service>")
+    assert find_topic("counters/arm") == topics.of_service(topics.COUNTERS, "arm")
+    assert find_topic("param/arm") == topics.parameters_of("arm") and find_topic("param") is None
+    assert find_topic("log/a b") is None is find_topic("log/a/b")
+    assert [topics.general_key(key) for key in ("log", "log/arm", "tf", "param", "param/arm")] == [
+        "log/<service>", "log/<service>", "tf", "param", "param/<service>"]
