@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from cli import completion, options
-from common.errors import ConfigError, UnknownName
+from common.errors import ConfigError, UnknownName, ZencellError
 from common.terminal import echo
 
 if TYPE_CHECKING:
@@ -24,6 +26,15 @@ X = Annotated[str, typer.Argument(metavar="X", help="[m] in world")]
 Y = Annotated[str, typer.Argument(metavar="Y", help="[m] in world")]
 Id = Annotated[str, typer.Argument(metavar="ID", help="as in `zencell topic echo scene_objects`")]
 NEGATIVE_NUMBERS = {"ignore_unknown_options": True}  # -0.2 is a coordinate, not an option
+
+
+class ArmOnly(ZencellError):
+    """The arm was stopped, though the task could not be told."""
+
+    exit_code = 1
+
+    def __init__(self, error: ZencellError) -> None:
+        super().__init__(f"the arm is stopped and stays so until a start; the task did not hear of it: {error}")
 
 
 def call(
@@ -86,19 +97,24 @@ def send(
 # --- task -------------------------------------------------------------------------------------------------------
 
 
-def _task(command: str, cell: str | None, domain: str | None, connect: str | None) -> None:
+def _task(
+    command: str, cell: str | None, domain: str | None, connect: str | None, override: bool = False
+) -> None:
     from common import topics
     from common.config import check
     from common.messages import TaskCommand
 
-    message: TaskCommand = check(TaskCommand, {"command": command})
+    message: TaskCommand = check(TaskCommand, {"command": command, "by": options.person(), "override": override})
     send(topics.TASK_COMMAND, message, TIMEOUT, cell, domain, connect)
 
 
 @task.command()
-def start(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
-    """Start the task of a cell that was told to wait, or start it again; a robot that is held is let go."""
-    _task("start", cell, domain, connect)
+def start(
+    override: options.Override = False,
+    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+) -> None:
+    """Start the task of a cell that waits or was stopped, or start it again; a robot that you hold is let go."""
+    _task("start", cell, domain, connect, override)
 
 
 @task.command()
@@ -108,15 +124,39 @@ def pause(cell: options.CellName = None, domain: options.Domain = None, connect:
 
 
 @task.command()
-def resume(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
-    """Let the robot go on along its path after a pause."""
-    _task("resume", cell, domain, connect)
+def resume(
+    override: options.Override = False,
+    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+) -> None:
+    """Let the robot go on along its path after a pause of yours."""
+    _task("resume", cell, domain, connect, override)
 
 
 @task.command()
 def stop(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
-    """Stop the robot, give up its motion, and wait for a start."""
-    _task("stop", cell, domain, connect)
+    """Stop the robot, give up its motion, and wait for a start, also if the task does not answer."""
+    from cli.inspection import inspect
+    from cli.schema import to_json
+    from common import topics
+    from common.errors import RequestFailed
+    from common.messages import StopRequest, TaskCommand
+
+    by = options.person()
+
+    async def visit(bus: Bus) -> Message:
+        arm = asyncio.create_task(bus.client(topics.MOTION_STOP).call(StopRequest(owner=by), TIMEOUT))
+        try:
+            told: Message = await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="stop", by=by), TIMEOUT)
+        except RequestFailed as error:
+            with contextlib.suppress(RequestFailed):
+                await arm
+                raise ArmOnly(error) from None
+            raise
+        with contextlib.suppress(RequestFailed):
+            await arm
+        return told
+
+    typer.echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
 
 
 @task.command()
@@ -136,7 +176,7 @@ def home(
         from cli.inspection import cell_clock
 
         bus.clock = await cell_clock(bus)  # requests to move say when they were decided
-        return await OperatorMotion(bus).move(JointGoal(named="home"), planner=planner)
+        return await OperatorMotion(bus, owner=options.person()).move(JointGoal(named="home"), planner=planner)
 
     echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import os
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from cli.screens import Content, Screen
     from common.chaos.agent import Chaos
     from common.config import Cell
+    from common.messages import Inhibit
     from common.supervision.collector import Collector
     from common.supervision.supervisor import Supervisor
     from common.transport.bus import Bus
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 START_REQUEST_TIMEOUT = 5.0  # [s]
+FIRST_WORD = 2.0  # [s] in which the executor of a cell that is up has said how the robot is
+EXECUTOR, OURSELVES = "trajectory_executor", ("watchdog", "controller")
 
 
 class Disturbance(NamedTuple):
@@ -277,8 +281,14 @@ class Operation:
         from common.supervision.operation import beside
 
         collector = await self._came_up(bus)
-        if not self.cell.run.autostart:
-            await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"), START_REQUEST_TIMEOUT)
+        kept = await self._kept(bus)
+        if not self._simulated:
+            self._tell_kept(kept)
+        if (self._simulated and kept) or (not self.cell.run.autostart and not kept):  # who says `run` says start
+            start = TaskCommand(command="start", by=options.person(), override=bool(kept))
+            await bus.client(topics.TASK_COMMAND).call(start, START_REQUEST_TIMEOUT)
+            for inhibit in kept:
+                self._note(f"Let go: {self.cell.name} was {inhibit.told}")
 
         async def end() -> None:
             if self.first is not None:
@@ -299,8 +309,35 @@ class Operation:
         took = f"{self.summary.ready:.1f} s"
         self._screen.note(f"{self.cell.name} is up at {endpoint} after {took}. Read it from outside:")
         self._screen.note(zenoh_cli_line(endpoint, self.cell.name))
+        self._tell_kept(await self._kept(bus))
         await beside(self._disturbing(), collector.run())
         return 0
+
+    async def _kept(self, bus: Bus) -> list[Inhibit]:
+        """What persons stopped or hold since before the cell came up; says so when they made it slower."""
+        from common import topics
+
+        if not any(entry.kind == EXECUTOR for entry in self.cell.services.values()):
+            return []  # on another host, or a cell without an arm
+        reader, motion = bus.reader(topics.MOTION_STATUS), None
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(FIRST_WORD):
+                motion = reader.latest or await reader.next()
+        if motion is None:
+            return []
+        if motion.speed_scaling < 1:
+            set_it = f"`zencell param set services.{EXECUTOR}.speed_scaling=1`"
+            self._note(f"Motions go at {100 * motion.speed_scaling:.0f} % of their speed: {set_it} ends that")
+        return [inhibit for inhibit in motion.inhibits if inhibit.by not in OURSELVES]
+
+    def _tell_kept(self, kept: list[Inhibit]) -> None:
+        for inhibit in kept:
+            verb = "start" if inhibit.kind == "stopped" else "resume"
+            self._note(f"{self.cell.name} is {inhibit.told}: `zencell task {verb}` lets it go on")
+
+    def _note(self, line: str) -> None:
+        assert self._screen is not None
+        self._screen.note(line)
 
     async def _disturbing(self) -> None:
         if self._chaos is not None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import getpass
 import math
+import socket
 from typing import Annotated
 
 import typer
@@ -56,6 +58,9 @@ PublishedKey = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="one JSON object a line")]
 Count = Annotated[str | None, typer.Option("--count", "-n", metavar="N", help="stop after N")]
+Override = Annotated[
+    bool, typer.Option("--override", help="although another person holds the robot; is logged with both names")
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="PATH=VALUE",
@@ -114,3 +119,12 @@ def rate(text: str) -> float:
     if not 0 < value <= MOST_PER_SECOND:
         raise ConfigError("--rate", text, f"must be more than 0 and at most {MOST_PER_SECOND:g} [Hz]")
     return value
+
+
+def person() -> str:
+    """Who gives a command here: what a cell remembers of who stopped or holds a robot."""
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a user without a name, as in a container
+        user = "somebody"
+    return f"{user}@{socket.gethostname()}"[:120]

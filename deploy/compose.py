@@ -54,7 +54,7 @@ networks:
   cell: {internal: true}   # nothing in it reaches the outside, nor is reached from there
   page: {}
 volumes:
-  data: {}                 # recordings and stages
+  data: {}                 # recordings, stages, and what persons stopped or hold: keep it
 """
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import yaml
 
+from common.sim.standing import STATE_VARIABLE
 from deploy.containers import (
     DATA,
     IMAGE,
@@ -36,6 +37,7 @@ def manifests() -> dict[str, str]:
                         port=VIEWER_PORT if container.page else None)
             for container in containers_of(file, cell)
         ]
+        made += _claims(file, containers_of(file, cell))
         folders[file] = (made, [f"../{ROUTER}", f"{file}.yaml"])
     texts = {}
     for folder, (made, resources) in folders.items():
@@ -81,7 +83,7 @@ def _deployment(name: str, cell: str, container: Container, port: int | None) ->
         "automountServiceAccountToken": False,
         "terminationGracePeriodSeconds": 10,
         "containers": [main],
-        "volumes": [{"name": "tmp", "emptyDir": {}}, {"name": "data", "emptyDir": {}}],
+        "volumes": [{"name": "tmp", "emptyDir": {}}, {"name": "data", **_data(name, container)}],
     }
     return {
         "apiVersion": "apps/v1",
@@ -94,6 +96,28 @@ def _deployment(name: str, cell: str, container: Container, port: int | None) ->
             "template": {"metadata": {"labels": labels}, "spec": pod},
         },
     }
+
+
+def _data(name: str, container: Container) -> dict[str, Any]:
+    """Where a pod keeps its data: what persons stopped or hold outlives the pod."""
+    if STATE_VARIABLE not in container.environment:
+        return {"emptyDir": {}}
+    return {"persistentVolumeClaim": {"claimName": name}}
+
+
+def _claims(file: str, containers: list[Container]) -> list[dict[str, Any]]:
+    """The claims of the pods that keep something."""
+    names = [f"{file}-{container.name}".replace("_", "-") for container in containers
+             if STATE_VARIABLE in container.environment]
+    return [
+        {
+            "apiVersion": "v1",
+            "kind": "PersistentVolumeClaim",
+            "metadata": {"name": name, "labels": _labels(name, file)},
+            "spec": {"accessModes": ["ReadWriteOnce"], "resources": {"requests": {"storage": "64Mi"}}},
+        }
+        for name in names
+    ]
 
 
 def _service(name: str, port: int) -> dict[str, Any]:

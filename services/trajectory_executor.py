@@ -204,7 +204,7 @@ async def run(bus: Bus, config: Config) -> None:
     config.speed_scaling = speed_of(inhibits.speed, configured)
     if config.speed_scaling != configured:
         bus.log.warning("speed is at %.0f %%, as it was set while the cell ran: `zencell param set "
-                        "trajectory_executor.speed_scaling` changes it", 100 * config.speed_scaling)
+                        "services.trajectory_executor.speed_scaling=1` ends that", 100 * config.speed_scaling)
     bus.keep_parameters = keep_speed
     bus.serve(topics.MOTION_EXECUTE, execute)
     bus.serve(topics.MOTION_STOP, stop)

@@ -14,7 +14,7 @@ from common.process.operator_motion import OperatorMotion
 from common.process.service import main
 from common.transport.bus import Bus
 from common.viewer.access import address_of
-from common.viewer.console import Console
+from common.viewer.console import BY, Console
 from common.viewer.feeds import Feeds, Periods, Topics
 from common.viewer.guard import close_server, make_server
 from common.viewer.layers import Layers, find_layers
@@ -92,7 +92,7 @@ async def run(bus: Bus, config: Config) -> None:
     feeds = Feeds(bus, read.always, read.on_demand)
     console = Console(bus, config.members, feeds, read.requests)
     status = feeds.reader(read.status) if read.status is not None else None
-    motions = OperatorMotion(bus, [status] if status is not None else [])
+    motions = OperatorMotion(bus, [status] if status is not None else [], owner=BY)
     server = make_server(config.host, config.port, config.token, published=config.published)
     try:
         page = Page(

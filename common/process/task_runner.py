@@ -321,6 +321,6 @@ def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None) -> N
     others = [inhibit.told for inhibit in motion.inhibits
               if inhibit.kind == "held" and inhibit.by not in (*SOMEBODY, command.by)]
     if others:
-        raise Refused("held", f"the robot is {'; '.join(others)}: only they let go of it, or you with --override")
+        raise Refused("held", f"the robot is {'; '.join(others)}: only they let go of it, unless you override that")
     if command.command == "resume" and motion.stopped:
         raise Refused("stopped", f"the robot is {motion.stopped}: start the task to go on")

@@ -163,9 +163,10 @@ class Console(Desk):
         client: Client[Q, A] = self._clients[request.key]
         return await client.call(message, timeout)
 
-    async def command(self, command: str) -> None:
-        """Tell the task to start, pause, resume or stop."""
-        await self.ask(topics.TASK_COMMAND, TaskCommand.model_validate({"command": command}))
+    async def command(self, command: str, override: bool = False) -> None:
+        """Tell the task to start, pause, resume or stop; to start or resume although another person holds the arm."""
+        said = {"command": command, "by": BY, "override": override}
+        await self.ask(topics.TASK_COMMAND, TaskCommand.model_validate(said))
 
     async def stop(self) -> None:
         """Bring the arm to rest and end the task, at the same time: one that fails does not hold the other back.
@@ -174,8 +175,8 @@ class Console(Desk):
             RequestFailed: the arm could not be told; or it could, but the task could not.
         """
         told = await asyncio.gather(
-            self.ask(topics.MOTION_STOP, StopRequest(reason="stopped on the page"), _SOON),
-            self.ask(topics.TASK_COMMAND, TaskCommand(command="stop"), _SOON),
+            self.ask(topics.MOTION_STOP, StopRequest(reason="stopped on the page", owner=BY), _SOON),
+            self.ask(topics.TASK_COMMAND, TaskCommand(command="stop", by=BY), _SOON),
             return_exceptions=True,
         )
         for answer in told:

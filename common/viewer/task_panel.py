@@ -8,11 +8,12 @@ from typing import Any
 
 import viser
 
-from common.errors import ZencellError
+from common.errors import RemoteError, ZencellError
 from common.messages import MotionStatus, TaskStatus
 from common.viewer import words
 from common.viewer.console import SLIDING, Console, assign
 from common.viewer.markup import STYLE, block, fields, span, text
+from common.viewer.words import problem
 
 COMMANDS = ("Start", "Pause", "Resume")
 SLOWEST = 5  # [%]
@@ -41,6 +42,7 @@ class TaskPanel:
             home: has the arm go home.
         """
         self._console, self._words = console, told
+        self._refused = ""  # command that was, because another person holds the arm
         self._speed_told = self._speed_heard = 100  # [%]
         gui.add_html(STYLE + STOP_STYLE)
         stop = gui.add_button("STOP", color="red", icon=viser.Icon.HAND_STOP)
@@ -79,6 +81,9 @@ class TaskPanel:
         if task is not None and task.message:
             lines.append(f"<div>{span(task.message, 'bad' if task.state == 'ERROR' else 'dim')}</div>")
         lines.append(f"<div>{span('Arm:', 'dim')} {text(words.motion(motion))} · {text(gripper)}</div>")
+        for one in motion.inhibits if motion is not None else ():
+            if task is None or one.told not in task.message:
+                lines.append(f"<div>{span(one.told, 'dim')}</div>")
         if task is not None:
             lines.append(fields(self._words.counters(task, rejected)))
         state = task.state if task else ""
@@ -98,7 +103,14 @@ class TaskPanel:
     async def _command(self, chosen: str) -> None:
         if chosen in COMMANDS:
             self.tell("")
-            await self._console.command(chosen.lower())
+            override, self._refused = chosen == self._refused, ""
+            try:
+                await self._console.command(chosen.lower(), override)
+            except RemoteError as error:
+                if error.code != "held":
+                    raise
+                self._refused = chosen
+                self.tell(f"{problem(error)}: press {chosen} again for that")
 
     async def _set_speed(self, percent: float) -> None:
         self._speed_told = round(percent)

@@ -1,0 +1,68 @@
+"""A stop that outlives every process of a cell, killed all at once, and a `run` that lets go of it."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
+import pytest
+
+from common import topics
+from common.messages import JointState
+from common.transport.bus import Reader
+from common.transport.connect import connect
+from common.transport.endpoint import endpoint_of
+from tests.harness import PATIENCE, Place, Zencell, free_domain, until
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+UP = "zenoh --mode client"  # when all is ready
+PANDA = ("panda", "--no-viewer", "--set", "world.count=1", "--speed", "3")
+
+
+def kill_all(command: Zencell) -> None:
+    """SIGKILL for the supervisor and all that it started, none before the other has had a word."""
+    everybody = [psutil.Process(command.process.pid), *command.children().values()]
+    for process in everybody:
+        with suppress(psutil.NoSuchProcess):
+            process.kill()
+    command.end()
+    command.until_childless()
+
+
+async def assert_still(joints: Reader[JointState]) -> None:
+    first = await joints.next()
+    later = await until(joints, lambda s: s.header.stamp > first.header.stamp + 5_000_000_000)
+    assert later.position == first.position
+
+
+async def test_stop_outlives_supervisor_and_executor_that_are_killed_and_up_says_so(tmp_path: Path) -> None:
+    place = Place(tmp_path, free_domain())
+    command = place.start("up", *PANDA)
+    async with connect(cell="panda", service="watcher", endpoint=endpoint_of(place.domain), timeout=PATIENCE) as bus:
+        motion = bus.reader(topics.MOTION_STATUS)
+        command.until(UP)
+        await until(motion, lambda m: m.state == "active" and m.progress > 0.1)
+        await asyncio.to_thread(place.say, "param", "set", "services.trajectory_executor.speed_scaling=0.05")
+        await asyncio.to_thread(place.say, "task", "stop")
+    kill_all(command)
+    command = place.start("up", *PANDA)
+    command.until("Motions go at 5 % of their speed")
+    told = command.until("panda is stopped since")
+    assert "`zencell task start` lets it go on" in told and "@" in told
+    async with connect(cell="panda", service="watcher", endpoint=endpoint_of(place.domain), timeout=PATIENCE) as bus:
+        joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
+        await assert_still(joints)
+        command.children()["trajectory_executor"].kill()
+        await asyncio.to_thread(command.until, "trajectory_executor is ready again")
+        again = await until(motion, lambda m: m.state == "none")
+        assert again.stopped and again.speed_scaling == 0.05
+        await assert_still(joints)
+    await asyncio.to_thread(place.say, "param", "set", "services.trajectory_executor.speed_scaling=1")
+    command.interrupt()
+    assert command.end() == 0
+    run = place.start("run", *PANDA)
+    run.until("Let go: panda was stopped since")
+    assert run.end() == 0
