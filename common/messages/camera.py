@@ -2,34 +2,39 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import Finite, Header, Message
+from common.messages.basics import LARGEST, SMALL, Finite, Header, Label, Message, Text
 from common.messages.geometry import Color, Pose, Vector3
 
 
 class Image(Message):
     """Pixels, row by row. `step` is the row stride in bytes; 0 means unpadded. See common/perception/image.py."""
 
+    most_bytes: ClassVar[int] = LARGEST
+    most_parts: ClassVar[int] = 16
+
     header: Header
     height: int = Field(ge=1, le=16384)
     width: int = Field(ge=1, le=16384)
-    encoding: str = Field(description="bgr8, rgb8, mono8, 16UC1 or 32FC1")
+    encoding: Label = Field(description="bgr8, rgb8, mono8, 16UC1 or 32FC1")
     is_bigendian: bool = False
-    step: int = Field(0, ge=0)
+    step: int = Field(0, ge=0, le=LARGEST)
     data: bytes
 
 
 class CameraInfo(Message):
     """Pinhole calibration, as sensor_msgs/CameraInfo: `k` is the 3x3 intrinsic matrix [px], row by row."""
 
+    most_bytes: ClassVar[int] = SMALL
+
     header: Header
     height: int = Field(ge=1, le=16384)
     width: int = Field(ge=1, le=16384)
-    distortion_model: str = "plumb_bob"
-    d: list[Finite] = []
+    distortion_model: Label = "plumb_bob"
+    d: list[Finite] = Field([], max_length=64)
     k: list[Finite] = Field(min_length=9, max_length=9)
 
     @model_validator(mode="after")
@@ -42,13 +47,13 @@ class CameraInfo(Message):
 class Marker(Message):
     """Something to look at: a detection or a shape for the operator. `scale` is the full size [m]."""
 
-    ns: str
+    ns: Label
     id: int
     type: Literal["sphere", "cylinder", "box", "text"]
     pose: Pose
     scale: Vector3
     color: Color = Color()
-    text: str = ""
+    text: Text = ""
     pixel: tuple[Finite, Finite] | None = Field(None, description="where the centre is seen, (u, v) [px]")
     partial: bool = Field(False, description="touches the border of the picture: not wholly in view")
 
@@ -56,19 +61,25 @@ class Marker(Message):
 class MarkerArray(Message):
     """Markers of one instant; a later message with the same header frame replaces them all."""
 
+    most_bytes: ClassVar[int] = 256 * 1024
+    most_parts: ClassVar[int] = 8 * 1024
+
     header: Header
-    markers: list[Marker]
+    markers: list[Marker] = Field(max_length=1000)
 
 
 class PointCloud2(Message):
     """Points as rows of little-endian float32 x, y, z and one packed colour, as sensor_msgs/PointCloud2."""
 
+    most_bytes: ClassVar[int] = LARGEST
+    most_parts: ClassVar[int] = 16
+
     header: Header
     height: int = Field(ge=1, le=16384)
     width: int = Field(ge=1, le=16384)
-    fields: list[str] = ["x", "y", "z", "rgb"]
+    fields: list[Label] = Field(["x", "y", "z", "rgb"], max_length=64)
     point_step: int = Field(16, ge=4, le=256, description="bytes of one point")
-    row_step: int = Field(ge=4, description="bytes of one row")
+    row_step: int = Field(ge=4, le=LARGEST, description="bytes of one row")
     data: bytes
 
 
@@ -76,11 +87,14 @@ class Rejection(Message):
     """A detected object that is not offered to the task, and why."""
 
     position: Vector3
-    reason: str
+    reason: Text
 
 
 class Rejections(Message):
     """Rejections that are new: one is sent once for each place."""
 
+    most_bytes: ClassVar[int] = 256 * 1024
+    most_parts: ClassVar[int] = 8 * 1024
+
     header: Header
-    rejected: list[Rejection]
+    rejected: list[Rejection] = Field(max_length=1000)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from common.messages.basics import Finite, Fraction, Header, Message, Name
-from common.messages.robot import JointTrajectory
+from common.messages.basics import MOST_STAMP, SMALL, Finite, Fraction, Header, Label, Message, Name, Remark, Text
+from common.messages.robot import TRAJECTORY_BYTES, JointTrajectory
 
 GoalState = Literal["none", "rejected", "active", "succeeded", "aborted", "cancelled"]
 Holder = Literal["person", "watchdog", "controller"]
-Who = Annotated[str, Field(max_length=120)]
-Since = Annotated[int, Field(ge=0, lt=2**63)]
+Who = Label
+Since = Annotated[int, Field(ge=0, le=MOST_STAMP)]
 MOST_INHIBITS = 32  # that are told of
 
 
@@ -22,6 +22,9 @@ class ExecuteRequest(Message):
 
     The header says when that was decided: a request that comes too late is refused.
     """
+
+    most_bytes: ClassVar[int] = TRAJECTORY_BYTES + SMALL
+    most_parts: ClassVar[int] = 128 * 1024
 
     header: Header = Header()
     id: Name
@@ -38,8 +41,10 @@ class StopRequest(Message):
     outlives every process. By the requester it ends its goal only. A goal that is named and comes later is refused.
     """
 
-    id: str = ""
-    reason: str = "asked to"
+    most_bytes: ClassVar[int] = SMALL
+
+    id: Label = ""
+    reason: Text = "asked to"
     by: Literal["person", "requester"] = "person"
     owner: Who = Field("", description="name of the person")
 
@@ -50,8 +55,10 @@ class HoldRequest(Message):
     A person's hold outlives every process. Who gave no name holds for everybody, and everybody lets go of that.
     """
 
+    most_bytes: ClassVar[int] = SMALL
+
     hold: bool
-    reason: str = ""
+    reason: Text = ""
     by: Literal["person", "watchdog"] = Field(
         "person", description="each lets go only of its own hold; the robot moves when nobody holds it"
     )
@@ -68,7 +75,7 @@ class Inhibit(Message):
 
     kind: Literal["stopped", "held"]
     by: Who = Field(description="name of a person; watchdog; controller")
-    reason: Annotated[str, Field(max_length=500)] = ""
+    reason: Remark = ""
     since: Since = Field(description="when that was said last [ns since the Unix epoch], later than all before it")
 
     @property
@@ -81,15 +88,18 @@ class Inhibit(Message):
 class MotionStatus(Message):
     """State of the newest goal, and the answer to execute, stop and hold."""
 
+    most_bytes: ClassVar[int] = 4 * SMALL  # with all that keeps the robot from moving
+    most_parts: ClassVar[int] = 256
+
     header: Header = Header()
-    id: str = ""
+    id: Label = ""
     state: GoalState = "none"
     progress: Fraction = 0.0
-    error: str = Field("", description="code, such as start_mismatch, limit, path_tolerance, cancelled")
-    message: str = ""
-    source: str = Field("", description="who said so: the controller by its name, or hardware")
+    error: Label = Field("", description="code, such as start_mismatch, limit, path_tolerance, cancelled")
+    message: Text = ""
+    source: Label = Field("", description="who said so: the controller by its name, or hardware")
     held: bool = Field(False, description="kept at rest on its path until let go; no new goal begins to move")
-    held_by: list[Holder] = []
+    held_by: list[Holder] = Field([], max_length=8)
     speed_scaling: Fraction = Field(1.0, description="trajectories are followed at this share of their speed")
     inhibits: Annotated[list[Inhibit], Field(max_length=MOST_INHIBITS)] = Field(
         [], description="who stopped or holds the robot")
@@ -113,13 +123,17 @@ class MotionStatus(Message):
 class GripperCommand(Message):
     """Move the fingers to a width [m]. The requester mints `id`; the same id never moves them twice."""
 
+    most_bytes: ClassVar[int] = SMALL
+
     id: Name
-    width: Annotated[float, Field(ge=0, le=0.2, allow_inf_nan=False)]
+    width: Annotated[float, Field(ge=0, le=0.2)]
     effort: Annotated[float, Field(ge=0, le=1e4, description="grip force [N]; 0: as much as the gripper has")] = 0.0
 
 
 class GripperState(Message):
     """Width between the fingers [m], whether something is between them, and the newest command."""
+
+    most_bytes: ClassVar[int] = SMALL
 
     header: Header = Header()
     width: Finite = 0.0
@@ -127,8 +141,8 @@ class GripperState(Message):
     effort: Finite = Field(0.0, description="what the fingers press with [N]")
     holding: bool = False
     moving: bool = False
-    id: str = ""
+    id: Label = ""
     state: GoalState = "none"
-    error: Annotated[str, Field(max_length=120)] = Field("", description="code of a refusal, such as stopped")
-    message: str = ""
-    source: str = Field("", description="name of the gripper's controller")
+    error: Label = Field("", description="code of a refusal, such as stopped")
+    message: Text = ""
+    source: Label = Field("", description="name of the gripper's controller")

@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import Finite, Fraction, Header, Message, Name
+from common.messages.basics import SMALL, Fraction, Header, Label, Message, Metres, Name
+
+Unit = Annotated[float, Field(ge=-1.001, le=1.001)]  # part of a quaternion
+MOST_POSES = 256
+Labels = Annotated[list[Label], Field(max_length=MOST_POSES)]
+Corner = tuple[Metres, Metres]  # of what is drawn on a plane [m]
+Corners = Annotated[list[Corner], Field(max_length=2000)]
 
 
 class Vector3(Message):
     """A point, displacement [m] or box size [m]."""
 
-    x: Finite = 0.0
-    y: Finite = 0.0
-    z: Finite = 0.0
+    x: Metres = 0.0
+    y: Metres = 0.0
+    z: Metres = 0.0
 
 
 class Quaternion(Message):
     """A unit quaternion; refused when its norm is more than 1e-3 off one."""
 
-    x: Finite = 0.0
-    y: Finite = 0.0
-    z: Finite = 0.0
-    w: Finite = 1.0
+    x: Unit = 0.0
+    y: Unit = 0.0
+    z: Unit = 0.0
+    w: Unit = 1.0
 
     @model_validator(mode="after")
     def _is_unit(self) -> Quaternion:
@@ -43,10 +50,13 @@ class Pose(Message):
 class PoseArray(Message):
     """Poses of several things; `ids[i]` and `labels[i]`, where given, belong to `poses[i]`."""
 
+    most_bytes: ClassVar[int] = 2 * SMALL
+    most_parts: ClassVar[int] = 1024
+
     header: Header = Header()
-    poses: list[Pose] = []
-    ids: list[str] = []
-    labels: list[str] = Field([], description="of truth: table, held, falling, box, or elsewhere (out of sight)")
+    poses: list[Pose] = Field([], max_length=MOST_POSES)
+    ids: Labels = []
+    labels: Labels = Field([], description="of truth: table, held, falling, box, or elsewhere (out of sight)")
 
     @model_validator(mode="after")
     def _same_length(self) -> PoseArray:
@@ -68,7 +78,10 @@ class TransformStamped(Message):
 class TFMessage(Message):
     """Transforms of one instant."""
 
-    transforms: list[TransformStamped]
+    most_bytes: ClassVar[int] = 256 * 1024
+    most_parts: ClassVar[int] = 8 * 1024
+
+    transforms: list[TransformStamped] = Field(max_length=1000)
 
 
 class Color(Message):

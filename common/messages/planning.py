@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import Finite, Fraction, Header, Message, Name
+from common.messages.basics import SMALL, Count, Finite, Fraction, Header, Label, Message, Name, Text
 from common.messages.geometry import Pose, Vector3
-from common.messages.robot import JointTrajectory
+from common.messages.robot import TRAJECTORY_BYTES, Joints, JointTrajectory
+from common.messages.scene import Pairs
 
 
 class JointGoal(Message):
     """Joint positions to end at [rad], in the order of the robot's group; or the name of a named pose."""
 
     kind: Literal["joints"] = "joints"
-    positions: list[Finite] = []
-    named: str = Field("", description="a named pose of the robot file, such as home; used when positions is empty")
+    positions: Joints = []
+    named: Label = Field("", description="a named pose of the robot file, such as home; used when positions is empty")
 
 
 class PoseGoal(Message):
@@ -31,8 +32,8 @@ class PoseGoal(Message):
     kind: Literal["pose"] = "pose"
     pose: Pose
     position_tolerance: Vector3 = Vector3()
-    tilt_tolerance: Annotated[float, Field(ge=0, le=math.pi, allow_inf_nan=False)] = 0.0
-    yaw_tolerance: Annotated[float, Field(ge=0, le=math.pi, allow_inf_nan=False)] = 0.0
+    tilt_tolerance: Annotated[float, Field(ge=0, le=math.pi)] = 0.0
+    yaw_tolerance: Annotated[float, Field(ge=0, le=math.pi)] = 0.0
 
 
 class PathGoal(Message):
@@ -43,11 +44,11 @@ class PathGoal(Message):
 
     kind: Literal["path"] = "path"
     waypoints: list[Pose] = Field(min_length=1, max_length=20000)
-    step: Annotated[float, Field(gt=0, le=0.1, allow_inf_nan=False)] | None = Field(
+    step: Annotated[float, Field(gt=0, le=0.1)] | None = Field(
         None, description="way between poses for which joint positions are solved [m]; None: the planner's"
     )
     min_fraction: Fraction | None = Field(None, description="less of the path is refused; None: the planner's")
-    tool_speed: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] | None = Field(None, description="[m/s]")
+    tool_speed: Annotated[float, Field(ge=1e-5, le=5)] | None = Field(None, description="[m/s]")
 
 
 class ArcGoal(Message):
@@ -77,7 +78,7 @@ class SequenceItem(Message):
 
     goal: Annotated[JointGoal | PoseGoal | ArcGoal, Field(discriminator="kind")]
     straight: bool = False
-    blend_radius: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = Field(0.0, description="[m]")
+    blend_radius: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="[m]")
 
 
 class SequenceGoal(Message):
@@ -101,48 +102,54 @@ class PlanRequest(Message):
     the tool has moved `contact_distance`.
     """
 
+    most_bytes: ClassVar[int] = 4 * 1024 * 1024  # a path of 20000 poses
+    most_parts: ClassVar[int] = 64 * 1024
+
     header: Header = Header()
     id: Name
-    stage: str = Field("", description="what the motion is for: appears in every error")
-    start: list[Finite] = Field([], description="joint positions [rad]; empty: where the robot is now")
+    stage: Label = Field("", description="what the motion is for: appears in every error")
+    start: Joints = Field([], description="joint positions [rad]; empty: where the robot is now")
     goal: Annotated[JointGoal | PoseGoal | PathGoal | ArcGoal | SequenceGoal, Field(discriminator="kind")]
     straight: bool = Field(False, description="only a straight line of the tool will do")
-    allowed_collisions: list[tuple[str, str]] = Field([], description="in addition to the planning scene's")
-    attach: str = ""
+    allowed_collisions: Pairs = Field([], description="in addition to the planning scene's")
+    attach: Label = ""
     attach_pose: Pose | None = Field(None, description="of the attached object in the tool frame, when not held yet")
     release: bool = False
-    contact_distance: Annotated[float, Field(ge=0, le=0.2, allow_inf_nan=False)] = 0.02
-    velocity_scaling: Annotated[float, Field(gt=0, le=1)] | None = None
-    acceleration_scaling: Annotated[float, Field(gt=0, le=1)] | None = None
+    contact_distance: Annotated[float, Field(ge=0, le=0.2)] = 0.02
+    velocity_scaling: Annotated[float, Field(ge=1e-4, le=1)] | None = None
+    acceleration_scaling: Annotated[float, Field(ge=1e-4, le=1)] | None = None
     planning_time: Annotated[float, Field(gt=0, le=600)] | None = Field(None, description="wall time [s]")
     planning_attempts: Annotated[int, Field(ge=1, le=100)] | None = None
-    planner: str = Field("", description="use only this one, of the pipeline or of the project")
+    planner: Label = Field("", description="use only this one, of the pipeline or of the project")
     seed: int | None = None
 
 
 class PlanAttempt(Message):
     """One try of one planner. `error` is empty for a success."""
 
-    planner: str
+    planner: Label
     seconds: Finite
-    error: str = ""
-    message: str = ""
+    error: Label = ""
+    message: Text = ""
     fraction: Finite = 0.0
-    waypoint: int | None = None
-    colliding: tuple[str, str] | None = None
+    waypoint: Count | None = None
+    colliding: tuple[Label, Label] | None = None
 
 
 class PlanResponse(Message):
     """A trajectory, or the error of the planner that got furthest. All attempts are listed."""
 
+    most_bytes: ClassVar[int] = TRAJECTORY_BYTES + 64 * SMALL  # with all that was tried
+    most_parts: ClassVar[int] = 128 * 1024
+
     header: Header = Header()
     id: Name
     ok: bool
     trajectory: JointTrajectory | None = None
-    planner: str = ""
+    planner: Label = ""
     seconds: Finite = Field(0.0, description="wall time [s] of the whole request")
     fraction: Finite = 0.0
-    error: str = Field("", description="code: start_in_collision, no_ik, collision, incomplete, timeout, ...")
-    message: str = Field("", description="one line naming stage, planner, waypoint and colliding pair")
-    colliding: tuple[str, str] | None = None
-    attempts: list[PlanAttempt] = []
+    error: Label = Field("", description="code: start_in_collision, no_ik, collision, incomplete, timeout, ...")
+    message: Text = Field("", description="one line naming stage, planner, waypoint and colliding pair")
+    colliding: tuple[Label, Label] | None = None
+    attempts: list[PlanAttempt] = Field([], max_length=1000)

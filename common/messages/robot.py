@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import Finite, Header, Message, Name
+from common.messages.basics import MOST_JOINTS, SMALL, Finite, Header, Message, Name
+
+MOST_SECONDS = 1e6  # of a trajectory
+MOST_POINTS = 25_000  # of a trajectory
+TRAJECTORY_BYTES = 7 * 1024 * 1024  # so many points of seven joints
+
+Joints = Annotated[list[Finite], Field(max_length=MOST_JOINTS)]
 
 
 class JointState(Message):
     """Positions [rad or m], velocities [rad/s or m/s] and efforts of named joints."""
 
+    most_bytes: ClassVar[int] = SMALL
+
     header: Header
-    name: list[Name]
-    position: list[Finite]
-    velocity: list[Finite] = []
-    effort: list[Finite] = []
+    name: list[Name] = Field(max_length=MOST_JOINTS)
+    position: Joints
+    velocity: Joints = []
+    effort: Joints = []
 
     @model_validator(mode="after")
     def _same_length(self) -> JointState:
@@ -30,10 +38,10 @@ class JointState(Message):
 class JointTrajectoryPoint(Message):
     """State of all joints at a time [s] after the start."""
 
-    time_from_start: Annotated[float, Field(ge=0, allow_inf_nan=False)]
-    positions: list[Finite]
-    velocities: list[Finite]
-    accelerations: list[Finite]
+    time_from_start: Annotated[float, Field(ge=0, le=MOST_SECONDS)]
+    positions: Joints
+    velocities: Joints
+    accelerations: Joints
 
     @model_validator(mode="after")
     def _same_length(self) -> JointTrajectoryPoint:
@@ -45,9 +53,12 @@ class JointTrajectoryPoint(Message):
 class JointTrajectory(Message):
     """A timed path of the named joints; the first point is where the robot starts, at time 0."""
 
+    most_bytes: ClassVar[int] = TRAJECTORY_BYTES
+    most_parts: ClassVar[int] = 128 * 1024
+
     header: Header = Header()
-    joint_names: list[Name] = Field(min_length=1)
-    points: list[JointTrajectoryPoint]
+    joint_names: list[Name] = Field(min_length=1, max_length=MOST_JOINTS)
+    points: list[JointTrajectoryPoint] = Field(max_length=MOST_POINTS)
 
     @model_validator(mode="after")
     def _dof_fits(self) -> JointTrajectory:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import Finite, Header, Message, Name, Positive
-from common.messages.geometry import Color, Pose
+from common.messages.basics import Header, Label, Message, Name, Positive
+from common.messages.geometry import Color, Corners, Pose
+
+Pairs = Annotated[list[tuple[Label, Label]], Field(max_length=2000)]
 
 
 class CollisionObject(Message):
@@ -21,7 +23,7 @@ class CollisionObject(Message):
     role: Literal["fixture", "container", "target", "contained", "attached"]
     shape: Literal["box", "sphere", "cylinder", "prism"]
     dimensions: list[Positive] = Field(min_length=1, max_length=3)
-    outline: list[tuple[Finite, Finite]] = Field([], description="cross-section of a prism [m], in its own frame")
+    outline: Corners = Field([], description="cross-section of a prism [m], in its own frame")
     pose: Pose
     color: Color = Color()
 
@@ -45,7 +47,10 @@ class AttachedObject(Message):
 class PlanningScene(Message):
     """What the planner avoids, all of it perceived or fixed; poses of `objects` are in `header.frame_id`."""
 
+    most_bytes: ClassVar[int] = 256 * 1024
+    most_parts: ClassVar[int] = 8 * 1024
+
     header: Header
-    objects: list[CollisionObject] = []
-    attached: list[AttachedObject] = []
-    allowed_collisions: list[tuple[str, str]] = Field([], description="pairs of link or object names that may touch")
+    objects: list[CollisionObject] = Field([], max_length=500)
+    attached: list[AttachedObject] = Field([], max_length=50)
+    allowed_collisions: Pairs = Field([], description="pairs of link or object names that may touch")

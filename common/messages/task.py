@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from common.messages.basics import Finite, Header, Message
+from common.messages.basics import SMALL, Count, Finite, Header, Label, Message, Name, Text
 from common.messages.camera import Rejection
 from common.messages.execution import Who
 
 
 class TaskCommand(Message):
     """What a person may tell the task. Who gives no name has none of their own holds."""
+
+    most_bytes: ClassVar[int] = SMALL
 
     command: Literal["start", "pause", "resume", "stop"]
     by: Who = Field("", description="name of the person")
@@ -22,10 +24,10 @@ class TaskCommand(Message):
 class PlanFigure(Message):
     """One successful plan, for the summary."""
 
-    planner: str
+    planner: Label
     seconds: Finite
     fraction: Finite
-    attempts: int
+    attempts: Count
 
 
 class TaskStatus(Message):
@@ -34,20 +36,23 @@ class TaskStatus(Message):
     `figures` are the task's own, by name; they stand in the summary of a run as they are.
     """
 
+    most_bytes: ClassVar[int] = 256 * 1024
+    most_parts: ClassVar[int] = 8 * 1024
+
     header: Header = Header()
-    state: str = Field("IDLE", description="DONE and ERROR end a run; IDLE is at rest; all else is the task's own")
+    state: Label = Field("IDLE", description="DONE and ERROR end a run; IDLE is at rest; all else is the task's own")
     paused: bool = False
     started: bool = False
-    stage: str = ""
-    subject: str = Field("", description="what is in work: the id of an object, for example")
-    done: int = Field(0, description="of `total`")
-    total: int = Field(0, description="what the task has seen and may do or has done")
-    failures: int = 0
-    retries: int = 0
-    skipped: list[Rejection] = Field([], description="what could not be done, where, and why")
-    plans: list[PlanFigure] = []
+    stage: Label = ""
+    subject: Label = Field("", description="what is in work: the id of an object, for example")
+    done: Count = Field(0, description="of `total`")
+    total: Count = Field(0, description="what the task has seen and may do or has done")
+    failures: Count = 0
+    retries: Count = 0
+    skipped: list[Rejection] = Field([], max_length=1000, description="what could not be done, where, and why")
+    plans: list[PlanFigure] = Field([], max_length=1000)
     moving_seconds: Finite = Field(0.0, description="cell time in motion [s]")
     planning_seconds: Finite = Field(0.0, description="wall time spent in plan requests [s]")
     task_seconds: Finite = Field(0.0, description="cell time since the start of the task [s]")
-    figures: dict[str, bool | int | Finite | str | None] = {}
-    message: str = ""
+    figures: dict[Name, bool | int | Finite | Text | None] = Field({}, max_length=200)
+    message: Text = ""

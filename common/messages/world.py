@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import Finite, Header, Message, Name, Positive
-from common.messages.geometry import Color, Pose, Vector3
+from common.messages.basics import SMALL, Finite, Header, Label, Message, Metres, Name, Positive
+from common.messages.geometry import Color, Corners, Pose, Vector3
 
 Shape = Literal["sphere", "box", "cylinder", "prism", "ring", "mesh"]
-Corner = tuple[Finite, Finite]
 
 
 class SceneUpdate(Message):
     """What happened to an object of the simulated world, as in the seed: "remove:ID", "add:ID"."""
 
+    most_bytes: ClassVar[int] = SMALL
+
     header: Header = Header()
-    data: str
+    data: Label
     pose: Pose | None = None
 
 
@@ -29,15 +30,18 @@ class WorldEdit(Message):
     world, but for what is said here.
     """
 
+    most_bytes: ClassVar[int] = 4 * SMALL
+    most_parts: ClassVar[int] = 2048 + 8
+
     op: Literal["add", "move", "remove", "reset", "drop"]
-    id: str = ""
+    id: Label = ""
     position: Vector3 | None = Field(None, description="centre [m]; z is found from what lies there")
     yaw: Finite | None = Field(None, description="of what is added or moved [rad]")
-    like: str = Field("", description="id of an object of the world's first layout: add one more of those")
+    like: Label = Field("", description="id of an object of the world's first layout: add one more of those")
     shape: Literal["sphere", "box", "cylinder", "prism", "ring"] | None = None
     size: Vector3 | None = Field(None, description="of the box about it [m]; of a sphere or what is round, x counts")
     inner_radius: Positive | None = Field(None, description="of a ring [m]")
-    polygon: list[Corner] = Field([], description="cross-section of a prism [m]; its height is z of size")
+    polygon: Corners = Field([], description="cross-section of a prism [m]; its height is z of size")
     color: Color | None = None
     mass: Positive | None = Field(None, description="[kg]")
 
@@ -45,8 +49,11 @@ class WorldEdit(Message):
 class WorldEditReply(Message):
     """The object that was changed and what is in the world now."""
 
-    id: str
-    ids: list[str]
+    most_bytes: ClassVar[int] = 4 * SMALL
+    most_parts: ClassVar[int] = 512
+
+    id: Label
+    ids: list[Label] = Field(max_length=1000)
 
 
 class WorldObject(Message):
@@ -64,19 +71,21 @@ class WorldObject(Message):
     shape: Shape
     pose: Pose = Pose()
     size: Vector3 = Field(Vector3(), description="of the box about it, along the axes of its own frame [m]")
-    inner_radius: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="of a ring [m]")
-    polygon: list[Corner] = Field([], description="cross-section of a prism, anticlockwise [m], in its own frame")
-    vertices: list[tuple[Finite, Finite, Finite]] = Field([], description="of a mesh [m], in its own frame")
-    triangles: list[tuple[int, int, int]] = Field([], description="of a mesh: indices of vertices")
+    inner_radius: Annotated[float, Field(ge=0, le=1e7)] = Field(0.0, description="of a ring [m]")
+    polygon: Corners = Field([], description="cross-section of a prism, anticlockwise [m], in its own frame")
+    vertices: list[tuple[Metres, Metres, Metres]] = Field(
+        [], max_length=40_000, description="of a mesh [m], in its own frame"
+    )
+    triangles: list[tuple[int, int, int]] = Field([], max_length=80_000, description="of a mesh: indices of vertices")
     color: Color = Color()
     state: Literal["table", "held", "falling", "contained", "elsewhere"] = Field(
         "table", description="lies on something, in the hand, falls, lies in a container, or is out of sight"
     )
-    container: str = Field("", description="id of the container in which it lies")
-    outline: list[Corner] = Field([], description="of what stands upright [m], world")
-    hole: list[Corner] = Field([], description="of what stands upright and has one [m], world")
-    base: Finite = Field(0.0, description="z on which it stands [m]")
-    height: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="of what stands upright [m]")
+    container: Label = Field("", description="id of the container in which it lies")
+    outline: Corners = Field([], description="of what stands upright [m], world")
+    hole: Corners = Field([], description="of what stands upright and has one [m], world")
+    base: Metres = Field(0.0, description="z on which it stands [m]")
+    height: Annotated[float, Field(ge=0, le=1e7)] = Field(0.0, description="of what stands upright [m]")
 
     @model_validator(mode="before")
     @classmethod
@@ -90,8 +99,11 @@ class WorldObject(Message):
 class WorldObjects(Message):
     """All solids of the simulated world: the truth."""
 
+    most_bytes: ClassVar[int] = 4 * 1024 * 1024  # meshes
+    most_parts: ClassVar[int] = 128 * 1024
+
     header: Header = Header()
-    objects: list[WorldObject] = []
+    objects: list[WorldObject] = Field([], max_length=1000)
 
 
 def _from_outline(values: dict[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import zlib
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
 
@@ -11,13 +13,16 @@ from pydantic import ValidationError
 
 from common.errors import DecodeError
 from common.messages import SCHEMA_VERSION, Message
+from common.messages.basics import LARGEST, SMALL, clean, is_name
 
-DEFAULT_LIMIT = 32 * 1024 * 1024  # [bytes]; a 4096 x 2560 bgr8 picture still fits
+DEFAULT_LIMIT = LARGEST  # [bytes]
+_MOST_FIELDS = 256  # of a map: each that a message does not know costs time to refuse
 MSGPACK = "application/msgpack"
 CHECKED_BYTES = 64 * 1024  # of a payload that its checksum covers: a damaged pixel harms nobody
 _SHOWN = 60  # characters of a value that an error shows
 
 M = TypeVar("M", bound=Message)
+T = TypeVar("T")
 
 
 def encoding_of(model: type[Message]) -> str:
@@ -51,25 +56,55 @@ def decode(model: type[M], payload: bytes, limit: int = DEFAULT_LIMIT) -> M:
     Raises:
         DecodeError: one line: too large, not msgpack, bytes after the end, or the first field that does not fit.
     """
-    value = _unpack(payload, limit, model.__name__)
+    if len(payload) <= SMALL or not gc.isenabled():
+        return _decode(model, payload, limit)
+    gc.disable()  # it would look again and again at all that is made of a large payload: half of the time
+    try:
+        return _decode(model, payload, limit)
+    finally:
+        gc.enable()
+
+
+def _decode(model: type[M], payload: bytes, limit: int) -> M:
+    value = _unpack(payload, min(limit, model.most_bytes), model.__name__, model.most_parts)
     if not isinstance(value, dict):
         raise DecodeError(f"{model.__name__}: payload is {_kind(value)}, not a map")
     try:
         return model.model_validate(value)
     except ValidationError as error:
         raise DecodeError(_first_error(error, model.__name__)) from None
+    except Exception as error:  # a check of a message of somebody's own that did not think of everything
+        raise DecodeError(f"{model.__name__}: {type(error).__name__}: {_one_line(str(error))}") from None
 
 
-def _unpack(payload: bytes, limit: int, name: str) -> Any:
+def _counting(most: int) -> Callable[[T], T]:
+    """What is called with each list and map of a payload, and refuses one too many."""
+    left = most
+
+    def count(part: T) -> T:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise ValueError(f"more than {most} lists and maps")
+        return part
+
+    return count
+
+
+def _unpack(payload: bytes, limit: int, name: str, parts: int = 64) -> Any:
     if len(payload) > limit:
         raise DecodeError(f"{name}: payload has {len(payload)} bytes, the limit is {limit}")
     if not payload:
         raise DecodeError(f"{name}: payload is empty")
     try:
-        return msgpack.unpackb(payload, raw=False, strict_map_key=True)
+        count = _counting(parts) if len(payload) > SMALL else None
+        return msgpack.unpackb(
+            payload, raw=False, strict_map_key=True, max_map_len=_MOST_FIELDS, max_array_len=4 * parts, max_ext_len=0,
+            object_hook=count, list_hook=count,
+        )
     except msgpack.ExtraData as error:
         raise DecodeError(f"{name}: {len(error.extra)} bytes after the end of the message") from None
-    except (ValueError, TypeError, msgpack.UnpackException, RecursionError, OverflowError) as error:
+    except Exception as error:
         raise DecodeError(f"{name}: not msgpack: {_one_line(str(error) or type(error).__name__)}") from None
 
 
@@ -78,6 +113,8 @@ def _first_error(error: ValidationError, name: str) -> str:
     first = errors[0]
     field = ".".join([name, *(str(part) for part in first["loc"])])
     reason = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    if first["type"] == "string_pattern_mismatch":  # the only one that messages have
+        reason = "must be a name without control characters"
     given = "" if first["type"] in ("missing", "value_error") else f", not {_shown(first['input'])}"
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
     return _one_line(f"{field}: {reason}{given}{more}")
@@ -99,7 +136,7 @@ def _kind(value: object) -> str:
 
 
 def _one_line(text: str) -> str:
-    return " ".join(text.split())
+    return clean(" ".join(text.split()))
 
 
 class Attachment(NamedTuple):
@@ -145,7 +182,7 @@ def decode_attachment(data: bytes | None) -> Attachment | None:
         return None
     value = _unpack(data, 1024, "attachment")
     match value:
-        case [str(writer), int(sequence), int(schema), str(trace), *rest]:
+        case [str(writer), int(sequence), int(schema), str(trace), *rest] if is_name(writer) and is_name(trace):
             if schema != SCHEMA_VERSION:
                 raise DecodeError(f"attachment: schema version {schema}, this side has {SCHEMA_VERSION}")
             match rest:
@@ -170,5 +207,5 @@ def decode_error(payload: bytes) -> tuple[str, str] | None:
         return None
     match value:
         case {"code": str(code), "message": str(message)}:
-            return code, message
+            return clean(code), clean(message)
     return None

@@ -26,7 +26,8 @@ ROUTER_STUCK_MS = 300  # the same in the router, where all that comes from the w
 LINK_RETRY_MS = (100, 1000)  # between two tries to reach the router of another host: at first, and at most
 STREAM_BATCHES = 16  # of 64 kB that may wait in a link: a whole picture, so that what follows it is not dropped
 MOST_BYTES = 40 * 1024 * 1024  # of one message; the largest picture that is read has 32 MB
-MOST_BYTES_BESIDES = 8 * 1024 * 1024  # of one that holds no picture: minutes of a trajectory have 1 MB
+MOST_BYTES_BESIDES = 8 * 1024 * 1024 + 4096  # of one that holds no picture: minutes of a trajectory have 1 MB
+BESIDE_BYTES = 4096  # that a message may have beside its payload
 MOST_SESSIONS = 512  # at one router: 50 cells of ten services
 MOST_PENDING = 32  # of these that have not shown who they are yet
 ACCEPT_MS = 3000  # in which they must; a loaded machine takes 1 s
@@ -178,7 +179,7 @@ def router_settings(
         mode="router", listen__endpoints=list(endpoints), connect__endpoints=list(links),
         connect__timeout_ms=-1, connect__exit_on_failure=False,
         connect__retry={"period_init_ms": first, "period_max_ms": most, "period_increase_factor": 1.5},
-        low_pass_filter=[size_limit(small)],
+        low_pass_filter=size_limits(small),
         transport__unicast__max_sessions=MOST_SESSIONS,
         transport__unicast__accept_pending=MOST_PENDING,
         transport__unicast__accept_timeout=ACCEPT_MS,
@@ -186,13 +187,23 @@ def router_settings(
     )
 
 
-def size_limit(more: Sequence[str] = ()) -> dict[str, Any]:
+def size_limits(more: Sequence[str] = ()) -> list[dict[str, Any]]:
     """What the router drops, because it is larger than any message of its topic ever is; `more` keys beside our own."""
-    return {
-        "id": "no pictures", "flows": ["ingress"], "messages": ["put", "query", "reply"],
-        "key_exprs": sorted(f"*/{key}" for key in (*small_keys(), *more)),
-        "size_limit": MOST_BYTES_BESIDES,
-    }
+    from common.application import all_topics
+
+    by_size: dict[int, list[str]] = {}
+    for topic in all_topics().values():
+        most = max(topic.message.most_bytes, getattr(topic, "answer", topic.message).most_bytes)
+        if (allowed := most + BESIDE_BYTES) <= MOST_BYTES_BESIDES:
+            by_size.setdefault(allowed, []).append(topic.expression)
+    by_size.setdefault(MOST_BYTES_BESIDES, []).extend(more)
+    return [
+        {
+            "id": f"at most {size} bytes", "flows": ["ingress"], "messages": ["put", "query", "reply"],
+            "key_exprs": sorted(f"*/{key}" for key in keys), "size_limit": size,
+        }
+        for size, keys in sorted(by_size.items()) if keys
+    ]
 
 
 def small_keys() -> list[str]:

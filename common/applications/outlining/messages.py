@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, computed_field, model_validator
 
-from common.messages.basics import Finite, Header, Message, Name
-from common.messages.geometry import Color, PoseArray
+from common.messages.basics import SMALL, Count, Finite, Header, Label, Message, Name, Text
+from common.messages.geometry import Color, Pose, PoseArray
 from common.messages.task import TaskStatus
 
 
 class Contour(Message):
     """One closed contour in a picture. `pixels` are (u, v) [px], every one along the edge."""
 
-    index: int = Field(ge=0)
+    index: Count
     label: Name
-    pixels: list[tuple[Finite, Finite]] = Field(min_length=1)
+    pixels: list[tuple[Finite, Finite]] = Field(min_length=1, max_length=65_536)
     area: Finite = Field(0.0, description="[px^2]")
     parent: int = Field(-1, description="index of the contour around this one, or -1")
     touches_border: bool = False
@@ -26,27 +26,34 @@ class Contour(Message):
 class Contours(Message):
     """All contours of one picture, and the one that was chosen."""
 
+    most_bytes: ClassVar[int] = 4 * 1024 * 1024
+    most_parts: ClassVar[int] = 128 * 1024
+
     header: Header
-    width: int = Field(ge=1)
-    height: int = Field(ge=1)
-    contours: list[Contour] = []
+    width: int = Field(ge=1, le=16384)
+    height: int = Field(ge=1, le=16384)
+    contours: list[Contour] = Field([], max_length=1000)
     selected: int = Field(-1, description="index of the chosen contour, or -1")
-    message: str = ""
+    message: Text = ""
 
 
 class OutlineSelect(Message):
     """Choose an object: the largest that does not touch the border, one of a colour, or one by its index."""
 
+    most_bytes: ClassVar[int] = SMALL
+
     rule: Literal["auto", "colour", "index"] = "auto"
-    index: int | None = Field(None, ge=0)
-    colour: str = Field("", description="red, green, blue, yellow, ... of the object's inside")
+    index: Count | None = None
+    colour: Label = Field("", description="red, green, blue, yellow, ... of the object's inside")
 
 
 class OutlineSelection(Message):
     """What was chosen."""
 
+    most_bytes: ClassVar[int] = SMALL
+
     index: int
-    label: str
+    label: Label
 
 
 class OutlinePoints(PoseArray):
@@ -56,10 +63,16 @@ class OutlinePoints(PoseArray):
     and `message` says why.
     """
 
-    object: str = Field("", description="label of the chosen contour")
-    invalid_depth: int = Field(0, ge=0, description="pixels whose depth was filled from neighbours")
+    most_bytes: ClassVar[int] = 4 * 1024 * 1024
+    most_parts: ClassVar[int] = 128 * 1024
+
+    poses: list[Pose] = Field([], max_length=20_000)
+    ids: list[Label] = Field([], max_length=20_000)
+    labels: list[Label] = Field([], max_length=20_000)
+    object: Label = Field("", description="label of the chosen contour")
+    invalid_depth: Count = Field(0, description="pixels whose depth was filled from neighbours")
     given: bool = Field(False, description="by a file: need not be the outline of anything that was seen")
-    message: str = ""
+    message: Text = ""
 
 
 OutlineState = Literal[
@@ -71,11 +84,11 @@ class OutlineStatus(TaskStatus):
     """State and figures of the outline task. `subject` is the label of the object that is outlined."""
 
     state: OutlineState = "IDLE"
-    points: int = 0
+    points: Count = 0
     fraction: Finite = 0.0
     length_m: Finite = 0.0
     closed: bool = False
-    invalid_depth: int = Field(0, description="pixels of the contour whose depth was filled from neighbours")
+    invalid_depth: Count = Field(0, description="pixels of the contour whose depth was filled from neighbours")
     standoff: Finite = Field(0.0, description="of the tool above the contour [m]")
 
     @model_validator(mode="before")
