@@ -120,10 +120,15 @@ async def _status(bus: Bus, cell: str) -> SupervisorStatus | None:
 
 async def cell_clock(bus: Bus) -> Clock:
     """The clock that the cell runs by; the environment's where no supervisor tells."""
+    import socket
+
     from common.clock import Clock
 
     status = await supervisor_status(bus)
-    return Clock(status.speed, status.epoch) if status is not None and status.epoch else bus.clock
+    if status is None or not status.epoch:
+        return bus.clock
+    here = status.host == socket.gethostname()  # another host has a clock of its own
+    return Clock(status.speed, status.epoch, status.booted if here and status.booted else None)
 
 
 @dataclass(frozen=True)

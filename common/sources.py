@@ -11,12 +11,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
+# Where there is no such clock (macOS), the monotonic one is shared by all processes as well.
+_HOST_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
+
 
 class Sources(Protocol):
     """A clock that never goes back, one that says what day it is, and ids."""
 
     def monotonic_ns(self) -> int:
         """Time since some moment [ns]."""
+
+    def host_ns(self) -> int:
+        """Time since this host was started, also while it slept [ns]: the same in all its processes."""
 
     def wall_ns(self) -> int:
         """Time since the Unix epoch [ns]."""
@@ -25,10 +31,15 @@ class Sources(Protocol):
         """So many bytes that nobody else has, in hexadecimal digits."""
 
 
+def _host_ns() -> int:
+    return time.clock_gettime_ns(_HOST_CLOCK)
+
+
 class Machine:
     """The clocks of this machine, and ids that nobody can guess."""
 
     monotonic_ns = staticmethod(time.monotonic_ns)
+    host_ns = staticmethod(_host_ns)
     wall_ns = staticmethod(time.time_ns)
     token_hex = staticmethod(secrets.token_hex)
 
@@ -45,6 +56,11 @@ def monotonic() -> float:
 def monotonic_ns() -> int:
     """Time since some moment [ns], for durations."""
     return _Chosen.sources.monotonic_ns()
+
+
+def host_ns() -> int:
+    """Time since this host was started, also while it slept [ns]: the same in all its processes."""
+    return _Chosen.sources.host_ns()
 
 
 def wall_ns() -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from common.clock import KEPT_VARIABLE
 from common.config import Cell, load_cell, names_of
 from common.sim.standing import STATE_VARIABLE
 
@@ -47,7 +48,7 @@ def router() -> Container:
 
 def containers_of(file: str, cell: Cell) -> list[Container]:
     """The services of a cell, in start order."""
-    environment = {"ZENCELL_CONNECT": f"tcp/{ROUTER}:{ROUTER_PORT}", "ZENCELL_CELL": file}
+    environment = {"ZENCELL_CONNECT": f"tcp/{ROUTER}:{ROUTER_PORT}", "ZENCELL_CELL": file, KEPT_VARIABLE: DATA}
     kept = {EXECUTOR: {STATE_VARIABLE: DATA}}  # started again, it finds what it simulates as it was
     return [
         Container(

@@ -38,6 +38,9 @@ class SupervisorStatus(Message):
     epoch: int = Field(
         0, ge=0, le=MOST_STAMP, description="when cell time and wall time were equal [ns since the Unix epoch]"
     )
+    booted: int = Field(
+        0, ge=-MOST_STAMP, le=MOST_STAMP, description="when the clock of that host was at 0 [ns since the Unix epoch]"
+    )
     seed: int = 0
     world: Text = Field("", description="that replaces the cell's, as it was asked for")
     overrides: list[Text] = Field(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, NoReturn, Protocol, TypeVar
 
-from common.clock import EPOCH_VARIABLE, SPEED_VARIABLE, Clock
+from common.clock import BOOTED_VARIABLE, EPOCH_VARIABLE, KEPT_VARIABLE, SPEED_VARIABLE, Clock
 from common.config import Cell, Parameters, Watchdogs, load_cell, service_config
 from common.errors import ConfigError, UnknownName, ZencellError
 from common.process.lifeline import Lifeline, fail, leave
@@ -90,7 +90,8 @@ def clock_from(speed: float | None, environ: Mapping[str, str] = os.environ) -> 
     try:
         return Clock.from_environment(variables)
     except ValueError as error:
-        given = {name: variables[name] for name in (SPEED_VARIABLE, EPOCH_VARIABLE) if name in variables}
+        names = (SPEED_VARIABLE, EPOCH_VARIABLE, BOOTED_VARIABLE, KEPT_VARIABLE)
+        given = {name: variables[name] for name in names if name in variables}
         raise ConfigError("speed", given, f"cannot be used: {error}") from None
 
 

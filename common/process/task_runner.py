@@ -29,6 +29,8 @@ Q = TypeVar("Q", bound=m.Message)
 
 GOAL_TIMEOUT = 1.0  # [s] wall: for a goal to be accepted
 PLAN_OVERTIME = 5.0  # [s] wall: that a plan may take beyond its planning time
+REFUSED_AGAIN = 0.1  # [s] wall: what is told of the second refusal of a motion in a row; it doubles with each
+LONGEST_REFUSED = 2.0  # [s] wall
 LONGEST_STEP = LOOK_PERIOD  # [s] wall: time passes too
 WAITS = "the arm waits: "
 SOMEBODY = ("", "person", "watchdog", "controller")  # whose holds are nobody's own
@@ -132,6 +134,7 @@ class TaskRunner(Generic[V]):
         self._asking: dict[str, asyncio.Task[None]] = {}  # the newest of each kind
         self._keeping: set[asyncio.Task[None]] = set()  # a person's stops and holds that were not answered yet
         self._ended: dict[int, asyncio.Event] = {}  # by the identity of a command: whether it was answered, or is void
+        self._refused = 0  # motions in a row
         self._newest = 0  # `since` of the newest inhibit that we were answered with
         self._before: m.TaskStatus | None = None
         bus.serve(topics.TASK_COMMAND, self._obey)
@@ -257,8 +260,11 @@ class TaskRunner(Generic[V]):
             await self._ask(self._grip, command, GOAL_TIMEOUT, self._answered, lambda error: m.GripperState(
                 id=command.id, state="rejected", message=error.message))
         elif isinstance(command, m.ExecuteRequest):
-            await self._ask(self._execute, command, GOAL_TIMEOUT, self._answered, lambda error: m.MotionStatus(
-                id=command.id, state="rejected", error=error.code, message=error.message))
+            answer = await persist(self._execute, command, GOAL_TIMEOUT, lambda error: m.MotionStatus(
+                id=command.id, state="rejected", error=error.code, message=error.message), self._note)
+            await self._back_off(answer.state == "rejected")
+            self._answered(answer)
+            self._woken.set()
         elif isinstance(command, m.HoldRequest):
             if command.by == "person" and not command.hold:
                 command.heard = self._heard_of()
@@ -267,6 +273,12 @@ class TaskRunner(Generic[V]):
         else:
             await self._ask(self._stop, command, GOAL_TIMEOUT, self._kept, lambda error: m.MotionStatus(
                 message=error.message))
+
+    async def _back_off(self, refused: bool) -> None:
+        """Return when a refusal may be told: what is refused again and again is not asked for as fast as one can."""
+        self._refused = self._refused + 1 if refused else 0
+        if self._refused > 1:
+            await asyncio.sleep(min(REFUSED_AGAIN * 2 ** min(self._refused - 2, 10), LONGEST_REFUSED))
 
     def _kept(self, answer: m.MotionStatus) -> None:
         self._newest = max(self._newest, answer.newest)

@@ -171,7 +171,8 @@ async def _publish(bus: Bus, cell: Cell, launch: Launch, supervisor: Supervisor,
             out.put(SupervisorStatus(
                 header=bus.header(), cell=bus.cell, host=elsewhere.host,
                 services=[*elsewhere.ours(supervisor.statuses), *away],
-                speed=bus.clock.speed, epoch=bus.clock.epoch_ns, seed=cell.run.seed, world=launch.world or "",
+                speed=bus.clock.speed, epoch=bus.clock.epoch_ns, booted=bus.clock.booted_ns,
+                seed=cell.run.seed, world=launch.world or "",
                 overrides=[text for text in launch.overrides if SECRET not in text.partition("=")[0]],
             ))
         with contextlib.suppress(TimeoutError):

@@ -10,7 +10,7 @@ import numpy as np
 
 from common.virtual.network import FAIR, Weather
 
-Kind = Literal["crash", "restart", "cut", "router lost", "stalled", "late goal", "person"]
+Kind = Literal["crash", "restart", "cut", "router lost", "stalled", "late goal", "person", "clock step"]
 Amid = Literal["", "asker", "asked"]
 
 # At least, and soon: in short runs as well.
@@ -27,6 +27,8 @@ CUT_SECONDS = 0.3, 4.0
 LATE_SECONDS = 0.3, 3.0  # two links, each of which holds something up for less than its lease
 STALL_SECONDS = 0.2, 1.6  # less than Zenoh's lease of 2 s, after which a link is cut
 SECONDS = {"cut": CUT_SECONDS, "stalled": STALL_SECONDS, "late goal": LATE_SECONDS}
+STEP_SECONDS = 60.0, 3600.0  # by which somebody sets the system clock, forth or back
+STEP_SOON = 2.0  # [s] of cell time in which it happens
 SKEW = 0.09  # [s] by which clocks are wrong at most; two of them differ by less than their tolerance of 0.2 s
 ROUTER_SHARE = 0.25  # of the cuts but for the first
 PERSON_SHARE = 0.5  # of the runs: somebody stops the task early on
@@ -42,12 +44,12 @@ class Fault:
         at: when [s] of cell time from the cell being ready.
         kind: an end without `finally`; SIGTERM; a link that is cut; all links that are cut; a link on which everything
             comes late; a goal that is asked for, or the answer, comes late; a person who stops the task, moves the
-            arm and starts the task again.
-        target: name of the process; empty for the router and for a person.
+            arm and starts the task again; the system clock of the host is set.
+        target: name of the process; empty for the router, for a person and for the system clock.
         amid: it hits who next asks for a plan or a goal of arm or fingers, or who is asked for it, instead of the
             target; of a late goal it is the request, or the answer.
         turns: of the process from then on until it crashes.
-        seconds: for which a link is cut or stalled, or by which something is late.
+        seconds: for which a link is cut or stalled, or by which something is late or the clock is set.
     """
 
     at: float
@@ -106,6 +108,10 @@ def make_plan(seed: int, services: Sequence[str]) -> Plan:
     )
     skews = tuple((name, float(random.uniform(-SKEW, SKEW))) for name in services)
     speed = float(random.choice(SPEEDS)) if random.random() < OTHER_SPEED else 1.0
+    chance = np.random.default_rng([seed, 7])
+    step = float(chance.uniform(*STEP_SECONDS) * chance.choice([-1.0, 1.0]))
+    faults.append(Fault(float(chance.uniform(0.0, STEP_SOON)), "clock step", seconds=step))
+    faults.sort(key=lambda fault: fault.at)
     return Plan(tuple(faults), weather, skews, speed, shuffled=True)
 
 

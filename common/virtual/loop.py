@@ -84,6 +84,7 @@ class VirtualLoop(base_events.BaseEventLoop):
         super().__init__()
         self._shuffle = Random(f"turns of {seed}").shuffle if shuffled else None  # a text: the same in every process
         self._now = 0.0
+        self.stepped_ns = 0  # by which somebody set the system clock
         self._work_ns = 0  # done by the call that computes now
         self._computing = False
         self._ids = Random(f"ids of {seed}")  # a text: the same in every process
@@ -103,9 +104,13 @@ class VirtualLoop(base_events.BaseEventLoop):
             self._work_ns += LOOK_NS
         return round(self._now * 1e9) + self._work_ns
 
+    def host_ns(self) -> int:
+        """Virtual time since the host was started [ns]."""
+        return self.monotonic_ns()
+
     def wall_ns(self) -> int:
-        """Virtual time since the Unix epoch [ns]."""
-        return EPOCH_NS + self.monotonic_ns()
+        """What the host takes for the time since the Unix epoch [ns]."""
+        return EPOCH_NS + self.stepped_ns + self.monotonic_ns()
 
     def token_hex(self, count: int) -> str:
         """An id that the seed decides, of so many bytes."""

@@ -71,12 +71,17 @@ class Misfortune:
                 person.cancel()
 
     def _note(self, fault: Fault, name: str) -> None:
-        lasts = f" for {fault.seconds:.1f} s" if fault.seconds else ""
+        by = "by" if fault.kind == "clock step" else "for"
+        lasts = f" {by} {fault.seconds:.1f} s" if fault.seconds else ""
         self._tell(f"FAULT {fault.kind} {name}{f' amid a goal: {fault.amid}' if fault.amid else ''}{lasts}")
         self.made[fault.kind] += 1
 
     async def _hit(self, fault: Fault) -> None:
         loop, network = self._host.loop, self._network
+        if fault.kind == "clock step":
+            self._note(fault, "")
+            loop.stepped_ns += round(fault.seconds * 1e9)
+            return
         if fault.kind == "late goal":
             if await self._next_goal(fault.amid, fault.seconds) is not None:
                 self._note(fault, "")

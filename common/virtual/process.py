@@ -43,7 +43,7 @@ class SkewedClock(Clock):
     def __init__(self, like: Clock, skew_ns: int) -> None:
         """Be as far from the cell's clock as said."""
         self._skew_ns = skew_ns
-        super().__init__(like.speed, like.epoch_ns)
+        super().__init__(like.speed, like.epoch_ns, like.booted_ns)
 
     def _wall_ns(self) -> int:
         return super()._wall_ns() + self._skew_ns

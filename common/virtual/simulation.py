@@ -251,7 +251,7 @@ class Simulation:
             )
             self._hash.update(sample.payload)
         if self._trace is not None:
-            self._trace.add(sample, self._loop.wall_ns())
+            self._trace.add(sample, self._loop.wall_ns() - self._loop.stepped_ns)
         if session.name == VISITOR:  # who may say anything, also what is no message
             return
         self.invariants.on_put(session.name, session.life, sample)

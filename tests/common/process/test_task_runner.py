@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from itertools import pairwise
 from typing import Any
 
 from common import messages as m
@@ -153,3 +154,35 @@ async def test_what_is_missing_is_told_in_the_status_and_holds_the_arm_until_it_
         joints.put(m.JointState(header=m.Header(stamp=1), name=["j"], position=[0.0]))
         release = await executor.next()
         assert isinstance(release, m.HoldRequest) and not release.hold and release.by == "watchdog"
+
+
+async def test_motion_that_is_refused_again_and_again_is_asked_for_more_and_more_slowly() -> None:
+    net, asked = LocalNetwork(), []
+    loop = asyncio.get_running_loop()
+    enough = asyncio.Event()
+
+    class Stubborn(Script):
+        def step(self, view: Any) -> list[Command]:
+            again, self.status.message = not asked or self.status.message == "rejected", ""
+            return [m.ExecuteRequest(id=f"{len(asked)}", trajectory=m.JointTrajectory(joint_names=["a"], points=[]))
+                    ] if again else []
+
+    async def refuse(request: m.ExecuteRequest) -> m.MotionStatus:
+        asked.append(loop.time())
+        if len(asked) == 6:
+            enough.set()
+        return m.MotionStatus(id=request.id, state="rejected", error="clock_ahead")
+
+    executor = net.bus("trajectory_executor")
+    executor.serve(topics.MOTION_EXECUTE, refuse)
+    await executor.ready()
+
+    async def run(bus: Bus, config: None) -> None:
+        runner = TaskRunner(bus, Stubborn(), lambda: None, bus.writer(PICK_PLACE_STATUS), lambda: 1.0)
+        await bus.ready()
+        await runner.run(())
+
+    async with running_service(net, run, None, name="smart_pick_place"), asyncio.timeout(30):
+        await enough.wait()
+    waits = [after - before for before, after in pairwise(asked)]
+    assert waits[1] >= 0.1 and waits[2] >= 0.2 and waits[3] >= 0.4 and waits[4] >= 0.8

@@ -1,0 +1,74 @@
+"""One time for all processes of a host, whatever becomes of its system clock."""
+
+import pytest
+
+from common import clock as clocks
+from common.clock import BOOTED_VARIABLE, KEPT_VARIABLE, Clock
+from common.sources import drawn_from
+
+HOUR = 3600 * 10**9
+
+
+class Host:
+    """A host whose clocks are set by hand."""
+
+    def __init__(self):
+        self.own, self.wall = 5 * HOUR, 1_700_000_000 * 10**9
+
+    def pass_time(self, ns):
+        self.own, self.wall = self.own + ns, self.wall + ns
+
+    def host_ns(self):
+        return self.own
+
+    monotonic_ns = host_ns
+
+    def wall_ns(self):
+        return self.wall
+
+    def token_hex(self, count):
+        return "00" * count
+
+
+@pytest.fixture
+def host():
+    with drawn_from(Host()) as _:
+        from common.sources import _Chosen
+
+        yield _Chosen.sources
+
+
+@pytest.mark.parametrize("step", [HOUR, -HOUR, 600 * 10**9])
+@pytest.mark.parametrize("speed", [1.0, 3.0])
+def test_process_that_is_started_again_after_a_step_of_the_system_clock_agrees_with_the_others(host, step, speed):
+    supervisor = Clock(speed)
+    handed = supervisor.environment()
+    first = Clock.from_environment(handed)
+    host.pass_time(10**9)
+    host.wall += step
+    host.pass_time(10**9)
+    again = Clock.from_environment(handed)
+    assert again.now_ns() == first.now_ns() == supervisor.now_ns() == supervisor.epoch_ns + int(2e9 * speed)
+
+
+def test_processes_without_a_supervisor_agree_by_a_folder_that_they_share(host, tmp_path, monkeypatch):
+    boot_id = tmp_path / "boot_id"
+    boot_id.write_text("a\n")
+    monkeypatch.setattr(clocks, "BOOT_ID", boot_id)
+    shared = {KEPT_VARIABLE: str(tmp_path)}
+    first = Clock.from_environment(shared)
+    host.wall += HOUR
+    assert Clock.from_environment(shared).now_ns() == first.now_ns()
+    assert Clock.from_environment({}).now_ns() == first.now_ns() + HOUR
+    boot_id.write_text("b\n")
+    assert Clock.from_environment(shared).now_ns() == first.now_ns() + HOUR, "the host was started anew: asked again"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["boot_id", "clock-a", "clock-b"]
+
+
+def test_what_was_handed_down_goes_before_what_is_kept_and_nonsense_is_told(host, tmp_path):
+    both = {BOOTED_VARIABLE: "17", KEPT_VARIABLE: str(tmp_path)}
+    assert Clock.from_environment(both).booted_ns == 17 and not list(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="invalid literal"):
+        Clock.from_environment({BOOTED_VARIABLE: "yesterday"})
+    with pytest.raises(ValueError, match=r"ZENCELL_CLOCK .*/none: No such file"):
+        Clock.from_environment({KEPT_VARIABLE: str(tmp_path / "none")})
