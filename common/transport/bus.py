@@ -12,14 +12,15 @@ from typing import Any, TypeVar
 
 from common import topics
 from common.clock import Clock
+from common.errors import ConfigError
 from common.messages import Header, Message, ServiceCounters
 from common.remapping import Remapping
-from common.sources import new_id
+from common.sources import new_id, wall_ns
 from common.topics import PublishedKind, Request, Topic, of_service
 from common.transport.codec import DEFAULT_LIMIT
 from common.transport.handoff import Doorbell, call_on_loop
 from common.transport.keys import alive_key, owns_key, serves_key
-from common.transport.ownership import SHARED, Owner, require_only
+from common.transport.ownership import MEET, SHARED, Meetings, Owner, process_name, require_only
 from common.transport.reader import Reader
 from common.transport.requests import Client, Server
 from common.transport.session import Declared, Publisher, RawReply, RawSample, Session
@@ -79,7 +80,7 @@ class Bus:
         self._raw_states: list[RawWriter] = []
         self._servers: list[Server[Any, Any]] = []
         self._tokens: list[Declared] = []
-        self._process = new_id()
+        self._life = new_id()
         self._owned: dict[str, Owner] = {}  # by key
         self._watches: dict[str, TokenWatch] = {}
         self._heard: dict[Reader[Any], Declared] = {}  # readers that are subscribed
@@ -149,6 +150,7 @@ class Bus:
             )
         )
         if self.ready_event.is_set():
+            self._servers[-1].open()
             self._declare_token(serves_key(self.cell, served.key, self.service))
 
     def client(self, topic: Request[Q, A]) -> Client[Q, A]:
@@ -185,18 +187,52 @@ class Bus:
         for owner in self._owned.values():
             self._declare_token(f"{self.cell}{owner.token}")
         await require_only(self._owned, self.owners)
+        self._settle_in()
         self._counters = Writer(self._session, self.cell, self.service, counters)
         for server in self._servers:
+            server.open()
             self._declare_token(serves_key(self.cell, server.topic.key, self.service))
         self.ready_event.set()
         self._declare_token(alive_key(self.cell, self.service))
+
+    def _settle_in(self) -> None:
+        """Say since when the keys are ours, instead of asking for them, and look out for others who own them."""
+        asked, self._tokens = self._tokens, []
+        process = process_name(self._life, wall_ns())
+        for key, owner in self._owned.items():
+            self._owned[key] = replace(owner, process=process)
+            self._declare_token(f"{self.cell}{self._owned[key].token}")
+        for token in asked:
+            token.undeclare()
+        if not self._owned:
+            return
+        meetings = Meetings(self._owned)
+
+        def judge(other: Owner) -> None:
+            stays, told = meetings.judge(other)
+            if self._closed or not told:
+                return
+            if stays:
+                self.log.warning("%s", told)
+            else:
+                self._on_crash(ConfigError(f"services.{self.service}", ..., told))
+
+        def hear(token: str, there: bool) -> None:
+            if (other := meetings.hear(token, there)) is not None:
+                self._loop.call_later(MEET, judge, other)
+
+        def on_token(token: str, there: bool) -> None:
+            call_on_loop(self._loop, lambda: hear(token, there))
+
+        self._session.watch_tokens(owns_key(self.cell), on_token, lambda token: None, lambda: None)
 
     def _own(self, key: str, own: str) -> None:
         """Take note that a key is written or served here."""
         if key in SHARED or key in self._owned:
             return
-        self._owned[key] = Owner(key, own, self.service, self._process)
-        if self.ready_event.is_set():
+        since = wall_ns() if self.ready_event.is_set() else None
+        self._owned[key] = Owner(key, own, self.service, process_name(self._life, since))
+        if since is not None:
             self._declare_token(f"{self.cell}{self._owned[key].token}")
 
     def _watch(self, key: str) -> TokenWatch:

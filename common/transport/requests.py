@@ -55,7 +55,12 @@ class Server(Generic[Q, A]):
         self._limit = limit
         self._refusals = Refusals(topic.key, loop, log)
         self._tasks: set[asyncio.Task[None]] = set()
-        session.queryable(self._key, lambda query: call_on_loop(loop, lambda: self._start(query)), complete=True)
+        self._session, self._loop = session, loop
+
+    def open(self) -> None:
+        """Be asked from now on: not before it is sure that nobody else serves the key, who would miss requests."""
+        self._session.queryable(
+            self._key, lambda query: call_on_loop(self._loop, lambda: self._start(query)), complete=True)
 
     @property
     def invalid(self) -> int:

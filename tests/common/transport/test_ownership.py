@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 
 import pytest
 
@@ -106,5 +108,92 @@ async def test_keys_are_told_under_the_name_in_the_cell_with_the_own_word() -> N
 
 
 def test_token_says_who_holds_it() -> None:
-    owner = Owner("left/image_raw", "camera/image_raw", "left", "a1")
+    owner = Owner("left/image_raw", "camera/image_raw", "left", ownership.process_name("a1", 7))
     assert Owner.of(f"panda{owner.token}") == owner
+    assert owner.life == "a1" and not owner.asks and replace(owner, process=ownership.process_name("a2")).asks
+
+
+def test_who_was_ready_first_stays_and_who_asks_never_displaces_anybody() -> None:
+    names = [ownership.process_name(*each) for each in (("b", 5), ("a", 6), ("c", 6), ("a0", None))]
+    owners = [Owner("tf", "tf", "camera", name) for name in names]
+    for earlier, later in itertools.combinations(owners, 2):
+        assert earlier.was_before(later) and not later.was_before(earlier)
+
+
+class Split:
+    """Two networks of one cell, each with a service of the same name, that are joined."""
+
+    def __init__(self) -> None:
+        self.nets = LocalNetwork(), LocalNetwork()
+        self.buses: list[Bus] = []
+        self.stood: list[asyncio.Task[None]] = []
+
+    async def start(self, side: int, service: str = "arm") -> None:
+        bus = self.nets[side].bus(service)
+        bus.serve(topics.TASK_COMMAND, obey)
+        bus.writer(topics.JOINT_STATES)
+
+        async def run() -> None:
+            await bus.ready()
+            await asyncio.Event().wait()
+
+        self.buses.append(bus)
+        self.stood.append(asyncio.create_task(bus.run(run())))
+        await bus.ready_event.wait()
+
+    def join(self) -> None:
+        """Show to each side the tokens of the other."""
+        tokens = [list(net.tokens) for net in self.nets]
+        for net, theirs in zip(self.nets, reversed(tokens), strict=True):
+            session = net.session()
+            for entry in theirs:
+                session.token(entry.key)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+async def test_split_network_that_is_whole_again_leaves_the_one_that_was_there_first(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, first: int
+) -> None:
+    monkeypatch.setattr("common.transport.bus.MEET", 0.0)
+    split = Split()
+    for side in (first, 1 - first):
+        await split.start(side)
+    split.join()
+    with pytest.raises(ConfigError, match=r"services\.arm: another arm .* was there first: this one ends"):
+        await asyncio.wait_for(split.stood[1], 20)
+    assert not split.stood[0].done() and caplog.text.count("gives way: this one was there first") == 1
+    split.stood[0].cancel()
+
+
+async def test_second_service_that_is_started_while_one_is_up_is_told_of_by_both(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("common.transport.bus.MEET", 0.0)
+    monkeypatch.setattr(ownership, "GIVE_UP", 0.3)
+    split = Split()
+    await split.start(0)
+    second = split.nets[0].bus("arm")
+    second.serve(topics.TASK_COMMAND, obey)
+    with pytest.raises(ConfigError, match="another arm is up"):
+        await second.ready()
+    assert "another arm (process" in caplog.text and not split.stood[0].done()
+    split.stood[0].cancel()
+
+
+async def test_who_asks_for_a_key_that_is_alive_takes_no_request_away(new_bus: NewBus, monkeypatch) -> None:
+    monkeypatch.setattr(ownership, "GIVE_UP", 20.0)
+    first, second, tool = await new_bus("task"), await new_bus("task"), await new_bus("tool")
+
+    async def steal(_: TaskCommand) -> TaskStatus:
+        raise AssertionError("asked the one that is not there yet")
+
+    first.serve(topics.TASK_COMMAND, obey)
+    second.serve(topics.TASK_COMMAND, steal)
+    await first.ready()
+    asking = asyncio.create_task(second.ready())
+    client = tool.client(topics.TASK_COMMAND)
+    await client.wait_available(20)
+    for _ in range(5):
+        assert await client.call(TaskCommand(command="start"), 20) == TaskStatus()
+    assert not asking.done()
+    asking.cancel()
