@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import UnknownName, ZencellError
-from common.messages import ArcGoal, JointGoal, PathGoal, PlanningScene, PlanRequest, PoseGoal, SequenceGoal
+from common.messages import ArcGoal, JointGoal, PathGoal, PlanningScene, PlanRequest, Pose, PoseGoal, SequenceGoal
 from common.planning.collision import CollisionWorld, Pair
 from common.planning.problem import Arc, Goal, GoalSequence, Part, Region, ToolPath
 from common.robot.model import RobotModel
@@ -18,6 +19,7 @@ Array = NDArray[np.float64]
 
 
 _MEASURED = 1e-4  # [rad] a measured state may stand this far beyond its limit
+_FAR = 2.0  # times the reach; of what is nearer the planners tell how far they come
 _AT_FIRST = (0.002, 0.02)  # [m], [rad] a path begins this close to where the robot is
 
 
@@ -70,7 +72,10 @@ def check_request(
 def _single_goal(robot: RobotModel, goal: JointGoal | PoseGoal | ArcGoal) -> Array | Region | Arc:
     if isinstance(goal, JointGoal):
         return _joint_goal(robot, goal)
+    _require_near(robot, goal.pose, "goal")
     if isinstance(goal, ArcGoal):
+        if goal.via is not None:
+            _require_near(robot, Pose(position=goal.via), "point on the way")
         via, center = (None if p is None else np.array([p.x, p.y, p.z]) for p in (goal.via, goal.center))
         return Arc(pose_to_matrix(goal.pose), via, center)
     tolerance = goal.position_tolerance
@@ -108,7 +113,23 @@ def _joint_goal(robot: RobotModel, goal: JointGoal) -> Array:
     return _within_limits(robot, positions, "goal", "goal_out_of_limits")
 
 
+def _require_near(robot: RobotModel, pose: Pose, what: str) -> None:
+    """Return when a pose is not so far off that looking for a way there is absurd.
+
+    Raises:
+        BadRequest: out_of_reach.
+    """
+    place = pose.position
+    away, reach = math.dist((place.x, place.y, place.z), robot.foot), robot.reach
+    if away > _FAR * reach:
+        where = f"({place.x:g}, {place.y:g}, {place.z:g})"
+        message = f"{what} at {where} is {away:.3g} m away from the robot, which reaches {reach:.2f} m"
+        raise BadRequest("out_of_reach", message)
+
+
 def _tool_path(robot: RobotModel, start: Array, goal: PathGoal) -> ToolPath:
+    for number, pose in enumerate(goal.waypoints, 1):
+        _require_near(robot, pose, f"point {number} of {len(goal.waypoints)}")
     poses = np.array([pose_to_matrix(pose) for pose in goal.waypoints])
     T_tcp_first = invert(robot.fk(start)) @ poses[0]
     away = float(np.linalg.norm(T_tcp_first[:3, 3]))

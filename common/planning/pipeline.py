@@ -16,7 +16,7 @@ from common.planning.collision import CollisionWorld, Pair
 from common.planning.obstacles import BadShape, ObstacleCache
 from common.planning.planners import Plan, load_planner, planner_names
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result, ToolPath
-from common.planning.retiming import RetimingFailed, TimedPath, stretch
+from common.planning.retiming import RetimingFailed, TimedPath, TooLong, require_tellable, stretch
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.timing import BLENDS, retime
 from common.planning.validation import Fault, validate
@@ -83,7 +83,7 @@ class PlanningPipeline:
         best: tuple[str, Result] | None = None
         for name, (plan, options) in planners.items():
             since = monotonic()
-            result = plan(problem, options, flag)
+            result = self._ask(plan, problem, options, flag)
             trajectory = None
             if not result.error:
                 trajectory, result = self._finish(problem, result)
@@ -169,11 +169,21 @@ class PlanningPipeline:
             rng=np.random.default_rng(self._seed if request.seed is None else abs(request.seed)),
         )
 
+    def _ask(self, plan: Plan, problem: Problem, options: Parameters, flag: Cancel) -> Result:
+        """The planner's answer; some time their paths themselves, and may fail at that."""
+        try:
+            return plan(problem, options, flag)
+        except RetimingFailed as error:
+            return Result(error="retiming_failed", message=f"retiming: {error}")
+        except TooLong as error:
+            return Result(error=error.code, message=str(error))
+
     def _finish(self, problem: Problem, result: Result) -> tuple[TimedPath | None, Result]:
         """The timed and validated trajectory and the result, or None and the result with what is wrong."""
         wrong = result
         try:
             for trajectory in self._timings(problem, result):
+                require_tellable(trajectory)
                 fault = self._fault(problem, trajectory)
                 if fault is None:
                     return trajectory, result
@@ -183,6 +193,8 @@ class PlanningPipeline:
                 )
         except RetimingFailed as error:
             wrong = replace(result, error="retiming_failed", message=f"retiming: {error}")
+        except TooLong as error:
+            wrong = replace(result, error=error.code, message=str(error))
         return None, wrong
 
     def _timings(self, problem: Problem, result: Result) -> Iterator[TimedPath]:

@@ -169,3 +169,11 @@ class Result:
 
 
 NOT_APPLICABLE = "not_applicable"
+MOST_STEPS = 25_000  # poses of the tool for which joint positions are solved
+
+
+def too_fine(steps: float) -> Result | None:
+    """The refusal of a way of the tool in so many steps, or None for one that can be followed."""
+    if steps <= MOST_STEPS:
+        return None
+    return Result(error="too_long", message=f"the way takes {steps:.3g} steps of the tool, {MOST_STEPS} are the most")

@@ -16,7 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from common.messages.robot import MOST_POINTS, MOST_SECONDS
 from common.planning.path import SmoothPath
+from common.sources import monotonic
 
 Array = NDArray[np.float64]
 
@@ -45,6 +47,25 @@ class RetimingFailed(Exception):
     """A path that cannot be followed within the limits, which only a broken path or limit brings about."""
 
 
+class TooLong(Exception):
+    """A path whose timing takes more time than there is, or more states than a trajectory may have."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+def require_tellable(trajectory: TimedPath) -> None:
+    """Return when a trajectory can be sent.
+
+    Raises:
+        TooLong: too_long: it has too many states, or takes longer than any motion does.
+    """
+    if (states := len(trajectory.times)) > MOST_POINTS or trajectory.duration > MOST_SECONDS:
+        told = f"the trajectory has {states} states and takes {trajectory.duration:.3g} s"
+        raise TooLong("too_long", f"{told}, {MOST_POINTS} states and {MOST_SECONDS:g} s are the most")
+
+
 def parametrise(
     path: SmoothPath,
     velocity: ArrayLike,
@@ -52,6 +73,7 @@ def parametrise(
     step: float = 0.02,
     speed: float = math.inf,
     braking: ArrayLike | None = None,
+    deadline: float = math.inf,
 ) -> TimedPath:
     """The time-optimal trajectory along a path, at rest at both ends.
 
@@ -61,15 +83,23 @@ def parametrise(
         step: largest joint movement between grid points [rad].
         speed: highest ds/dt: that of the tool along a path that is measured by the tool's way [m/s].
         braking: limits (dof,) that hold instead of `acceleration` where speed along the path is lost.
+        deadline: on the monotonic clock of common.sources [s], after which no finer grid is begun.
 
     Raises:
         RetimingFailed: no speed is feasible somewhere.
+        TooLong: too_long, timeout.
     """
     limit_v, limit_a = np.asarray(velocity, dtype=float), np.asarray(acceleration, dtype=float)
     limit_b = limit_a if braking is None else np.asarray(braking, dtype=float)
     move = float((np.maximum(np.abs(path.d0), np.abs(path.d1)).max(axis=1) * path.lengths).sum())
+    if not 0 < move < math.inf:
+        raise RetimingFailed(f"the path moves the joints by {move:g} rad")
     step = min(step, move / _LEAST_INTERVALS)
     for _ in range(_REFINEMENTS):
+        if monotonic() > deadline:
+            raise TooLong("timeout", "planning was ended while the path was timed")
+        if (states := len(path.lengths) + move / step) > MOST_POINTS:
+            raise TooLong("too_long", f"the path takes {states:.3g} states, a trajectory has {MOST_POINTS} at most")
         trajectory = _timed(path.divided(step), limit_v, limit_a, limit_b, speed)
         if _overshoot(trajectory, np.maximum(limit_a, limit_b)) <= _OVERSHOOT:
             return trajectory

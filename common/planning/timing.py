@@ -13,11 +13,12 @@ from common.config import Parameters
 from common.planning.collision import CollisionWorld
 from common.planning.path import SmoothPath, blended_path, dense_path, distinct
 from common.planning.problem import Problem, Result
-from common.planning.retiming import TimedPath, join, parametrise
+from common.planning.retiming import RetimingFailed, TimedPath, join, parametrise
 
 Array = NDArray[np.float64]
 
 LIMIT_SHARE = 0.98  # of the limits: between two states the controller's cubic may exceed them a little
+FINISHING = 1.0  # [s] after the deadline of a plan, for timing and checking a path that was found in time
 # [rad] taken from both edges at a corner, where that is free. A blend that passes within a hair of something may be
 # found free here and not by validation, which looks at other positions: then smaller ones are tried, in the end none.
 BLENDS = (0.25, 0.06, 0.0)
@@ -41,11 +42,15 @@ def retime(problem: Problem, result: Result, blend: float = BLENDS[0]) -> TimedP
         still = np.zeros((2, problem.robot.dof))
         return TimedPath(np.array([0.0, 0.01]), np.array([waypoints[0], waypoints[0]]), still, still)
     velocity, acceleration = LIMIT_SHARE * problem.velocity, LIMIT_SHARE * problem.acceleration
+    deadline = problem.deadline + FINISHING
     if result.way is not None:
+        if not np.abs(np.diff(result.waypoints, axis=0)).max(axis=1).all():
+            raise RetimingFailed("two waypoints are one: the steps are finer than joint positions are solved")
         paths = blended_path(result.waypoints, result.way.cuts, result.way.lengths)
-        return join([parametrise(path, velocity, acceleration, speed=result.way.speed or math.inf) for path in paths])
+        speed = result.way.speed or math.inf
+        return join([parametrise(path, velocity, acceleration, speed=speed, deadline=deadline) for path in paths])
     paths = [dense_path(waypoints)] if result.dense else free_blends(waypoints, problem.world, blend)
-    return join([parametrise(path, velocity, acceleration) for path in paths])
+    return join([parametrise(path, velocity, acceleration, deadline=deadline) for path in paths])
 
 
 def free_blends(waypoints: Array, world: CollisionWorld, blend: float, step: float = 0.003) -> list[SmoothPath]:
@@ -117,6 +122,7 @@ def follow_in_time(problem: Problem, path: ToolWaypoints, limits: ToolLimits) ->
         np.concatenate([velocity, tool_v]),
         np.concatenate([acceleration, tool_a]),
         braking=np.concatenate([acceleration, tool_b]),
+        deadline=problem.deadline + FINISHING,
     )
     dof = robot.dof
     return TimedPath(timed.times, timed.positions[:, :dof], timed.velocities[:, :dof], timed.accelerations[:, :dof])

@@ -90,6 +90,20 @@ class RobotModel:
         return cls(config, full_model, urdf, srdf)
 
     @property
+    def reach(self) -> float:
+        """Farther [m] from the first joint than the TCP can ever be: all links stretched out, all slides drawn out."""
+        placements = [placement.translation for placement in self.model.jointPlacements[2:]]
+        tcp = self.model.frames[self.tcp_frame].placement.translation
+        slides = [max(abs(low), abs(high)) for joint, low, high in zip(
+            self.model.joints[1:], self.lower, self.upper, strict=True) if joint.shortname().startswith("JointModelP")]
+        return float(sum(np.linalg.norm(way) for way in (*placements, tcp)) + sum(slides))
+
+    @property
+    def foot(self) -> Array:
+        """(3,) where the first joint is [m], world."""
+        return np.asarray(self.model.jointPlacements[1].translation)
+
+    @property
     def package_folders(self) -> list[Path]:
         """Folders in which the URDF's package:// meshes are looked up."""
         return package_folders(self.config.package_dirs)

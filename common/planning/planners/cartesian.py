@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +13,7 @@ from pydantic import Field
 
 from common.config import Parameters
 from common.planning.path import smoothed
-from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result, ToolPath, ToolWay
+from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result, ToolPath, ToolWay, too_fine
 from common.robot.ik import converge
 from common.robot.model import RobotModel
 
@@ -83,6 +84,9 @@ def _path(problem: Problem, goal: ToolPath, options: Options, cancel: Cancel) ->
     """All lines of a path."""
     step = goal.step or options.step
     poses = [pin.SE3(T) for T in goal.poses]
+    ways = [_distance(a, b) for a, b in pairwise(poses)]
+    if refusal := too_fine(sum(max(1, way / step, turn / options.rotation_step) for way, turn in ways)):
+        return refusal
     targets: list[_Target] = []
     last = poses[0]
     for point, pose in enumerate(poses[1:], 1):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from common.planning.arcs import NoArc, arc_poses, circle_about, circle_through
 from common.planning.planners import cartesian, lin
-from common.planning.problem import NOT_APPLICABLE, Arc, Cancel, Problem, Result, ToolPath
+from common.planning.problem import NOT_APPLICABLE, Arc, Cancel, Problem, Result, ToolPath, too_fine
 from common.planning.timing import ToolWaypoints, follow_in_time
 
 Array = NDArray[np.float64]
@@ -43,6 +43,8 @@ def arc_waypoints(problem: Problem, arc: Arc, options: Options, cancel: Cancel) 
             circle = circle_about(start, arc.center, goal)
     except NoArc as error:
         return Result(error="bad_goal", message=f"no arc: {error}")
+    if refusal := too_fine(circle.length / options.step):
+        return refusal
     poses = arc_poses(circle, T_start, T_goal, options.step, options.rotation_step)
     following = cartesian.Options(
         step=0.2,  # the poses are as close together as they should be
