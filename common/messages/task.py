@@ -8,7 +8,7 @@ from pydantic import Field
 
 from common.messages.basics import SMALL, Count, Finite, Header, Label, Message, Name, Text
 from common.messages.camera import Rejection
-from common.messages.execution import Who
+from common.messages.execution import Since, Who
 
 
 class TaskCommand(Message):
@@ -19,6 +19,8 @@ class TaskCommand(Message):
     command: Literal["start", "pause", "resume", "stop"]
     by: Who = Field("", description="name of the person")
     override: bool = Field(False, description="start or resume although another person holds the robot; is logged")
+    heard: Since | None = Field(None, description="`since` of the newest inhibit that the person had heard of: later "
+                                                  "ones stay")
 
 
 class PlanFigure(Message):

@@ -175,6 +175,7 @@ class TaskRunner(Generic[V]):
                 request.owner = command.by
             if isinstance(request, m.HoldRequest):
                 request.override = command.override and not request.hold
+                request.heard = command.heard
         self._told += asked
         self._woken.set()
         now = self._task.status
@@ -267,7 +268,8 @@ class TaskRunner(Generic[V]):
             self._woken.set()
         elif isinstance(command, m.HoldRequest):
             if command.by == "person" and not command.hold:
-                command.heard = self._heard_of()
+                heard = self._heard_of()
+                command.heard = heard if command.heard is None or heard is None else min(heard, command.heard)
             await self._ask(self._hold, command, GOAL_TIMEOUT, self._kept, lambda error: m.MotionStatus(
                 message=error.message))
         else:

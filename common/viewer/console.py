@@ -165,7 +165,8 @@ class Console(Desk):
 
     async def command(self, command: str, override: bool = False) -> None:
         """Tell the task to start, pause, resume or stop; to start or resume although another person holds the arm."""
-        said = {"command": command, "by": BY, "override": override}
+        motion = self.latest(topics.MOTION_STATUS)
+        said = {"command": command, "by": BY, "override": override, "heard": motion.newest if motion else None}
         await self.ask(topics.TASK_COMMAND, TaskCommand.model_validate(said))
 
     async def stop(self) -> None:

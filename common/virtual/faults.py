@@ -10,7 +10,7 @@ import numpy as np
 
 from common.virtual.network import FAIR, Weather
 
-Kind = Literal["crash", "restart", "cut", "router lost", "stalled", "late goal", "person", "clock step"]
+Kind = Literal["crash", "restart", "cut", "router lost", "stalled", "late goal", "person", "clock step", "ended"]
 Amid = Literal["", "asker", "asked"]
 
 # At least, and soon: in short runs as well.
@@ -31,6 +31,8 @@ STEP_SECONDS = 60.0, 3600.0  # by which somebody sets the system clock, forth or
 STEP_SOON = 2.0  # [s] of cell time in which it happens
 SKEW = 0.09  # [s] by which clocks are wrong at most; two of them differ by less than their tolerance of 0.2 s
 ROUTER_SHARE = 0.25  # of the cuts but for the first
+ENDED_SHARE = 0.5  # of the runs: somebody stops or pauses the task, and processes die then
+ENDED_LATEST = 15.0  # [s] of cell time from the cell being ready
 PERSON_SHARE = 0.5  # of the runs: somebody stops the task early on
 SPEEDS = 0.5, 2.0, 3.0  # cell time per wall time of those runs that have another than 1
 OTHER_SPEED = 0.3  # share of those
@@ -44,7 +46,8 @@ class Fault:
         at: when [s] of cell time from the cell being ready.
         kind: an end without `finally`; SIGTERM; a link that is cut; all links that are cut; a link on which everything
             comes late; a goal that is asked for, or the answer, comes late; a person who stops the task, moves the
-            arm and starts the task again; the system clock of the host is set.
+            arm and starts the task again; the system clock of the host is set; a person who stops or pauses it, upon
+            which task or executor or both crash, and who starts it later.
         target: name of the process; empty for the router, for a person and for the system clock.
         amid: it hits who next asks for a plan or a goal of arm or fingers, or who is asked for it, instead of the
             target; of a late goal it is the request, or the answer.
@@ -111,6 +114,9 @@ def make_plan(seed: int, services: Sequence[str]) -> Plan:
     chance = np.random.default_rng([seed, 7])
     step = float(chance.uniform(*STEP_SECONDS) * chance.choice([-1.0, 1.0]))
     faults.append(Fault(float(chance.uniform(0.0, STEP_SOON)), "clock step", seconds=step))
+    ends = np.random.default_rng([seed, 9])  # of its own, so that it leaves the other faults as they are
+    if ends.random() < ENDED_SHARE:
+        faults.append(Fault(float(ends.uniform(0.0, ENDED_LATEST)), "ended"))
     faults.sort(key=lambda fault: fault.at)
     return Plan(tuple(faults), weather, skews, speed, shuffled=True)
 

@@ -28,6 +28,8 @@ from common.messages import (
     PlanRequest,
     PointCloud2,
     ServiceCounters,
+    StopRequest,
+    TaskCommand,
     WorldEdit,
 )
 from common.topics import AnyTopic
@@ -63,6 +65,7 @@ LIMITS = "every set-point within limits"
 FRESH = "no motion begins that was decided long ago"
 GOAL = "the arm moves for a goal only"
 HELD = "an arm that is held rests"
+ASKED = "no motion that nobody asked for since the last stop"
 TRUTH = "nothing that decides saw the truth"
 OUTCOMES = "every request ends in one of five ways"
 NEWER = "nothing is read twice, or after what is newer"
@@ -109,6 +112,10 @@ class Invariants:
         self._told: dict[tuple[str, str], bool] = {}  # by controller's process and goal: whether it was accepted
         self._stray = 0  # set-points that moved without a goal
         self._restless = 0  # set-points that moved although the arm is held
+        self._ended = False  # a person stopped or held the arm, and nobody has asked for motion since
+        self._ended_at: float | None = None  # cell time of the first set-point since
+        self._unasked = 0  # set-points that moved nevertheless
+        self._by_persons: set[str] = set()  # goals
         self._strange = 0
 
     def _broke(self, holds: object, what: str) -> bool:
@@ -225,6 +232,13 @@ class Invariants:
         self._restless = self._restless + 1 if resting else 0
         if self._broke(self._restless <= UNTOLD, HELD):
             self._tell(HELD, f"it moves {way.max():.4f} rad")
+        if self._ended and self._ended_at is None:
+            self._ended_at = now
+        unasked = self._ended_at is not None and now - self._ended_at >= AT_REST
+        unasked = unasked and (goals is None or goals.active not in self._by_persons)
+        self._unasked = self._unasked + 1 if unasked else 0
+        if self._broke(self._unasked <= UNTOLD, ASKED):
+            self._tell(ASKED, f"it moves {way.max():.4f} rad for {goals.active if goals else 'nobody'}")
 
     # --- requests -----------------------------------------------------------------------------------------------------
 
@@ -235,6 +249,10 @@ class Invariants:
             if self._broke(known is request or known == request, ONCE):
                 self._tell(ONCE, f"{request.id} is asked for twice, as {type(known).__name__} and another time as "
                                  f"{type(request).__name__}, which are not the same")
+        if isinstance(request, TaskCommand) and request.command in ("start", "resume"):
+            self._ended, self._ended_at = False, None
+        if isinstance(request, ExecuteRequest) and request.owner:
+            self._by_persons.add(request.id)
         if isinstance(request, ExecuteRequest):
             self._decided.setdefault(request.id, self._now())
         elif isinstance(request, WorldEdit):
@@ -242,6 +260,9 @@ class Invariants:
 
     def _on_serve(self, life: str, request: Message, answer: Message) -> None:
         """Who asks for a goal again hears what became of it: what was accepted stays so, and what was refused too."""
+        stop = isinstance(request, StopRequest) or (isinstance(request, HoldRequest) and request.hold)
+        if stop and getattr(request, "by", "") == "person":
+            self._ended, self._ended_at = True, None
         if isinstance(request, GOALS) and isinstance(answer, MotionStatus | GripperState):
             accepted = answer.state != "rejected"
             before = self._told.setdefault((life, request.id), accepted)

@@ -29,6 +29,9 @@ TURN = 0.0005  # [s] that stands for a turn where something is to happen just wh
 GOALS = (topics.MOTION_EXECUTE.key, topics.GRIPPER_COMMAND.key)
 PLAN = topics.MOTION_PLAN.key
 PERSON = "person"
+EXECUTOR = "trajectory_executor"
+VICTIM_SHARE = 0.7  # of task and executor, each, when a person has stopped the robot
+LOOKS_ON = 3.0, 8.0  # [s] for which it rests then
 PERSON_TIMEOUT = 2.0  # [s] of a person's request
 PERSON_SLOW = 0.3  # [s] that a message takes to or from a person on average, at most
 PERSON_LATE = 1.0  # [s] at most between a person's stop and what is done next, in two places at once
@@ -53,6 +56,7 @@ class Misfortune:
         self._host, self._plan, self._status, self._tell = host, plan, status, tell
         self._network = host.network
         self._random = np.random.default_rng([seed, 6])
+        self._ends = np.random.default_rng([seed, 8])
 
     async def run(self) -> None:
         """Return when all has happened; cancelled, nothing more does."""
@@ -63,6 +67,8 @@ class Misfortune:
                 await asyncio.sleep(max(0.0, began + fault.at / speed - loop.time()))
                 if fault.kind == "person":
                     persons.append(self._begin_person())
+                elif fault.kind == "ended":
+                    persons.append(self._begin_ending())
                 else:
                     await self._hit(fault)
             await asyncio.gather(*persons)
@@ -177,6 +183,50 @@ class Misfortune:
         session.slow = float(self._random.uniform(0.0, PERSON_SLOW))
         return context.run(lambda: asyncio.create_task(self._be_person(session)))
 
+    def _begin_ending(self) -> asyncio.Task[None]:
+        self.made["ended"] += 1
+        context = context_of(Life(PERSON))
+        session = self._network.attach(context, PERSON, 1000 + self.made["ended"])
+        return context.run(lambda: asyncio.create_task(self._end_and_start(session)))
+
+    async def _end_and_start(self, session: VirtualSession) -> None:
+        """Stop or pause the robot; let those crash who could start it again; start it some time later."""
+        host, random = self._host, self._ends
+        bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
+        executor = next(entry.name for entry in host.cell.services.values() if entry.kind == EXECUTOR)
+        ends = random.choice(["stop", "task stop", "task pause"])
+        victims = [name for name in (executor, host.cell.task) if random.random() < VICTIM_SHARE]
+        self._tell(f"FAULT ended: {ends}, then {' and '.join(victims) or 'nobody'} crashes")
+        try:
+            if ends == "stop":
+                await persist(bus.client(topics.MOTION_STOP), m.StopRequest(), PERSON_TIMEOUT,
+                              lambda error: m.MotionStatus(), lambda problem: None)
+            else:
+                said = m.TaskCommand(command="pause" if ends == "task pause" else "stop")
+                await persist(bus.client(topics.TASK_COMMAND), said, PERSON_TIMEOUT, lambda error: m.TaskStatus(),
+                              lambda problem: None)
+            for name in victims:
+                host.processes[name].kill()
+            await asyncio.sleep(float(random.uniform(*LOOKS_ON)))
+            await self._start(bus)
+        finally:
+            await bus.close()
+            self._network.detach(session)
+
+    async def _start(self, bus: VirtualBus) -> None:
+        """Start the task as a person does: again, as long as the robot stays stopped."""
+        motion, status = bus.reader(topics.MOTION_STATUS), bus.reader(self._status)
+        while True:
+            heard = motion.latest.newest if motion.latest else None
+            start = m.TaskCommand(command="start", heard=heard)
+            await persist(bus.client(topics.TASK_COMMAND), start, PERSON_TIMEOUT, lambda error: m.TaskStatus(),
+                          lambda problem: None)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(PERSON_TIMEOUT):
+                    while not _started(status.latest, motion.latest):  # noqa: ASYNC110 - time is free here
+                        await asyncio.sleep(AGAIN)
+                    return
+
     async def _be_person(self, session: VirtualSession) -> None:
         """Stop the task; then send the arm home and start the task, from two places that know nothing of each other."""
         host = self._host
@@ -195,8 +245,13 @@ class Misfortune:
             async with asyncio.TaskGroup() as group:
                 group.create_task(go_home())
                 await asyncio.sleep(float(self._random.uniform(0.0, PERSON_LATE)))
-                start = m.TaskCommand(command="start")
-                await persist(command, start, PERSON_TIMEOUT, lambda error: m.TaskStatus(), lambda problem: None)
+                await self._start(bus)
         finally:
             await bus.close()
             self._network.detach(session)
+
+
+def _started(task: m.TaskStatus | None, motion: m.MotionStatus | None) -> bool:
+    """Whether nothing that a person said keeps the task any more."""
+    kept = motion is None or any(inhibit.by == PERSON for inhibit in motion.inhibits)
+    return task is not None and task.started and not kept

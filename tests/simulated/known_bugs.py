@@ -13,7 +13,9 @@ from common.applications.pick_place.perceived import PerceivedScene
 from common.config import load_cell
 from common.control.controller import TrajectoryController
 from common.control.goals import GoalMemory
+from common.control.inhibits import Record
 from common.control.limiter import Limiter
+from common.control.record_file import RecordFile
 from common.sources import host_ns, wall_ns
 from common.transport import requests
 from common.transport.reader import Newness
@@ -112,6 +114,7 @@ BUGS = {
         trajectory_executor, "objection", lambda age, oldest, ahead: None),
     "objects and arm forgotten at a restart": lambda: patch.object(
         trajectory_executor, "state_file", lambda cell: None),
+    "a stop dies with the executor": lambda: patch.object(RecordFile, "load", lambda self: (Record(), "")),
     "a new goal while another runs": _two_goals,
     "a request that waits without end": _waits_without_end,
     "a request that is not asked again": _never_asked_again,
