@@ -52,9 +52,10 @@ def init(
     from common.config import load_cell, names_of
     from common.errors import ConfigError
     from common.security.access import access_control
-    from common.security.certificates import Authority
+    from common.security.certificates import Authority, write_secret
     from common.security.checking import certificate_in, hosts_in
     from common.transport.credentials import ACCESS, AUTHORITY, OBSERVER, OPERATOR, ROUTER_NAME, common_name
+    from common.viewer.access import ROLES, make_token, token_file
 
     valid = options.whole("--days", days, 1)
     assert valid is not None
@@ -76,6 +77,9 @@ def init(
     authority.issue(ROUTER_NAME, list(dict.fromkeys([*LOCAL, *reached])), valid, router, router.with_suffix(".key"))
     for name in names:
         authority.issue(name, [], valid, place / f"{name}.pem", place / f"{name}.key")
+    for cell in loaded:
+        for role in ROLES if any(entry.kind == VIEWER for entry in cell.services.values()) else ():
+            write_secret(token_file(place, cell.name, role), f"{make_token()}\n".encode())
     text = ACCESS_HEAD + json.dumps(access_control(rights), indent=1) + "\n"
     (place / ACCESS).write_text(text, encoding="utf-8")
     echo(f"{len(names) + 1} certificates, valid for {valid} days, and {ACCESS} in {folder}")

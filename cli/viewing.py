@@ -45,6 +45,7 @@ def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
         ConfigError: there is no page, the port is taken, or one of the options cannot be used.
     """
     from common.errors import ConfigError
+    from common.transport.credentials import secure_folder
     from common.viewer.access import (
         TOKEN_VARIABLE,
         address_of,
@@ -77,7 +78,8 @@ def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
         raise ConfigError(f"services.{entry.name}.port", wanted, f"must be a whole number from 1 to {HIGHEST_PORT}")
     overrides = [] if host is None else [f"services.{entry.name}.host={at}"]
     address, environment = address_of(at, number), {}
-    if not (is_loopback(at) or entry.parameters.get("token") or os.environ.get(TOKEN_VARIABLE)):
+    near = is_loopback(at) and secure_folder() is None
+    if not (near or entry.parameters.get("token") or os.environ.get(TOKEN_VARIABLE)):
         environment[TOKEN_VARIABLE] = make_token()
         address += f"/?token={environment[TOKEN_VARIABLE]}"
     return Page(address, (*overrides, f"services.{entry.name}.port={number}"), environment, free)

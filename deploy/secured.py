@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from common.transport.credentials import ACCESS, AUTHORITY, OPERATOR, ROUTER_NAME, common_name
+from common.viewer.access import ROLES, token_file
 from deploy.compose import lines_of
 from deploy.containers import IMAGE, ROUTER, ROUTER_PORT, cells, containers_of
 
@@ -27,7 +29,8 @@ def compose_secure() -> str:
     blocks = [_block(ROUTER, ROUTER_NAME, at_router, ACCESS)]
     for file, cell in cells().items():
         for container in containers_of(file, cell):
-            blocks.append(_block(f"{file}-{container.name}", common_name(cell.name, container.name), reached))
+            tokens = [token_file(Path(), cell.name, role).name for role in ROLES] if container.page else []
+            blocks.append(_block(f"{file}-{container.name}", common_name(cell.name, container.name), reached, *tokens))
     return HEAD + "\n".join([*blocks, _tool(reached)])
 
 

@@ -13,7 +13,8 @@ from common.config import Members, Parameters, RobotConfig, Run, Surroundings
 from common.process.operator_motion import OperatorMotion
 from common.process.service import main
 from common.transport.bus import Bus
-from common.viewer.access import address_of
+from common.transport.credentials import secure_folder
+from common.viewer.access import address_of, tokens_in
 from common.viewer.console import BY, Console
 from common.viewer.feeds import Feeds, Periods, Topics
 from common.viewer.guard import close_server, make_server
@@ -36,11 +37,14 @@ class Config(Parameters):
     world: Surroundings
     run: Run
     members: Members
-    host: str = Field("127.0.0.1", min_length=1, description="address to listen at; others than this need a token")
+    host: str = Field(
+        "127.0.0.1", min_length=1, description="address to listen at; others than this, and secured cells, need a token"
+    )
     port: int = Field(8080, ge=0, le=65535, description="TCP port; 0: any that is free")
     token: str = Field("", repr=False, description="that a browser has to bring: http://HOST:PORT/?token=TOKEN")
     published: bool = Field(
-        False, description="the port is reached through a loopback only, as compose.yaml has it: no token is needed"
+        False, description="the port is reached through a loopback only, as compose.yaml has it: from its gateway no "
+                           "token is needed in an open cell"
     )
     layout: str = Field("", description="file of the layout; empty: config/viewer.yaml")
     layers: list[str] = Field([], description="layers of the scene of your own: dotted modules, as my_pkg.my_layer")
@@ -93,7 +97,11 @@ async def run(bus: Bus, config: Config) -> None:
     console = Console(bus, config.members, feeds, read.requests)
     status = feeds.reader(read.status) if read.status is not None else None
     motions = OperatorMotion(bus, [status] if status is not None else [], owner=BY)
-    server = make_server(config.host, config.port, config.token, published=config.published)
+    folder = None if bus.declares_only else secure_folder()
+    server = make_server(
+        config.host, config.port, config.token, published=config.published, secured=folder is not None,
+        tokens=tokens_in(folder, bus.cell) if folder is not None else None,
+    )
     try:
         page = Page(
             server, feeds, console, motions, config.members, application, layers, cell=config.run.cell, layout=layout,

@@ -17,6 +17,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from http import HTTPStatus
+from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 from common.errors import ConfigError
@@ -25,10 +26,49 @@ FIRST_PORT = 8080  # when none is asked for
 LAST_PORT = FIRST_PORT + 99
 TOKEN_VARIABLE = "ZENCELL_VIEWER_TOKEN"  # in the environment, where no list of processes shows it
 SHORTEST_TOKEN = 16  # characters
+ROLES = ("look", "operate", "tune")  # what a token is for: nothing but looking, moving, changing parameters
+EVERYTHING = frozenset(ROLES)
 TOKEN = re.compile(rf"[A-Za-z0-9._~-]{{{SHORTEST_TOKEN},}}")  # what needs no escaping in an address or a cookie
 
 _AUTHORITY = re.compile(r"(?P<host>\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:(?P<port>\d{1,5}))?", re.IGNORECASE)
 _DEFAULT_PORTS = {"http": 80, "https": 443}
+
+
+def token_file(folder: Path, cell: str, role: str) -> Path:
+    """Where the token of a role at the page of a secured cell is kept."""
+    return folder / f"{cell}.page.{role}"
+
+
+def tokens_in(folder: Path, cell: str) -> dict[str, str]:
+    """The tokens of a secured cell's page by role, as far as they are there.
+
+    Raises:
+        ConfigError: others can read one of them, or it is none.
+    """
+    found = {}
+    for role in ROLES:
+        path = token_file(folder, cell, role)
+        if not path.is_file():
+            continue
+        if path.stat().st_mode & 0o077:
+            raise ConfigError("--secure", str(path), "can be read by others: chmod 600 it")
+        try:
+            found[role] = path.read_text(encoding="ascii").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError("--secure", str(path), f"cannot be read: {error}") from None
+        if not TOKEN.fullmatch(found[role]):
+            raise ConfigError("--secure", str(path), "holds no token: `zencell secure init DIR --renew` makes one")
+    return found
+
+
+def gateways(table: Path = Path("/proc/net/route")) -> frozenset[str]:
+    """Addresses from which what was published by the engine of a container comes in: those of default routes."""
+    try:
+        rows = [line.split() for line in table.read_text(encoding="ascii").splitlines()[1:]]
+    except OSError:
+        return frozenset()
+    found = (bytes.fromhex(row[2])[::-1] for row in rows if len(row) > 2 and row[1] == "00000000")
+    return frozenset(str(ipaddress.IPv4Address(address)) for address in found)
 
 
 def is_loopback(host: str) -> bool:
@@ -57,15 +97,20 @@ class Access:
 
     host: str  # that it listens at
     port: int
-    token: str = field(default="", repr=False)  # empty: none is asked for
+    token: str = field(default="", repr=False)  # for operating and tuning
+    tokens: Mapping[str, str] = field(default_factory=dict, repr=False)  # by role; without any, none is asked for
+    near: frozenset[str] = frozenset()  # addresses beside the loopback's that count as this machine
 
-    def answer(self, path: str, headers: Mapping[str, Sequence[str]], *, upgrade: bool) -> Answer | None:
+    def answer(
+        self, path: str, headers: Mapping[str, Sequence[str]], *, upgrade: bool, peer: str = "127.0.0.1"
+    ) -> Answer | None:
         """None for a request that may pass; else what it gets: a refusal, or the cookie for the token it brought.
 
         Args:
             path: of the request, with its query.
             headers: values of `host`, `origin` and `cookie`, each as often as it was sent.
             upgrade: whether a WebSocket is asked for.
+            peer: address at the other end of the connection. What a request says of itself anybody can say.
         """
         hosts, origins = headers.get("host", ()), headers.get("origin", ())
         host = _parts(hosts[0]) if len(hosts) == 1 else None
@@ -73,12 +118,15 @@ class Access:
             return _refusal(HTTPStatus.FORBIDDEN, f"this page is not served under that name; open {self.address}")
         if any(not _same_origin(origin, host) for origin in origins):
             return _refusal(HTTPStatus.FORBIDDEN, "this page is not open to other web pages")
-        if not self.token or self._has_cookie(headers.get("cookie", ())):
+        if not self._asks:
+            return None if self._is_near(peer) else _refusal(
+                HTTPStatus.UNAUTHORIZED, f"this page is for its own machine: set {TOKEN_VARIABLE} for others")
+        if self.roles(headers.get("cookie", ())):
             return None
         given = parse_qs(urlsplit(path).query).get("token", [])
-        if not given or not _equal(given[0], self.token):
+        if not given or not self._roles_of(given[0]):
             return _refusal(HTTPStatus.UNAUTHORIZED, "this page needs its token: open the address with ?token=...")
-        return None if upgrade else self._welcome()
+        return None if upgrade else self._welcome(given[0])
 
     @property
     def address(self) -> str:
@@ -97,16 +145,36 @@ class Access:
         # An address cannot be rebound; a name must be this machine's own.
         return _address(name) is not None or name in _own_names()
 
-    def _has_cookie(self, headers: Sequence[str]) -> bool:
-        pairs = [part.strip().partition("=") for header in headers for part in header.split(";")]
-        return any(name == self._cookie and _equal(value, self.token) for name, _, value in pairs)
+    @property
+    def _asks(self) -> bool:
+        """Whether a token is needed."""
+        return bool(self.token or self.tokens)
 
-    def _welcome(self) -> Answer:
+    def _is_near(self, peer: str) -> bool:
+        address = _address(peer.partition("%")[0])
+        mapped = getattr(address, "ipv4_mapped", None) or address
+        return mapped is not None and (mapped.is_loopback or str(mapped) in self.near)
+
+    def _roles_of(self, given: str) -> frozenset[str]:
+        """What a token is for; nothing, if it is none of ours."""
+        found = {role for role, token in self.tokens.items() if _equal(given, token)}
+        if self.token and _equal(given, self.token):
+            found |= EVERYTHING
+        return frozenset(found | {"look"}) if found else frozenset()
+
+    def roles(self, cookies: Sequence[str]) -> frozenset[str]:
+        """What somebody may do who brings these cookies; everything, where no token is asked for."""
+        if not self._asks:
+            return EVERYTHING
+        pairs = [part.strip().partition("=") for header in cookies for part in header.split(";")]
+        return frozenset().union(*(self._roles_of(value) for name, _, value in pairs if name == self._cookie))
+
+    def _welcome(self, token: str) -> Answer:
         # Not a redirect: coming from a link in a mail, that would not carry a SameSite=Strict cookie yet.
         return Answer(
             HTTPStatus.OK,
             '<!doctype html><meta charset="utf-8"><title>zencell</title><script>location.replace("/")</script>',
-            {"Set-Cookie": f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"},
+            {"Set-Cookie": f"{self._cookie}={token}; Path=/; HttpOnly; SameSite=Strict"},
         )
 
 

@@ -28,6 +28,7 @@ from common.viewer.access import (
     TOKEN_VARIABLE,
     Access,
     Answer,
+    gateways,
     is_loopback,
     open_socket,
     refusal,
@@ -54,27 +55,35 @@ POLICY = (
 )
 
 
-def make_server(host: str, port: int, token: str = "", *, published: bool = False) -> viser.ViserServer:
+def make_server(
+    host: str, port: int, token: str = "", *, published: bool = False, secured: bool = False,
+    tokens: Mapping[str, str] | None = None,
+) -> viser.ViserServer:
     """A server of pages at host and port that refuses foreign web pages, foreign names, and who has not the token.
 
     Args:
         host: address or name to listen at; beyond this machine there must be a token.
         port: TCP port; 0 is any that is free (`server.get_port()`).
         token: that a browser has to bring once; empty: `ZENCELL_VIEWER_TOKEN`, and without that none is asked for.
-        published: the port is reached through the loopback of a machine only, as that of a container: no token is
-            needed, and no other name than the loopback's is served.
+        published: the port is reached through the loopback of a machine only, as that of a container: who comes from
+            its gateway needs no token, and no other name than the loopback's is served.
+        secured: there must be a token, wherever it listens.
+        tokens: by role, beside that for everything.
 
     Raises:
         ConfigError: the port is taken (names by whom), the host is not of this machine, or the token is missing or
             too short.
     """
     token = token or os.environ.get(TOKEN_VARIABLE, "")
-    _check_token("127.0.0.1" if published else host, token)
+    _check_token("127.0.0.1" if published else host, token, secured, bool(tokens))
     try:
         listening = open_socket(host, port)
     except OSError as error:
         raise refusal(error, host, port) from None
-    guard = Guard(Access("127.0.0.1" if published else host, listening.getsockname()[1], token))
+    guard = Guard(Access(
+        "127.0.0.1" if published else host, listening.getsockname()[1], token, tokens or {},
+        gateways() if published else frozenset(),
+    ))
     server = made_server(listening, guard.before, OPTIONS)
     if not (published or is_loopback(host)):
         log.warning(
@@ -107,7 +116,8 @@ class Guard:
         async def guarded(connection: websocket_server.ServerConnection, request: Request) -> Response | None:
             said = {name: request.headers.get_all(name) for name in ("host", "origin", "cookie")}
             upgrade = "upgrade" in request.headers
-            answer = self.access.answer(request.path, said, upgrade=upgrade)
+            peer = str((connection.remote_address or ("",))[0])
+            answer = self.access.answer(request.path, said, upgrade=upgrade, peer=peer)
             if answer is None and upgrade and len(connection.server.connections) >= MAX_PAGES:
                 answer = Answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_PAGES} pages are open already: close one\n")
             if answer is not None:
@@ -135,8 +145,11 @@ class Bounded(websocket_server.ServerConnection):
             self.transport.abort()
 
 
-def _check_token(host: str, token: str) -> None:
-    if not token and not is_loopback(host):
+def _check_token(host: str, token: str, secured: bool, others: bool) -> None:
+    if secured and not (token or others):
+        raise ConfigError("services.viewer.token", ..., f"is needed in a secured cell, as {TOKEN_VARIABLE} in the "
+                          "environment; `zencell secure init DIR --renew` makes one for each role")
+    if not (token or others or is_loopback(host)):
         raise ConfigError(
             "services.viewer.token", ..., f"is needed for a page at {host}, as {TOKEN_VARIABLE} in the environment"
         )

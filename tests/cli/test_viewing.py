@@ -10,6 +10,7 @@ import pytest
 from cli.viewing import page_of
 from common.config import Cell, load_cell
 from common.errors import ConfigError
+from common.transport.credentials import SECURE_VARIABLE
 from common.viewer.access import FIRST_PORT, TOKEN_VARIABLE
 from tests.harness import Zencell, ask
 
@@ -112,6 +113,14 @@ def test_beyond_this_machine_a_token_is_made_that_no_command_line_shows(cell: Ce
     assert page.address.endswith(f"/?token={token}") and "0.0.0.0" not in page.address
     assert page.overrides[0] == "services.viewer.host=0.0.0.0"
     assert token not in repr(page.overrides)
+
+
+def test_page_of_a_secured_cell_has_a_token_on_its_own_machine_too(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    open_page = page_of(cell, None, None)
+    assert open_page is not None and not open_page.environment
+    monkeypatch.setenv(SECURE_VARIABLE, "certs")
+    page = page_of(cell, None, None)
+    assert page is not None and page.address.endswith(f"/?token={page.environment[TOKEN_VARIABLE]}")
 
 
 def test_token_that_a_person_gave_is_not_shown(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,9 +40,9 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     made: list[viser.ViserServer] = []
 
     def one(
-        host: str = "127.0.0.1", port: int = 0, token: str = "", *, published: bool = False
+        host: str = "127.0.0.1", port: int = 0, token: str = "", **options: Any
     ) -> viser.ViserServer:
-        made.append(make_server(host, port, token, published=published))
+        made.append(make_server(host, port, token, **options))
         return made[-1]
 
     yield one
@@ -314,6 +314,22 @@ def test_viser_that_serves_in_another_way_is_not_left_unguarded(monkeypatch: pyt
     with pytest.raises(RuntimeError, match="serves in another way"):
         make_server("127.0.0.1", 0)
     assert stopped == [True]
+
+
+def test_page_of_a_secured_cell_needs_a_token_on_its_own_machine_too(make: Make) -> None:
+    with pytest.raises(ConfigError, match=f"services.viewer.token: is needed in a secured cell.*{TOKEN_VARIABLE}"):
+        make(secured=True)
+    server = make(secured=True, tokens={"look": SECRET})
+    assert (get(server).status, get(server, f"/?token={SECRET}").status) == (401, 200)
+
+
+async def test_another_container_does_not_open_a_published_page_by_saying_that_it_is_near(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = make("0.0.0.0", published=True)
+    # As from another container: what comes in has another address than the loopback's.
+    monkeypatch.setattr(guard.Bounded, "remote_address", ("172.18.0.7", 5555))
+    assert get(server).status == await refused(server) == 401
 
 
 def test_published_page_needs_no_token_and_is_served_under_loopback_names_only(make: Make) -> None:

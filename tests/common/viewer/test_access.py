@@ -2,10 +2,23 @@
 
 import socket
 from http import HTTPStatus
+from pathlib import Path
 
 import pytest
 
-from common.viewer.access import TOKEN, Access, address_of, is_loopback, make_token
+from common.errors import ConfigError
+from common.security.certificates import write_secret
+from common.viewer.access import (
+    ROLES,
+    TOKEN,
+    Access,
+    address_of,
+    gateways,
+    is_loopback,
+    make_token,
+    token_file,
+    tokens_in,
+)
 
 SECRET = "correct-horse-battery"
 HERE = Access("127.0.0.1", 8080)
@@ -116,3 +129,51 @@ def test_made_tokens_are_long_differ_and_need_no_escaping() -> None:
 
 def test_secret_is_not_in_what_is_logged_of_the_rules() -> None:
     assert SECRET not in repr(WIDE)
+
+
+@pytest.mark.parametrize(("peer", "passes"), [
+    ("127.0.0.1", True), ("127.8.9.1", True), ("::1", True), ("::ffff:127.0.0.1", True), ("172.18.0.1", True),
+    ("::ffff:172.18.0.1", True), ("172.18.0.7", False),
+    ("::ffff:172.18.0.7", False), ("fe80::1%eth0", False), ("", False),
+])
+def test_where_no_token_is_asked_for_the_socket_tells_who_is_near_and_not_the_request(peer: str, passes: bool) -> None:
+    published = Access("127.0.0.1", 8080, near=frozenset({"172.18.0.1"}))
+    answer = published.answer("/", {"host": ["127.0.0.1:8080"]}, upgrade=True, peer=peer)
+    assert (answer is None) is passes
+    if answer is not None:
+        assert answer.status is HTTPStatus.UNAUTHORIZED and "ZENCELL_VIEWER_TOKEN" in answer.text
+
+
+def test_gateway_of_a_container_is_that_of_its_default_route(tmp_path: Path) -> None:
+    table = tmp_path / "route"
+    rows = ["Iface Destination Gateway Flags", "eth1 00000000 010012AC 0003", "eth0 000013AC 00000000 0001", ""]
+    table.write_text("\n".join(rows).replace(" ", "\t"))
+    assert gateways(table) == {"172.18.0.1"}
+    assert gateways(tmp_path / "none") == frozenset()
+
+
+def test_each_token_opens_for_its_role_and_the_one_of_before_for_everything() -> None:
+    tokens = {role: f"{role}-token-of-the-page" for role in ROLES}
+    access = Access("127.0.0.1", 8080, SECRET, tokens)
+    for role, token in tokens.items():
+        assert status(access, "127.0.0.1:8080", cookie=f"zencell-8080={token}") == 0
+        assert access.roles([f"zencell-8080={token}"]) == {"look", role}
+        assert status(access, "127.0.0.1:8080", path=f"/?token={token}") == 0
+    assert access.roles([f"zencell-8080={SECRET}"]) == set(ROLES)
+    assert not access.roles(["zencell-8080=look", "zencell-8081=" + SECRET])
+    assert status(access, "127.0.0.1:8080") == HTTPStatus.UNAUTHORIZED
+    assert SECRET not in repr(access) and "of-the-page" not in repr(access)
+    assert HERE.roles([]) == set(ROLES)
+
+
+def test_tokens_of_a_folder_are_those_that_only_its_owner_reads(tmp_path: Path) -> None:
+    assert tokens_in(tmp_path, "panda") == {}
+    for role in ROLES[:2]:
+        write_secret(token_file(tmp_path, "panda", role), f"{role}-token-of-the-page\n".encode())
+    assert tokens_in(tmp_path, "panda") == {role: f"{role}-token-of-the-page" for role in ROLES[:2]}
+    token_file(tmp_path, "panda", "look").chmod(0o640)
+    with pytest.raises(ConfigError, match=r"panda\.page\.look' can be read by others: chmod 600 it"):
+        tokens_in(tmp_path, "panda")
+    write_secret(token_file(tmp_path, "panda", "look"), b"short\n")
+    with pytest.raises(ConfigError, match=r"panda\.page\.look' holds no token"):
+        tokens_in(tmp_path, "panda")
