@@ -19,13 +19,17 @@ REFRESHES = 4  # [1/s]
 class LiveScreen:
     """A table of the processes that stays below the lines that they write."""
 
-    def __init__(self, console: Console, content: Callable[[], Content]) -> None:
+    def __init__(
+        self, console: Console, content: Callable[[], Content], drain: Callable[[], None] = lambda: None
+    ) -> None:
         """Take the terminal over.
 
         Args:
             console: of the terminal.
             content: asked for what to show a few times a second; called on another thread.
+            drain: returns soon, when all was written if somebody reads.
         """
+        self._drain = drain
         self._content = content
         self._live = Live(
             console=console, get_renderable=lambda: render(self._content()), refresh_per_second=REFRESHES,
@@ -48,6 +52,7 @@ class LiveScreen:
     def close(self) -> None:
         """Leave the last table standing and give the terminal back."""
         self._live.stop()
+        self._drain()
 
 
 def _style_of(line: str) -> str:

@@ -8,6 +8,7 @@ import json
 import logging
 import os
 import signal
+import sys
 import tempfile
 import time
 from collections.abc import Awaitable, Callable
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from cli import hosts, options, securing, viewing
-from common.terminal import echo
+from common.terminal import printable
 
 if TYPE_CHECKING:
     from cli.screens import Content, Screen
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 START_REQUEST_TIMEOUT = 5.0  # [s]
+LAST_WORDS = 5.0  # [s] for whoever is slow to read what became of a run
 FIRST_WORD = 2.0  # [s] in which the executor of a cell that is up has said how the robot is
 EXECUTOR, OURSELVES = "trajectory_executor", ("watchdog", "controller")
 
@@ -174,6 +176,7 @@ class Operation:
 
     def run_to_end(self) -> int:
         """Exit code of a run: 0 when the task is DONE, 1 when it is not, 130 after Ctrl-C."""
+        from common.process.lossy import LossyWriter
         from common.reporting.summary import describe
         from common.supervision.supervisor import StartFailed
 
@@ -184,8 +187,10 @@ class Operation:
             self._write_summary()
             raise
         self._write_summary()
+        out = LossyWriter(sys.stdout)
         for line in describe(self.summary.as_dict(), self.fold.figures):
-            echo(line)
+            out.put(printable(line) + "\n")
+        out.flush(LAST_WORDS)
         return code
 
     def stay(self) -> int:

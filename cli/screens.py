@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import os
@@ -9,9 +10,10 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TextIO, cast
 
 from common.messages import ServiceStatus
+from common.process.lossy import LossyWriter, told_lost
 from common.terminal import printable
 
 
@@ -43,25 +45,35 @@ class Screen(Protocol):
 class PlainScreen:
     """Lines on stderr, each with the name of who wrote it; no control characters. Notes go to stdout."""
 
+    def __init__(self) -> None:
+        """Write to stderr and stdout of now."""
+        self._lines, self._notes = LossyWriter(sys.stderr), LossyWriter(sys.stdout)
+
     def line(self, service: str, text: str) -> None:
         """Show one line that a process wrote."""
-        _write(printable(text if f" {service}: " in text[:80] else f"{service}: {text}"))
+        self._lines.put(printable(text if f" {service}: " in text[:80] else f"{service}: {text}") + "\n")
 
     def note(self, text: str) -> None:
         """Show a line for the person in front of it."""
-        sys.stdout.write(printable(text, keep="\n") + "\n")
-        sys.stdout.flush()
+        self._notes.put(printable(text, keep="\n") + "\n")
 
     def progress(self, text: str) -> None:
         """Show how far the task is."""
         self.line("task", text)
 
     def close(self) -> None:
-        """Nothing to leave behind."""
+        """Write what still waits, if somebody reads."""
+        self._lines.flush()
+        self._notes.flush()
 
 
 class JsonScreen:
     """One JSON object a line on stderr: time, service, level, message."""
+
+    def __init__(self) -> None:
+        """Write to stderr of now."""
+        self._lines = LossyWriter(
+            sys.stderr, lambda lines: _object("supervisor", "warning", told_lost(lines)).rstrip("\n"))
 
     def line(self, service: str, text: str) -> None:
         """Pass on what is such an object already, wrap what is not."""
@@ -71,23 +83,21 @@ class JsonScreen:
             except ValueError:
                 value = None
             if isinstance(value, dict) and "message" in value:
-                _write(json.dumps({"service": service, **value}))
+                self._lines.put(json.dumps({"service": service, **value}) + "\n")
                 return
-        self._object(service, "info", text)
+        self._lines.put(_object(service, "info", text))
 
     def note(self, text: str) -> None:
         """Show a line for the person in front of it."""
-        self._object("supervisor", "info", text)
+        self._lines.put(_object("supervisor", "info", text))
 
     def progress(self, text: str) -> None:
         """Show how far the task is."""
-        self._object("task", "info", text)
-
-    def _object(self, service: str, level: str, message: str) -> None:
-        _write(json.dumps({"time": round(time.time(), 6), "service": service, "level": level, "message": message}))
+        self._lines.put(_object("task", "info", text))
 
     def close(self) -> None:
-        """Nothing to leave behind."""
+        """Write what still waits, if somebody reads."""
+        self._lines.flush()
 
 
 def open_screen(content: Callable[[], Content], *, log_json: bool, plain: bool = False) -> Screen:
@@ -99,7 +109,8 @@ def open_screen(content: Callable[[], Content], *, log_json: bool, plain: bool =
 
         from cli.live import LiveScreen
 
-        return LiveScreen(Console(stderr=True), content)
+        terminal = _Terminal(sys.stderr)
+        return LiveScreen(Console(file=cast(TextIO, terminal)), content, terminal.drain)
     return PlainScreen()
 
 
@@ -125,6 +136,34 @@ class ScreenHandler(logging.Handler):
         self._screen.line(record.name, text)
 
 
-def _write(text: str) -> None:
-    sys.stderr.write(text + "\n")
-    sys.stderr.flush()
+def _object(service: str, level: str, message: str) -> str:
+    said = {"time": round(time.time(), 6), "service": service, "level": level, "message": message}
+    return json.dumps(said) + "\n"
+
+
+class _Terminal(io.TextIOBase):
+    """A terminal that nobody waits for who writes to it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self._out = stream, LossyWriter(stream)
+
+    def write(self, text: str) -> int:
+        self._out.put(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Nothing: it is written soon."""
+
+    def drain(self) -> None:
+        """Write what still waits, if somebody reads."""
+        self._out.flush()
+
+    def isatty(self) -> bool:
+        return self._stream.isatty()
+
+    def fileno(self) -> int:
+        return self._stream.fileno()
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        return self._stream.encoding

@@ -99,7 +99,8 @@ class RunningCell:
     """A `zencell run` or `zencell up` in a domain of its own; its log and its summary are files in a folder."""
 
     def __init__(
-        self, folder: Path, verb: str, cell: str, *arguments: str, secrets: Mapping[str, str] | None = None
+        self, folder: Path, verb: str, cell: str, *arguments: str, secrets: Mapping[str, str] | None = None,
+        output: int | None = None,
     ) -> None:
         """Start it; use it in a `with` block, at the end of which everything it started is gone.
 
@@ -109,6 +110,7 @@ class RunningCell:
             cell: name of the cell.
             arguments: further options, but for domain and summary; without `--viewer-port` there is no page.
             secrets: environment variables that no command line may show.
+            output: descriptor of the file that stdout and stderr go to, instead of the log.
         """
         end_in_order()
         if "--viewer-port" not in arguments:
@@ -120,7 +122,7 @@ class RunningCell:
         with (folder / LOG).open("wb") as log:
             self.process = subprocess.Popen(
                 command, cwd=folder, env={**environment(folder), **(secrets or {})}, stdin=subprocess.DEVNULL,
-                stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
+                stdout=log if output is None else output, stderr=subprocess.STDOUT, start_new_session=True,
             )
 
     def __enter__(self) -> RunningCell:

@@ -196,7 +196,7 @@ class TrajectoryController:
             rejected = MotionStatus(
                 id=goal, state="rejected", error=refusal.code, message=str(refusal), source=self._name
             )
-            return self._as_of_now(self._memory.put(goal, rejected))
+            return self._as_of_now(self._memory.put(goal, rejected, refused=True))
         if not near:
             self._hold = measured.copy()
             if self._limiter.at_rest:

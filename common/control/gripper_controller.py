@@ -45,7 +45,7 @@ class GripperController:
         if message:
             rejected = GripperState.model_validate(
                 {**reading, "id": request.id, "state": "rejected", "error": code, "message": message})
-            return self._memory.put(request.id, rejected)
+            return self._memory.put(request.id, rejected, refused=True)
         if self.state.state == "active":
             replaced = {"state": "cancelled", "message": f"replaced by {request.id!r}"}
             self._memory.put(self.state.id, self.state.model_copy(update=replaced))

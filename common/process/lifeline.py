@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import logging
 import os
@@ -16,6 +17,7 @@ from typing import NoReturn
 log = logging.getLogger(__name__)
 
 PR_SET_PDEATHSIG = 1  # of linux/prctl.h
+FLUSH_SECONDS = 0.5
 GRACE_SECONDS = 0.7  # from the signal to the end; the rest of the second is the system's
 
 
@@ -108,11 +110,18 @@ def wake_when_orphaned() -> None:
 
 def leave(code: int) -> NoReturn:
     """End the process now: neither threads that still compute nor the network can hold it."""
+    flushing = threading.Thread(target=_flush, daemon=True)
+    flushing.start()
+    flushing.join(FLUSH_SECONDS)  # whoever should read may not
+    os._exit(code)
+
+
+def _flush() -> None:
     for handler in logging.getLogger().handlers:
         handler.flush()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
 
 
 def fail(error: Exception) -> NoReturn:

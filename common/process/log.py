@@ -5,14 +5,18 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import sys
 import threading
 from typing import Any, Literal, cast
 
 from common import topics
 from common.messages import LogLine
+from common.process.lossy import LossyWriter, told_lost
 from common.terminal import printable
 from common.transport.bus import Bus
 from common.transport.handoff import call_on_loop
+
+FLUSH_SECONDS = 0.3  # for what was said last when a process ends
 
 
 class _Human(logging.Formatter):
@@ -43,10 +47,28 @@ class _Json(logging.Formatter):
         return json.dumps(line)
 
 
+class _Lossy(logging.Handler):
+    """Writes lines to stderr as long as somebody reads them, and never waits."""
+
+    def __init__(self, formatter: logging.Formatter) -> None:
+        super().__init__()
+        self.setFormatter(formatter)
+        self._out = LossyWriter(sys.stderr, lambda lines: self.format(logging.LogRecord(
+            __name__, logging.WARNING, "", 0, told_lost(lines), None, None)))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            self._out.put(f"{self.format(record)}\n")
+        except Exception:  # noqa: BLE001 - as every handler of logging
+            self.handleError(record)
+
+    def flush(self) -> None:
+        self._out.flush(FLUSH_SECONDS)
+
+
 def log_to_stderr(service: str, *, as_json: bool) -> None:
-    """Write the process's log lines of level info and above to stderr."""
-    handler = logging.StreamHandler()
-    handler.setFormatter(_Json(service) if as_json else _Human(service))
+    """Write the process's log lines of level info and above to stderr, without ever waiting for who reads them."""
+    handler = _Lossy(_Json(service) if as_json else _Human(service))
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(logging.INFO)

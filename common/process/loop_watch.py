@@ -84,6 +84,8 @@ def end_stuck(still: float) -> NoReturn:
     def tell() -> None:
         faulthandler.dump_traceback(sys.__stderr__ or 2, all_threads=True)
         log.critical("the event loop has not turned for %.1f s; where it hangs is above", still)
+        for handler in logging.getLogger().handlers:
+            handler.flush()
 
     telling = threading.Thread(target=tell, daemon=True)
     telling.start()

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -6,10 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.control.controller import LARGEST_STEP
-from common.control.goals import REMEMBERED
+from common.control.goals import REMEMBERED, GoalMemory
 from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware
 from tests.common.hardware.rig import START, STEP, T0, Rig
+from tests.harness import ROOT
 
 
 @pytest.mark.parametrize("hardware", [None, LagHardware(START, 0.03, None)])
@@ -67,18 +69,27 @@ def test_same_id_again_gives_the_state_of_that_goal_and_moves_nothing(rig, rest_
         assert np.array_equal(rig.q, before)
 
 
-def test_the_last_goals_are_remembered_and_a_running_one_always(rig, rest_to_rest):
+def test_goals_that_were_followed_are_remembered_however_many_are_refused(rig, rest_to_rest):
     there, back = rest_to_rest([0, 0], [0.01, 0], 0.5), rest_to_rest([0.01, 0], [0, 0], 0.5)
     rig.accept("first", there)
     rig.until_over()
     rig.accept("running", back)
-    for number in range(REMEMBERED - 1):
+    for number in range(REMEMBERED + 1):
         rig.accept(f"busy {number}", there)
-        rig.step(1e-4)
     assert rig.accept("running", there).state == "active"
-    assert rig.accept(f"busy {REMEMBERED // 2}", there).error == "busy"
+    assert rig.accept(f"busy {REMEMBERED}", there).error == "busy"
     rig.until_over()
-    assert rig.accept("first", there).state == "active", "forgotten by now: a new goal"
+    assert rig.accept("first", there).state == "succeeded", "not followed again"
+    assert rig.accept("busy 0", there).state == "active", "forgotten by now: a new goal"
+
+
+def test_as_many_goals_are_remembered_as_the_docs_say():
+    said = re.search(r"newest goals by id \((\d+) of", (ROOT / "docs" / "security.md").read_text())
+    assert said is not None and int(said[1]) == REMEMBERED
+    memory = GoalMemory()
+    for number in range(REMEMBERED + 1):
+        memory.put(f"{number}", number + 1)
+    assert memory.get("0") is None and memory.get("1") == 2
 
 
 @given(fraction=st.floats(0.02, 0.98), end=st.floats(0.1, 1.0))
