@@ -103,7 +103,7 @@ class PlanRequest(Message):
     """
 
     most_bytes: ClassVar[int] = 4 * 1024 * 1024  # a path of 20000 poses
-    most_parts: ClassVar[int] = 64 * 1024
+    most_parts: ClassVar[int] = 128 * 1024
 
     header: Header = Header()
     id: Name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import zlib
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from common.messages import SCHEMA_VERSION, Message
 from common.messages.basics import LARGEST, SMALL, clean, is_name
 
 DEFAULT_LIMIT = LARGEST  # [bytes]
+_LEVELS = 3  # of a large payload that are read in pieces: down to the points of a trajectory
 _MOST_FIELDS = 256  # of a map: each that a message does not know costs time to refuse
 MSGPACK = "application/msgpack"
 CHECKED_BYTES = 64 * 1024  # of a payload that its checksum covers: a damaged pixel harms nobody
@@ -50,23 +52,34 @@ def _is_plain(model: type[Message]) -> bool:
     return not (own.computed_fields or own.field_serializers or own.model_serializers)
 
 
-def decode(model: type[M], payload: bytes, limit: int = DEFAULT_LIMIT) -> M:
-    """The message that a payload holds.
+async def decode_beside(model: type[M], payload: bytes, limit: int = DEFAULT_LIMIT) -> M:
+    """The message that a payload holds, read beside the loop where that takes more than a moment.
+
+    Raises:
+        DecodeError: as `decode`.
+    """
+    if len(payload) <= SMALL:
+        return decode(model, payload, limit)
+    return await asyncio.to_thread(decode, model, payload, limit, in_pieces=True)
+
+
+def decode(model: type[M], payload: bytes, limit: int = DEFAULT_LIMIT, *, in_pieces: bool = False) -> M:
+    """The message that a payload holds; read in pieces, other threads have their turns meanwhile.
 
     Raises:
         DecodeError: one line: too large, not msgpack, bytes after the end, or the first field that does not fit.
     """
     if len(payload) <= SMALL or not gc.isenabled():
-        return _decode(model, payload, limit)
+        return _decode(model, payload, limit, in_pieces)
     gc.disable()  # it would look again and again at all that is made of a large payload: half of the time
     try:
-        return _decode(model, payload, limit)
+        return _decode(model, payload, limit, in_pieces)
     finally:
         gc.enable()
 
 
-def _decode(model: type[M], payload: bytes, limit: int) -> M:
-    value = _unpack(payload, min(limit, model.most_bytes), model.__name__, model.most_parts)
+def _decode(model: type[M], payload: bytes, limit: int, in_pieces: bool) -> M:
+    value = _unpack(payload, min(limit, model.most_bytes), model.__name__, model.most_parts, in_pieces)
     if not isinstance(value, dict):
         raise DecodeError(f"{model.__name__}: payload is {_kind(value)}, not a map")
     try:
@@ -91,17 +104,43 @@ def _counting(most: int) -> Callable[[T], T]:
     return count
 
 
-def _unpack(payload: bytes, limit: int, name: str, parts: int = 64) -> Any:
+def _in_pieces(unpacker: msgpack.Unpacker, payload: bytes, count: Callable[[Any], Any], levels: int) -> Any:
+    """The next value, of whose upper levels each part is read by itself: other threads have their turns between."""
+    kind = payload[unpacker.tell()] if levels and unpacker.tell() < len(payload) else 0
+    if 0x80 <= kind <= 0x8F or kind in (0xDE, 0xDF):
+        read: dict[str, Any] = {}
+        for _ in range(unpacker.read_map_header()):
+            name = unpacker.unpack()
+            if not isinstance(name, str):
+                raise ValueError(f"{type(name).__name__} is not allowed for map key")
+            read[name] = _in_pieces(unpacker, payload, count, levels - 1)
+        return count(read)
+    if 0x90 <= kind <= 0x9F or kind in (0xDC, 0xDD):
+        length = unpacker.read_array_header()
+        return count([_in_pieces(unpacker, payload, count, levels - 1) for _ in range(length)])
+    return count(unpacker.unpack())  # by itself, it costs as much as a list
+
+
+def _unpack(payload: bytes, limit: int, name: str, parts: int = 64, in_pieces: bool = False) -> Any:
     if len(payload) > limit:
         raise DecodeError(f"{name}: payload has {len(payload)} bytes, the limit is {limit}")
     if not payload:
         raise DecodeError(f"{name}: payload is empty")
     try:
+        most: dict[str, Any] = {"max_map_len": _MOST_FIELDS, "max_array_len": 4 * parts, "max_ext_len": 0}
         count = _counting(parts) if len(payload) > SMALL else None
-        return msgpack.unpackb(
-            payload, raw=False, strict_map_key=True, max_map_len=_MOST_FIELDS, max_array_len=4 * parts, max_ext_len=0,
-            object_hook=count, list_hook=count,
+        if count is None or not in_pieces:
+            return msgpack.unpackb(
+                payload, raw=False, strict_map_key=True, object_hook=count, list_hook=count, **most)
+        unpacker = msgpack.Unpacker(
+            raw=False, strict_map_key=True, max_buffer_size=len(payload), max_str_len=len(payload),
+            max_bin_len=len(payload), object_hook=count, list_hook=count, **most,
         )
+        unpacker.feed(payload)
+        value = _in_pieces(unpacker, payload, count, _LEVELS)
+        if left := len(payload) - unpacker.tell():
+            raise msgpack.ExtraData(value, payload[-left:])
+        return value
     except msgpack.ExtraData as error:
         raise DecodeError(f"{name}: {len(error.extra)} bytes after the end of the message") from None
     except Exception as error:

@@ -13,8 +13,8 @@ from common.topics import Request
 from common.transport.codec import (
     Attachment,
     checksum_of,
-    decode,
     decode_attachment,
+    decode_beside,
     decode_error,
     encode,
     encode_attachment,
@@ -55,6 +55,7 @@ class Server(Generic[Q, A]):
         self._limit = limit
         self._refusals = Refusals(topic.key, loop, log)
         self._tasks: set[asyncio.Task[None]] = set()
+        self._in_order = asyncio.Lock()
         self._session, self._loop = session, loop
 
     def open(self) -> None:
@@ -87,7 +88,8 @@ class Server(Generic[Q, A]):
                 attachment = decode_attachment(query.attachment)
                 sender = attachment.writer if attachment else NO_SENDER
                 require_whole(attachment, self._key, payload)
-                request = decode(self.topic.message, payload, self._limit)
+                async with self._in_order:  # what came first is answered first, however large it is
+                    request = await decode_beside(self.topic.message, payload, self._limit)
             except DecodeError as error:
                 self._refuse(query, "invalid", error, sender)
                 return
@@ -217,7 +219,7 @@ class Client(Generic[Q, A]):
             raise RemoteError(self.topic.key, *refusal)
         try:
             require_whole(decode_attachment(reply.sample.attachment), self._key, reply.sample.payload)
-            return decode(self.topic.answer, reply.sample.payload, self._limit)
+            return await decode_beside(self.topic.answer, reply.sample.payload, self._limit)
         except DecodeError as error:
             raise RemoteError(self.topic.key, "bad_answer", f"the answer cannot be read: {error}") from None
 

@@ -1,0 +1,120 @@
+"""Large requests are read beside the loop, in pieces and in order; what takes long to read is refused early."""
+
+import asyncio
+import contextlib
+import threading
+from time import process_time
+from typing import Any
+
+import msgpack
+import pytest
+
+from common import messages as m
+from common.application import all_topics
+from common.errors import DecodeError
+from common.messages.basics import SMALL, Message
+from common.messages.robot import MOST_POINTS
+from common.topics import MOTION_EXECUTE
+from common.transport.codec import decode, encode
+from common.transport.local import LocalNetwork
+
+JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
+MESSAGES = sorted(
+    {model for topic in all_topics().values() for model in (topic.message, getattr(topic, "answer", topic.message))},
+    key=lambda model: model.__name__,
+)
+VALUES: list[Any] = [{}, [], 1, 2**60, "ab", b"", [0], {"a": 0}]
+
+
+def execute(points: int, name: str = "a") -> m.ExecuteRequest:
+    row = [0.125] * 7
+    made = [m.JointTrajectoryPoint.model_construct(
+        time_from_start=0.01 * i, positions=row, velocities=row, accelerations=row) for i in range(points)]
+    return m.ExecuteRequest(
+        id=name, trajectory=m.JointTrajectory.model_construct(header=m.Header(), joint_names=JOINTS, points=made))
+
+
+def seconds_to_decode(model: type[Message], payload: bytes) -> float:
+    """Least CPU time of three tries."""
+    times = []
+    for _ in range(3):
+        began = process_time()
+        with contextlib.suppress(DecodeError):
+            decode(model, payload)
+        times.append(process_time() - began)
+    return min(times)
+
+
+@pytest.mark.parametrize("model", [model for model in MESSAGES if model.most_bytes <= 4 * SMALL])
+def test_nothing_that_is_small_takes_long_to_refuse(model: type[Message]) -> None:
+    worst = 0.0
+    for field in model.model_fields:
+        for value in VALUES:
+            count = (model.most_bytes - 64) // len(msgpack.packb(value))
+            worst = max(worst, seconds_to_decode(model, msgpack.packb({field: [value] * count})))
+    worst = max(worst, seconds_to_decode(model, msgpack.packb({f"{i:x}": 0 for i in range(1500)})))
+    assert worst < 0.02  # measured: 1.5 ms; a machine that is busy counts the work of others' caches too
+
+
+@pytest.mark.parametrize(("model", "payload"), [
+    (m.PoseArray, msgpack.packb({"poses": [{}] * 30_000})),
+    (m.Image, msgpack.packb({"data": [[]] * 1_000_000})),
+    (m.PlanningScene, msgpack.packb({"objects": [{}] * 200_000})),
+    (m.PlanRequest, msgpack.packb({"goal": [[0]] * 1_000_000})),
+    (m.ServiceCounters, msgpack.packb({"service": "a", "received": {f"{i:x}": "" for i in range(2000)}})),
+], ids=lambda value: getattr(value, "__name__", ""))
+def test_what_cost_seconds_costs_milliseconds(model: type[Message], payload: bytes) -> None:
+    with pytest.raises(DecodeError):
+        decode(model, payload)
+    assert seconds_to_decode(model, payload) < 0.15
+
+
+def test_the_longest_trajectory_fits_and_reads_the_same_in_pieces() -> None:
+    request = execute(MOST_POINTS)
+    payload = encode(request)
+    assert len(payload) <= m.ExecuteRequest.most_bytes
+    assert decode(m.ExecuteRequest, payload, in_pieces=True) == decode(m.ExecuteRequest, payload)
+
+
+@pytest.mark.parametrize("in_pieces", [False, True])
+@pytest.mark.parametrize(("payload", "reason"), [
+    (encode(execute(200)) + b"\x00", "1 bytes after the end"),
+    (encode(execute(200))[:-1], "not msgpack"),
+    (msgpack.packb({1: 1, "id": "a" * SMALL}), "not allowed for map key"),
+    (msgpack.packb({"id": [[]] * 400_000}), "more than 131072 lists and maps"),
+    (msgpack.packb({"id": [0] * 600_000}), "exceeds max_array_len|more than 131072 lists"),
+    (msgpack.packb({"id": msgpack.ExtType(5, b"0" * SMALL)}), "exceeds max_ext_len"),
+    (msgpack.packb({"id": b"a" * SMALL})[:-9] + b"\xc1" * 9, r"id: must be a valid string"),
+], ids=["more", "less", "key", "lists", "list", "extension", "bytes"])
+def test_large_payloads_are_refused_alike(payload: bytes, reason: str, in_pieces: bool) -> None:
+    with pytest.raises(DecodeError, match=reason):
+        decode(m.ExecuteRequest, payload, in_pieces=in_pieces)
+
+
+async def test_large_requests_are_read_beside_the_loop_and_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    beside: list[bool] = []
+
+    def noted(model: Any, payload: bytes, *rest: Any, **more: Any) -> Message:
+        if model is m.ExecuteRequest:
+            beside.append(threading.current_thread() is not threading.main_thread())
+        return decode(model, payload, *rest, **more)
+
+    monkeypatch.setattr("common.transport.codec.decode", noted)
+    network = LocalNetwork()
+    server, client = network.bus("server"), network.bus("client")
+    heard: list[str] = []
+
+    async def handle(request: m.ExecuteRequest) -> m.MotionStatus:
+        heard.append(request.id)
+        return m.MotionStatus(id=request.id)
+
+    server.serve(MOTION_EXECUTE, handle)
+    await server.ready()
+    calls = client.client(MOTION_EXECUTE)
+    sizes = {"large": 4000, "small": 2, "middle": 200, "last": 1}
+    asked = [asyncio.create_task(calls.call(execute(points, name), timeout=30.0)) for name, points in sizes.items()]
+    answers = await asyncio.gather(*asked)
+    assert beside == [True, False, True, False]
+    assert heard == [answer.id for answer in answers] == list(sizes)
+    await client.close()
+    await server.close()
