@@ -156,7 +156,7 @@ def stop(cell: options.CellName = None, domain: options.Domain = None, connect: 
             await arm
         return told
 
-    typer.echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
+    echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
 
 
 @task.command()
