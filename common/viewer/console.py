@@ -14,7 +14,16 @@ from pydantic import JsonValue
 from common import topics
 from common.config import Members
 from common.errors import RequestFailed, ZencellError
-from common.messages import Message, Parameter, ParameterRequest, StopRequest, TaskCommand, Vector3, WorldEdit
+from common.messages import (
+    Message,
+    MotionStatus,
+    Parameter,
+    ParameterRequest,
+    StopRequest,
+    TaskCommand,
+    Vector3,
+    WorldEdit,
+)
 from common.topics import Request, Topic
 from common.viewer.feeds import Feeds
 from common.viewer.words import problem
@@ -150,6 +159,7 @@ class Console(Desk):
         """
         super().__init__()
         self._feeds = feeds
+        self._newest = 0  # `since` of the stop that was said here
         asked: list[Request[Any, Any]] = [topics.TASK_COMMAND, topics.MOTION_STOP, topics.WORLD_EDIT]
         self._clients: dict[str, Client[Any, Any]] = {request.key: bus.client(request) for request in [*asked, *more]}
         self._parameters = {name: bus.client(topics.parameters_of(name)) for name in members.services}
@@ -166,7 +176,8 @@ class Console(Desk):
     async def command(self, command: str, override: bool = False) -> None:
         """Tell the task to start, pause, resume or stop; to start or resume although another person holds the arm."""
         motion = self.latest(topics.MOTION_STATUS)
-        said = {"command": command, "by": BY, "override": override, "heard": motion.newest if motion else None}
+        heard = max(motion.newest, self._newest) if motion else None
+        said = {"command": command, "by": BY, "override": override, "heard": heard}
         await self.ask(topics.TASK_COMMAND, TaskCommand.model_validate(said))
 
     async def stop(self) -> None:
@@ -183,6 +194,8 @@ class Console(Desk):
         for answer in told:
             if isinstance(answer, BaseException):
                 raise answer
+            if isinstance(answer, MotionStatus):
+                self._newest = answer.newest
 
     async def move(self, object_id: str, x: float, y: float) -> None:
         """Put an object of the simulated world somewhere [m]."""

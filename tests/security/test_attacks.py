@@ -276,6 +276,8 @@ def test_an_observer_sees_everything_and_commands_nothing(secured: Secured) -> N
         for key in ("panda/motion/stop", "panda/motion/*", "panda/**"):
             assert observer.ask(key, stop, timeout=1.0) == []
         assert operator.ask("panda/motion/stop", stop)
+        let_go = encode(m.HoldRequest(hold=False, stops=True))
+        assert operator.ask("panda/motion/hold", let_go)  # for the tests after it
 
 
 @pytest.mark.usefixtures("same_processes")

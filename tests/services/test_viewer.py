@@ -88,6 +88,7 @@ class Played:
     bus: Bus
     port: int = 0
     commands: list[str] = field(default_factory=list)
+    holder: str = ""
     stops: list[str] = field(default_factory=list)
     sets: list[tuple[dict[str, object], str]] = field(default_factory=list)
     selects: list[OutlineSelect] = field(default_factory=list)
@@ -95,6 +96,8 @@ class Played:
 
     async def command(self, request: m.TaskCommand) -> m.TaskStatus:
         self.commands.append(request.command)
+        if self.holder and not request.override:
+            raise Refused("held", f"the robot is held by {self.holder}")
         return m.TaskStatus()
 
     async def stop(self, request: m.StopRequest) -> m.MotionStatus:
@@ -178,6 +181,23 @@ async def test_task_is_told_what_is_clicked(panda: Played, page: BrowserDouble, 
     await page.click(command)
     await until(lambda: panda.commands)
     assert panda.commands == [command.lower()]
+
+
+async def test_robot_that_another_holds_goes_on_when_that_is_said_twice(panda: Played, page: BrowserDouble) -> None:
+    panda.holder = "anna"
+    await page.click("Resume")
+    await page.until(lambda: "the robot is held by anna: press Resume again for that" in page.text)
+    await page.click("Start")
+    await page.until(lambda: "press Start again" in page.text)
+    await page.click("Start")
+    await page.until(lambda: "press Start again" not in page.text)
+    assert panda.commands == ["resume", "start", "start"]
+
+
+async def test_who_stopped_the_robot_is_shown_though_no_task_says_so(panda: Played, page: BrowserDouble) -> None:
+    stop = m.Inhibit(kind="stopped", by="anna", reason="smoke", since=0)
+    panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(inhibits=[stop]))
+    await page.until(lambda: "stopped since 1970-01-01 00:00:00 UTC by anna (smoke)" in page.text)
 
 
 async def test_state_and_counters_are_shown_in_words(panda: Played, page: BrowserDouble) -> None:
