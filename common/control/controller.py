@@ -259,7 +259,7 @@ class TrajectoryController:
             measured: where the robot is, (dof,) [rad].
             measured_velocity: (dof,) [rad/s].
         """
-        if self._fault:  # the arm may have sagged meanwhile
+        if self._fault or (self._last is None and self._goal is None):  # it may have sagged, or begin anywhere
             self._fault, self._hold = "", measured.copy()
             self._limiter.rest(measured)
         elapsed = self._period if self._last is None else max(now - self._last, 0.0)

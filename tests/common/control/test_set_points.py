@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.control.controller import LARGEST_STEP, LATE
+from common.hardware.mock import MockHardware
 from common.messages import JointTrajectory, JointTrajectoryPoint
 from tests.common.control.test_holding import LIMITS, winding
 from tests.common.control.test_limiter import assert_within
@@ -108,6 +109,13 @@ def test_arm_that_is_off_is_taken_back_within_limits():
     assert np.allclose(rig.positions[-1], where) and not rig.velocities[-1].any()
     rig.assert_within(HARD)
     assert rig.accept("b", goal_at(where, 1e-6)).state == "active" and rig.until_over().state == "succeeded"
+
+
+def test_set_points_begin_where_the_arm_is_found():
+    rig = Sampled(LIMITS, MockHardware(np.array([0.7, -0.4]), None))
+    for _ in range(5):
+        rig.step()
+    assert np.array_equal(rig.positions[1:], [[0.7, -0.4]] * 5)
 
 
 EVENTS = st.one_of(
