@@ -16,6 +16,7 @@ from common.transport.bus import Bus
 from common.transport.credentials import secure_folder
 from common.viewer.access import address_of, tokens_in
 from common.viewer.console import BY, Console
+from common.viewer.doors import Doors
 from common.viewer.feeds import Feeds, Periods, Topics
 from common.viewer.guard import close_server, make_server
 from common.viewer.layers import Layers, find_layers
@@ -94,13 +95,14 @@ async def run(bus: Bus, config: Config) -> None:
     layers = find_layers(application, config.layers, config.members.keys)
     read = Topics(application, layers.values(), config.members.keys)
     feeds = Feeds(bus, read.always, read.on_demand)
-    console = Console(bus, config.members, feeds, read.requests)
+    doors = Doors(lambda line: bus.log.info("%s", line))
+    console = Console(bus, config.members, feeds, read.requests, doors)
     status = feeds.reader(read.status) if read.status is not None else None
     motions = OperatorMotion(bus, [status] if status is not None else [], owner=BY)
     folder = None if bus.declares_only else secure_folder()
     server = make_server(
         config.host, config.port, config.token, published=config.published, secured=folder is not None,
-        tokens=tokens_in(folder, bus.cell) if folder is not None else None,
+        tokens=tokens_in(folder, bus.cell) if folder is not None else None, doors=doors,
     )
     try:
         page = Page(

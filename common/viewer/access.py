@@ -118,7 +118,7 @@ class Access:
             return _refusal(HTTPStatus.FORBIDDEN, f"this page is not served under that name; open {self.address}")
         if any(not _same_origin(origin, host) for origin in origins):
             return _refusal(HTTPStatus.FORBIDDEN, "this page is not open to other web pages")
-        if not self._asks:
+        if not self.asks:
             return None if self._is_near(peer) else _refusal(
                 HTTPStatus.UNAUTHORIZED, f"this page is for its own machine: set {TOKEN_VARIABLE} for others")
         if self.roles(headers.get("cookie", ())):
@@ -146,7 +146,7 @@ class Access:
         return _address(name) is not None or name in _own_names()
 
     @property
-    def _asks(self) -> bool:
+    def asks(self) -> bool:
         """Whether a token is needed."""
         return bool(self.token or self.tokens)
 
@@ -164,7 +164,7 @@ class Access:
 
     def roles(self, cookies: Sequence[str]) -> frozenset[str]:
         """What somebody may do who brings these cookies; everything, where no token is asked for."""
-        if not self._asks:
+        if not self.asks:
             return EVERYTHING
         pairs = [part.strip().partition("=") for header in cookies for part in header.split(";")]
         return frozenset().union(*(self._roles_of(value) for name, _, value in pairs if name == self._cookie))

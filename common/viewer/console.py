@@ -25,6 +25,7 @@ from common.messages import (
     WorldEdit,
 )
 from common.topics import Request, Topic
+from common.viewer.doors import Doors, Need
 from common.viewer.feeds import Feeds
 from common.viewer.words import problem
 
@@ -80,9 +81,11 @@ class Desk:
     What goes wrong in a way that a person can understand is told; anything else is a bug and ends `run`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, doors: Doors | None = None) -> None:
         """Make a desk, on the running loop. `tell` is to be replaced by whoever can show a line to the person."""
         self.tell: Tell = lambda _line, _kind="bad": None
+        self.doors = doors or Doors()
+        self.doors.refused = lambda line: self.put(lambda: self.tell(line))
         self._loop = asyncio.get_running_loop()
         self._orders: asyncio.Queue[Act] = asyncio.Queue()
 
@@ -112,8 +115,9 @@ class Desk:
 
     # Callbacks of viser that are coroutines run on its loop at once; others would wait for a thread.
 
-    def on_click(self, button: viser.GuiButtonHandle, act: Act) -> None:
-        """Do something whenever a button is clicked."""
+    def on_click(self, button: viser.GuiButtonHandle, act: Act, need: Need = "operate") -> None:
+        """Do something whenever a button is clicked by somebody who may."""
+        self.doors.need(button._impl.uuid, need, button.label)
 
         async def clicked(_event: object) -> None:
             self.put(act)
@@ -124,6 +128,7 @@ class Desk:
         self, buttons: viser.GuiButtonGroupHandle, act: Callable[[str], Coroutine[Any, Any, None] | None]
     ) -> None:
         """Do something with the text of the button that was clicked in a group."""
+        self.doors.need(buttons._impl.uuid, "operate", buttons.label)
 
         async def clicked(event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
             chosen = event.target.value
@@ -133,9 +138,11 @@ class Desk:
         buttons.on_click(clicked)
 
     def on_change(
-        self, handle: viser.GuiInputHandle[V], act: Callable[[V], Coroutine[Any, Any, None] | None]
+        self, handle: viser.GuiInputHandle[V], act: Callable[[V], Coroutine[Any, Any, None] | None],
+        need: Need = "operate",
     ) -> None:
         """Do something with the value that a person gave; not with one that the service sets itself."""
+        self.doors.need(handle._impl.uuid, need, handle.label)
 
         async def changed(event: viser.GuiEvent[viser.GuiInputHandle[V]]) -> None:
             value = event.target.value
@@ -148,7 +155,10 @@ class Desk:
 class Console(Desk):
     """A desk that knows whom to ask. Each request ends in an answer or raises a `RequestFailed`."""
 
-    def __init__(self, bus: Bus, members: Members, feeds: Feeds, more: Iterable[Request[Any, Any]] = ()) -> None:
+    def __init__(
+        self, bus: Bus, members: Members, feeds: Feeds, more: Iterable[Request[Any, Any]] = (),
+        doors: Doors | None = None,
+    ) -> None:
         """Declare the clients.
 
         Args:
@@ -156,8 +166,9 @@ class Console(Desk):
             members: who is in the cell.
             feeds: what the cell says.
             more: what else may be asked.
+            doors: know who may do what on the page.
         """
-        super().__init__()
+        super().__init__(doors)
         self._feeds = feeds
         self._newest = 0  # `since` of the stop that was said here
         asked: list[Request[Any, Any]] = [topics.TASK_COMMAND, topics.MOTION_STOP, topics.WORLD_EDIT]

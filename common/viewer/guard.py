@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import gzip
 import inspect
+import itertools
 import logging
 import os
 import threading
 from collections.abc import Mapping
+from functools import partial
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -33,7 +35,8 @@ from common.viewer.access import (
     open_socket,
     refusal,
 )
-from common.viewer.viser_inside import File, Process, client_files, made_server, quiet
+from common.viewer.doors import VISITOR, Doors, Visitor
+from common.viewer.viser_inside import File, Process, client_files, let_in, made_server, quiet
 
 if TYPE_CHECKING:
     import asyncio
@@ -57,7 +60,7 @@ POLICY = (
 
 def make_server(
     host: str, port: int, token: str = "", *, published: bool = False, secured: bool = False,
-    tokens: Mapping[str, str] | None = None,
+    tokens: Mapping[str, str] | None = None, doors: Doors | None = None,
 ) -> viser.ViserServer:
     """A server of pages at host and port that refuses foreign web pages, foreign names, and who has not the token.
 
@@ -69,6 +72,7 @@ def make_server(
             its gateway needs no token, and no other name than the loopback's is served.
         secured: there must be a token, wherever it listens.
         tokens: by role, beside that for everything.
+        doors: are asked whether somebody may do what comes from a browser, where there is a token.
 
     Raises:
         ConfigError: the port is taken (names by whom), the host is not of this machine, or the token is missing or
@@ -85,6 +89,9 @@ def make_server(
         gateways() if published else frozenset(),
     ))
     server = made_server(listening, guard.before, OPTIONS)
+    if doors is not None:
+        doors.guarded = guard.access.asks
+        let_in(server, partial(_admit, doors))
     if not (published or is_loopback(host)):
         log.warning(
             "the page is served beyond this machine, without encryption: `ssh -L %d:127.0.0.1:%d HOST` to a page on "
@@ -103,12 +110,17 @@ def close_server(server: viser.ViserServer) -> None:
         log.warning("not all pages were closed within %g s", STOP_TIMEOUT)
 
 
+def _admit(doors: Doors, part: str, value: object) -> bool:
+    return doors.admit(VISITOR.get(), part, value)
+
+
 class Guard:
     """Stands in front of what serves the page."""
 
     def __init__(self, access: Access) -> None:
         """Hold to these rules."""
         self.access = access
+        self._numbers = itertools.count(1)
 
     def before(self, process: Process) -> Process:
         """What to ask about a request instead of `process`, which is asked about those that may pass."""
@@ -120,6 +132,8 @@ class Guard:
             answer = self.access.answer(request.path, said, upgrade=upgrade, peer=peer)
             if answer is None and upgrade and len(connection.server.connections) >= MAX_PAGES:
                 answer = Answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_PAGES} pages are open already: close one\n")
+            if upgrade and answer is None:  # from here on this task and all that it starts handle their messages
+                VISITOR.set(Visitor(next(self._numbers), peer, self.access.roles(said["cookie"])))
             if answer is not None:
                 if answer.status is not HTTPStatus.OK:
                     log.debug("refused %s: %s", connection.remote_address, answer.text)

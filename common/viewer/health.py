@@ -91,7 +91,7 @@ class LogPanel:
         self._lines: deque[tuple[int, str]] = deque(maxlen=KEPT)
         self._changed = True
         chosen = gui.add_dropdown("Show", LEVELS, initial_value=level, hint="lines of this level and above")
-        desk.on_change(chosen, self._set_level)
+        desk.on_change(chosen, self._set_level, "look")
         self._html = gui.add_html("")
 
     def add(self, line: LogLine) -> None:

@@ -26,6 +26,7 @@ from common.messages import Rejections
 from common.reporting.summary import Rejected
 from common.topics import Topic
 from common.viewer.console import Console
+from common.viewer.doors import VISITOR
 from common.viewer.feeds import ANNOTATED, LIVE, Feeds, News, Periods, Topics
 from common.viewer.health import HealthPanel, LogPanel
 from common.viewer.layers import Layers, layers_shown
@@ -119,14 +120,18 @@ class Page:
         async def count(_client: viser.ClientHandle) -> None:
             console.put(self._count)
 
+        async def leave(client: viser.ClientHandle) -> None:
+            console.doors.leave(VISITOR.get())
+            await count(client)
+
         server.on_client_connect(count)
-        server.on_client_disconnect(count)
+        server.on_client_disconnect(leave)
 
     def _lay_out_view(self, gui: viser.GuiApi) -> None:
         """Ticks for the layers, one for editing the simulated world, and a button that saves the layout."""
         for name, kind in self._kinds.items():
             self.console.on_change(gui.add_checkbox(kind.LABEL or name, self._shown[name]),
-                                   partial(self._set_layer, name))
+                                   partial(self._set_layer, name), "look")
         gui.add_divider()
         edit = gui.add_checkbox("Edit the simulated world", self._editing, hint="drag objects to other places")
         self.console.on_change(edit, self._set_editing)
@@ -137,6 +142,7 @@ class Page:
             client = event.client
             self.console.put(lambda: self._save(client))
 
+        self.console.doors.need(button._impl.uuid, "tune", "Save layout")
         button.on_click(clicked)
         self._note = gui.add_html("")
 

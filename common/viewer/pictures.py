@@ -64,7 +64,7 @@ class PicturePanel:
         self._images: dict[str, dict[str, viser.GuiImageHandle]] = {name: {} for name in LABELS}  # each by its source
         self._notes: dict[str, viser.GuiHtmlHandle] = {}
         for name, tick in self._ticks.items():
-            desk.on_change(tick, partial(self._set_shown, name))
+            desk.on_change(tick, partial(self._set_shown, name), "look")
             with self._folders[name]:
                 self._notes[name] = gui.add_html(block(span("No picture yet", "dim"), f"{name} picture", pictures=0))
         self._count = dict.fromkeys(LABELS, 0)

@@ -46,18 +46,22 @@ class TaskPanel:
         self._speed_told = self._speed_heard = 100  # [%]
         gui.add_html(STYLE + STOP_STYLE)
         stop = gui.add_button("STOP", color="red", icon=viser.Icon.HAND_STOP)
-        console.on_click(stop, self._stop)
+        console.on_click(stop, self._stop, "stop")
         hotkey = gui.add_command("Stop the arm and the task", hotkey="escape", icon=viser.Icon.HAND_STOP)
 
         async def pressed(_event: object) -> None:
             console.put(self._stop)
 
+        console.doors.need(hotkey._impl.uuid, "stop", "STOP")
         hotkey.on_trigger(pressed)
         self._state = gui.add_html("")
         self._progress = gui.add_progress_bar(0.0)
         self._notice = gui.add_html("")
         console.on_choice(gui.add_button_group("Task", COMMANDS), self._command)
         console.on_choice(gui.add_button_group("Arm", ("Go home",)), lambda _: home())
+        if console.doors.guarded:
+            take = gui.add_button("Take over", hint="one at a time moves the arm; STOP is for everybody")
+            console.on_click(take, lambda: self.tell("You operate", "good"), "take")
         self._speed = gui.add_slider("Speed [%]", SLOWEST, 100, 5, 100, hint="share of the planned speed, at once")
         console.on_change(self._speed, self._set_speed)
 
@@ -81,6 +85,8 @@ class TaskPanel:
         if task is not None and task.message:
             lines.append(f"<div>{span(task.message, 'bad' if task.state == 'ERROR' else 'dim')}</div>")
         lines.append(f"<div>{span('Arm:', 'dim')} {text(words.motion(motion))} · {text(gripper)}</div>")
+        if self._console.doors.guarded:
+            lines.append(f"<div>{span('Operates:', 'dim')} {text(self._console.doors.operator or 'nobody')}</div>")
         for one in motion.inhibits if motion is not None else ():
             if task is None or one.told not in task.message:
                 lines.append(f"<div>{span(one.told, 'dim')}</div>")

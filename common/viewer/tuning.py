@@ -64,7 +64,7 @@ class TuningPanel:
                 self._folders[group] = self._gui.add_folder(group.replace("_", " "), expand_by_default=False)
         with self._folders[group]:
             knob = Knob(self._gui, parameter, services)
-        self._console.on_change(knob.handle, lambda value: self._turn(knob, value))
+        self._console.on_change(knob.handle, lambda value: self._turn(knob, value), "tune")
         return knob
 
     async def _turn(self, knob: Knob, value: Any) -> None:

@@ -37,7 +37,13 @@ import viser
 import websockets.asyncio.server as websocket_server
 import zstandard
 from rich import get_console
-from viser._messages import ShareUrlDisconnect, ShareUrlRequest
+from viser._messages import (
+    GetRenderResponseMessage,
+    GuiUpdateMessage,
+    ShareUrlDisconnect,
+    ShareUrlRequest,
+    ViewerCameraMessage,
+)
 from websockets.http11 import Request, Response
 
 if TYPE_CHECKING:
@@ -90,6 +96,38 @@ def made_server(
     for message in (ShareUrlRequest, ShareUrlDisconnect):
         server._websock_server.unregister_handler(message)
     return server
+
+
+# From a browser: what nobody else sees. All else changes something for everybody.
+_OWN = (ViewerCameraMessage, GetRenderResponseMessage)
+
+
+def let_in(server: viser.ViserServer, may: Callable[[str, object], bool]) -> None:
+    """Have each message of a browser that changes something for others dropped, unless it may be.
+
+    Args:
+        server: of the page.
+        may: is asked with the id of the part of the page (empty: the scene) and the value that it is given, on the
+            server's own loop and in the context of the connection.
+    """
+    inside = server._websock_server
+    handle = inside._handle_incoming_message
+
+    def show_again(client_id: Any, part: str) -> None:
+        """What a field really says, for the browser that shows something else now."""
+        field, client = server.gui._gui_input_handle_from_uuid.get(part), server.get_clients().get(client_id)
+        if field is not None and client is not None and not isinstance(field, viser.GuiButtonHandle):
+            client._websock_connection.queue_message(GuiUpdateMessage(part, {"value": field.value}))
+
+    async def handle_what_may_be(client_id: Any, message: Any) -> None:
+        if not isinstance(message, _OWN):
+            value = message.updates.get("value") if isinstance(message, GuiUpdateMessage) else None
+            if not may(getattr(message, "uuid", ""), value):
+                show_again(client_id, getattr(message, "uuid", ""))
+                return
+        await handle(client_id, message)
+
+    inside._handle_incoming_message = handle_what_may_be  # type: ignore[method-assign]
 
 
 @contextmanager

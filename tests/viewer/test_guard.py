@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass
 from email.message import Message
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -23,10 +24,13 @@ from common.config import load_cell, service_config
 from common.config.tunables import describe
 from common.errors import ConfigError
 from common.viewer import guard
-from common.viewer.access import TOKEN_VARIABLE
+from common.viewer.access import ROLES, TOKEN_VARIABLE
+from common.viewer.console import Desk
+from common.viewer.doors import VISITOR, Doors, Need
 from common.viewer.guard import close_server, make_server
 from common.viewer.viser_inside import client_files
 from services.viewer import Config
+from tests.common.viewer.browser_double import CAMERA
 
 SECRET = "correct-horse-battery"
 PATIENCE = 20.0  # [s]
@@ -336,3 +340,74 @@ def test_published_page_needs_no_token_and_is_served_under_loopback_names_only(m
     server = make("0.0.0.0", published=True)
     assert get(server).status == get(server, Host="localhost:8080").status == 200
     assert get(server, Host="panda-viewer:8080").status == get(server, Host="172.17.0.2:8080").status == 403
+
+
+@asynccontextmanager
+async def operated(make: Make) -> AsyncIterator[tuple[viser.ViserServer, Desk, dict[str, str], list[str]]]:
+    """A page with a button to start, one to stop and an arrow to drag: ids of these by name, and what was done."""
+    done: list[str] = []
+    doors = Doors(done.append)
+    server = make(tokens={role: f"{role}-token-of-the-page" for role in ROLES}, doors=doors)
+    desk = Desk(doors)
+    running = asyncio.create_task(desk.run())
+    needs: dict[str, Need] = {"Start": "operate", "Stop": "stop", "Faster": "tune"}
+    ids = {}
+    for name, need in needs.items():
+        button = server.gui.add_button(name)
+        desk.on_click(button, partial(done.append, name), need)
+        ids[name] = button._impl.uuid
+
+    async def leave(_: viser.ClientHandle) -> None:
+        doors.leave(VISITOR.get())
+
+    server.on_client_disconnect(leave)
+    yield server, desk, ids, done
+    running.cancel()
+
+
+def cookie_of(server: viser.ViserServer, role: str) -> str:
+    return f"zencell-{server.get_port()}={role}-token-of-the-page"
+
+
+async def click(connection: ClientConnection, part: str) -> None:
+    await connection.send(msgspec.msgpack.encode(CAMERA))  # before which viser lets nobody act
+    update = {"type": "GuiUpdateMessage", "uuid": part, "updates": {"value": True}}
+    await connection.send(msgspec.msgpack.encode(update))
+
+
+async def test_token_says_what_a_raw_socket_may_do_and_stop_is_for_all(make: Make) -> None:
+    async with operated(make) as (server, desk, ids, done):
+        refused_: asyncio.Queue[str] = asyncio.Queue()
+        desk.tell = lambda line, kind="bad": refused_.put_nowait(line)
+        for role, may in (("look", ["Stop"]), ("operate", ["Start", "Stop"]), ("tune", ["Faster", "Stop"])):
+            done.clear()
+            async with open_page(server, cookie=cookie_of(server, role)) as connection, asyncio.timeout(PATIENCE):
+                for name in ("Start", "Faster", "Stop"):
+                    await click(connection, ids[name])
+                while "Stop" not in done:  # noqa: ASYNC110
+                    await asyncio.sleep(0.005)
+                assert [each for each in done if each in ids] == may
+                for _ in range(3 - len(may)):
+                    assert f"({role}, 127.0.0.1) has no token to " in await refused_.get()
+
+
+async def test_second_operator_waits_until_the_first_has_gone(make: Make) -> None:
+    async with operated(make) as (server, desk, ids, done), asyncio.timeout(PATIENCE):
+        cookie = cookie_of(server, "operate")
+        async with open_page(server, cookie=cookie) as second:
+            async with open_page(server, cookie=cookie) as first:
+                await click(first, ids["Start"])
+                while done.count("Start") < 1:  # noqa: ASYNC110
+                    await asyncio.sleep(0.005)
+                holder = desk.doors.operator
+                await click(second, ids["Start"])
+                await click(second, ids["Stop"])
+                while "Stop" not in done:  # noqa: ASYNC110
+                    await asyncio.sleep(0.005)
+                assert done.count("Start") == 1 and desk.doors.operator == holder
+            while desk.doors.operator:  # noqa: ASYNC110
+                await asyncio.sleep(0.005)
+            await click(second, ids["Start"])
+            while done.count("Start") < 2:  # noqa: ASYNC110
+                await asyncio.sleep(0.005)
+            assert desk.doors.operator not in ("", holder)
