@@ -127,4 +127,4 @@ def person() -> str:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user without a name, as in a container
         user = "somebody"
-    return f"{user}@{socket.gethostname()}"[:120]
+    return "".join(filter(str.isprintable, f"{user}@{socket.gethostname()}"))[:120]

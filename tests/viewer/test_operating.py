@@ -68,7 +68,7 @@ async def test_pause_stops_the_arm_and_resume_starts_it(bring: Bring, watched: W
         await until(joints, lambda state: not is_moving(state), PATIENCE)
         still = (await after(joints, 5)).position
         assert (await after(joints, 100)).position == pytest.approx(still, abs=1e-6)
-        await page.locator('[data-part="task"][data-paused="True"]').get_by_text("Paused").wait_for()
+        await page.locator('[data-part="task"][data-paused="True"]').get_by_text("Paused", exact=True).wait_for()
         await page.get_by_role("button", name="Resume").click()
         await until(joints, is_moving, PATIENCE)
         assert not (await until(status, lambda told: not told.paused, PATIENCE)).paused
