@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup run up test test-all containers check audit bench chaos soak docs deploy clean
+.PHONY: setup run up test test-all containers check audit bench chaos fuzz soak docs deploy clean
 
 setup: $(STAMP)
 
@@ -45,6 +45,9 @@ bench: setup  ## every published figure, one module each
 
 chaos: setup  ## fifty runs, each under a plan of faults of its own: all of them have to end well
 	$(BIN)/python -m benchmarks.chaos
+
+fuzz: setup  ## a million changed payloads through every message, and thousands under the keys of both cells
+	$(BIN)/python -m benchmarks.fuzz
 
 soak: setup  ## thirty minutes of work beside a slow and a stuck subscriber: nothing may grow or get lost
 	$(BIN)/python -m benchmarks.soak

@@ -1,0 +1,176 @@
+"""Payloads by the million: does anything but a refusal come of them, and does a cell go on that gets them?
+
+`python -m benchmarks.fuzz` changes payloads of all messages by a seed and decodes them; then it puts and asks what it
+made under every key of both cells, on the virtual clock. With `--live SECONDS` it does so to a cell of real processes
+as well, and compares the gaps in its joint states with those of as long a time before. Exit code 1 if anything but
+DecodeError was raised, a process ended, or there were more gaps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from common import topics
+from common.application import all_topics
+from common.config import load_cell
+from common.errors import DecodeError
+from common.messages.basics import SMALL
+from common.topics import Topic
+from common.transport.bus import Bus
+from common.transport.codec import decode
+from common.virtual.simulation import Simulation
+from tests.harness import RunningCell, beside, until
+from tests.mutations import Mutations, models
+
+GAP = 0.05  # [s] between two joint states
+TOLD = 10  # findings that are printed in full
+PAUSE = 0.002  # [s] of virtual time between two payloads
+SECONDS = 60.0  # of virtual time
+SHY = ("supervisor/status",)  # what the visit itself lives by
+
+
+def decoded(count: int, seed: int) -> list[str]:
+    """Decode so many payloads; a line for each finding."""
+    mutations, found = Mutations(seed), Counter[str]()
+    every = models()
+    slowest: dict[str, tuple[float, int]] = {}
+    read, began = 0, time.process_time()
+    lines: list[str] = []
+    for i in range(count):
+        model = every[i % len(every)]
+        payload = mutations.payload(model)
+        since = time.thread_time()
+        try:
+            decode(model, payload)
+            read += 1
+        except DecodeError:
+            pass
+        except BaseException as error:  # which is what this looks for
+            found[f"{model.__name__}: {type(error).__name__}"] += 1
+            if len(lines) < TOLD:
+                lines.append(f"{model.__name__}: {type(error).__name__}: {error}: {payload[:200].hex()}")
+        took = time.thread_time() - since
+        if model.most_bytes <= SMALL and took > slowest.get(model.__name__, (0.0, 0))[0]:
+            slowest[model.__name__] = took, len(payload)
+    seconds = time.process_time() - began
+    name, (most, size) = max(slowest.items(), key=lambda item: item[1])
+    print(f"{count} payloads of {len(every)} messages in {seconds:.0f} s of CPU time: {read} read, "
+          f"{count - read - found.total()} refused, {found.total()} something else; the slowest of a small message: "
+          f"{1e3 * most:.2f} ms ({name}, {size} bytes)", flush=True)
+    return [*lines, *(f"{count} times {what}" for what, count in found.items())]
+
+
+async def attack(bus: Bus, mutations: Mutations, cell: str, pause: float) -> None:
+    """Put and ask what the mutations give under each key of the cell, one after the other, for ever."""
+    writers: dict[str, Any] = {}
+    while True:
+        for topic in all_topics().values():
+            key = f"{cell}/{topic.key.replace(topics.SERVICE, 'camera_simulator')}"
+            if topic.key in SHY:
+                continue
+            payload = mutations.payload(topic.message)
+            if isinstance(topic, Topic):
+                if key not in writers:
+                    writers[key] = bus.raw_publisher(key, "application/msgpack", reliable=topic.kind != "stream")
+                writers[key].put(payload, b"")
+            elif payload:
+                asyncio.get_running_loop().create_task(bus.raw_get(key, 0.5, payload=payload))
+            await asyncio.sleep(pause)
+
+
+class _Unheard(list[str]):
+    """A list that stays empty."""
+
+    def append(self, item: str) -> None:
+        """Leave it."""
+
+
+def simulated(name: str, seed: int) -> list[str]:
+    """Attack a cell on the virtual clock until its task ends or does not; a line for each process that ended."""
+    sent = 0
+
+    async def visit(bus: Bus) -> None:
+        mutations = Mutations(seed)
+        make = mutations.payload
+
+        def counted(model: Any) -> bytes:
+            nonlocal sent
+            sent += 1
+            return make(model)
+
+        mutations.payload = counted  # type: ignore[method-assign]
+        await attack(bus, mutations, name, PAUSE)
+
+    simulation = Simulation(load_cell(name, ["services.viewer.port=0"]), seed, limit=SECONDS, visit=visit)
+    simulation.invariants.broken = _Unheard()  # some payloads are valid: a ball more, a goal that nobody decided
+    outcome = simulation.run()
+    print(f"{name}, seed {seed}: {sent} payloads under its keys in {outcome.seconds:.0f} s of its time: "
+          f"{outcome.state or 'no end'}, {len(outcome.crashes)} crashes, restarts {outcome.restarts}", flush=True)
+    return [f"{name}, seed {seed}: {crash}" for crash in outcome.crashes]
+
+
+class Gaps:
+    """Counts long gaps between joint states."""
+
+    def __init__(self) -> None:
+        self.count, self.longest, self.came = 0, 0.0, 0
+
+    async def watch(self, bus: Bus) -> None:
+        """Read for ever."""
+        states, last = bus.reader(topics.JOINT_STATES), None
+        async for _ in states:
+            now = time.monotonic()
+            if last is not None:
+                self.count += now - last > GAP
+                self.longest = max(self.longest, now - last)
+            last, self.came = now, self.came + 1
+
+
+async def live(seconds: float, seed: int, folder: Path) -> list[str]:
+    """Compare a cell that is attacked with itself before; a line for each thing that is worse."""
+    with RunningCell(folder, "up", "panda") as cell:
+        async with cell.listen() as bus, cell.listen() as attacker:
+            await until(bus.reader(topics.MOTION_STATUS), lambda status: status.progress > 0, 120.0)
+            before = {name: process.pid for name, process in cell.processes().items()}
+            calm, attacked = Gaps(), Gaps()
+            async with beside(calm.watch(bus)):
+                await asyncio.sleep(seconds)
+            async with beside(attacked.watch(bus), attack(attacker, Mutations(seed), "panda", 0.001)):
+                await asyncio.sleep(seconds)
+            after = {name: process.pid for name, process in cell.processes().items()}
+        wrong = [f"{name} ended: {folder}" for name, pid in before.items() if after.get(name) != pid]
+        for what, gaps in (("before", calm), ("attacked", attacked)):
+            print(f"{what}: {gaps.came} joint states in {seconds:.0f} s, {gaps.count} gaps above {1e3 * GAP:.0f} ms, "
+                  f"the longest {1e3 * gaps.longest:.0f} ms", flush=True)
+        if attacked.count > calm.count:
+            wrong.append(f"{attacked.count} gaps in joint states, {calm.count} before")
+        cell.interrupt()
+        await cell.ended(30.0)
+    return wrong
+
+
+def main() -> int:
+    """Read the options and run."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.fuzz", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--payloads", type=int, default=1_000_000, help="that are decoded")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--runs", type=int, default=1, help="of each cell on the virtual clock")
+    parser.add_argument("--live", type=float, default=0.0, metavar="SECONDS", help="against a cell of real processes")
+    options = parser.parse_args()
+    wrong = decoded(options.payloads, options.seed) if options.payloads else []
+    for seed in range(options.seed, options.seed + options.runs):
+        wrong += [line for name in ("panda", "ur5") for line in simulated(name, seed)]
+    if options.live:
+        wrong += asyncio.run(live(options.live, options.seed, Path(tempfile.mkdtemp(prefix="zencell-fuzz-"))))
+    print("\n".join(wrong) or "nothing but refusals")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
