@@ -6,6 +6,7 @@ through a second process and nothing else listens, so that no port is left ungua
 
 from __future__ import annotations
 
+import asyncio
 import gzip
 import inspect
 import itertools
@@ -15,7 +16,7 @@ import threading
 from collections.abc import Mapping
 from functools import partial
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlsplit
 
 import viser
@@ -37,9 +38,6 @@ from common.viewer.access import (
 )
 from common.viewer.doors import VISITOR, Doors, Visitor
 from common.viewer.viser_inside import File, Process, client_files, let_in, made_server, quiet
-
-if TYPE_CHECKING:
-    import asyncio
 
 log = logging.getLogger(__name__)
 
@@ -87,7 +85,7 @@ def make_server(
     guard = Guard(Access(
         "127.0.0.1" if published else host, listening.getsockname()[1], token, tokens or {},
         gateways() if published else frozenset(),
-    ))
+    ), doors)
     server = made_server(listening, guard.before, OPTIONS)
     if doors is not None:
         doors.guarded = guard.access.asks
@@ -117,10 +115,17 @@ def _admit(doors: Doors, part: str, value: object) -> bool:
 class Guard:
     """Stands in front of what serves the page."""
 
-    def __init__(self, access: Access) -> None:
-        """Hold to these rules."""
+    def __init__(self, access: Access, doors: Doors | None = None) -> None:
+        """Hold to these rules, and tell the doors who has gone."""
         self.access = access
         self._numbers = itertools.count(1)
+        self._doors = doors
+        self._waiting: set[asyncio.Task[None]] = set()
+
+    async def _see_off(self, connection: websocket_server.ServerConnection, visitor: Visitor) -> None:
+        await connection.wait_closed()
+        if self._doors is not None:
+            self._doors.leave(visitor)
 
     def before(self, process: Process) -> Process:
         """What to ask about a request instead of `process`, which is asked about those that may pass."""
@@ -133,7 +138,11 @@ class Guard:
             if answer is None and upgrade and len(connection.server.connections) >= MAX_PAGES:
                 answer = Answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_PAGES} pages are open already: close one\n")
             if upgrade and answer is None:  # from here on this task and all that it starts handle their messages
-                VISITOR.set(Visitor(next(self._numbers), peer, self.access.roles(said["cookie"])))
+                visitor = Visitor(next(self._numbers), peer, self.access.roles(said["cookie"]))
+                VISITOR.set(visitor)
+                waiting = asyncio.create_task(self._see_off(connection, visitor))
+                self._waiting.add(waiting)
+                waiting.add_done_callback(self._waiting.discard)
             if answer is not None:
                 if answer.status is not HTTPStatus.OK:
                     log.debug("refused %s: %s", connection.remote_address, answer.text)

@@ -26,7 +26,6 @@ from common.messages import Rejections
 from common.reporting.summary import Rejected
 from common.topics import Topic
 from common.viewer.console import Console
-from common.viewer.doors import VISITOR
 from common.viewer.feeds import ANNOTATED, LIVE, Feeds, News, Periods, Topics
 from common.viewer.health import HealthPanel, LogPanel
 from common.viewer.layers import Layers, layers_shown
@@ -120,12 +119,8 @@ class Page:
         async def count(_client: viser.ClientHandle) -> None:
             console.put(self._count)
 
-        async def leave(client: viser.ClientHandle) -> None:
-            console.doors.leave(VISITOR.get())
-            await count(client)
-
         server.on_client_connect(count)
-        server.on_client_disconnect(leave)
+        server.on_client_disconnect(count)
 
     def _lay_out_view(self, gui: viser.GuiApi) -> None:
         """Ticks for the layers, one for editing the simulated world, and a button that saves the layout."""
