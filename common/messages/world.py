@@ -118,7 +118,7 @@ def _from_outline(values: dict[str, Any]) -> dict[str, Any]:
             across, along = math.dist(outline[0], outline[1]), math.dist(outline[1], outline[2])
             yaw = math.atan2(ys[1] - ys[0], xs[1] - xs[0])
         inner = (max(a for a, _ in hole) - min(a for a, _ in hole)) / 2 if hole else 0.0
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, LookupError):
         return {}  # whatever is wrong with them is told by their own fields
     found: dict[str, Any] = {
         "pose": {"position": {"x": x, "y": y, "z": base + height / 2},

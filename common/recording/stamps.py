@@ -8,6 +8,8 @@ from typing import Any
 
 import msgpack
 
+from common.messages.basics import MOST_STAMP
+
 SEEN_BYTES = 512  # from the front of a payload, where the header is
 
 
@@ -30,7 +32,7 @@ def _first_stamp(unpacker: Any) -> int | None:
         if name == "header":
             header = unpacker.unpack()
             stamp = header.get("stamp") if isinstance(header, dict) else None
-            return stamp if isinstance(stamp, int) else None
+            return stamp if isinstance(stamp, int) and 0 <= stamp <= MOST_STAMP else None
         if name == "transforms":
             return _first_stamp(unpacker) if unpacker.read_array_header() else None
         unpacker.skip()

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from common.errors import DecodeError
 from common.messages import SCHEMA_VERSION, Message
-from common.messages.basics import LARGEST, SMALL, clean, is_name
+from common.messages.basics import LARGEST, MOST_STAMP, SMALL, clean, is_name
 
 DEFAULT_LIMIT = LARGEST  # [bytes]
 _LEVELS = 3  # of a large payload that are read in pieces: down to the points of a trajectory
@@ -221,7 +221,9 @@ def decode_attachment(data: bytes | None) -> Attachment | None:
         return None
     value = _unpack(data, 1024, "attachment")
     match value:
-        case [str(writer), int(sequence), int(schema), str(trace), *rest] if is_name(writer) and is_name(trace):
+        case [str(writer), int(sequence), int(schema), str(trace), *rest] if (
+            is_name(writer) and is_name(trace) and 0 <= sequence <= MOST_STAMP
+        ):
             if schema != SCHEMA_VERSION:
                 raise DecodeError(f"attachment: schema version {schema}, this side has {SCHEMA_VERSION}")
             match rest:

@@ -151,6 +151,12 @@ def test_plain_values_hold_what_fields_may_hold(value: Any, reason: str) -> None
         decode(m.ParameterRequest, pack(set={"a": value}))
 
 
+def test_an_outline_of_something_else_refuses_the_object() -> None:
+    for outline in ({"12": 0, "34": 0, "56": 0, "78": 0}, 7, [[1, 2]], [["1", "2"]] * 4, [[1e308, -1e308]] * 4):
+        with pytest.raises(DecodeError, match=r"WorldObjects"):
+            decode(m.WorldObjects, pack(objects=[{"id": "a", "shape": "box", "outline": outline, "height": -1}]))
+
+
 def test_plain_values_are_not_nested_deeply() -> None:
     value: Any = 1
     for _ in range(20):

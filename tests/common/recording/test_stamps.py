@@ -30,6 +30,11 @@ def test_payload_without_a_header_has_no_stamp_and_is_left_alone(payload: bytes)
     assert restamp(payload, lambda stamp: stamp + 1) == payload
 
 
+@pytest.mark.parametrize("stamp", [-1, 2**63, 2**64 - 1, "7", 1.0])
+def test_a_stamp_that_no_clock_shows_is_none(stamp: object) -> None:  # a file has no room for it either
+    assert stamp_of(msgpack.packb({"header": {"stamp": stamp}})) is None
+
+
 @given(st.binary(max_size=700))
 def test_rubbish_never_raises(payload: bytes) -> None:
     stamp_of(payload)

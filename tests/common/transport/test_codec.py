@@ -100,7 +100,8 @@ def test_missing_attachment_is_allowed() -> None:
 
 @pytest.mark.parametrize(
     "data", [b"\xc1", msgpack.packb([1, 2]), msgpack.packb(["a", 1, 99, ""]), msgpack.packb(["a", 1, 1, "", "sum"]),
-             msgpack.packb({"a": 1})]
+             msgpack.packb(["a", -1, 1, ""]), msgpack.packb(["a", 2**64 - 1, 1, ""]), msgpack.packb({"a": 1}),
+             msgpack.packb(["\x1b[2J", 1, 1, ""])]
 )
 def test_foreign_attachment_is_refused(data: bytes) -> None:
     with pytest.raises(DecodeError, match="attachment"):
