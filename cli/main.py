@@ -61,7 +61,7 @@ class CommandLine(typer.Typer):
         except typer.TyperException as error:
             code = _fail(_with_choices(error), error.exit_code)
         except RequestFailed as error:
-            code = _fail(str(error), EXIT_FAILED)
+            code = _fail(printable(error), EXIT_FAILED)  # in words of somebody else
         except ZencellError as error:
             code = _fail(str(error), getattr(error, "exit_code", EXIT_BAD_INPUT))
         except (KeyboardInterrupt, typer.Abort):
@@ -79,7 +79,7 @@ def _with_choices(error: typer.TyperException) -> str:
 
 
 def _fail(message: str, code: int) -> int:
-    echo(f"zencell: {printable(message)}", err=True)
+    echo(f"zencell: {message}", err=True)
     return code
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import datetime
 import json
 from collections.abc import Collection
 from pathlib import Path
@@ -71,6 +72,9 @@ def init(
     authority = Authority.load(certificate, key) if renew else Authority.new(valid)
     if not renew:
         authority.write(certificate, key)
+    elif authority.until < datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=valid - 1):
+        authority = authority.prolonged(valid)  # else it would end before what it signs now
+        authority.write(certificate, key)
     names = [OPERATOR, OBSERVER, *(common_name(cell, process) for cell, all_ in rights.items() for process in all_)]
     router = place / f"{ROUTER_NAME}.pem"
     reached = hosts or (hosts_in(certificate_in(router)) if renew and router.is_file() else [])
@@ -85,6 +89,57 @@ def init(
     echo(f"{len(names) + 1} certificates, valid for {valid} days, and {ACCESS} in {folder}")
     echo(f"keep {key} elsewhere: nothing but another `secure init --renew` needs it")
     echo(f"next: zencell up {(cells or names_of('cells'))[0]} --secure {folder}")
+
+
+@app.command("renew")
+def renew_(
+    folder: Folder,
+    days: Annotated[str, typer.Option("--days", metavar="N", help="for which the certificates are valid")] = str(DAYS),
+    authority: Annotated[bool, typer.Option("--authority", help="with a new authority beside the one of before, which "
+                                                                "is trusted until --forget")] = False,
+    forget: Annotated[bool, typer.Option("--forget", help="trust no authority of before any more")] = False,
+) -> None:
+    """Make the certificates that are there anew, while the cell runs; rules and names stay.
+
+    The router takes what is new within seconds and has everybody connect anew, each with what is new of his own.
+    """
+    from cryptography import x509
+
+    from common.errors import ConfigError
+    from common.security.certificates import Authority
+    from common.security.checking import certificate_in, hosts_in
+    from common.transport.credentials import AUTHORITY, ROUTER_NAME
+
+    valid, place = options.whole("--days", days, 1), Path(folder)
+    assert valid is not None
+    certificate, key = place / f"{AUTHORITY}.pem", place / f"{AUTHORITY}.key"
+    if authority and forget:
+        raise ConfigError("--forget", ..., "comes when everybody has a certificate of the new authority: apart from "
+                                           "--authority")
+    if not key.is_file():
+        raise ConfigError("DIR", folder, f"has no {key.name} to sign with")
+    certificate_in(certificate)
+    trusted = x509.load_pem_x509_certificates(certificate.read_bytes())
+    signer = Authority.load(certificate, key)
+    if forget:
+        signer.write(certificate, key)
+        echo(f"{certificate}: {len(trusted) - 1} authorities of before are trusted no more")
+        return
+    if authority:
+        signer = Authority.new(valid)
+    elif signer.until < datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=valid - 1):
+        signer, trusted = signer.prolonged(valid), trusted[1:]
+    signer.write(certificate, key, beside=trusted)  # before those that it signs: nobody meets one that he does not know
+    names = [path.stem for path in sorted(place.glob("*.pem")) if path.stem != AUTHORITY]
+    for name in sorted(names, key=ROUTER_NAME.__eq__):  # the router's last: it looks for its own
+        file = place / f"{name}.pem"
+        hosts = hosts_in(certificate_in(file)) if name == ROUTER_NAME else []
+        signer.issue(name, hosts, valid, file, file.with_suffix(".key"))
+    echo(f"{len(names)} certificates, valid for {valid} days, in {folder}; a router that uses them shows them within "
+         "seconds, and has everybody connect anew")
+    if authority:
+        echo(f"the authority of before is trusted too: when every host has its new files, `zencell secure renew "
+             f"{folder} --forget`, and {certificate.name} to every host once more")
 
 
 @app.command()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import resource
 import threading
 from typing import NoReturn
 
@@ -21,7 +22,8 @@ from common.transport.endpoint import (
     endpoints_of,
     is_loopback,
 )
-from common.transport.router import log, open_router, tell_of_links
+from common.transport.expiry import EndWatch
+from common.transport.router import Router, log, tend
 
 OPEN = (
     "whoever reaches %s can read and command every cell behind it: `zencell secure init DIR`, then --secure DIR "
@@ -48,6 +50,8 @@ def main() -> NoReturn:
                              "are known; repeatable")
     add_process_options(parser)
     options = parser.parse_args()
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # a connection takes three files in a secured router
     lifeline = Lifeline(gate=options.gate)
     stop = threading.Event()
     lifeline.start()
@@ -63,7 +67,7 @@ def main() -> NoReturn:
         endpoints = endpoints_of("--listen", options.listen, LISTEN_VARIABLE) or [endpoint_of(domain)]
         links = endpoints_of("--link", options.link, LINK_VARIABLE)
         secured = secure_folder()
-        session = open_router(endpoints, secured, links, options.small)
+        router = Router(endpoints, secured, links, options.small)
     except ZencellError as error:
         fail(error)
     log.info("listening at %s", " and ".join(endpoints))
@@ -72,9 +76,10 @@ def main() -> NoReturn:
             log.warning(OPEN, endpoint)
     for link in links:
         log.info("to be linked with the router at %s", link)
-    tell_of_links(session, stop)
+    ends = EndWatch()
+    tend(router, stop, lambda: ends.tell(log))
     log.info("stopped: %s", lifeline.reason)
-    closing = threading.Thread(target=session.close, daemon=True)
+    closing = threading.Thread(target=router.close, daemon=True)
     closing.start()
     closing.join(_CLOSE_SECONDS)
     leave(0)

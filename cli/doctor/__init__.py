@@ -33,7 +33,7 @@ def doctor(
 
 def examine(endpoint: str) -> Iterator[Finding]:
     """All findings, in the order in which they matter."""
-    from cli.doctor import clocks, configuration, leftovers, machine, network, software
+    from cli.doctor import certificates, clocks, configuration, leftovers, machine, network, software
 
     yield software.python()
     yield from software.packages()
@@ -42,6 +42,7 @@ def examine(endpoint: str) -> Iterator[Finding]:
     yield network.router(endpoint)
     yield from network.versions(endpoint)
     yield from clocks.clocks(endpoint)
+    yield from certificates.certificates()
     yield network.page()
     yield from leftovers.processes()
     yield machine.shared_memory()

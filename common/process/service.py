@@ -22,6 +22,7 @@ from common.process.parameters import serve_parameters
 from common.transport.bus import Bus
 from common.transport.credentials import Credentials, common_name, credentials_of, secure_folder
 from common.transport.endpoint import endpoint_of
+from common.transport.expiry import PERIOD, EndWatch
 from common.transport.handoff import call_on_loop
 from common.transport.zenoh_session import ZenohSession, close_bounded, open_zenoh
 
@@ -194,15 +195,28 @@ async def _live(run: Run[P], start: Start[P], lifeline: Lifeline) -> int:
         root = logging.getLogger()
         to_topic = BusLog(bus)
         root.addHandler(to_topic)
+        ends = asyncio.create_task(_watch_end(bus, start.credentials))
         watch = LoopWatch(asyncio.get_running_loop(), lambda: _patience(start.watchdogs, bus.ready_event.is_set()))
         try:
             return await serve(run, bus, start.config, lifeline)
         finally:
             watch.stop()
+            ends.cancel()
             root.removeHandler(to_topic)
             await bus.close()
     finally:
         await close_bounded(session, _CLOSE_SECONDS)
+
+
+async def _watch_end(bus: Bus, credentials: Credentials | None) -> None:
+    """Log when the certificate of the process is about to end, as the page shows it."""
+    if credentials is None:
+        return
+    watch = EndWatch(credentials.certificate.parent, frozenset([credentials.certificate.stem]))
+    await bus.ready_event.wait()
+    while True:
+        watch.tell(bus.log)
+        await asyncio.sleep(PERIOD)
 
 
 def _patience(watchdogs: Watchdogs, ready: bool) -> float:

@@ -28,18 +28,16 @@ class Authority:
     def new(cls, days: int) -> Authority:
         """An authority that is trusted for so many days."""
         key = ec.generate_private_key(ec.SECP256R1())
-        name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, CA_NAME)])
-        usage = x509.KeyUsage(
-            digital_signature=False, content_commitment=False, key_encipherment=False, data_encipherment=False,
-            key_agreement=False, key_cert_sign=True, crl_sign=True, encipher_only=False, decipher_only=False,
-        )
-        certificate = (
-            _builder(name, name, key.public_key(), days)
-            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-            .add_extension(usage, critical=True)
-            .sign(key, hashes.SHA256())
-        )
-        return cls(certificate, key)
+        return cls(_signed_by_itself(key, days), key)
+
+    @property
+    def until(self) -> datetime.datetime:
+        """The end of its time."""
+        return self._certificate.not_valid_after_utc
+
+    def prolonged(self, days: int) -> Authority:
+        """The same with a certificate for so many days from now: what it has signed is valid under both."""
+        return Authority(_signed_by_itself(self._key, days), self._key)
 
     @classmethod
     def load(cls, certificate: Path, key: Path) -> Authority:
@@ -49,12 +47,19 @@ class Authority:
             raise ValueError(f"{key} is not an elliptic curve key")
         return cls(x509.load_pem_x509_certificate(certificate.read_bytes()), private)
 
-    def write(self, certificate: Path, key: Path) -> None:
-        """Write both; the key for its owner's eyes only."""
-        certificate.write_bytes(self._certificate.public_bytes(serialization.Encoding.PEM))
+    def write(self, certificate: Path, key: Path, beside: Sequence[x509.Certificate] = ()) -> None:
+        """Write both; the key for its owner's eyes only.
+
+        Args:
+            certificate: file for it.
+            key: file for its key.
+            beside: certificates of authorities that are trusted as well, after its own.
+        """
+        every = [self._certificate, *(each for each in beside if each != self._certificate)]
+        certificate.write_bytes(b"".join(each.public_bytes(serialization.Encoding.PEM) for each in every))
         write_secret(key, _key_bytes(self._key))
 
-    def issue(self, name: str, hosts: Sequence[str], days: int, certificate: Path, key: Path) -> None:
+    def issue(self, name: str, hosts: Sequence[str], days: float, certificate: Path, key: Path) -> None:
         """Write a certificate and its key.
 
         Args:
@@ -78,8 +83,22 @@ class Authority:
         write_secret(key, _key_bytes(own))
 
 
+def _signed_by_itself(key: ec.EllipticCurvePrivateKey, days: float) -> x509.Certificate:
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, CA_NAME)])
+    usage = x509.KeyUsage(
+        digital_signature=False, content_commitment=False, key_encipherment=False, data_encipherment=False,
+        key_agreement=False, key_cert_sign=True, crl_sign=True, encipher_only=False, decipher_only=False,
+    )
+    return (
+        _builder(name, name, key.public_key(), days)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(usage, critical=True)
+        .sign(key, hashes.SHA256())
+    )
+
+
 def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: int
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: float
 ) -> x509.CertificateBuilder:
     now = datetime.datetime.now(datetime.UTC)
     begins, ends = sorted((now - BACKDATED, now + datetime.timedelta(days=days)))

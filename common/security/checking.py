@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -35,21 +36,30 @@ def require_valid(folder: Path, names: Iterable[str], renew: str, now: datetime.
     if not folder.is_dir():
         raise ConfigError(FIELD, str(folder), "is not a folder; make one with `zencell secure init DIR`")
     at = now or datetime.datetime.now(datetime.UTC)
-    authority: x509.Certificate | None = None
+    authorities: list[x509.Certificate] = []
     for name in names:
         own = credentials_of(name, folder)
-        if authority is None:
-            authority = certificate_in(own.authority)
-            _require_in_time(own.authority, authority, at, AFRESH)
+        if not authorities:
+            certificate_in(own.authority)
+            authorities = x509.load_pem_x509_certificates(own.authority.read_bytes())
+            _require_in_time(own.authority, authorities[0], at, f"`{renew}`")
         certificate = certificate_in(own.certificate)
         _require_in_time(own.certificate, certificate, at, f"`{renew}`")
         try:
-            certificate.verify_directly_issued_by(authority)
+            _require_issued(certificate, authorities)
             key = serialization.load_pem_private_key(own.key.read_bytes(), password=None)
         except (InvalidSignature, ValueError, TypeError):
             raise ConfigError(FIELD, str(own.certificate), f"is not of {own.authority.name}: `{renew}`") from None
         if key.public_key() != certificate.public_key() or common_name_in(certificate) != name:
             raise ConfigError(FIELD, str(own.certificate), f"is not that of {own.key.name}: `{renew}`")
+
+
+def _require_issued(certificate: x509.Certificate, authorities: Iterable[x509.Certificate]) -> None:
+    for authority in authorities:
+        with contextlib.suppress(InvalidSignature, ValueError, TypeError):
+            certificate.verify_directly_issued_by(authority)
+            return
+    raise InvalidSignature
 
 
 def require_current(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import ssl
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,6 +80,20 @@ def credentials_of(name: str, folder: Path) -> Credentials:
     if found.key.stat().st_mode & 0o077:
         raise ConfigError("--secure", str(found.key), "can be read by others: chmod 600 it")
     return found
+
+
+def require_pair(found: Credentials) -> None:
+    """Return when key and certificate belong together, and the authority's can be read.
+
+    Raises:
+        ConfigError: they do not.
+    """
+    try:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(found.certificate, found.key)
+        context.load_verify_locations(found.authority)
+    except (OSError, ValueError) as error:
+        raise ConfigError("--secure", str(found.certificate), f"cannot be used with its key: {error}") from None
 
 
 def read_access(folder: Path) -> dict[str, Any]:

@@ -113,6 +113,12 @@ def listening(domain: int, wider: Sequence[str]) -> list[str]:
     return [*every, *(e for e in wider if e not in every)] if every else list(dict.fromkeys([own, *wider]))
 
 
+def address_of(endpoint: str) -> tuple[str, int]:
+    """Host and port of an endpoint."""
+    host, _, port = endpoint.partition("/")[2].split("?")[0].split("#")[0].rpartition(":")
+    return host.strip("[]"), int(port)
+
+
 def is_any(endpoint: str) -> bool:
     """Whether it stands for all addresses of a host."""
     return endpoint.partition("/")[2].rpartition(":")[0].strip("[]") in {"0.0.0.0", "::"}

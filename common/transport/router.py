@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import zenoh
 
 from common.errors import ConfigError, ZencellError
-from common.transport.credentials import ROUTER_NAME, Credentials, credentials_of, read_access
-from common.transport.endpoint import client_config, is_encrypted, port_of, router_config
+from common.transport.credentials import (
+    ACCESS,
+    AUTHORITY,
+    ROUTER_NAME,
+    Credentials,
+    credentials_of,
+    read_access,
+    require_pair,
+)
+from common.transport.endpoint import address_of, client_config, is_encrypted, port_of, router_config
+from common.transport.front import Front
 
 log = logging.getLogger("router")
 
@@ -45,6 +56,108 @@ def holder_of(port: int) -> str:
     return "another process"
 
 
+class Router:
+    """A router as `open_router` opens it; a secured one stands behind a front, and can show new certificates.
+
+    A `with` block.
+    """
+
+    def __init__(
+        self, endpoints: Sequence[str], secured: Path | None = None, links: Sequence[str] = (),
+        small: Sequence[str] = (),
+    ) -> None:
+        """Listen.
+
+        Raises:
+            PortInUse, ConfigError: as `open_router`.
+        """
+        self._front: Front | None = None
+        self._secured, self._links, self._small = secured, links, small
+        self._besides = [*endpoints]
+        if secured is not None:
+            _require_encrypted(endpoints, links)
+            shown = [endpoint for endpoint in endpoints if endpoint.startswith("tls/")]
+            self._besides = [endpoint for endpoint in endpoints if endpoint not in shown]
+            self._front = _front(shown)
+        try:
+            self._files = self._seen = self._files_now()
+            self.session = self._open()
+        except BaseException:
+            if self._front is not None:
+                self._front.close()
+            raise
+
+    def __enter__(self) -> Router:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Route no more."""
+        self.session.close()  # type: ignore[no-untyped-call]
+        if self._front is not None:
+            self._front.close()
+
+    def _open(self) -> zenoh.Session:
+        if self._front is None:
+            return open_router(self._besides, self._secured, self._links, self._small)
+        host, port = "127.0.0.1", _free_port()
+        session = open_router([f"tls/{host}:{port}", *self._besides], self._secured, self._links, self._small)
+        self._front.open(host, port)
+        return session
+
+    def _files_now(self) -> dict[str, bytes]:
+        names = (f"{AUTHORITY}.pem", f"{ROUTER_NAME}.pem", f"{ROUTER_NAME}.key", ACCESS)
+        return {name: (self._secured / name).read_bytes() for name in names} if self._secured is not None else {}
+
+    def renew(self) -> bool:
+        """Whether certificates or rules are others than before, and are in force from now on; everybody connects anew.
+
+        To be called again and again: they count when they were the same at two calls.
+
+        Raises:
+            ConfigError: they cannot be used; those of before stay in force, and this is said once.
+        """
+        if self._front is None or self._besides:
+            return False
+        try:
+            now = self._files_now()
+        except OSError:
+            return False  # are just being replaced
+        before, self._seen = self._seen, now
+        if now in (self._files, {}) or now != before:
+            return False
+        self._files = now
+        assert self._secured is not None
+        require_pair(credentials_of(ROUTER_NAME, self._secured))
+        read_access(self._secured)
+        old, self.session = self.session, self._open()
+        old.close()  # type: ignore[no-untyped-call]
+        return True
+
+
+def _front(endpoints: Sequence[str]) -> Front:
+    try:
+        return Front(endpoints)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise PortInUse(error.filename, holder_of(address_of(error.filename)[1])) from None
+        raise ConfigError("endpoint", error.filename, f"cannot be listened at: {error.strerror}") from None
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+def _require_encrypted(endpoints: Sequence[str], links: Sequence[str]) -> None:
+    for option, given in (("--listen", endpoints), ("--link", links)):
+        for each in given:
+            if not is_encrypted(each):
+                raise ConfigError(option, each, "is an open endpoint: with certificates it must be tls/HOST:PORT")
+
+
 def open_router(
     endpoints: Sequence[str], secured: Path | None = None, links: Sequence[str] = (), small: Sequence[str] = ()
 ) -> zenoh.Session:
@@ -60,10 +173,8 @@ def open_router(
         PortInUse: names the port, the domain and the process that holds it.
         ConfigError: the router cannot listen there for another reason.
     """
-    for option, given in (("--listen", endpoints), ("--link", links)):
-        for each in given:
-            if secured is not None and not is_encrypted(each):
-                raise ConfigError(option, each, "is an open endpoint: with certificates it must be tls/HOST:PORT")
+    if secured is not None:
+        _require_encrypted(endpoints, links)
     try:
         if secured is None:
             return zenoh.open(router_config(endpoints, links=links, small=small))
@@ -78,11 +189,23 @@ def open_router(
         raise ConfigError("endpoint", endpoint, f"cannot be listened at: {reason}") from None
 
 
-def tell_of_links(session: zenoh.Session, stop: threading.Event) -> None:
-    """Log which routers of other hosts are reached and lost, until told to stop."""
+def tend(router: Router, stop: threading.Event, look: Callable[[], None] = lambda: None) -> None:
+    """Show new certificates, and log which routers of other hosts are reached and lost, until told to stop.
+
+    Args:
+        router: that is tended.
+        stop: ends it.
+        look: called now and then.
+    """
     linked: set[str] = set()
     while not stop.wait(_LOOK_SECONDS):
-        now = {str(zid) for zid in session.info.routers_zid()}
+        try:
+            if router.renew():
+                log.warning("certificates or rules are new: everybody connects anew, with their own that are new")
+        except ZencellError as error:
+            log.error("%s; those of before stay in force", error)
+        look()
+        now = {str(zid) for zid in router.session.info.routers_zid()}
         for zid in now - linked:
             log.info("linked with router %s", zid)
         for zid in linked - now:

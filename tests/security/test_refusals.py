@@ -84,7 +84,7 @@ def test_a_recorder_needs_a_certificate_of_its_own_where_one_is_started(refusal:
 
 
 @pytest.mark.parametrize(("name", "remedy"), [(ROUTER_NAME, "--renew"), ("panda.smart_pick_place", "--renew"),
-                                              ("ca", "make it anew")])
+                                              ("ca", "--renew")])
 def test_a_certificate_that_has_run_out_is_named_with_its_day(
     refusal: Refusal, folder: Path, name: str, remedy: str
 ) -> None:

@@ -1,0 +1,180 @@
+"""Certificates end: it is said before, they are made anew while all runs, and an authority is replaced with overlap."""
+
+import datetime
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from cli.doctor.certificates import certificates as findings
+from cli.main import app
+from common.security.access import Rights, access_control
+from common.security.certificates import Authority
+from common.security.checking import certificate_in, require_valid
+from common.transport.credentials import Credentials, credentials_of
+from common.transport.expiry import EndWatch, end_of, warning_of
+from common.transport.router import Router, tend
+from tests.security.holders import REFUSED, Holder
+from tests.security.test_routers import free_port
+
+NAMES = ("router", "operator", "panda.camera")
+PATIENCE = 20.0  # [s] only ever waited for by a test that fails
+RENEW = "zencell secure renew DIR"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    authority = Authority.new(100)
+    authority.write(tmp_path / "ca.pem", tmp_path / "ca.key")
+    for name in NAMES:
+        hosts = ["localhost", "127.0.0.1", "arm.example.org"] if name == "router" else []
+        authority.issue(name, hosts, 40, tmp_path / f"{name}.pem", tmp_path / f"{name}.key")
+    rules = access_control({"panda": {"camera": Rights(write={"x"}, read={"x"})}})
+    (tmp_path / "access.json5").write_text(json.dumps(rules))
+    return tmp_path
+
+
+@pytest.fixture
+def endpoint(folder: Path) -> Iterator[str]:
+    """A router that is tended, as its process does it."""
+    found, stop = f"tls/127.0.0.1:{free_port()}", threading.Event()
+    with Router([found], folder) as router:
+        tending = threading.Thread(target=tend, args=[router, stop])
+        tending.start()
+        yield found
+        stop.set()
+        tending.join()
+
+
+def until(what: str, reached: Callable[[], object]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not reached():
+        assert time.monotonic() < end, what
+        time.sleep(0.05)
+
+
+def now_in(days: float) -> datetime.datetime:
+    return datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
+
+
+# --- when it is said ---------------------------------------------------------------------------------------------
+
+
+def test_the_end_is_that_of_the_certificate(folder: Path) -> None:
+    for name in ("ca", *NAMES):
+        assert end_of(folder / f"{name}.pem") == certificate_in(folder / f"{name}.pem").not_valid_after_utc
+    Authority.new(365 * 40).write(folder / "late.pem", folder / "late.key")  # told in another form from 2050 on
+    assert end_of(folder / "late.pem") == certificate_in(folder / "late.pem").not_valid_after_utc
+    assert end_of(folder / "ca.key") is None
+    assert end_of(folder / "none.pem") is None
+
+
+@pytest.mark.parametrize(("days", "urgent", "said"), [
+    (9, None, ""), (11, False, "in 29 days"), (38, False, "in 2 days"), (39.5, True, "in 12 hours"),
+    (41, True, "has ended"),
+])
+def test_it_is_said_30_days_and_one_day_before(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, days: float, urgent: bool | None, said: str
+) -> None:
+    monkeypatch.setenv("ZENCELL_SECURE", str(folder))
+    at = now_in(days) + datetime.timedelta(minutes=-1)
+    found = warning_of("router", certificate_in(folder / "router.pem").not_valid_after_utc, at)
+    assert (found[0] if found else None) is urgent
+    told = [*findings(at)]
+    assert {finding.level for finding in told} == {{None: "ok", False: "warn", True: "fail"}[urgent]}
+    assert all(said in finding.what for finding in told)
+    assert len(told) == (1 if urgent is None else len(NAMES))
+
+
+def test_each_end_is_logged_once_and_once_more_when_it_is_urgent(folder: Path) -> None:
+    watch = EndWatch(folder)
+    assert watch.look() == []
+    assert len(watch.look(now_in(11))) == len(NAMES)
+    assert watch.look(now_in(12)) == []
+    assert len(watch.look(now_in(39.5))) == len(NAMES)
+    assert [urgent for urgent, _ in watch.look(now_in(41))] == [True] * len(NAMES)
+    assert watch.look(now_in(42)) == []
+    own = EndWatch(folder, frozenset(["panda.camera"]))
+    ((_, line),) = own.look(now_in(11))
+    assert "the certificate of panda.camera ends on" in line
+    assert f"`zencell secure renew {folder}`" in line
+
+
+# --- made anew while all runs ---------------------------------------------------------------------------------------
+
+
+def test_all_is_made_anew_also_an_authority_that_would_end_before(folder: Path) -> None:
+    before = {name: (folder / f"{name}.pem").read_bytes() for name in (*NAMES, "ca")}
+    assert app.execute(["secure", "renew", str(folder)]) == 0
+    assert all((folder / f"{name}.pem").read_bytes() != text for name, text in before.items())
+    require_valid(folder, NAMES, RENEW, now_in(363))
+    (folder / "camera.pem").write_bytes(before["panda.camera"])
+    certificate_in(folder / "camera.pem").verify_directly_issued_by(certificate_in(folder / "ca.pem"))
+
+
+def test_whoever_is_connected_shows_his_new_certificate_without_a_restart(folder: Path, endpoint: str) -> None:
+    with Holder(endpoint, credentials_of("panda.camera", folder)) as camera:
+        assert camera.connected
+        assert app.execute(["secure", "renew", str(folder), "--authority"]) == 0
+        with_both = (folder / "ca.pem").read_bytes()
+        assert with_both.count(b"BEGIN") == 2
+        assert app.execute(["secure", "renew", str(folder), "--forget"]) == 0
+        # The router takes what is new and ends all links: who is back has shown what is new, and trusts what is new.
+        until("a certificate of the new authority is not let in",
+              lambda: is_let_in(endpoint, credentials_of("operator", folder)))
+        until("who was connected is not back", lambda: camera.connected)
+
+
+def is_let_in(endpoint: str, credentials: Credentials) -> bool:
+    try:
+        with Holder(endpoint, credentials, connect_ms=REFUSED) as one:
+            return one.connected
+    except zenoh.ZError:
+        return False
+
+
+def test_an_authority_is_replaced_with_overlap_and_then_trusted_no_more(
+    folder: Path, endpoint: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    elsewhere = tmp_path_factory.mktemp("another_host")  # which gets its new files later
+    for name in ("ca.pem", "operator.pem", "operator.key"):
+        (elsewhere / name).write_bytes((folder / name).read_bytes())
+    (elsewhere / "operator.key").chmod(0o600)
+    old = credentials_of("operator", elsewhere)
+    assert app.execute(["secure", "renew", str(folder), "--authority"]) == 0
+    (elsewhere / "ca.pem").write_bytes((folder / "ca.pem").read_bytes())
+    new = credentials_of("operator", folder)
+    until("the new one is not let in", lambda: is_let_in(endpoint, new))
+    assert is_let_in(endpoint, old), "both authorities are trusted"
+    assert app.execute(["secure", "renew", str(folder), "--forget"]) == 0
+    (elsewhere / "ca.pem").write_bytes((folder / "ca.pem").read_bytes())
+    until("the old one is still let in", lambda: not is_let_in(endpoint, old))
+    until("the new one is not let in", lambda: is_let_in(endpoint, new))
+
+
+def test_what_cannot_be_used_leaves_in_force_what_was_there(
+    folder: Path, endpoint: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.ERROR, "router"):
+        (folder / "router.key").write_bytes((folder / "operator.key").read_bytes())
+        until("nothing was said", lambda: caplog.records)
+    assert "those of before stay in force" in caplog.text
+    assert is_let_in(endpoint, credentials_of("operator", folder))
+
+
+def test_a_certificate_that_ends_opens_nothing_new_and_ends_nothing_that_runs(folder: Path, endpoint: str) -> None:
+    lasts = 3.0  # [s]
+    Authority.load(folder / "ca.pem", folder / "ca.key").issue(
+        "operator", [], lasts / 86400, folder / "operator.pem", folder / "operator.key")
+    own = credentials_of("operator", folder)
+    with Holder(endpoint, own) as running:
+        heard = running.hear("panda/x")
+        until("it is still let in", lambda: not is_let_in(endpoint, own))
+        with Holder(endpoint, credentials_of("panda.camera", folder)) as camera:
+            until("what runs has ended", lambda: (camera.put("panda/x", b"a"), heard.samples)[1])
+        assert running.connected
