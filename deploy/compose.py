@@ -6,6 +6,7 @@ from typing import Any
 
 import yaml
 
+from common.viewer.access import TOKEN_VARIABLE
 from deploy.containers import (
     CONFIG,
     DATA,
@@ -106,7 +107,8 @@ def _extras(container: Container, before: list[str]) -> dict[str, Any]:
         extras["mem_limit"] = f"{container.memory}m"
     if container.page:
         published = f"127.0.0.1:${{ZENCELL_PAGE:-{VIEWER_PORT}}}:{VIEWER_PORT}"
-        extras |= {"networks": ["cell", "page"], "ports": [published]}
+        token = {TOKEN_VARIABLE: f"${{{TOKEN_VARIABLE}:-}}"}
+        extras |= {"networks": ["cell", "page"], "ports": [published], "environment": container.environment | token}
     if container.is_task:
         extras["depends_on"] = {name: {"condition": "service_healthy"} for name in before}
     return extras

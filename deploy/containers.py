@@ -14,7 +14,7 @@ VIEWER, VIEWER_PORT = "viewer", 8080
 EXECUTOR = "trajectory_executor"
 CONFIG = "/app/config"
 DATA = "/data"
-# A container's port is published to the loopback of its host only, and forwarded from a pod only by kubectl.
+# A container's port is published to the loopback of its host only.
 PAGE = ["--set", "services.{name}.host=0.0.0.0", "--set", "services.{name}.published=true"]
 USER = 10001  # as in the Dockerfile
 # About twice what a service takes in a whole run [MB]: benchmarks/resources.py prints that.
@@ -32,7 +32,7 @@ class Container:
     memory: int = USUAL_MEMORY  # [MB]
     is_task: bool = False  # is started when all the others are ready
     page: bool = False  # has a port for people
-    arguments: list[str] = field(default_factory=list)
+    arguments: list[str] = field(default_factory=list)  # where the engine publishes ports
 
 
 def cells() -> dict[str, Cell]:

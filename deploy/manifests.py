@@ -60,7 +60,7 @@ def _deployment(name: str, cell: str, container: Container, port: int | None) ->
     main: dict[str, Any] = {
         "name": container.name.replace("_", "-"),
         "image": IMAGE,
-        "command": [*container.command, *container.arguments],
+        "command": container.command,  # a page listens within its pod only, where kubectl forwards from
         "env": environment,
         "resources": {
             "requests": {"cpu": CPU_OF_A_SERVICE, "memory": f"{container.memory // 2}Mi"},

@@ -47,6 +47,11 @@ def test_container_is_locked_down(name: str) -> None:
     assert "./config:/app/config:ro" in service["volumes"]
 
 
+def test_page_of_a_pod_listens_within_it_only() -> None:
+    for file in (ROOT / "deploy" / "kubernetes").rglob("*.yaml"):
+        assert "viewer.host" not in file.read_text() and "viewer.published" not in file.read_text()
+
+
 def test_only_the_page_is_published_and_only_to_this_machine() -> None:
     published = {name: service["ports"] for name, service in COMPOSE["services"].items() if "ports" in service}
     assert set(published) == {f"{cell}-viewer" for cell in CELLS}
