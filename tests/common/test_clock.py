@@ -13,7 +13,7 @@ class Host:
     """A host whose clocks are set by hand."""
 
     def __init__(self):
-        self.own, self.wall = 5 * HOUR, 1_700_000_000 * 10**9
+        self.own, self.wall, self.asleep = 5 * HOUR, 1_700_000_000 * 10**9, 0
 
     def pass_time(self, ns):
         self.own, self.wall = self.own + ns, self.wall + ns
@@ -21,7 +21,8 @@ class Host:
     def host_ns(self):
         return self.own
 
-    monotonic_ns = host_ns
+    def monotonic_ns(self):
+        return self.own - self.asleep
 
     def wall_ns(self):
         return self.wall
@@ -49,6 +50,14 @@ def test_process_that_is_started_again_after_a_step_of_the_system_clock_agrees_w
     host.pass_time(10**9)
     again = Clock.from_environment(handed)
     assert again.now_ns() == first.now_ns() == supervisor.now_ns() == supervisor.epoch_ns + int(2e9 * speed)
+
+
+def test_host_that_slept_has_one_time_for_what_ran_before_and_what_is_started_after(host):
+    supervisor = Clock()
+    host.pass_time(HOUR)
+    host.asleep += HOUR
+    assert supervisor.now_ns() == host.wall_ns() == Clock.from_environment(supervisor.environment()).now_ns()
+    assert Clock().now_ns() == supervisor.now_ns(), "and one without a supervisor too"
 
 
 def test_processes_without_a_supervisor_agree_by_a_folder_that_they_share(host, tmp_path, monkeypatch):
