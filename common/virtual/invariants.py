@@ -49,12 +49,10 @@ OLDEST = 2.3  # [s] from when a motion is decided to its begin; later ones are r
 LATE = 0.5  # [s] that the end of a request may come after its time-out
 MOVED = 2e-3  # [m] farther from where it lay, a thing was moved
 JUMP = 0.02  # [rad] from where the arm was to the first set-point of another process
-BLEND = 0.08  # [rad/s] by which the difference to the start of a trajectory, while it fades, adds to its speed
-SHARP = 1.0  # [rad/s^2] the same for acceleration
 AT_REST = 2.0  # [s] of cell time after which an arm that is held is at rest
 STILL = 1e-9  # [rad]
 UNTOLD = 3  # set-points that may come before it is told of the goal, or of being let go
-CYCLE = 0.025  # [s] of cell time at most between two cycles of a controller that is not held up
+CYCLE = 0.025  # [s] of cell time at most between two cycles of a controller in time; a late one moves no further
 STALL = 0.3  # [s] of cell time after which a trajectory goes on where it was
 CARRIED, CONTAINED, LOST = ("held", "falling"), "contained", "elsewhere"  # what the truth says of an object
 
@@ -205,7 +203,7 @@ class Invariants:
         """Look at set-points q (dof,) [rad] and dq [rad/s], given where the arm is, at cell time [s]."""
         if self.ended:
             return
-        fastest = 1.03 * limits.velocity + BLEND
+        fastest = 1.03 * limits.velocity
         fits = (q >= limits.lower - 2e-3) & (q <= limits.upper + 2e-3) & (np.abs(dq) <= fastest)
         if self._broke(fits.all(), LIMITS):  # what is not a number is within nothing
             self._tell(LIMITS, f"q {np.round(q, 4).tolist()}, dq {np.round(dq, 3).tolist()}")
@@ -217,10 +215,10 @@ class Invariants:
             if self._broke((way <= JUMP).all(), LIMITS):
                 self._tell(LIMITS, f"a jump of {way.max():.3f} rad after {passed:.3f} s")
             return
-        if self._broke((way <= fastest * passed + 1e-3).all(), LIMITS):
+        if self._broke((way <= fastest * min(passed, CYCLE) + 1e-3).all(), LIMITS):
             self._tell(LIMITS, f"a step of {way.max():.4f} rad in {passed * 1e3:.1f} ms")
         change = np.abs(dq - last[1])
-        if self._broke((change <= (1.1 * limits.braking + SHARP) * max(passed, 0.01) + 1e-3).all(), LIMITS):
+        if self._broke((change <= 1.1 * limits.braking * max(passed, 0.01) + 1e-3).all(), LIMITS):
             self._tell(LIMITS, f"velocity changes by {change.max():.3f} rad/s in {passed * 1e3:.1f} ms")
         if way.max() <= STILL or passed > 2 * CYCLE:
             return
