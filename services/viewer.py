@@ -15,7 +15,7 @@ from common.process.service import main
 from common.transport.bus import Bus
 from common.transport.credentials import secure_folder
 from common.viewer.access import address_of, tokens_in
-from common.viewer.console import BY, Console
+from common.viewer.console import Console
 from common.viewer.doors import Doors
 from common.viewer.feeds import Feeds, Periods, Topics
 from common.viewer.guard import close_server, make_server
@@ -98,7 +98,7 @@ async def run(bus: Bus, config: Config) -> None:
     doors = Doors(lambda line: bus.log.info("%s", line))
     console = Console(bus, config.members, feeds, read.requests, doors)
     status = feeds.reader(read.status) if read.status is not None else None
-    motions = OperatorMotion(bus, [status] if status is not None else [], owner=BY)
+    motions = OperatorMotion(bus, [status] if status is not None else [], owner=lambda: doors.person)
     folder = None if bus.declares_only else secure_folder()
     server = make_server(
         config.host, config.port, config.token, published=config.published, secured=folder is not None,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 from common import messages as m
@@ -49,15 +49,18 @@ class MotionFailed(ZencellError):
 class OperatorMotion:
     """Moves the robot for a person; any number of these may live in a cell, the executor follows one goal at a time."""
 
-    def __init__(self, bus: Bus, tasks: Sequence[Reader[Any]] | None = None, owner: str = SOMEBODY) -> None:
+    def __init__(
+        self, bus: Bus, tasks: Sequence[Reader[Any]] | None = None, owner: str | Callable[[], str] = SOMEBODY
+    ) -> None:
         """Declare what is asked and heard.
 
         Args:
             bus: in the cell.
             tasks: readers of what the cell's tasks say of themselves (a `TaskStatus`); all that there may be if None.
-            owner: name of the person, whose own stops and holds, and nobody else's, do not keep the robot.
+            owner: name of the person, or what says who asks now, whose own stops and holds, and nobody else's, do not
+                keep the robot.
         """
-        self._owner = owner
+        self._owner = owner if callable(owner) else lambda: owner
         self._bus = bus
         self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
         self._stop, self._hold = bus.client(topics.MOTION_STOP), bus.client(topics.MOTION_HOLD)
@@ -110,10 +113,10 @@ class OperatorMotion:
     async def _follow(self, trajectory: m.JointTrajectory, timeout: float, heard: int) -> m.MotionStatus:
         """As `follow`; what was said later than `heard`, when the motion was asked for, keeps the robot."""
         if (await self._require_free()).held:  # with nothing under way, letting go moves nothing, nor does it later
-            await self._hold.call(m.HoldRequest(hold=False, reason="a person moves the robot", owner=self._owner,
+            await self._hold.call(m.HoldRequest(hold=False, reason="a person moves the robot", owner=self._owner(),
                                                 into_stop=True, heard=heard), REQUEST_TIMEOUT)
         request = m.ExecuteRequest(
-            header=self._bus.header(), id=_mint(), trajectory=trajectory, owner=self._owner, heard=heard)
+            header=self._bus.header(), id=_mint(), trajectory=trajectory, owner=self._owner(), heard=heard)
         try:
             answer = await self._execute.call(request, REQUEST_TIMEOUT)
             if answer.state == "rejected":
@@ -129,7 +132,7 @@ class OperatorMotion:
         status = await self._known()
         self._require_no_task()
         for inhibit in status.inhibits:
-            if inhibit.by not in (self._owner, SOMEBODY, *OURSELVES):
+            if inhibit.by not in (self._owner(), SOMEBODY, *OURSELVES):
                 raise MotionFailed(inhibit.kind, f"the robot is {inhibit.told}")
         try:
             async with asyncio.timeout(COME_TO_REST):

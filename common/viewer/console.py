@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable, Coroutine, Iterable
+from contextvars import Context, copy_context
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import viser
@@ -40,7 +41,6 @@ A = TypeVar("A", bound=Message)
 V = TypeVar("V")
 V_co = TypeVar("V_co", covariant=True)
 
-BY = "page"
 EXECUTOR = "trajectory_executor"
 SPEED = f"services.{EXECUTOR}.speed_scaling"
 SLIDING = 0.15  # [s] after a slider came to rest, what it says is sent
@@ -87,25 +87,25 @@ class Desk:
         self.doors = doors or Doors()
         self.doors.refused = lambda line: self.put(lambda: self.tell(line))
         self._loop = asyncio.get_running_loop()
-        self._orders: asyncio.Queue[Act] = asyncio.Queue()
+        self._orders: asyncio.Queue[tuple[Act, Context]] = asyncio.Queue()
 
     def put(self, act: Act) -> None:
-        """Have something done; from any thread. A loop that has ended does nothing more."""
+        """Have something done for who asks now; from any thread. A loop that has ended does nothing more."""
         with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._orders.put_nowait, act)
+            self._loop.call_soon_threadsafe(self._orders.put_nowait, (act, copy_context()))
 
     async def run(self) -> None:
         """Carry out orders until cancelled."""
         async with asyncio.TaskGroup() as group:
             while True:
-                act = await self._orders.get()
+                act, context = await self._orders.get()
                 try:
-                    doing = act()
+                    doing = context.run(act)
                 except ZencellError as error:
                     self.tell(problem(error))
                     continue
                 if doing is not None:
-                    group.create_task(self._see_through(doing))
+                    group.create_task(self._see_through(doing), context=context)
 
     async def _see_through(self, doing: Coroutine[Any, Any, None]) -> None:
         try:
@@ -188,7 +188,7 @@ class Console(Desk):
         """Tell the task to start, pause, resume or stop; to start or resume although another person holds the arm."""
         motion = self.latest(topics.MOTION_STATUS)
         heard = max(motion.newest, self._newest) if motion else None
-        said = {"command": command, "by": BY, "override": override, "heard": heard}
+        said = {"command": command, "by": self.doors.person, "override": override, "heard": heard}
         await self.ask(topics.TASK_COMMAND, TaskCommand.model_validate(said))
 
     async def stop(self) -> None:
@@ -198,8 +198,8 @@ class Console(Desk):
             RequestFailed: the arm could not be told; or it could, but the task could not.
         """
         told = await asyncio.gather(
-            self.ask(topics.MOTION_STOP, StopRequest(reason="stopped on the page", owner=BY), _SOON),
-            self.ask(topics.TASK_COMMAND, TaskCommand(command="stop", by=BY), _SOON),
+            self.ask(topics.MOTION_STOP, StopRequest(reason="stopped on the page", owner=self.doors.person), _SOON),
+            self.ask(topics.TASK_COMMAND, TaskCommand(command="stop", by=self.doors.person), _SOON),
             return_exceptions=True,
         )
         for answer in told:
@@ -226,7 +226,7 @@ class Console(Desk):
 
     async def set_parameter(self, services: list[str], path: str, value: JsonValue) -> None:
         """Change a parameter in every service that has it."""
-        request = ParameterRequest(set={path: value}, by=BY)
+        request = ParameterRequest(set={path: value}, by=self.doors.person)
         await asyncio.gather(*(self._parameters[name].call(request, _SOON) for name in services))
 
     async def set_speed(self, scaling: float) -> None:

@@ -15,6 +15,7 @@ from common.sources import monotonic
 
 Need = Literal["stop", "look", "operate", "tune", "take"]
 
+BY = "page"  # who asks, where it is not known which person
 IDLE = 60.0  # [s] without an order, after which who operates has given that back
 QUIET = 2.0  # [s] in which the same order of the same person, such as a slider on its way, is logged once
 LONGEST = 60  # characters of a value in the log
@@ -53,6 +54,12 @@ class Doors:
     def need(self, part: str, need: Need, what: str) -> None:
         """Say what a part of the page needs; one of which nothing is said moves the arm."""
         self._needs[part] = (need, what)
+
+    @property
+    def person(self) -> str:
+        """What to call who asks now: one host is one person, whose own stops and holds are no other's."""
+        visitor = VISITOR.get()
+        return f"{BY} {visitor.address}" if self.guarded and visitor is not None else BY
 
     @property
     def operator(self) -> str:

@@ -412,3 +412,20 @@ async def test_second_operator_waits_until_the_first_has_gone(make: Make) -> Non
             while "Start" not in done:  # noqa: ASYNC110
                 await asyncio.sleep(0.005)
             assert desk.doors.operator not in ("", holder)
+
+
+async def test_what_somebody_asks_for_is_asked_in_their_name(make: Make) -> None:
+    async with operated(make) as (server, desk, _ids, _), asyncio.timeout(PATIENCE):
+        persons: asyncio.Queue[str] = asyncio.Queue()
+
+        async def act() -> None:
+            await asyncio.sleep(0)
+            persons.put_nowait(desk.doors.person)
+
+        button = server.gui.add_button("Later")
+        desk.on_click(button, act, "stop")
+        async with open_page(server, cookie=cookie_of(server, "look")) as connection:
+            await click(connection, button._impl.uuid)
+            assert await persons.get() == "page 127.0.0.1"
+        desk.put(act)
+        assert await persons.get() == desk.doors.person == "page"
