@@ -51,6 +51,7 @@ MOVED = 2e-3  # [m] farther from where it lay, a thing was moved
 JUMP = 0.02  # [rad] from where the arm was to the first set-point of another process
 AT_REST = 2.0  # [s] of cell time after which an arm that is held is at rest
 STILL = 1e-9  # [rad]
+ENDS = ("stop", "pause")
 UNTOLD = 3  # set-points that may come before it is told of the goal, or of being let go
 CYCLE = 0.025  # [s] of cell time at most between two cycles of a controller in time; a late one moves no further
 STALL = 0.3  # [s] of cell time after which a trajectory goes on where it was
@@ -110,7 +111,8 @@ class Invariants:
         self._told: dict[tuple[str, str], bool] = {}  # by controller's process and goal: whether it was accepted
         self._stray = 0  # set-points that moved without a goal
         self._restless = 0  # set-points that moved although the arm is held
-        self._ended = False  # a person stopped or held the arm, and nobody has asked for motion since
+        self._last_word = ""  # of persons: what they told the task, or "stop" to the executor
+        self._ended = False  # the arm was stopped or is held, as a person said last
         self._ended_at: float | None = None  # cell time of the first set-point since
         self._unasked = 0  # set-points that moved nevertheless
         self._by_persons: set[str] = set()  # goals
@@ -247,7 +249,11 @@ class Invariants:
             if self._broke(known is request or known == request, ONCE):
                 self._tell(ONCE, f"{request.id} is asked for twice, as {type(known).__name__} and another time as "
                                  f"{type(request).__name__}, which are not the same")
-        if isinstance(request, TaskCommand) and request.command in ("start", "resume"):
+        if isinstance(request, TaskCommand):
+            self._last_word = request.command
+        elif isinstance(request, StopRequest) and request.owner:  # of the task's own it has none
+            self._last_word = "stop"
+        if self._last_word not in ENDS:
             self._ended, self._ended_at = False, None
         if isinstance(request, ExecuteRequest) and request.owner:
             self._by_persons.add(request.id)
@@ -259,7 +265,7 @@ class Invariants:
     def _on_serve(self, life: str, request: Message, answer: Message) -> None:
         """Who asks for a goal again hears what became of it: what was accepted stays so, and what was refused too."""
         stop = isinstance(request, StopRequest) or (isinstance(request, HoldRequest) and request.hold)
-        if stop and getattr(request, "by", "") == "person":
+        if stop and getattr(request, "by", "") == "person" and self._last_word in ENDS:
             self._ended, self._ended_at = True, None
         if isinstance(request, GOALS) and isinstance(answer, MotionStatus | GripperState):
             accepted = answer.state != "rejected"

@@ -17,6 +17,7 @@ from common.errors import RequestFailed
 from common.process.operator_motion import MotionFailed, OperatorMotion
 from common.process.persist import persist
 from common.topics import Topic
+from common.transport.reader import Reader
 from common.virtual.faults import Amid, Fault, Plan
 from common.virtual.loop import Life, context_of
 from common.virtual.network import VirtualSession
@@ -28,7 +29,7 @@ NEXT_GOAL = 1.5  # [s] for which the next goal is waited for
 TURN = 0.0005  # [s] that stands for a turn where something is to happen just when a goal is asked for
 GOALS = (topics.MOTION_EXECUTE.key, topics.GRIPPER_COMMAND.key)
 PLAN = topics.MOTION_PLAN.key
-PERSON = "person"
+PERSON, PAGE = "person", "page"
 EXECUTOR = "trajectory_executor"
 VICTIM_SHARE = 0.7  # of task and executor, each, when a person has stopped the robot
 LOOKS_ON = 3.0, 8.0  # [s] for which it rests then
@@ -193,13 +194,14 @@ class Misfortune:
         """Stop or pause the robot; let those crash who could start it again; start it some time later."""
         host, random = self._host, self._ends
         bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
+        heard_of = bus.reader(topics.MOTION_STATUS)
         executor = next(entry.name for entry in host.cell.services.values() if entry.kind == EXECUTOR)
         ends = random.choice(["stop", "task stop", "task pause"])
         victims = [name for name in (executor, host.cell.task) if random.random() < VICTIM_SHARE]
         self._tell(f"FAULT ended: {ends}, then {' and '.join(victims) or 'nobody'} crashes")
         try:
             if ends == "stop":
-                await persist(bus.client(topics.MOTION_STOP), m.StopRequest(), PERSON_TIMEOUT,
+                await persist(bus.client(topics.MOTION_STOP), m.StopRequest(owner=PAGE), PERSON_TIMEOUT,
                               lambda error: m.MotionStatus(), lambda problem: None)
             else:
                 said = m.TaskCommand(command="pause" if ends == "task pause" else "stop")
@@ -208,14 +210,14 @@ class Misfortune:
             for name in victims:
                 host.processes[name].kill()
             await asyncio.sleep(float(random.uniform(*LOOKS_ON)))
-            await self._start(bus)
+            await self._start(bus, heard_of)
         finally:
             await bus.close()
             self._network.detach(session)
 
-    async def _start(self, bus: VirtualBus) -> None:
+    async def _start(self, bus: VirtualBus, motion: Reader[m.MotionStatus]) -> None:
         """Start the task as a person does: again, as long as the robot stays stopped."""
-        motion, status = bus.reader(topics.MOTION_STATUS), bus.reader(self._status)
+        status = bus.reader(self._status)
         while True:
             heard = motion.latest.newest if motion.latest else None
             start = m.TaskCommand(command="start", heard=heard)
@@ -231,7 +233,7 @@ class Misfortune:
         """Stop the task; then send the arm home and start the task, from two places that know nothing of each other."""
         host = self._host
         bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
-        command = bus.client(topics.TASK_COMMAND)
+        command, heard_of = bus.client(topics.TASK_COMMAND), bus.reader(topics.MOTION_STATUS)
         motion = OperatorMotion(bus, [bus.reader(self._status)])
 
         async def go_home() -> None:
@@ -245,7 +247,7 @@ class Misfortune:
             async with asyncio.TaskGroup() as group:
                 group.create_task(go_home())
                 await asyncio.sleep(float(self._random.uniform(0.0, PERSON_LATE)))
-                await self._start(bus)
+                await self._start(bus, heard_of)
         finally:
             await bus.close()
             self._network.detach(session)
@@ -253,5 +255,5 @@ class Misfortune:
 
 def _started(task: m.TaskStatus | None, motion: m.MotionStatus | None) -> bool:
     """Whether nothing that a person said keeps the task any more."""
-    kept = motion is None or any(inhibit.by == PERSON for inhibit in motion.inhibits)
+    kept = motion is None or any(inhibit.by in (PERSON, PAGE) for inhibit in motion.inhibits)
     return task is not None and task.started and not kept
