@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import gc
 import logging
 import os
 import sys
@@ -197,9 +198,11 @@ async def _live(run: Run[P], start: Start[P], lifeline: Lifeline) -> int:
         root.addHandler(to_topic)
         ends = asyncio.create_task(_watch_end(bus, start.credentials))
         watch = LoopWatch(asyncio.get_running_loop(), lambda: _patience(start.watchdogs, bus.ready_event.is_set()))
+        settling = asyncio.create_task(_settle(bus), name="settle")
         try:
             return await serve(run, bus, start.config, lifeline)
         finally:
+            settling.cancel()
             watch.stop()
             ends.cancel()
             root.removeHandler(to_topic)
@@ -217,6 +220,15 @@ async def _watch_end(bus: Bus, credentials: Credentials | None) -> None:
     while True:
         watch.tell(bus.log)
         await asyncio.sleep(PERIOD)
+
+
+async def _settle(bus: Bus) -> None:
+    """Leave out of the garbage collector's looks what is there when the service is ready: modules, models.
+
+    A whole look at them takes 50 ms, in which no set-point leaves.
+    """
+    await bus.ready_event.wait()
+    gc.freeze()
 
 
 def _patience(watchdogs: Watchdogs, ready: bool) -> float:
