@@ -4,8 +4,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from common.application import all_topics
 from common.errors import ConfigError
-from common.transport.endpoint import endpoint_of
+from common.messages.basics import LARGEST
+from common.transport.endpoint import BESIDE_BYTES, endpoint_of, size_limits
 
 
 @pytest.mark.parametrize(
@@ -51,3 +53,12 @@ def test_client_file_points_at_the_default_router_and_searches_for_nothing() -> 
     assert json.loads(config.get_json("mode")) == "client"
     assert json.loads(config.get_json("connect/endpoints")) == [endpoint_of(environ={})]
     assert json.loads(config.get_json("scouting/multicast/enabled")) is False
+
+
+def test_the_router_takes_nothing_larger_than_readers_do() -> None:
+    limits = {key: entry["size_limit"] for entry in size_limits() for key in entry["key_exprs"]}
+    for topic in all_topics().values():
+        most = max(topic.message.most_bytes, getattr(topic, "answer", topic.message).most_bytes)
+        if most < LARGEST:
+            assert limits[f"*/{topic.expression}"] == most + BESIDE_BYTES
+    assert limits["*/joint_states"] < 32 * 1024 < limits["*/planning_scene"] < limits["*/motion/execute"]
