@@ -90,8 +90,10 @@ def test_task_service_that_dies_while_paused_leaves_the_robot_held_until_somebod
         joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
         status = bus.reader(PICK_PLACE_STATUS)
         await until(status, lambda s: s.stage == "across", 90)
+        await until(joints, lambda s: moves(cell, s))
         await tell(bus, "pause")
         at_rest = await held(motion)
+        assert at_rest.state == "active" and 0 < at_rest.progress < 1, at_rest
         cell.kill("smart_pick_place")
         found = await until(status, lambda s: s.paused and "found held" in s.message)
         assert found.stage == "" and found.started
