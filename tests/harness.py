@@ -280,10 +280,19 @@ class Place:
     def __init__(self, folder: Path, domain: int) -> None:
         self.folder = folder
         self.domain = domain
+        self.started: list[Zencell] = []
 
     def start(self, *arguments: str) -> Zencell:
         """A command as a process of its own."""
-        return Zencell(self.folder, self.domain, *arguments)
+        self.started.append(Zencell(self.folder, self.domain, *arguments))
+        return self.started[-1]
+
+    def end(self) -> None:
+        """End whatever still runs of what was started."""
+        for command in self.started:
+            if command.process.poll() is None:
+                command.interrupt()
+                command.end()
 
     def ask(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """A command that ends by itself."""

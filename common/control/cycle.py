@@ -152,7 +152,8 @@ class ControlCycle:
             return
         self._obstructible.place(state.width)
         self._obstructible.obstruct(self._world.obstruction(self._kinematics.fk(self._q), state.width))
-        self._gripper.resume(state.width if state.told_width is None else state.told_width, now)
+        if state.told_width is not None:
+            self._gripper.resume(state.told_width, now)
         self._gripper.update(self._obstructible.read(now))
 
     def execute(self, request: ExecuteRequest, now: float, objection: Refused | None = None) -> MotionStatus:

@@ -20,7 +20,7 @@ class GripperController:
         self._gripper = gripper
         self._config = config
         self._memory: GoalMemory[GripperState] = GoalMemory(remember)
-        self._target = 0.0
+        self._target: float | None = None  # [m]; of whoever asked last
         self.state = GripperState(source=config.controller)
 
     def command(self, request: GripperCommand, now: float, objection: Refused | None = None) -> GripperState:
@@ -55,8 +55,8 @@ class GripperController:
         return self._memory.put(request.id, self.state)
 
     @property
-    def told(self) -> float:
-        """Width that the fingers were told last [m]."""
+    def told(self) -> float | None:
+        """Width that the fingers were told last [m]; None when nobody has told them anything."""
         return self._target
 
     def resume(self, width: float, now: float) -> None:
@@ -73,6 +73,7 @@ class GripperController:
         }
         if state.state == "active" and not reading.moving:
             changes["state"] = "succeeded"
+            assert self._target is not None
             if abs(reading.width - self._target) > SETTLED and not reading.holding:
                 changes["state"] = "aborted"
                 changes["message"] = f"fingers stopped at {reading.width:.4f} m, not at {self._target:.4f} m"

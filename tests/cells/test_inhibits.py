@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -38,8 +39,14 @@ async def assert_still(joints: Reader[JointState]) -> None:
     assert later.position == first.position
 
 
-async def test_stop_outlives_supervisor_and_executor_that_are_killed_and_up_says_so(tmp_path: Path) -> None:
-    place = Place(tmp_path, free_domain())
+@pytest.fixture
+def place(tmp_path: Path) -> Iterator[Place]:
+    made = Place(tmp_path, free_domain())
+    yield made
+    made.end()
+
+
+async def test_stop_outlives_supervisor_and_executor_that_are_killed_and_up_says_so(place: Place) -> None:
     command = place.start("up", *PANDA)
     async with connect(cell="panda", service="watcher", endpoint=endpoint_of(place.domain), timeout=PATIENCE) as bus:
         motion = bus.reader(topics.MOTION_STATUS)

@@ -212,3 +212,14 @@ class Numb:
 def test_backend_whose_gripper_does_not_fit_is_a_configuration_error(limits, fingers):
     with pytest.raises(ConfigError, match=r"robot\.hardware\.backend"):
         Rig(limits, MockHardware(START, fingers))
+
+
+def test_fingers_that_nobody_told_anything_stay_where_they_are_after_a_restart(limits):
+    rig = Rig(limits)
+    rig.run(0.1)
+    standing = rig.cycle.standing()
+    assert standing.width == 0.08
+    again = Rig(limits, MockHardware(START, Fingers(GRIPPER, 0.05)))
+    again.cycle.restore(standing, again.now)
+    again.run(1.0)
+    assert {state.width for state in again.grippers} == {0.08}
