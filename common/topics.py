@@ -98,8 +98,8 @@ DEPTH_CAMERA_POINTS = Topic("depth_camera/points", m.PointCloud2, "stream",
                             "coloured points, only while somebody listens")
 DEPTH_CAMERA_INFO = Topic("depth_camera/camera_info", m.CameraInfo, "state", "intrinsics")
 SUPERVISOR_STATUS = Topic("supervisor/status", m.SupervisorStatus, "state", "all processes")
-LOG = Topic(f"log/{SERVICE}", m.LogLine, "event", "log lines of a service; all of them: `topic echo log`", signed=True)
-COUNTERS = Topic(f"counters/{SERVICE}", m.ServiceCounters, "state",
+LOG = Topic("log/<service>", m.LogLine, "event", "log lines of a service; all of them: `topic echo log`", signed=True)
+COUNTERS = Topic("counters/<service>", m.ServiceCounters, "state",
                  "received, dropped and refused messages of a service, each second", signed=True)
 
 MOTION_PLAN = Request("motion/plan", m.PlanRequest, m.PlanResponse, "plan a trajectory")
@@ -111,7 +111,7 @@ GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState,
                           "move the fingers; the result appears on gripper/state")
 WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "add, move, remove, reset; simulated hardware only")
 TASK_COMMAND = Request("task/command", m.TaskCommand, m.TaskStatus, "start, pause, resume or stop the task")
-PARAMETERS = Request(f"param/{SERVICE}", m.ParameterRequest, m.ParameterReply,
+PARAMETERS = Request("param/<service>", m.ParameterRequest, m.ParameterReply,
                      "parameters of a service: what there is, and changing it while it runs")
 
 AnyTopic = Topic[m.Message] | Request[m.Message, m.Message]

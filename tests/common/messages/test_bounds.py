@@ -21,7 +21,7 @@ CONTROL = (m.JointState, m.StopRequest, m.HoldRequest, m.GripperCommand, m.Gripp
            m.ServiceCounters, m.LogLine)
 
 
-class Shine(Message):
+class Polish(Message):
     """A message of somebody's own that says little of its fields."""
 
     gloss: float = 0.0
@@ -49,7 +49,7 @@ def nodes(schema: Any) -> list[dict[str, Any]]:
     return own + [node for value in schema.values() for node in nodes(value)]
 
 
-@pytest.mark.parametrize("model", [*MESSAGES, Shine])
+@pytest.mark.parametrize("model", [*MESSAGES, Polish])
 def test_every_number_is_bounded_and_every_list_ends_at_its_first_error(model: type[Message]) -> None:
     for node in nodes(model.__pydantic_core_schema__):
         match node["type"]:
@@ -95,7 +95,7 @@ def test_what_is_read_where_something_moves_is_small(model: type[Message]) -> No
 )
 def test_messages_of_ones_own_take_nothing_for_something_else(fields: dict[str, Any], reason: str) -> None:
     with pytest.raises(DecodeError, match=reason):
-        decode(Shine, pack(**fields))
+        decode(Polish, pack(**fields))
 
 
 def test_a_whole_number_is_a_number() -> None:
