@@ -80,6 +80,7 @@ class Bus:
         self._raw_states: list[RawWriter] = []
         self._servers: list[Server[Any, Any]] = []
         self._tokens: list[Declared] = []
+        self._owners: TokenWatch | None = None
         self._life = new_id()
         self._owned: dict[str, Owner] = {}  # by key
         self._watches: dict[str, TokenWatch] = {}
@@ -221,10 +222,8 @@ class Bus:
             if (other := meetings.hear(token, there)) is not None:
                 self._loop.call_later(MEET, judge, other)
 
-        def on_token(token: str, there: bool) -> None:
-            call_on_loop(self._loop, lambda: hear(token, there))
-
-        self._session.watch_tokens(owns_key(self.cell), on_token, lambda token: None, lambda: None)
+        self._owners = TokenWatch(self._session, owns_key(self.cell), self._loop, name=str)
+        self._owners.on_change(hear)
 
     def _own(self, key: str, own: str) -> None:
         """Take note that a key is written or served here."""
@@ -260,7 +259,12 @@ class Bus:
 
     async def owners(self) -> list[Owner]:
         """Who writes or serves what in the cell now: services that are ready or just become so."""
-        found = {Owner.of(token) for token in await self.raw_tokens(owns_key(self.cell))}  # a token of ours comes twice
+        if self._owners is None:
+            tokens = frozenset(await self.raw_tokens(owns_key(self.cell)))  # one of ours comes twice
+        else:  # while they are watched, Zenoh would only tell of those that the watch has seen so far
+            await self._owners.known(1.0)
+            tokens = self._owners.names
+        found = {Owner.of(token) for token in tokens}
         return sorted(found, key=lambda owner: (owner.service, owner.key))
 
     def header(self, frame_id: str = "") -> Header:

@@ -12,10 +12,13 @@ _OVERLAP_SECONDS = 1.0  # in which the watch has surely reported what the first 
 
 
 class TokenWatch:
-    """The tokens under a key expression; services are named by the last part of their tokens."""
+    """The tokens under a key expression; what they name is the last part of them, or told by `name`."""
 
-    def __init__(self, session: Session, key: str, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self, session: Session, key: str, loop: asyncio.AbstractEventLoop, name: Callable[[str], str] | None = None
+    ) -> None:
         self._loop = loop
+        name = name or _name
         self._watched: set[str] = set()
         self._first: set[str] = set()  # what the first question found and the watch has not reported yet
         self._known = asyncio.Event()
@@ -23,8 +26,8 @@ class TokenWatch:
         self._waiters: dict[asyncio.Event, None] = {}  # in their order
         session.watch_tokens(
             key,
-            lambda token, there: call_on_loop(loop, lambda: self._on_token(_name(token), there)),
-            lambda token: call_on_loop(loop, lambda: self._on_first(_name(token))),
+            lambda token, there: call_on_loop(loop, lambda: self._on_token(name(token), there)),
+            lambda token: call_on_loop(loop, lambda: self._on_first(name(token))),
             lambda: call_on_loop(loop, self._on_known),
         )
 
