@@ -20,7 +20,7 @@ from common.topics import PublishedKind, Request, Topic, of_service
 from common.transport.codec import DEFAULT_LIMIT
 from common.transport.handoff import Doorbell, call_on_loop
 from common.transport.keys import alive_key, owns_key, serves_key
-from common.transport.ownership import MEET, SHARED, Meetings, Owner, process_name, require_only
+from common.transport.ownership import MEET, SHARED, Meetings, Owner, process_name, require_only, who_owns
 from common.transport.reader import Reader
 from common.transport.requests import Client, Server
 from common.transport.session import Declared, Publisher, RawReply, RawSample, Session
@@ -260,12 +260,11 @@ class Bus:
     async def owners(self) -> list[Owner]:
         """Who writes or serves what in the cell now: services that are ready or just become so."""
         if self._owners is None:
-            tokens = frozenset(await self.raw_tokens(owns_key(self.cell)))  # one of ours comes twice
+            tokens = frozenset(await self.raw_tokens(owns_key(self.cell)))
         else:  # while they are watched, Zenoh would only tell of those that the watch has seen so far
             await self._owners.known(1.0)
             tokens = self._owners.names
-        found = {Owner.of(token) for token in tokens}
-        return sorted(found, key=lambda owner: (owner.service, owner.key))
+        return who_owns(tokens)
 
     def header(self, frame_id: str = "") -> Header:
         """A header with the cell time of now."""

@@ -7,7 +7,7 @@ they started, see each other when it is whole again: the one that was ready firs
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from common.errors import ConfigError
@@ -65,6 +65,16 @@ class Owner:
         """Who holds a token."""
         key, own, service, process = token.split("/")[2:]
         return cls(key.replace("|", "/"), own.replace("|", "/"), service, process)
+
+
+def who_owns(tokens: Iterable[str]) -> list[Owner]:
+    """Each owner once, by service and key; who just became ready has both its tokens for a moment."""
+    found: dict[tuple[str, str, str], Owner] = {}
+    for owner in map(Owner.of, tokens):
+        one = (owner.service, owner.key, owner.life)
+        if one not in found or not owner.asks:
+            found[one] = owner
+    return [found[one] for one in sorted(found)]
 
 
 async def require_only(mine: Mapping[str, Owner], look: Callable[[], Awaitable[list[Owner]]]) -> None:

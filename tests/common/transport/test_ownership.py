@@ -15,7 +15,7 @@ from common.messages import TaskCommand, TaskStatus
 from common.transport import ownership
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
-from common.transport.ownership import Owner
+from common.transport.ownership import Owner, process_name, who_owns
 
 NewBus = Callable[..., Awaitable[Bus]]
 
@@ -67,6 +67,15 @@ async def test_what_all_services_write_each_owns_for_itself_and_readers_own_noth
         ("log/writer", "log/writer", "writer")]
 
 
+def test_who_just_became_ready_owns_a_key_once_while_both_its_tokens_are_seen() -> None:
+    asks = Owner("joint_states", "joint_states", "executor", process_name("abc"))
+    ready = replace(asks, process=process_name("abc", since=7))
+    other = replace(asks, process=process_name("def"))
+    for seen in itertools.permutations(f"cell{each.token}" for each in (asks, ready, other)):
+        assert sorted(who_owns(seen), key=lambda owner: owner.life)[:1] == [ready]
+        assert {owner.life for owner in who_owns(seen)} == {"abc", "def"}
+
+
 async def test_second_writer_waits_for_the_first_to_go(new_bus: NewBus, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ownership, "GIVE_UP", 20.0)
     before, after = await new_bus("camera"), await new_bus("camera")
@@ -108,13 +117,13 @@ async def test_keys_are_told_under_the_name_in_the_cell_with_the_own_word() -> N
 
 
 def test_token_says_who_holds_it() -> None:
-    owner = Owner("left/image_raw", "camera/image_raw", "left", ownership.process_name("a1", 7))
+    owner = Owner("left/image_raw", "camera/image_raw", "left", process_name("a1", 7))
     assert Owner.of(f"panda{owner.token}") == owner
-    assert owner.life == "a1" and not owner.asks and replace(owner, process=ownership.process_name("a2")).asks
+    assert owner.life == "a1" and not owner.asks and replace(owner, process=process_name("a2")).asks
 
 
 def test_who_was_ready_first_stays_and_who_asks_never_displaces_anybody() -> None:
-    names = [ownership.process_name(*each) for each in (("b", 5), ("a", 6), ("c", 6), ("a0", None))]
+    names = [process_name(*each) for each in (("b", 5), ("a", 6), ("c", 6), ("a0", None))]
     owners = [Owner("tf", "tf", "camera", name) for name in names]
     for earlier, later in itertools.combinations(owners, 2):
         assert earlier.was_before(later) and not later.was_before(earlier)
