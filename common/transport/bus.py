@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
@@ -12,19 +11,17 @@ from typing import Any, TypeVar
 
 from common import topics
 from common.clock import Clock
-from common.errors import ConfigError
 from common.messages import Header, Message, ServiceCounters
 from common.remapping import Remapping
-from common.sources import new_id, wall_ns
 from common.topics import PublishedKind, Request, Topic, of_service
 from common.transport.codec import DEFAULT_LIMIT
 from common.transport.handoff import Doorbell, call_on_loop
-from common.transport.keys import alive_key, owns_key, serves_key
-from common.transport.ownership import MEET, SHARED, Meetings, Owner, process_name, require_only, who_owns
+from common.transport.keys import alive_key, serves_key
+from common.transport.ownership import SHARED, Owner, Ownership
 from common.transport.reader import Reader
 from common.transport.requests import Client, Server
 from common.transport.session import Declared, Publisher, RawReply, RawSample, Session
-from common.transport.tokens import Alive, TokenWatch
+from common.transport.tokens import Alive, TokenWatch, tokens_now
 from common.transport.writer import RawWriter, Writer
 
 __all__ = ["Bus", "Client", "Reader", "Writer"]  # what the type hints of a service name
@@ -80,9 +77,7 @@ class Bus:
         self._raw_states: list[RawWriter] = []
         self._servers: list[Server[Any, Any]] = []
         self._tokens: list[Declared] = []
-        self._owners: TokenWatch | None = None
-        self._life = new_id()
-        self._owned: dict[str, Owner] = {}  # by key
+        self._ownership = Ownership(session, cell, service, loop=self._loop, log=self.log, lose=self._on_crash)
         self._watches: dict[str, TokenWatch] = {}
         self._heard: dict[Reader[Any], Declared] = {}  # readers that are subscribed
         self._retuned: list[Callable[[], None]] = []
@@ -133,7 +128,7 @@ class Bus:
         topic = of_service(topic, self.service)
         written = self._in_cell(topic)
         writer = Writer(self._session, self.cell, self.service, written)
-        self._own(written.key, topic.key)
+        self._ownership.claim(written.key, topic.key)
         self._writers.append(writer)
         return writer
 
@@ -143,7 +138,7 @@ class Bus:
         The handler raises `Refused` to refuse one; any other exception is told to the requester and ends the service.
         """
         served = self._in_cell(topic)
-        self._own(served.key, topic.key)
+        self._ownership.claim(served.key, topic.key)
         self._servers.append(
             Server(
                 self._session, self.cell, self.service, served, handler, loop=self._loop, log=self.log,
@@ -184,55 +179,14 @@ class Bus:
         """
         self._remapping.require_used(self.service)
         counters = of_service(topics.COUNTERS, self.service)
-        self._own(counters.key, counters.key)
-        for owner in self._owned.values():
-            self._declare_token(f"{self.cell}{owner.token}")
-        await require_only(self._owned, self.owners)
-        self._settle_in()
+        self._ownership.claim(counters.key, counters.key)
+        await self._ownership.settle()
         self._counters = Writer(self._session, self.cell, self.service, counters)
         for server in self._servers:
             server.open()
             self._declare_token(serves_key(self.cell, server.topic.key, self.service))
         self.ready_event.set()
         self._declare_token(alive_key(self.cell, self.service))
-
-    def _settle_in(self) -> None:
-        """Say since when the keys are ours, instead of asking for them, and look out for others who own them."""
-        asked, self._tokens = self._tokens, []
-        process = process_name(self._life, wall_ns())
-        for key, owner in self._owned.items():
-            self._owned[key] = replace(owner, process=process)
-            self._declare_token(f"{self.cell}{self._owned[key].token}")
-        for token in asked:
-            token.undeclare()
-        if not self._owned:
-            return
-        meetings = Meetings(self._owned)
-
-        def judge(other: Owner) -> None:
-            stays, told = meetings.judge(other)
-            if self._closed or not told:
-                return
-            if stays:
-                self.log.warning("%s", told)
-            else:
-                self._on_crash(ConfigError(f"services.{self.service}", ..., told))
-
-        def hear(token: str, there: bool) -> None:
-            if (other := meetings.hear(token, there)) is not None:
-                self._loop.call_later(MEET, judge, other)
-
-        self._owners = TokenWatch(self._session, owns_key(self.cell), self._loop, name=str)
-        self._owners.on_change(hear)
-
-    def _own(self, key: str, own: str) -> None:
-        """Take note that a key is written or served here."""
-        if key in SHARED or key in self._owned:
-            return
-        since = wall_ns() if self.ready_event.is_set() else None
-        self._owned[key] = Owner(key, own, self.service, process_name(self._life, since))
-        if since is not None:
-            self._declare_token(f"{self.cell}{self._owned[key].token}")
 
     def _watch(self, key: str) -> TokenWatch:
         # One for each key: a second would be answered from what the first has seen so far, which may be nothing yet.
@@ -259,12 +213,7 @@ class Bus:
 
     async def owners(self) -> list[Owner]:
         """Who writes or serves what in the cell now: services that are ready or just become so."""
-        if self._owners is None:
-            tokens = frozenset(await self.raw_tokens(owns_key(self.cell)))
-        else:  # while they are watched, Zenoh would only tell of those that the watch has seen so far
-            await self._owners.known(1.0)
-            tokens = self._owners.names
-        return who_owns(tokens)
+        return await self._ownership.owners()
 
     def header(self, frame_id: str = "") -> Header:
         """A header with the cell time of now."""
@@ -358,15 +307,7 @@ class Bus:
 
     async def raw_tokens(self, key: str, timeout: float = 1.0) -> list[str]:
         """The liveliness tokens that match a full key expression, such as `*/alive/*`, now."""
-        tokens: list[str] = []
-        done = asyncio.Event()
-        self._session.get_tokens(
-            key, tokens.append, lambda: call_on_loop(self._loop, done.set), timeout=timeout
-        )
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(timeout):
-                await done.wait()
-        return sorted(tokens)
+        return await tokens_now(self._session, key, self._loop, timeout)
 
     # --- life -----------------------------------------------------------------------------------------------------
 
@@ -428,5 +369,6 @@ class Bus:
             self._beat.cancel()
         for token in reversed(self._tokens):
             token.undeclare()
+        self._ownership.close()
         for server in self._servers:
             await server.close()

@@ -7,12 +7,16 @@ they started, see each other when it is whole again: the one that was ready firs
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable, Mapping
-from dataclasses import dataclass
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 
 from common.errors import ConfigError
+from common.sources import new_id, wall_ns
 from common.topics import general_key
 from common.transport.keys import owns_key
+from common.transport.session import Declared, Session
+from common.transport.tokens import TokenWatch, tokens_now
 
 # What the supervisors of linked hosts say under one key; the readers tell them apart.
 SHARED = ("log/supervisor", "counters/supervisor", "supervisor/status")
@@ -77,59 +81,115 @@ def who_owns(tokens: Iterable[str]) -> list[Owner]:
     return [found[one] for one in sorted(found)]
 
 
-async def require_only(mine: Mapping[str, Owner], look: Callable[[], Awaitable[list[Owner]]]) -> None:
-    """Return when nobody else writes or serves what is ours; our own tokens are declared, so that one of two gives way.
+class Ownership:
+    """What a service writes and serves in its cell, with a token for each key, and who else has one of them."""
 
-    Args:
-        mine: by key.
-        look: who owns what now.
-
-    Raises:
-        ConfigError: somebody else does, and goes on doing so; names both and what helps.
-    """
-    deadline = asyncio.get_running_loop().time() + GIVE_UP
-    while True:
-        others = [each for each in await look() if each.key in mine and each.life != mine[each.key].life]
-        if not others:
-            return
-        if asyncio.get_running_loop().time() > deadline:
-            other = min(others, key=lambda each: (general_key(each.key) != each.key, each.service, each.key))
-            raise ConfigError(f"services.{mine[other.key].service}", ..., refusal(mine[other.key], other))
-        await asyncio.sleep(LOOK_PERIOD)
-
-
-class Meetings:
-    """Those who own what is ours, as far as they have shown up since we are ready."""
-
-    def __init__(self, mine: Mapping[str, Owner]) -> None:
-        """Know of nobody.
+    def __init__(
+        self, session: Session, cell: str, service: str, *, loop: asyncio.AbstractEventLoop, log: logging.Logger,
+        lose: Callable[[ConfigError], None],
+    ) -> None:
+        """Own nothing yet.
 
         Args:
-            mine: by key.
+            session: connection to the network.
+            cell: name of the cell.
+            service: name of the service.
+            loop: on which all of this runs.
+            log: of the service.
+            lose: called when a key of ours is that of somebody else, who was there first: this one has to end.
         """
-        self._mine = mine
-        self._there: set[Owner] = set()
-        self._told: set[str] = set()  # processes
+        self._session, self._cell, self._service = session, cell, service
+        self._loop, self._log, self._lose = loop, log, lose
+        self._life = new_id()
+        self._mine: dict[str, Owner] = {}  # by key
+        self._tokens: list[Declared] = []
+        self._settled = False
+        self._all: TokenWatch | None = None
+        self._others: set[Owner] = set()  # of keys of ours, as far as they have shown up since
+        self._told: set[str] = set()  # of whom, by process
 
-    def hear(self, token: str, there: bool) -> Owner | None:
-        """Take note of a token; who is to be looked at again in a moment, if it is of another owner of ours."""
+    def claim(self, key: str, own: str) -> None:
+        """Take note that a key is written or served here, under a word of our own; it is ours from `settle` on."""
+        if key in SHARED or key in self._mine:
+            return
+        since = wall_ns() if self._settled else None
+        self._mine[key] = Owner(key, own, self._service, process_name(self._life, since))
+        if since is not None:
+            self._declare(self._mine[key])
+
+    async def settle(self) -> None:
+        """Return when all that was claimed is ours; from then on look out for others who own it too.
+
+        Raises:
+            ConfigError: it is somebody else's, and stays so; names both and what helps.
+        """
+        for owner in self._mine.values():  # asked for aloud, so that one of two that ask gives way
+            self._declare(owner)
+        await self._require_only()
+        asked, self._tokens = self._tokens, []
+        process = process_name(self._life, wall_ns())
+        for key, owner in self._mine.items():
+            self._mine[key] = replace(owner, process=process)
+            self._declare(self._mine[key])
+        for token in asked:
+            token.undeclare()
+        self._settled = True
+        if self._mine:
+            self._all = TokenWatch(self._session, owns_key(self._cell), self._loop, name=str)
+            self._all.on_change(self._hear)
+
+    async def owners(self) -> list[Owner]:
+        """Who writes or serves what in the cell now: services that are ready or just become so."""
+        if self._all is None:
+            tokens = frozenset(await tokens_now(self._session, owns_key(self._cell), self._loop, 1.0))
+        else:  # while they are watched, Zenoh would only tell of those that the watch has seen so far
+            await self._all.known(1.0)
+            tokens = self._all.names
+        return who_owns(tokens)
+
+    def close(self) -> None:
+        """Own nothing any more."""
+        for token in reversed(self._tokens):
+            token.undeclare()
+        self._mine.clear()
+        self._others.clear()
+
+    def _declare(self, owner: Owner) -> None:
+        self._tokens.append(self._session.token(f"{self._cell}{owner.token}"))
+
+    async def _require_only(self) -> None:
+        deadline = self._loop.time() + GIVE_UP
+        while True:
+            others = [each for each in await self.owners() if each.key in self._mine and each.life != self._life]
+            if not others:
+                return
+            if self._loop.time() > deadline:
+                other = min(others, key=lambda each: (general_key(each.key) != each.key, each.service, each.key))
+                raise ConfigError(f"services.{self._service}", ..., refusal(self._mine[other.key], other))
+            await asyncio.sleep(LOOK_PERIOD)
+
+    def _hear(self, token: str, there: bool) -> None:
+        """Take note of a token; of another owner of what is ours it is looked at again in a moment."""
         other = Owner.of(token)
-        if (mine := self._mine.get(other.key)) is None or other.life == mine.life:
-            return None
-        (self._there.add if there else self._there.discard)(other)
-        return other if there else None
+        if other.key not in self._mine or other.life == self._life:
+            return
+        (self._others.add if there else self._others.discard)(other)
+        if there:
+            self._loop.call_later(MEET, self._judge, other)
 
-    def judge(self, other: Owner) -> tuple[bool, str]:
-        """Whether we stay, and what is to be said, if it is news."""
+    def _judge(self, other: Owner) -> None:
+        """Say who of the two stays, if that is news; lose if it is the other."""
+        if other not in self._others:
+            return
         mine = self._mine[other.key]
-        stays = mine.was_before(other)
-        if other not in self._there or (stays and other.life in self._told):
-            return True, ""
+        who = f"another {other.service}" if other.service == self._service else other.service
+        who = f"{who} (process {other.life})"
+        if not mine.was_before(other):
+            told = f"{who} has {mine.key} and was there first: this one ends"
+            self._lose(ConfigError(f"services.{self._service}", ..., told))
+        elif other.life not in self._told:
+            self._log.warning("%s claims %s too and gives way: this one was there first", who, mine.key)
         self._told.add(other.life)
-        who = f"another {other.service}" if other.service == mine.service else other.service
-        if stays:
-            return True, f"{who} (process {other.life}) claims {mine.key} too and gives way: this one was there first"
-        return False, f"{who} (process {other.life}) has {mine.key} and was there first: this one ends"
 
 
 def refusal(mine: Owner, other: Owner) -> str:

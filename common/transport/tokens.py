@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator, Callable
 
 from common.transport.handoff import call_on_loop
@@ -93,6 +94,17 @@ class TokenWatch:
         if before != now:
             for changed in self._waiters:
                 changed.set()
+
+
+async def tokens_now(session: Session, key: str, loop: asyncio.AbstractEventLoop, timeout: float) -> list[str]:
+    """The tokens under a full key expression that are there now, as far as they are known after `timeout` seconds."""
+    tokens: list[str] = []
+    done = asyncio.Event()
+    session.get_tokens(key, tokens.append, lambda: call_on_loop(loop, done.set), timeout=timeout)
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(timeout):
+            await done.wait()
+    return sorted(tokens)
 
 
 def _name(token: str) -> str:

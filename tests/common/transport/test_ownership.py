@@ -15,7 +15,7 @@ from common.messages import TaskCommand, TaskStatus
 from common.transport import ownership
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
-from common.transport.ownership import Owner, process_name, who_owns
+from common.transport.ownership import Owner, Ownership, process_name, who_owns
 
 NewBus = Callable[..., Awaitable[Bus]]
 
@@ -82,14 +82,14 @@ async def test_second_writer_waits_for_the_first_to_go(new_bus: NewBus, monkeypa
     for bus in (before, after):
         bus.writer(topics.CAMERA_IMAGE)
     await before.ready()
-    looked, look = asyncio.Event(), after.owners
+    looked, look = asyncio.Event(), Ownership.owners
 
-    async def owners() -> list[Owner]:
-        found = await look()
+    async def owners(ownership: Ownership) -> list[Owner]:
+        found = await look(ownership)
         looked.set()
         return found
 
-    monkeypatch.setattr(after, "owners", owners)
+    monkeypatch.setattr(Ownership, "owners", owners)
     becoming = asyncio.create_task(after.ready())
     await looked.wait()
     assert not becoming.done()
@@ -163,7 +163,7 @@ class Split:
 async def test_split_network_that_is_whole_again_leaves_the_one_that_was_there_first(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, first: int
 ) -> None:
-    monkeypatch.setattr("common.transport.bus.MEET", 0.0)
+    monkeypatch.setattr("common.transport.ownership.MEET", 0.0)
     split = Split()
     for side in (first, 1 - first):
         await split.start(side)
@@ -177,7 +177,7 @@ async def test_split_network_that_is_whole_again_leaves_the_one_that_was_there_f
 async def test_second_service_that_is_started_while_one_is_up_is_told_of_by_both(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("common.transport.bus.MEET", 0.0)
+    monkeypatch.setattr("common.transport.ownership.MEET", 0.0)
     monkeypatch.setattr(ownership, "GIVE_UP", 0.3)
     split = Split()
     await split.start(0)
