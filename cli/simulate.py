@@ -29,6 +29,10 @@ def simulate(
     seeds: Annotated[str | None, typer.Option("--seeds", metavar="A-B", help="a run for each of them [1-20]")] = None,
     seed: Annotated[str | None, typer.Option("--seed", metavar="N", help="just this one, told in full")] = None,
     faults: Annotated[bool, typer.Option("--faults", help="crashes, cut links, messages that go astray")] = False,
+    doubles: Annotated[
+        bool, typer.Option("--doubles", help="of perception and planner: task, executor and supervisor as they are, in "
+                                             "many more seeds")
+    ] = False,
     trace: Annotated[
         str | None, typer.Option("--trace", metavar="FILE.mcap", help="of --seed: a recording of all that travelled")
     ] = None,
@@ -45,6 +49,7 @@ def simulate(
     """
     from common.config import load_cell
     from common.errors import ConfigError
+    from common.virtual.doubles import settings_of, with_doubles
     from common.virtual.watched_arm import with_watched_arm
 
     if seeds is not None and seed is not None:
@@ -58,6 +63,9 @@ def simulate(
     if longest <= 0:
         raise ConfigError("--limit", limit, "must be more than 0 [s]")
     loaded = load_cell(cell, overrides or (), world=world)
+    if doubles:
+        given = (*settings_of(loaded.application), *(overrides or ()))
+        loaded = with_doubles(load_cell(cell, given, world=world))
     with_watched_arm(loaded)  # says in one line what cannot be simulated
     if one is None:
         raise typer.Exit(_campaign(loaded, several, faults, at_a_time, longest))

@@ -14,6 +14,9 @@ What it brings lies in modules of these names within the package, or else in the
     page      (optional) labels and layers of the operator's page
     recording (optional) how its messages are written for other tools, as common/recording/foxglove.py says
     verbs     (optional) verbs of the command line, as common/verbs.py says
+    double    (optional) a service, with `Config` and `run`, that stands for its perception in `simulate --doubles`:
+                REPLACES   kinds of the services that it stands for
+                SETTINGS   (optional) of a cell in which it does, as of `--set`: what makes a run short
 
 `TASK` in the package itself names the service that decides; without it the cell's `task` does. `GRASPS = True` says
 that the task takes objects in the hand, `FILLS = True` that `done` of its status counts those in containers.
@@ -99,6 +102,12 @@ class Application:
     def views(self) -> dict[Topic[Any], Callable[[WorldObjects], Message]]:
         """What the truth is called in the application: a message for each of these topics, made of the world's."""
         return self.find("topics", "VIEWS") or {}
+
+    @property
+    def double(self) -> ModuleType | None:
+        """The service that stands for its perception in a simulation, or None."""
+        found = self.part("double")
+        return found if hasattr(found, "REPLACES") else None
 
     @property
     def topics(self) -> dict[str, AnyTopic]:

@@ -90,7 +90,7 @@ class PlanningPipeline:
             if result.error != NOT_APPLICABLE:
                 attempts += _recorded(name, result, monotonic() - since)
             if trajectory is not None:
-                message = _message(self.robot, trajectory)
+                message = trajectory_message(self.robot, trajectory)
                 return PlanResponse(
                     id=request.id,
                     ok=True,
@@ -260,7 +260,8 @@ def _failed(
     )
 
 
-def _message(robot: RobotModel, trajectory: TimedPath) -> JointTrajectory:
+def trajectory_message(robot: RobotModel, trajectory: TimedPath) -> JointTrajectory:
+    """The message of a trajectory that was found good."""
     # Validation has just found these numbers finite and in shape: checking each again would take milliseconds.
     columns = (
         trajectory.times.tolist(),

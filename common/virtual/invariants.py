@@ -36,6 +36,7 @@ from common.topics import AnyTopic
 from common.transport.codec import decode
 from common.transport.local import intersects
 from common.transport.session import RawSample
+from common.virtual.doubles import is_double
 from common.virtual.process import Requests
 
 Place = tuple[float, float, float]  # x, y, z [m]
@@ -48,12 +49,13 @@ MOST_BROKEN = 5  # are told of
 OLDEST = 2.3  # [s] from when a motion is decided to its begin; later ones are refused, by clocks that are wrong
 LATE = 0.5  # [s] that the end of a request may come after its time-out
 MOVED = 2e-3  # [m] farther from where it lay, a thing was moved
-JUMP = 0.02  # [rad] from where the arm was to the first set-point of another process
+JUMP = 2.0  # [rad/s] times a period: from where the arm was to the first set-point of another process
 AT_REST = 2.0  # [s] of cell time after which an arm that is held is at rest
 STILL = 1e-9  # [rad]
 ENDS = ("stop", "pause")
+EXECUTOR, RATE = "trajectory_executor", 100.0  # [Hz] its cycles, if the cell does not say
 UNTOLD = 3  # set-points that may come before it is told of the goal, or of being let go
-CYCLE = 0.025  # [s] of cell time at most between two cycles of a controller in time; a late one moves no further
+CYCLES = 2.5  # periods at most between two cycles of a controller in time; a late one moves no further
 STALL = 0.3  # [s] of cell time after which a trajectory goes on where it was
 CARRIED, CONTAINED, LOST = ("held", "falling"), "contained", "elsewhere"  # what the truth says of an object
 
@@ -69,6 +71,13 @@ TRUTH = "nothing that decides saw the truth"
 OUTCOMES = "every request ends in one of five ways"
 NEWER = "nothing is read twice, or after what is newer"
 BELIEVED = "as many lie there as the task says"
+
+
+def rate_of(cell: Cell) -> float:
+    """Cycles of its controller per second of cell time."""
+    entries = [entry for entry in cell.services.values() if entry.kind == EXECUTOR]
+    return next((float(entry.parameters["joint_state_rate"]) for entry in entries
+                 if "joint_state_rate" in entry.parameters), RATE)
 
 
 @dataclass
@@ -92,6 +101,8 @@ class Invariants:
         requests.on_ask, requests.on_serve, requests.on_answer = self._on_ask, self._on_serve, self._on_answer
         application = find_application(cell.application)
         self._fills = application.fills
+        self._doubles = {entry.name for entry in cell.services.values() if is_double(entry)}
+        self._cycle = CYCLES / rate_of(cell)  # [s] of cell time
         known: dict[str, AnyTopic] = {**topics.platform_topics(), **application.topics}
         self._objects = f"{cell.name}/{topics.SCENE_OBJECTS.key}"
         self._truth = [self._objects, *(f"{cell.name}/{view.key}" for view in application.views)]
@@ -141,7 +152,7 @@ class Invariants:
             life: name and number of it, another after each start.
             sample: as it travels.
         """
-        if service in self.truth_readers:
+        if service in self.truth_readers and service not in self._doubles:
             model = self._messages.get(sample.encoding.rpartition(";")[2], Message)
             if self._broke(issubclass(model, SEEN_BY_CAMERAS), TRUTH):
                 self._tell(TRUTH, f"{service} hears it and says {sample.key}")
@@ -214,15 +225,15 @@ class Invariants:
             return
         passed, way = now - last[2], np.abs(q - last[0])
         if passed <= 0 or passed > STALL:  # another process, or one that stood still
-            if self._broke((way <= JUMP).all(), LIMITS):
+            if self._broke((way <= JUMP * self._cycle / CYCLES).all(), LIMITS):
                 self._tell(LIMITS, f"a jump of {way.max():.3f} rad after {passed:.3f} s")
             return
-        if self._broke((way <= fastest * min(passed, CYCLE) + 1e-3).all(), LIMITS):
+        if self._broke((way <= fastest * min(passed, self._cycle) + 1e-3).all(), LIMITS):
             self._tell(LIMITS, f"a step of {way.max():.4f} rad in {passed * 1e3:.1f} ms")
         change = np.abs(dq - last[1])
-        if self._broke((change <= 1.1 * limits.braking * max(passed, 0.01) + 1e-3).all(), LIMITS):
+        if self._broke((change <= 1.1 * limits.braking * max(passed, self._cycle / CYCLES) + 1e-3).all(), LIMITS):
             self._tell(LIMITS, f"velocity changes by {change.max():.3f} rad/s in {passed * 1e3:.1f} ms")
-        if way.max() <= STILL or passed > 2 * CYCLE:
+        if way.max() <= STILL or passed > 2 * self._cycle:
             return
         goals = self._goals.get(self._motion)
         self._stray = 0 if goals is not None and goals.active else self._stray + 1

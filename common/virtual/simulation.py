@@ -33,6 +33,7 @@ from common.supervision.supervisor import Supervisor
 from common.transport.bus import Bus
 from common.transport.codec import decode
 from common.transport.session import RawSample
+from common.virtual.doubles import is_double
 from common.virtual.faults import Plan, make_plan
 from common.virtual.invariants import Invariants
 from common.virtual.loop import VirtualLoop
@@ -48,6 +49,7 @@ SETTLE = 2.0  # [s] of virtual time for what still falls when the task has ended
 CLEARING = 30.0  # [s] of virtual time for what was cut off to come to its end
 SUPERVISOR, VISITOR, HOST = "supervisor", "visitor", "simulated"
 ENDED = ("DONE", "ERROR")
+SOONER = 0.5  # faults come in a cell with doubles, whose task takes half as long
 LEFT_OUT = ("viewer",)  # a page in a browser has no place on a virtual clock
 
 Visit = Callable[[Bus], Coroutine[Any, Any, None]]
@@ -107,7 +109,8 @@ class Simulation:
         kept = {key: entry for key, entry in cell.services.items() if entry.name not in LEFT_OUT}
         self.cell = with_watched_arm(cell.model_copy(update={"services": kept}))
         names = [entry.name for entry in kept.values()]
-        self.plan = make_plan(seed, names) if faults else Plan()
+        doubled = any(is_double(entry) for entry in kept.values())
+        self.plan = make_plan(seed, names, SOONER if doubled else 1.0) if faults else Plan()
         self.outcome = Outcome(seed)
         self._limit, self._trace, self._tell, self._visit = limit, trace, tell, visit
         self._failed: Exception | None = None  # of the visit

@@ -1,0 +1,96 @@
+"""A double of the motion planner, for simulations: interpolates between joint positions, through whatever is there."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common import messages as m
+from common import topics
+from common.config import Motion, Parameters, RobotConfig
+from common.errors import Refused
+from common.planning.pipeline import trajectory_message
+from common.planning.planners.joint_move import straight_profile
+from common.planning.retiming import TimedPath, join
+from common.robot.ik import solve_ik
+from common.robot.model import RobotModel
+from common.robot.transforms import pose_to_matrix
+from common.transport.bus import Bus
+
+Array = NDArray[np.float64]
+
+MOST_POSES = 200  # of a path
+
+
+class Config(Parameters):
+    """How fast it is."""
+
+    robot: RobotConfig
+    motion: Motion
+
+
+def waypoints(robot: RobotModel, start: Array, goal: object) -> list[Array]:
+    """Joint positions [rad] to come to rest at, one after the other.
+
+    Raises:
+        Refused: the goal is out of reach, or none of joints, pose and path.
+    """
+    if isinstance(goal, m.JointGoal):
+        return [robot.named(goal.named) if goal.named else np.array(goal.positions)]
+    if not isinstance(goal, m.PoseGoal | m.PathGoal):
+        raise Refused("not_applicable", f"the planner's double knows no {type(goal).__name__}")
+    poses = [goal.pose] if isinstance(goal, m.PoseGoal) else goal.waypoints[1:MOST_POSES]
+    found = [start]
+    for pose in poses:
+        q = solve_ik(robot, pose_to_matrix(pose), found[-1])
+        if q is None:
+            raise Refused("no_ik", f"({pose.position.x:.3f}, {pose.position.y:.3f}, {pose.position.z:.3f}) is out of "
+                                   "reach")
+        found.append(q)
+    return found[1:]
+
+
+def plan(robot: RobotModel, motion: Motion, request: m.PlanRequest, current: Array | None) -> m.PlanResponse:
+    """A trajectory that any controller can follow."""
+    start = np.array(request.start) if request.start else current
+    if start is None:
+        raise Refused("no_state", f"{request.stage or request.id}: the joint states are not known yet")
+    velocity = robot.velocity * (request.velocity_scaling or motion.velocity_scaling)
+    scaling = request.acceleration_scaling or motion.acceleration_scaling
+    parts: list[TimedPath] = []
+    try:
+        for q in waypoints(robot, start, request.goal):
+            parts.append(straight_profile(start, q, velocity, robot.acceleration * scaling, robot.jerk * scaling))
+            start = q
+    except Refused as error:
+        return m.PlanResponse(id=request.id, ok=False, error=error.code, message=str(error))
+    return m.PlanResponse(id=request.id, ok=True, trajectory=trajectory_message(robot, join(parts)), fraction=1.0)
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Serve plan requests as `motion_planner` does, from the newest joint states unless a start is given."""
+    scenes, states = bus.reader(topics.PLANNING_SCENE), bus.reader(topics.JOINT_STATES)
+    display = bus.writer(topics.DISPLAY_TRAJECTORY)
+    robot = RobotModel.load(config.robot)
+    one_at_a_time = asyncio.Lock()
+
+    async def handle(request: m.PlanRequest) -> m.PlanResponse:
+        async with one_at_a_time:
+            if scenes.latest is None:
+                raise Refused("no_scene", f"{request.stage or request.id}: there is no planning scene yet")
+            state = states.latest
+            current = None if state is None else robot.order(state.name, state.position)
+            response = await asyncio.to_thread(plan, robot, config.motion, request, current)
+        response.header = bus.header()
+        if response.trajectory is not None:
+            response.trajectory.header = bus.header()
+            display.put(response.trajectory)
+        else:
+            bus.log.warning("%s [%s]", response.message, response.error)
+        return response
+
+    bus.serve(topics.MOTION_PLAN, handle)
+    await bus.ready()
+    await asyncio.Event().wait()
