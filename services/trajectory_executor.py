@@ -223,32 +223,43 @@ async def run(bus: Bus, config: Config) -> None:
         bus.log.info("the arm and what is about it are as they were")
     alone, task = Alone(), config.members.task
     loop = asyncio.get_running_loop()
+    due = loop.time()
+
+    def turn() -> None:
+        nonlocal due
+        cycle.speed_scaling = config.speed_scaling
+        report = cycle.step(bus.header("world"))
+        if memory is not None and (standing := cycle.standing()) is not None:
+            memory.save(standing)
+        if report.joints is not None:
+            joints.put(report.joints)
+        if report.motion is not None:
+            motion.put(report.motion)
+            if report.motion.state == "aborted":
+                bus.log.warning("goal %s: %s [%s]", report.motion.id, report.motion.message, report.motion.error)
+        if report.gripper is not None and gripper is not None:
+            gripper.put(report.gripper)
+        if report.objects is not None and objects is not None:
+            objects.put(report.objects)
+            for writer, view in called:
+                writer.put(view(report.objects))
+        if updates is not None:
+            for update in report.updates:
+                updates.put(update)
+        due = max(due + period, loop.time())  # after an overrun from now on: no burst
+
     try:
         await bus.ready()
-        due = loop.time()
         while True:
-            cycle.speed_scaling = config.speed_scaling
             cycle.wait(alone.look(task in bus.alive, cycle.goal, config.when_alone), f"{task} is gone")
-            report = cycle.step(bus.header("world"))
-            if memory is not None and (standing := cycle.standing()) is not None:
-                memory.save(standing)
-            if report.joints is not None:
-                joints.put(report.joints)
-            if report.motion is not None:
-                motion.put(report.motion)
-                if report.motion.state == "aborted":
-                    bus.log.warning("goal %s: %s [%s]", report.motion.id, report.motion.message, report.motion.error)
-            if report.gripper is not None and gripper is not None:
-                gripper.put(report.gripper)
-            if report.objects is not None and objects is not None:
-                objects.put(report.objects)
-                for writer, view in called:
-                    writer.put(view(report.objects))
-            if updates is not None:
-                for update in report.updates:
-                    updates.put(update)
-            due = max(due + period, loop.time())  # after an overrun from now on: no burst
+            turn()
             await asyncio.sleep(due - loop.time())
+    except asyncio.CancelledError:  # whatever ends it: the arm comes to rest on its path first
+        cycle.wait(True, f"{bus.service} ends")
+        while not cycle.at_rest:
+            await asyncio.sleep(due - loop.time())
+            turn()
+        raise
     finally:
         cycle.close()
         if memory is not None:

@@ -157,6 +157,11 @@ class TrajectoryController:
         """Id of the goal that moves the robot; empty when there is none."""
         return self._goal.id if self._goal else ""
 
+    @property
+    def at_rest(self) -> bool:
+        """Whether the set-points rest, or there are none because the hardware does not work."""
+        return bool(self._fault) or self._limiter.at_rest
+
     def _as_of_now(self, status: MotionStatus) -> MotionStatus:
         now: dict[str, object] = {
             "held": bool(self._holds), "held_by": sorted(self._holds), "speed_scaling": self.speed_scaling,

@@ -211,6 +211,11 @@ class ControlCycle:
         return self._arm.goal
 
     @property
+    def at_rest(self) -> bool:
+        """Whether nothing moves the arm any more."""
+        return self._arm.at_rest
+
+    @property
     def speed_scaling(self) -> float:
         """Share of their speed at which trajectories are followed, 0 to 1."""
         return self._arm.speed_scaling

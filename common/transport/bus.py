@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from common import topics
 from common.clock import Clock
+from common.errors import ConfigError
 from common.messages import Header, Message, ServiceCounters
 from common.remapping import Remapping
 from common.topics import PublishedKind, Request, Topic, of_service
@@ -77,7 +78,9 @@ class Bus:
         self._raw_states: list[RawWriter] = []
         self._servers: list[Server[Any, Any]] = []
         self._tokens: list[Declared] = []
-        self._ownership = Ownership(session, cell, service, loop=self._loop, log=self.log, lose=self._on_crash)
+        self._ownership = Ownership(
+            session, cell, service, loop=self._loop, warn=lambda told: self.log.warning("%s", told), lose=self._lose)
+        self._lost = False  # what is ours to somebody else
         self._watches: dict[str, TokenWatch] = {}
         self._heard: dict[Reader[Any], Declared] = {}  # readers that are subscribed
         self._retuned: list[Callable[[], None]] = []
@@ -338,17 +341,33 @@ class Bus:
             self._crash.set_result(error)
 
     async def run(self, service: Coroutine[Any, Any, None]) -> None:
-        """Run a service's coroutine to its end; a handler that crashes ends it with that exception."""
+        """Run a service's coroutine to its end; it is cancelled when a handler crashes, or a key is another's.
+
+        Whatever ends it, a service that moves something brings it to rest when it is cancelled, and has a second.
+        """
         self._running = True
         task = asyncio.create_task(service, name=self.service)
         both: set[asyncio.Future[Any]] = {task, self._crash}
         try:
             await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
+            if self._lost:
+                await self._withdraw()
         finally:
             await self._end(task)
         if self._crash.done():
             raise self._crash.result()
         await task
+
+    def _lose(self, error: ConfigError) -> None:
+        self._lost = True
+        self._on_crash(error)
+
+    async def _withdraw(self) -> None:
+        """Leave the keys to who else has them: nothing is served any more, and nothing written but the log."""
+        await self.close()
+        for writer in self._writers:
+            if not writer.topic.signed:
+                writer.close()
 
     async def _end(self, task: asyncio.Task[None]) -> None:
         if task.done():

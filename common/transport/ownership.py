@@ -7,7 +7,6 @@ they started, see each other when it is whole again: the one that was ready firs
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
@@ -85,8 +84,8 @@ class Ownership:
     """What a service writes and serves in its cell, with a token for each key, and who else has one of them."""
 
     def __init__(
-        self, session: Session, cell: str, service: str, *, loop: asyncio.AbstractEventLoop, log: logging.Logger,
-        lose: Callable[[ConfigError], None],
+        self, session: Session, cell: str, service: str, *, loop: asyncio.AbstractEventLoop,
+        warn: Callable[[str], None], lose: Callable[[ConfigError], None],
     ) -> None:
         """Own nothing yet.
 
@@ -95,11 +94,11 @@ class Ownership:
             cell: name of the cell.
             service: name of the service.
             loop: on which all of this runs.
-            log: of the service.
+            warn: called with a line for the log.
             lose: called when a key of ours is that of somebody else, who was there first: this one has to end.
         """
         self._session, self._cell, self._service = session, cell, service
-        self._loop, self._log, self._lose = loop, log, lose
+        self._loop, self._warn, self._lose = loop, warn, lose
         self._life = new_id()
         self._mine: dict[str, Owner] = {}  # by key
         self._tokens: list[Declared] = []
@@ -188,7 +187,7 @@ class Ownership:
             told = f"{who} has {mine.key} and was there first: this one ends"
             self._lose(ConfigError(f"services.{self._service}", ..., told))
         elif other.life not in self._told:
-            self._log.warning("%s claims %s too and gives way: this one was there first", who, mine.key)
+            self._warn(f"{who} claims {mine.key} too and gives way: this one was there first")
         self._told.add(other.life)
 
 

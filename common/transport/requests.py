@@ -24,7 +24,7 @@ from common.transport.codec import (
 )
 from common.transport.handoff import call_on_loop
 from common.transport.reader import NO_SENDER, Refusals
-from common.transport.session import Query, RawReply, Session
+from common.transport.session import Declared, Query, RawReply, Session
 from common.transport.tokens import TokenWatch
 from common.transport.trace import current_trace, follow
 
@@ -57,10 +57,11 @@ class Server(Generic[Q, A]):
         self._tasks: set[asyncio.Task[None]] = set()
         self._in_order = asyncio.Lock()
         self._session, self._loop = session, loop
+        self._queryable: Declared | None = None
 
     def open(self) -> None:
         """Be asked from now on: not before it is sure that nobody else serves the key, who would miss requests."""
-        self._session.queryable(
+        self._queryable = self._session.queryable(
             self._key, lambda query: call_on_loop(self._loop, lambda: self._start(query)), complete=True)
 
     @property
@@ -134,8 +135,10 @@ class Server(Generic[Q, A]):
             query.reply(self._key, payload, encoding_of(self.topic.answer), attachment)
 
     async def close(self) -> None:
-        """Cancel what is being worked on: its requesters learn that it was lost."""
+        """Be asked no more, and cancel what is being worked on: its requesters learn that it was lost."""
         self._closed = True
+        if self._queryable is not None:
+            self._queryable.undeclare()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)

@@ -41,6 +41,10 @@ class Writer(Generic[M]):
         """Put the value of a state again under the same number: readers that have it ignore it."""
         self._raw.repeat()
 
+    def close(self) -> None:
+        """Send nothing any more, whatever is put."""
+        self._raw.close()
+
 
 class RawWriter:
     """Puts payloads under a full key; from any thread."""
@@ -64,8 +68,7 @@ class RawWriter:
         self._lock = threading.Lock()
         self._last: tuple[bytes, bytes] | None = None
         self._publisher = session.publisher(key, encoding, reliable=kind != "stream")
-        if kind == "state":
-            session.queryable(key, self._answer, complete=False)
+        self._queryable = session.queryable(key, self._answer, complete=False) if kind == "state" else None
 
     @property
     def matched(self) -> bool:
@@ -88,6 +91,13 @@ class RawWriter:
         with self._lock:
             if self._last is not None:
                 self._publisher.put(*self._last)
+
+    def close(self) -> None:
+        """Send nothing any more, whatever is put, and answer nobody."""
+        with self._lock:
+            self._publisher.undeclare()
+        if self._queryable is not None:
+            self._queryable.undeclare()
 
     def _answer(self, query: Query) -> None:
         last = self._last
