@@ -160,7 +160,10 @@ async def run(bus: Bus, config: Config) -> None:
     async def execute(request: ExecuteRequest) -> MotionStatus:
         age = bus.clock.age_ms(request.header.stamp) * 1e-3
         late = objection(age, config.request_timeout, config.clock_tolerance)
-        status = cycle.execute(request, bus.clock.now(), late)
+        judged = None
+        if late is None and cycle.takes_long(request):  # set-points go on leaving meanwhile
+            judged = await asyncio.to_thread(cycle.judge, request)
+        status = cycle.execute(request, bus.clock.now(), late, judged)
         if status.state == "rejected":
             bus.log.warning("goal %s rejected: %s [%s]", request.id, status.message, status.error)
         return status.model_copy(update={"header": bus.header()})

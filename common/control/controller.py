@@ -30,6 +30,7 @@ BLEND_SHARE = 0.5  # of the limits is for that difference at most; else it takes
 BEHIND = 1e-3  # [rad] between path and set-point, at which the goal's time stands still
 ARRIVED = 1e-6  # [rad] nearer, the set-point is on the path
 SLOWEST = 0.01  # of its speed, at which a trajectory is refused instead of being followed so slowly
+LONG = 3000  # points and samples of a trajectory, which cost a few milliseconds
 MOST_SAMPLES = 20_000  # of a trajectory, when it is looked for how fast it can be followed
 
 
@@ -121,6 +122,16 @@ def possible_share(goal: _Goal, limits: Limits, period: float) -> float:
                                    f"than {SLOWEST:.0%} of its speed")
 
 
+@dataclass(frozen=True)
+class Judged:
+    """What was found out about a trajectory, for an arm that begins at `begin` (dof,) [rad]: how it can be followed."""
+
+    begin: Vector
+    trajectory: Trajectory | None = None
+    share: float = 1.0
+    refusal: Refused | None = None
+
+
 class TrajectoryController:
     """Follows one trajectory at a time, and holds still between them."""
 
@@ -172,7 +183,8 @@ class TrajectoryController:
         return status.model_copy(update=now)
 
     def accept(
-        self, goal: str, trajectory: JointTrajectory, now: float, measured: Vector, objection: Refused | None = None
+        self, goal: str, trajectory: JointTrajectory, now: float, measured: Vector, objection: Refused | None = None,
+        judged: Judged | None = None,
     ) -> MotionStatus:
         """The state of the goal: active, or rejected with code and message; for a known id what became of it.
 
@@ -182,6 +194,7 @@ class TrajectoryController:
             now: cell time [s].
             measured: where the robot is, (dof,) [rad].
             objection: what speaks against a new goal from the start.
+            judged: what `judge` found out about the trajectory before.
         """
         known = self._memory.get(goal)
         if known is not None:
@@ -193,30 +206,62 @@ class TrajectoryController:
                 raise Refused("hardware_fault", self._fault)
             if self._goal is not None:
                 raise Refused("busy", f"goal {self._goal.id!r} is still being followed")
-            checked = checked_trajectory(trajectory, self._limits, measured, self._tolerances)
-            # Go on from the set-point, unless the arm was moved from outside since.
-            near = np.all(np.abs(self._hold - measured) <= self._tolerances.start)
-            taken = self._taken(goal, checked, self._hold if near else measured, now)
+            begin = self._begin(measured)
+            if judged is None:
+                judged = self.judge(trajectory, measured, begin)
+            elif np.any(np.abs(begin - judged.begin) > self._tolerances.start):
+                raise Refused("busy", "the arm was moved while the trajectory was looked at")
+            if judged.trajectory is None:
+                assert judged.refusal is not None
+                raise judged.refusal
+            taken = self._taken(goal, judged, begin, now)
         except Refused as refusal:
             rejected = MotionStatus(
                 id=goal, state="rejected", error=refusal.code, message=str(refusal), source=self._name
             )
             return self._as_of_now(self._memory.put(goal, rejected, refused=True))
-        if not near:
+        if begin is not self._hold:
             self._hold = measured.copy()
             if self._limiter.at_rest:
                 self._limiter.rest(measured)
         self._goal = taken
         return self._report("active", message=self._holding(taken))
 
-    def _taken(self, goal: str, trajectory: Trajectory, begin: Vector, now: float) -> _Goal:
-        offset = begin - trajectory.positions[0]
-        blend = blend_time(offset, trajectory.duration, self._limits)
-        taken = _Goal(goal, trajectory, offset, blend, now, Pace(0.0, 0.0 * begin))
-        taken.share = possible_share(taken, self._limits, self._period)
+    def takes_long(self, goal: str, trajectory: JointTrajectory) -> bool:
+        """Whether to `judge` the trajectory of a new goal takes longer than there is time for between set-points."""
+        points = trajectory.points
+        seconds = points[-1].time_from_start if points else 0.0
+        samples = len(points) + min(2 * seconds / self._period, MOST_SAMPLES)
+        return samples > LONG and self._goal is None and not self.knows(goal)
+
+    def judge(self, trajectory: JointTrajectory, measured: Vector, begin: Vector | None = None) -> Judged:
+        """Whether and how a trajectory can be followed from where the arm is, measured (dof,) [rad], and holds now.
+
+        Nothing is changed by it: any thread may ask.
+        """
+        begin = (self._begin(measured) if begin is None else begin).copy()
+        try:
+            checked = checked_trajectory(trajectory, self._limits, measured, self._tolerances)
+            offset = begin - checked.positions[0]
+            blend = blend_time(offset, checked.duration, self._limits)
+            like = _Goal("", checked, offset, blend, 0.0, Pace(0.0, 0.0 * begin))
+            return Judged(begin, checked, possible_share(like, self._limits, self._period))
+        except Refused as refusal:
+            return Judged(begin, refusal=refusal)
+
+    def _begin(self, measured: Vector) -> Vector:
+        """Where a motion begins (dof,) [rad]: at the set-point, unless the arm was moved from outside since."""
+        near = np.all(np.abs(self._hold - measured) <= self._tolerances.start)
+        return self._hold if near else measured
+
+    def _taken(self, goal: str, judged: Judged, begin: Vector, now: float) -> _Goal:
+        assert judged.trajectory is not None
+        offset = begin - judged.trajectory.positions[0]
+        blend = blend_time(offset, judged.trajectory.duration, self._limits)
+        pace = Pace(0.0, 0.0 * begin)
         if not self._holds and self._limiter.at_rest:
-            taken.pace.rate = self.speed_scaling * taken.share
-        return taken
+            pace.rate = self.speed_scaling * judged.share
+        return _Goal(goal, judged.trajectory, offset, blend, now, pace, judged.share)
 
     def cancel(self, goal: str, reason: str, now: float) -> MotionStatus:
         """Begin to bring the robot to rest along its path. An empty id means whatever runs.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from common.config import GripperConfig
 from common.control.checks import Tolerances
-from common.control.controller import PERIOD, TrajectoryController
+from common.control.controller import PERIOD, Judged, TrajectoryController
 from common.control.gripper_controller import GripperController
 from common.control.inhibits import Inhibits
 from common.errors import ConfigError, Refused
@@ -156,10 +156,20 @@ class ControlCycle:
             self._gripper.resume(state.told_width, now)
         self._gripper.update(self._obstructible.read(now))
 
-    def execute(self, request: ExecuteRequest, now: float, objection: Refused | None = None) -> MotionStatus:
+    def takes_long(self, request: ExecuteRequest) -> bool:
+        """Whether to `judge` the request takes longer than there is time for between two cycles."""
+        return self._arm.takes_long(request.id, request.trajectory)
+
+    def judge(self, request: ExecuteRequest) -> Judged:
+        """Whether and how the arm can do what is asked; nothing is changed by it: any thread may ask."""
+        return self._arm.judge(request.trajectory, self._q)
+
+    def execute(
+        self, request: ExecuteRequest, now: float, objection: Refused | None = None, judged: Judged | None = None
+    ) -> MotionStatus:
         """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
         inhibited = self._inhibits.objection(request.id, request.owner, request.heard)
-        return self._arm.accept(request.id, request.trajectory, now, self._q, inhibited or objection)
+        return self._arm.accept(request.id, request.trajectory, now, self._q, inhibited or objection, judged)
 
     def stop(self, request: StopRequest, now: float) -> MotionStatus:
         """The state of the goal, which is being brought to rest if it was moving the robot.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Generic, TypeVar
 
@@ -31,12 +32,16 @@ from common.transport.trace import current_trace, follow
 Q = TypeVar("Q", bound=Message)
 A = TypeVar("A", bound=Message)
 
+_MOST_WAITING = 1000  # requests that are not begun yet
 _LOOK_SECONDS = 1.0  # how long a new client looks for servers before a request is given up unsent
 _VANISH_SECONDS = 0.25  # the token of a server that has just answered may be gone before its answer is here
 
 
 class Server(Generic[Q, A]):
-    """Answers requests with a handler, each in a task of its own."""
+    """Answers requests with a handler, each in a task of its own.
+
+    Of many that come at once one is begun in each turn of the loop, so that all else has its turns between them.
+    """
 
     def __init__(
         self, session: Session, cell: str, service: str, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]],
@@ -55,6 +60,8 @@ class Server(Generic[Q, A]):
         self._limit = limit
         self._refusals = Refusals(topic.key, loop, log)
         self._tasks: set[asyncio.Task[None]] = set()
+        self._waiting: deque[Query] = deque()
+        self._beginning = False  # one has not had its turn yet
         self._in_order = asyncio.Lock()
         self._session, self._loop = session, loop
         self._queryable: Declared | None = None
@@ -74,11 +81,25 @@ class Server(Generic[Q, A]):
             query.finish()
             return
         self.received += 1
+        if len(self._waiting) >= _MOST_WAITING:
+            query.refuse(encode_error("busy", f"{_MOST_WAITING} requests wait already"))
+            query.finish()
+            return
+        if self._beginning:
+            self._waiting.append(query)
+        else:
+            self._begin(query)
+
+    def _begin(self, query: Query) -> None:
+        self._beginning = True
         task = asyncio.create_task(self._serve(query), name=f"{self.topic.key} request")
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     async def _serve(self, query: Query) -> None:
+        self._beginning = False
+        if self._waiting:
+            self._begin(self._waiting.popleft())
         try:
             payload = self._check(query)
             if payload is None:
@@ -139,6 +160,8 @@ class Server(Generic[Q, A]):
         self._closed = True
         if self._queryable is not None:
             self._queryable.undeclare()
+        while self._waiting:
+            self._waiting.pop().finish()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)

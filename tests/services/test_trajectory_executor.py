@@ -1,5 +1,6 @@
 import asyncio
 import json
+import threading
 from contextlib import asynccontextmanager
 
 import msgpack
@@ -11,6 +12,8 @@ from common import topics
 from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.config import load_cell, service_config
+from common.control.cycle import ControlCycle
+from common.control.record_file import RecordFile
 from common.errors import ConfigError, RemoteError, UnknownName
 from common.messages import (
     ExecuteRequest,
@@ -498,3 +501,58 @@ async def test_what_was_kept_of_another_layout_is_not_used(
         assert len((await person.see(person.balls, lambda _: True)).ids) == 1
         found = await person.see(person.joints, lambda _: True)
         assert found.position[: robot.dof] == pytest.approx(home)
+
+
+@asynccontextmanager
+async def blocked(monkeypatch, where, name: str):
+    """A method that takes as long as the block does; yields an event that is set once it was called."""
+    loop, entered, go_on = asyncio.get_running_loop(), asyncio.Event(), threading.Event()
+    method = getattr(where, name)
+
+    def wait(*arguments, **named):
+        loop.call_soon_threadsafe(entered.set)
+        assert go_on.wait(20)
+        return method(*arguments, **named)
+
+    monkeypatch.setattr(where, name, wait)
+    try:
+        yield entered
+    finally:
+        go_on.set()
+
+
+async def goes_on(person: Person, cycles: int = 20) -> None:
+    """Return when so many more joint states were taken."""
+    async with asyncio.timeout(20):
+        stamps = {(await person.joints.next()).header.stamp for _ in range(cycles)}
+    assert len(stamps) == cycles
+
+
+async def test_joint_states_go_on_while_a_long_trajectory_is_looked_at_and_a_stop_meanwhile_counts(
+    robot: RobotModel, monkeypatch
+) -> None:
+    home = robot.named("home")
+    there = move(robot, home, home + 0.3)
+    still = [JointTrajectoryPoint(time_from_start=60.0 + i, positions=there.points[-1].positions, velocities=[0.0] * 7,
+                                  accelerations=[0.0] * 7) for i in range(4000)]
+    long = there.model_copy(update={"points": [*there.points, *still]})
+    async with executor() as person:
+        async with blocked(monkeypatch, ControlCycle, "judge") as judging:
+            asked = asyncio.create_task(person.execute.call(person.asks(id="long", trajectory=long)))
+            await judging.wait()
+            await goes_on(person)
+            await person.stop.call(StopRequest(id="", by="person", owner="anna"))
+        answer = await asked
+        assert (answer.state, answer.error) == ("rejected", "stopped")
+        await person.hold.call(HoldRequest(hold=False, stops=True, owner="anna"))
+        answer = await person.execute.call(person.asks(id="again", trajectory=long))
+        assert answer.state == "active", answer.message
+
+
+async def test_joint_states_go_on_while_a_hold_is_recorded_on_a_disk_that_is_stuck(monkeypatch) -> None:
+    async with executor() as person, blocked(monkeypatch, RecordFile, "save") as saving:
+        asked = asyncio.create_task(person.hold.call(HoldRequest(hold=True, owner="anna"), timeout=60))
+        await saving.wait()
+        await goes_on(person)
+        assert (await person.see(person.motion, lambda m: m.held)).inhibits[0].by == "anna", "it holds at once"
+        assert not asked.done(), "what is answered outlives the executor"

@@ -8,8 +8,10 @@ from common import topics
 from common.errors import NoResponder, Refused, RemoteError, RequestLost, RequestTimeout
 from common.messages import TaskCommand, TaskStatus
 from common.topics import Request
+from common.transport import requests
 from common.transport.bus import Bus
 from common.transport.codec import decode_error, encode
+from common.transport.local import LocalNetwork
 from common.transport.session import RawReply
 
 PATIENCE = 20.0
@@ -250,3 +252,38 @@ async def test_alive_changes_can_be_iterated(new_bus) -> None:
     await service.ready()
     assert await asyncio.wait_for(first, PATIENCE) == ("service", True)
     await changes.aclose()
+
+
+async def test_of_many_requests_at_once_one_is_begun_in_each_turn() -> None:
+    net, loop = LocalNetwork(), asyncio.get_running_loop()
+    server, client = net.bus("server"), net.bus("client")
+    turns: list[int] = []
+    turn = 0
+
+    def count() -> None:
+        nonlocal turn
+        turn += 1
+        loop.call_soon(count)
+
+    async def note(request: TaskCommand) -> TaskStatus:
+        turns.append(turn)
+        return await answer(request)
+
+    await served(server, note)
+    count()
+    key = f"{client.cell}/{topics.TASK_COMMAND.key}"
+    all_replies = await asyncio.gather(*(ask_raw(client, key, encode(START)) for _ in range(50)))
+    assert len(turns) == len(set(turns)) == 50, "others have their turns between them"
+    assert all(reply.sample is not None for replies in all_replies for reply in replies)
+
+
+async def test_requests_that_nobody_can_begin_with_are_refused_in_the_end(monkeypatch) -> None:
+    monkeypatch.setattr(requests, "_MOST_WAITING", 10)
+    net = LocalNetwork()
+    server, client = net.bus("server"), net.bus("client")
+    await served(server)
+    key = f"{client.cell}/{topics.TASK_COMMAND.key}"
+    replies = [reply for (reply,) in await asyncio.gather(*(ask_raw(client, key, encode(START)) for _ in range(50)))]
+    refused = [decode_error(reply.error) for reply in replies if reply.sample is None]
+    assert len(replies) - len(refused) == 1 + 10 and {found[0] for found in refused if found} == {"busy"}
+    assert (await client.client(topics.TASK_COMMAND).call(START)).message == "start", "and later ones are answered"
