@@ -38,11 +38,12 @@ class Topic(Generic[M]):
     doc: str
     former: InitVar[str | None] = None
     signed: bool = field(default=False, kw_only=True)
+    plain: bool = field(default=True, kw_only=True)  # whether readers of a signed one read its plain key of before too
 
     @property
     def expression(self) -> str:
         """Key expression that covers it, without the cell; of a signed one also the plain key that it had before."""
-        return self.key.replace(f"/{SERVICE}", "/**")
+        return self.key.replace(f"/{SERVICE}", "/**" if self.plain else "/*")
 
     def __post_init__(self, former: str | None) -> None:
         _leave_out_writer(self, former)
@@ -98,9 +99,11 @@ DEPTH_CAMERA_POINTS = Topic("depth_camera/points", m.PointCloud2, "stream",
                             "coloured points, only while somebody listens")
 DEPTH_CAMERA_INFO = Topic("depth_camera/camera_info", m.CameraInfo, "state", "intrinsics")
 SUPERVISOR_STATUS = Topic("supervisor/status", m.SupervisorStatus, "state", "all processes")
-LOG = Topic("log/<service>", m.LogLine, "event", "log lines of a service; all of them: `topic echo log`", signed=True)
+LOG = Topic("log/<service>", m.LogLine, "event", "log lines of a service; all of them: `topic echo log`; "
+                                                 "deprecated: the supervisor repeats them under `log`", signed=True)
 COUNTERS = Topic("counters/<service>", m.ServiceCounters, "state",
-                 "received, dropped and refused messages of a service, each second", signed=True)
+                 "received, dropped and refused messages of a service, each second; "
+                 "deprecated: the supervisor repeats them under `counters`", signed=True)
 
 MOTION_PLAN = Request("motion/plan", m.PlanRequest, m.PlanResponse, "plan a trajectory")
 MOTION_EXECUTE = Request("motion/execute", m.ExecuteRequest, m.MotionStatus,

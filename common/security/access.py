@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 from common.application import all_topics
 from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, general_key, of_service, parameters_of
+from common.transport.copies import plain_key
 from common.transport.credentials import OBSERVER, OPERATOR, RECORDER, ROUTER_NAME, SUPERVISOR, common_name
 from common.transport.keys import alive_key, owns_key, serves_key
 
@@ -66,7 +67,9 @@ def _rights_of_each(service: str) -> Rights:
 def rights_of_supervisor() -> Rights:
     """What the supervisor of a cell may do: it writes the summary from all that it hears."""
     rights = _rights_of_each(SUPERVISOR)
-    return replace(rights, keep={*rights.keep, SUPERVISOR_STATUS.key}, read={"**"}, get={"**"}, call={"**"})
+    plain = {plain_key(topic) for topic in (LOG, COUNTERS)}  # of before, where it repeats what services say
+    keep = {*rights.keep, SUPERVISOR_STATUS.key}
+    return replace(rights, write=rights.write | plain, keep=keep, read={"**"}, get={"**"}, call={"**"})
 
 
 def rights_of_recorder(services: Iterable[Rights] = ()) -> Rights:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from common import topics
@@ -38,7 +39,7 @@ class Collector:
         self._on_progress = on_progress
         self._progress = fold.progress
         self._readers: list[Reader[Any]] = [bus.reader(topic) for topic in fold.topics]
-        self._counters = bus.reader(topics.COUNTERS)
+        self._counters = bus.reader(replace(topics.COUNTERS, plain=False))
         self._heard = asyncio.Event()
 
     async def run(self) -> None:

@@ -114,9 +114,11 @@ class Elsewhere:
         """
         self.host, self._own = host, frozenset(own)
         self._heard: dict[str, ServiceStatus] = {}
+        self._first = host  # of the hosts that were heard of
 
     def hear(self, status: SupervisorStatus) -> None:
         """Take note of what a supervisor says of its own part; what it passes on is not news."""
+        self._first = min(self._first, status.host)
         for service in status.services:
             if service.name not in self._own and service.host == status.host:
                 self._heard[service.name] = service
@@ -133,6 +135,10 @@ class Elsewhere:
             })
             for service in self._heard.values()
         ]
+
+    def is_told_here(self, service: str) -> bool:
+        """Whether it is for this host, and for one only, to repeat what a service says: what nobody keeps is shared."""
+        return service in self._own or (service not in self._heard and self._first == self.host)
 
     def ours(self, services: Collection[ServiceStatus]) -> list[ServiceStatus]:
         """Those of this host, with its name."""

@@ -7,6 +7,7 @@ import contextlib
 import logging
 import socket
 from collections.abc import Awaitable, Callable, Coroutine
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from common import topics
@@ -91,6 +92,7 @@ async def _work(
     prepare: Callable[[Bus], None],
 ) -> T:
     from common.process.log import BusLog
+    from common.supervision.plain_keys import keep_plain_keys
     from common.transport.connect import connect
 
     timeout = CONNECT_TIMEOUT if launch.connect else None  # our own router is watched by the supervisor
@@ -103,7 +105,8 @@ async def _work(
         if launch.connect:
             await _require_unused(bus, endpoint, {entry.name for entry in cell.services.values()})
         prepare(bus)
-        return await supervise(bus, cell, launch, supervisor, work)
+        here = Elsewhere(socket.gethostname(), [service.name for service in supervisor.statuses])
+        return await beside(keep_plain_keys(bus, here), supervise(bus, cell, launch, supervisor, work))
     finally:
         log.removeHandler(to_topic)
         await connecting.__aexit__(None, None, None)
@@ -185,7 +188,8 @@ async def _kill_frozen(bus: Bus, cell: Cell, supervisor: Supervisor) -> None:
     silence = LivenessWatchdog(cell.watchdogs)
 
     async def listen() -> None:
-        async for counters in bus.reader(topics.COUNTERS):  # which they tell each second while somebody listens
+        # which they tell each second while somebody listens
+        async for counters in bus.reader(replace(topics.COUNTERS, plain=False)):
             silence.heard(counters.service)
 
     async def look() -> None:

@@ -16,6 +16,7 @@ from common.messages import Header, Message, ServiceCounters
 from common.remapping import Remapping
 from common.topics import PublishedKind, Request, Topic, of_service
 from common.transport.codec import DEFAULT_LIMIT
+from common.transport.copies import without_copies
 from common.transport.handoff import Doorbell, call_on_loop
 from common.transport.keys import alive_key, serves_key
 from common.transport.ownership import SHARED, Owner, Ownership
@@ -117,7 +118,7 @@ class Bus:
         if reader in self._heard:
             return
         key = f"{self.cell}/{topic.expression}"
-        self._heard[reader] = self._session.subscriber(key, reader.arrive)
+        self._heard[reader] = self.raw_subscriber(key, reader.arrive)
         if topic.kind == "state":  # subscribed first: nothing can fall between the two
 
             def on_reply(reply: RawReply) -> None:
@@ -252,7 +253,7 @@ class Bus:
             waiting.append(sample)
             bell.ring()
 
-        declared = self._session.subscriber(key, on_sample)
+        declared = self.raw_subscriber(key, on_sample)
         try:
             while True:
                 while waiting:
@@ -267,7 +268,7 @@ class Bus:
 
         What is returned takes it back.
         """
-        return self._session.subscriber(key, on_sample)
+        return self._session.subscriber(key, without_copies(on_sample))
 
     def raw_watch(self, key: str, on_token: Callable[[str], None]) -> Declared:
         """Call back, on any thread, for each liveliness token under a full key expression that is there or appears."""

@@ -297,6 +297,17 @@ def test_nobody_says_for_another_that_it_lives(secured: Secured) -> None:
         assert {key for key, payload in told.samples if payload == forged} == {"panda/counters/camera_simulator"}
 
 
+def test_plain_counters_hold_what_the_supervisor_repeats_and_nothing_else(secured: Secured) -> None:
+    forged = encode(m.ServiceCounters(service="vision_detector", received={"by the camera": 1}))
+    with secured.holder("panda.camera_simulator") as camera, secured.holder("operator") as operator:
+        told = operator.hear("panda/counters")
+        for _ in range(10):
+            camera.put("panda/counters", forged)
+        both = {"vision_detector", "camera_simulator"}
+        told.wait(lambda samples: both <= {one.service for one in _counters(samples)})
+        assert forged not in [payload for _, payload in told.samples]
+
+
 # --- who does what it may, in a way that harms -----------------------------------------------------------------------
 
 
