@@ -8,6 +8,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -38,8 +40,10 @@ from common.robot.model import RobotModel
 from common.scene.workspace import WorkspaceBounds, bounds_told, reach_reason
 from common.sim.interface import GraspTolerances, load_world
 from common.sim.layout import layout
-from common.sim.standing import Standing, state_file
+from common.sim.standing import SavedBeside, Standing, state_file
 from common.transport.bus import Bus
+
+T = TypeVar("T")
 
 MOST_CYCLES = 250.0  # per second of wall time
 REACH_MARGIN = 0.008  # [m] random places keep from the ends of the reach: what is seen is a few millimetres off
@@ -197,7 +201,31 @@ async def run(bus: Bus, config: Config) -> None:
         return cycle.command(request, bus.clock.now()).model_copy(update={"header": bus.header()})
 
     async def edit(request: WorldEdit) -> WorldEditReply:
-        return cycle.edit(request, bus.clock.now())
+        if not world_changes.locked() and not cycle.edit_takes_long(request):
+            return cycle.edit(request, bus.clock.now())
+        return await in_world(lambda: cycle.edit(request, bus.clock.now()))
+
+    async def in_world(change: Callable[[], T]) -> T:
+        """Change the world beside the loop: the arm goes on meanwhile, and the world stands still."""
+        async with world_changes:
+            cycle.apart = True
+            try:
+                return await asyncio.to_thread(change)
+            finally:
+                cycle.apart = False
+
+    world_changes = asyncio.Lock()
+    moving: asyncio.Task[None] | None = None
+
+    def move_world() -> None:
+        """Have done beside the loop what takes long of what the hand does to the world."""
+        nonlocal moving
+        if moving is not None and moving.done():
+            moving.result()
+            moving = None
+        if moving is None and cycle.due is not None:
+            moving = asyncio.create_task(in_world(cycle.due), name="world")
+            cycle.due = None
 
     file = record_file(bus.cell)
     if not bus.declares_only:
@@ -216,12 +244,14 @@ async def run(bus: Bus, config: Config) -> None:
         bus.serve(topics.GRIPPER_COMMAND, command)
     if simulated:
         bus.serve(topics.WORLD_EDIT, edit)
-    memory = state_file(bus.cell) if simulated else None
-    kept = memory.load() if memory else None
+    standing_file = state_file(bus.cell) if simulated else None
+    kept = standing_file.load() if standing_file else None
     period = 1 / bus.clock.wall_rate(config.joint_state_rate, MOST_CYCLES)
     cycle = await asyncio.to_thread(
         make_cycle, config, simulated, kept, bus.clock.now(), inhibits, period * bus.clock.speed
     )
+    cycle.beside = True
+    memory = SavedBeside(standing_file) if standing_file and bus.has_threads else standing_file
     if kept is not None:
         bus.log.info("the arm and what is about it are as they were")
     alone, task = Alone(), config.members.task
@@ -232,6 +262,7 @@ async def run(bus: Bus, config: Config) -> None:
         nonlocal due
         cycle.speed_scaling = config.speed_scaling
         report = cycle.step(bus.header("world"))
+        move_world()
         if memory is not None and (standing := cycle.standing()) is not None:
             memory.save(standing)
         if report.joints is not None:
@@ -264,6 +295,8 @@ async def run(bus: Bus, config: Config) -> None:
             turn()
         raise
     finally:
+        if moving is not None:
+            moving.cancel()
         cycle.close()
         if memory is not None:
             memory.close()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -102,6 +104,9 @@ class ControlCycle:
         self._told_motion_at = self._told_gripper_at = self._told_world_at = -np.inf
         self._told_gripper: GripperState | None = None
         self._told_version = -1
+        self.beside = False  # whether somebody does what is due
+        self.due: Callable[[], None] | None = None  # to be done beside the cycles: the world stands still until then
+        self.apart = False  # the world is changed by somebody else, and stands still here
         self._kept: object = None
         self._waits = False  # held by ourselves
         self._inhibits = inhibits or Inhibits()
@@ -121,7 +126,7 @@ class ControlCycle:
             report.joints = self._joint_state(header, dq)
         report.motion = self._news_of_motion(header, now)
         report.gripper = self._news_of_gripper(header, now)
-        if self._world is not None:
+        if self._world is not None and not self.apart:
             report.updates = [update.model_copy(update={"header": header}) for update in self._world.take_events()]
             due = now - self._told_world_at >= WORLD_PERIOD or bool(report.updates)
             if self._world.version != self._told_version and due:
@@ -131,7 +136,7 @@ class ControlCycle:
 
     def standing(self) -> Standing | None:
         """What simulated hardware would be found like after a restart, if it has changed since the last call."""
-        if self._world is None:
+        if self._world is None or self.apart:
             return None
         width = self._gripper.state.width if self._gripper else None
         told = self._gripper.told if self._gripper else None
@@ -244,6 +249,11 @@ class ControlCycle:
             raise Refused("no_gripper", "this robot has no gripper")
         return self._gripper.command(request, now, self._inhibits.objection(request.id))
 
+    def edit_takes_long(self, request: WorldEdit) -> bool:
+        """Whether an edit may take longer than a cycle: it is made beside them then, `apart`."""
+        takes_long = getattr(self._world, "edit_takes_long", None)
+        return takes_long is not None and bool(takes_long(request))
+
     def edit(self, request: WorldEdit, now: float) -> WorldEditReply:
         """What was changed in the simulated world.
 
@@ -262,13 +272,18 @@ class ControlCycle:
         gripper = self._hardware.gripper
         if self._gripper is None or gripper is None:
             return
-        if self._world is None or self._kinematics is None or self._obstructible is None:
+        if self._world is None or self._kinematics is None or self._obstructible is None or self.apart:
             reading = gripper.read(now)
         else:
             T_world_tcp = self._kinematics.fk(self._q)
             self._obstructible.obstruct(self._world.obstruction(T_world_tcp, self._gripper.state.width))
             reading = gripper.read(now)
-            self._world.tick(now, T_world_tcp, reading.width, reading.holding)
+            tick = partial(self._world.tick, now, T_world_tcp, reading.width, reading.holding)
+            takes_long = getattr(self._world, "takes_long", None)
+            if self.beside and takes_long is not None and takes_long(reading.width, reading.holding):
+                self.due, self.apart = tick, True
+            else:
+                tick()
         self._width_rate = reading.velocity
         self._gripper.update(reading)
 

@@ -56,11 +56,14 @@ def overlap(a: Array, b: Array) -> bool:
 
 def _convex_parts(outline: Array) -> list[Array]:
     """The outline itself if it is convex, else triangles, all anticlockwise."""
+    return [outline] if is_convex(outline) else list(triangulate(outline))
+
+
+def is_convex(outline: Array) -> bool:
+    """Whether an outline (N, 2), anticlockwise, has no corner that points inwards."""
     side = np.roll(outline, -1, axis=0) - outline
     following = np.roll(side, -1, axis=0)
-    if (side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0] >= -1e-12).all():
-        return [outline]
-    return list(triangulate(outline))
+    return bool((side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0] >= -1e-12).all())
 
 
 def _meet(a: Array, b: Array) -> bool:

@@ -20,6 +20,7 @@ from common.messages import Header, Pose, SceneUpdate, Vector3, WorldEdit, World
 from common.robot.finger_joints import closing_frame
 from common.robot.transforms import invert, matrix_to_pose, transform
 from common.sim.bodies import Body, Rest, restored
+from common.sim.footprints import is_convex
 from common.sim.gripping import felt
 from common.sim.interface import GraspTolerances, StandingObject
 from common.sim.objects import Solid, pose_of, shaped, solid_of, solid_of_message
@@ -28,6 +29,10 @@ from common.sim.resting import Ground
 Array = NDArray[np.float64]
 
 GRAVITY = 9.81  # [m/s^2]
+MOST_OBJECTS = 500  # in the world: each is told of while something moves, and looked at in every cycle
+MOST_CORNERS = 50_000  # of all of them
+MOST_BENT = 200  # corners of a cross-section that is not convex: how it meets another takes time by their product
+FEW = 32  # spheres among which a place is found at once
 
 
 def create(
@@ -116,6 +121,18 @@ class KinematicWorld:
                 found[name] = ends
         self._between = found
         return max((high - low for low, high in found.values()), default=0.0)
+
+    def takes_long(self, width: float, gripping: bool) -> bool:
+        """Whether places have to be looked for in the next tick, which may take longer than a cycle: as of `tick`."""
+        if self._is_plain:
+            return False
+        if held := self.held:
+            return width > self._bodies[held].width + self._tolerances.release
+        return gripping and bool(self._between)
+
+    @property
+    def _is_plain(self) -> bool:
+        return len(self._bodies) <= FEW and all(body.solid.shape == "sphere" for body in self._bodies.values())
 
     def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
         """Move on to a time: see `common.sim.interface`."""
@@ -206,6 +223,11 @@ class KinematicWorld:
 
     # --- edits ---
 
+    def edit_takes_long(self, request: WorldEdit) -> bool:
+        """Whether an edit may take longer than a cycle."""
+        return not self._is_plain or request.shape not in (None, "sphere") or any(
+            solid.shape != "sphere" for solid in self._solids.values())
+
     def edit(self, request: WorldEdit, now: float) -> str:
         """Change the world as a person asks: see `common.sim.interface`."""
         if request.op == "reset":
@@ -216,6 +238,7 @@ class KinematicWorld:
         old = self._bodies.get(name)
         if request.op == "add":
             body = self._made(request)
+            self._require_room(body)
         elif old is None:
             raise Refused("unknown_id", str(UnknownName("object", name, list(self._bodies))))
         else:
@@ -261,6 +284,14 @@ class KinematicWorld:
         else:
             solid, like = _requested(request), ""
         return Body(name, solid, color, np.eye(4), "elsewhere", added=True, like=like)
+
+    def _require_room(self, body: Body) -> None:
+        if len(self._bodies) >= MOST_OBJECTS:
+            raise Refused("world_full", f"there are {len(self._bodies)} objects, and room for {MOST_OBJECTS}")
+        corners = sum(_corners(each.solid) for each in (*self._bodies.values(), body))
+        if corners > MOST_CORNERS:
+            raise Refused("world_full", f"all objects together would have {corners} corners; at most {MOST_CORNERS} "
+                                        "can be told of")
 
     def _free_name(self, kind: str) -> str:
         return next(n for i in range(1, len(self._bodies) + 2) if (n := f"{kind}_{i}") not in self._bodies)
@@ -336,7 +367,14 @@ def _requested(request: WorldEdit) -> Solid:
         raise Refused("no_size", "size: a box needs x, y and z")
     if request.shape == "prism" and len(request.polygon) < 3:
         raise Refused("no_size", "polygon: a prism needs at least 3 corners")
+    if len(request.polygon) > MOST_BENT and not is_convex(np.array(request.polygon)):
+        raise Refused("too_many_corners", f"polygon: has {len(request.polygon)} corners and is not convex; at most "
+                                          f"{MOST_BENT} can be")
     return shaped(request.shape, size, inner, request.polygon)
+
+
+def _corners(solid: Solid) -> int:
+    return len(solid.section) + len(solid.hole) + 3 * len(solid.mesh)
 
 
 __all__ = ["GraspTolerances", "KinematicWorld", "WorldObject", "create"]

@@ -6,9 +6,11 @@ ones do not either, their state is kept in a file, which survives the process ho
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import struct
+import threading
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +22,8 @@ from common.sim.interface import StandingObject
 
 STATE_VARIABLE = "ZENCELL_STATE"  # folder for what is kept, this and what persons decided
 STANDING_VARIABLE = "ZENCELL_STANDING"  # folder for this alone; without both nothing is kept
-SLOT = 256 * 1024  # [bytes] for each of the two newest states
+SLOT = 4 * 1024 * 1024  # [bytes] for each of the two newest states
+CLOSE_SECONDS = 0.3
 _HEAD = struct.Struct("<QII")  # number of the state, its length and checksum
 
 
@@ -65,6 +68,8 @@ class StateFile:
     def save(self, state: Standing) -> None:
         """Write a state, which outlives this process at once, but not the machine."""
         body = msgpack.packb(state, default=vars)
+        if _HEAD.size + len(body) > SLOT:  # it must not be written over the one before
+            return
         self._number += 1
         place = SLOT * (self._number % 2)
         os.pwrite(self._descriptor, _HEAD.pack(self._number, len(body), _checksum(self._number, body)) + body, place)
@@ -72,6 +77,42 @@ class StateFile:
     def close(self) -> None:
         """Close the file, which stays."""
         os.close(self._descriptor)
+
+
+class SavedBeside:
+    """Saves the newest state from a thread of its own: a disk that takes its time holds nobody."""
+
+    def __init__(self, file: StateFile) -> None:
+        """Save to this file."""
+        self._file = file
+        self._newest: Standing | None = None
+        self._ends = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._work, name="standing", daemon=True)
+        self._thread.start()
+
+    def save(self, state: Standing) -> None:
+        """Have a state written next, in place of one that still waits for that."""
+        with self._changed:
+            self._newest = state
+            self._changed.notify()
+
+    def close(self, seconds: float = CLOSE_SECONDS) -> None:
+        """Close the file when all is written; wait for that at most so long [s]."""
+        with self._changed:
+            self._ends = True
+            self._changed.notify()
+        self._thread.join(seconds)
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._newest is not None or self._ends)
+                state, self._newest = self._newest, None
+            if state is None:
+                return self._file.close()
+            with contextlib.suppress(OSError):  # a full disk stops no arm; what was kept before stays
+                self._file.save(state)
 
 
 def _checksum(number: int, body: bytes) -> int:

@@ -33,7 +33,8 @@ from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.scene.workspace import reach_reason
-from common.sim.standing import STANDING_VARIABLE, STATE_VARIABLE
+from common.sim.kinematic import KinematicWorld
+from common.sim.standing import STANDING_VARIABLE, STATE_VARIABLE, StateFile
 from common.transport.local import LocalNetwork
 from services import trajectory_executor
 from services.trajectory_executor import Config
@@ -556,3 +557,30 @@ async def test_joint_states_go_on_while_a_hold_is_recorded_on_a_disk_that_is_stu
         await goes_on(person)
         assert (await person.see(person.motion, lambda m: m.held)).inhibits[0].by == "anna", "it holds at once"
         assert not asked.done(), "what is answered outlives the executor"
+
+
+async def test_joint_states_go_on_while_a_place_is_looked_for_in_the_world(monkeypatch) -> None:
+    box = WorldEdit(op="add", shape="box", size=Vector3(x=0.02, y=0.02, z=0.02), position=Vector3(x=0.35, y=-0.4))
+    async with executor() as person:
+        async with blocked(monkeypatch, KinematicWorld, "edit") as editing:
+            asked = asyncio.create_task(person.edit.call(box, timeout=60))
+            await editing.wait()
+            await goes_on(person)
+        assert (await asked).id == "box_1"
+        objects = person.bus.reader(topics.SCENE_OBJECTS)
+        await person.see(objects, lambda seen: "box_1" in [thing.id for thing in seen.objects])
+
+
+async def test_joint_states_go_on_while_the_disk_is_stuck_on_which_the_simulated_world_is_kept(
+    robot: RobotModel, monkeypatch, tmp_path
+) -> None:
+    monkeypatch.setenv(STATE_VARIABLE, str(tmp_path))
+    home = robot.named("home")
+    async with executor() as person, blocked(monkeypatch, StateFile, "save") as saving:
+        await person.execute.call(person.asks(id="1", trajectory=move(robot, home, home + 0.1)))
+        await saving.wait()
+        done = await person.see(person.motion, lambda m: m.id == "1" and m.state != "active")
+        assert done.state == "succeeded"
+        await goes_on(person)
+    async with executor() as person:
+        assert np.allclose((await person.joints.next()).position[:7], home + 0.1, atol=2e-3), "the newest was kept"

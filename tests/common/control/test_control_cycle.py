@@ -223,3 +223,21 @@ def test_fingers_that_nobody_told_anything_stay_where_they_are_after_a_restart(l
     again.cycle.restore(standing, again.now)
     again.run(1.0)
     assert {state.width for state in again.grippers} == {0.08}
+
+
+def test_what_takes_long_in_the_world_is_left_to_others_and_the_arm_goes_on(rig, monkeypatch):
+    rig.cycle.beside = True
+    monkeypatch.setattr(KinematicWorld, "_is_plain", False)
+    rig.grip("close", 0.0)
+    while rig.cycle.due is None:
+        rig.step()
+    before = len(rig.joints)
+    with monkeypatch.context() as patched:
+        for name in ("tick", "obstruction", "objects", "take_events", "standing"):
+            patched.delattr(KinematicWorld, name)  # nothing of it is asked meanwhile
+        rig.run(0.2)
+        assert len(rig.joints) == before + 20 and rig.cycle.standing() is None
+    rig.cycle.due()
+    rig.cycle.due, rig.cycle.apart = None, False
+    rig.step()
+    assert rig.world.held == "ball_1" and rig.cycle.standing() is not None

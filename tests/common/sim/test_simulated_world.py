@@ -12,6 +12,7 @@ from common.config import Fixture, World
 from common.errors import ConfigError, Refused
 from common.messages import Header, Vector3, WorldEdit
 from common.robot.transforms import tool_down
+from common.sim import kinematic
 from common.sim.kinematic import KinematicWorld
 
 R = 0.03
@@ -436,3 +437,33 @@ def test_nothing_slips_out_of_an_empty_hand(name):
         rig.edit("drop", name)
     assert refused.value.code == "not_held"
     assert rig.where()["ball_1"][0] == "table"
+
+
+def test_world_takes_no_more_objects_than_can_be_told_of(monkeypatch) -> None:
+    assert kinematic.MOST_OBJECTS <= 1000, "of messages"
+    monkeypatch.setattr(kinematic, "MOST_OBJECTS", 3)
+    world = Rig().world
+    small = {"op": "add", "shape": "sphere", "size": Vector3(x=0.01)}
+    for i in range(2):
+        world.edit(WorldEdit(**small, position=Vector3(x=0.3 + 0.1 * i)), 0.0)
+    with pytest.raises(Refused, match="room for 3"):
+        world.edit(WorldEdit(**small, position=Vector3(x=0.7)), 0.0)
+    world.edit(WorldEdit(op="remove", id="sphere_1"), 0.0)
+    world.edit(WorldEdit(**small, position=Vector3(x=0.7)), 0.0)
+    monkeypatch.setattr(kinematic, "MOST_OBJECTS", 100)
+    monkeypatch.setattr(kinematic, "MOST_CORNERS", 500)
+    round_one = {"op": "add", "shape": "cylinder", "size": Vector3(x=0.01, y=0.01, z=0.01)}
+    world.edit(WorldEdit(**round_one, position=Vector3(x=0.3, y=0.2)), 0.0)
+    with pytest.raises(Refused, match="at most 500"):
+        world.edit(WorldEdit(**round_one, position=Vector3(x=0.4, y=0.2)), 0.0)
+
+
+def test_cross_section_with_many_corners_that_point_inwards_is_refused() -> None:
+    world = Rig().world
+    asked = {"op": "add", "shape": "prism", "size": Vector3(x=0.04, y=0.04, z=0.02)}
+    angles = np.linspace(0.0, 2 * math.pi, 1000, endpoint=False)
+    around = np.column_stack([np.cos(angles), np.sin(angles)])
+    star = around * np.where(np.arange(1000) % 2, 0.02, 0.01)[:, None]
+    with pytest.raises(Refused, match="polygon: has 1000 corners"):
+        world.edit(WorldEdit(**asked, polygon=star.tolist(), position=Vector3(x=0.3)), 0.0)
+    world.edit(WorldEdit(**asked, polygon=(0.02 * around).tolist(), position=Vector3(x=0.3)), 0.0)

@@ -145,3 +145,10 @@ def test_the_file_is_that_of_a_cell_on_a_host_and_only_where_a_folder_is_named(t
     file = state_file("panda", {STATE_VARIABLE: str(tmp_path)})
     assert file is not None
     assert [path.name for path in tmp_path.iterdir()] == [f"panda-{socket.gethostname()}.state"]
+
+
+def test_state_that_has_no_room_leaves_the_one_before(tmp_path) -> None:
+    file = StateFile(tmp_path / "state")
+    file.save(a_state(1))
+    file.save(a_state(2).model_copy(update={"q": [0.0] * (SLOT // 9)}))
+    assert StateFile(tmp_path / "state").load() == a_state(1)
