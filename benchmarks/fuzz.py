@@ -2,8 +2,10 @@
 
 `python -m benchmarks.fuzz` changes payloads of all messages by a seed and decodes them; then it puts and asks what it
 made under every key of both cells, on the virtual clock. With `--live SECONDS` it does so to a cell of real processes
-as well, and compares the gaps in its joint states with those of as long a time before. Exit code 1 if anything but
-DecodeError was raised, a process ended, or there were more gaps.
+as well, and compares the gaps in its joint states with those of as long a time in between without. Of each gap it says
+whether the executor computed, waited for a processor, which is the machine's load, or was held up by something else.
+Exit code 1 if anything but DecodeError was raised, a process ended, or there were more gaps without those in which the
+executor waited for a processor.
 """
 
 from __future__ import annotations
@@ -11,12 +13,15 @@ from __future__ import annotations
 import argparse
 import asyncio
 import tempfile
+import threading
 import time
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from contextlib import suppress
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from common import topics
 from common.application import all_topics
@@ -33,6 +38,9 @@ from tests.harness import RunningCell, beside, until
 from tests.mutations import Mutations, models
 
 GAP = 0.05  # [s] between two joint states
+ROUND = 60.0  # [s] of each side at once
+AFTER = 1.0  # [s]
+LOOK = 0.01  # [s] between two looks at what the executor spends
 TOLD = 10  # findings that are printed in full
 PAUSE = 0.002  # [s] of virtual time between two payloads
 SECONDS = 60.0  # of virtual time
@@ -138,11 +146,84 @@ def simulated(name: str, seed: int) -> list[str]:
     return [f"{name}, seed {seed}: {crash}" for crash in outcome.crashes]
 
 
+class Spent(NamedTuple):
+    """What the threads of a process have spent together until some time [ns]: computing, waiting for a processor."""
+
+    at: int
+    computing: int
+    waiting: int
+
+
+class Spending:
+    """Looks again and again, from a thread, at what a process spends; nothing where the system does not tell."""
+
+    def __init__(self, pid: int) -> None:
+        self._threads = Path(f"/proc/{pid}/task")
+        self._ends = threading.Event()
+        self.looks: list[Spent] = []
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Look no more."""
+        self._ends.set()
+        self._thread.join()
+
+    def _look(self) -> None:
+        while not self._ends.wait(LOOK):
+            began, computing, waiting = time.time_ns(), 0, 0
+            for thread in self._threads.glob("[0-9]*"):
+                with suppress(OSError):
+                    told = (thread / "schedstat").read_text().split()
+                    computing, waiting = computing + int(told[0]), waiting + int(told[1])
+            self.looks.append(Spent((began + time.time_ns()) // 2, computing, waiting))
+
+    def between(self, begin: int, end: int) -> tuple[float, float]:
+        """Seconds that were spent computing, and waiting, from the last look before a time [ns] to the first after."""
+        if not self.looks:
+            return 0.0, 0.0
+        first = self.looks[max(bisect_right(self.looks, begin, key=lambda look: look.at) - 1, 0)]
+        last = self.looks[min(bisect_left(self.looks, end, key=lambda look: look.at), len(self.looks) - 1)]
+        return (last.computing - first.computing) * 1e-9, (last.waiting - first.waiting) * 1e-9
+
+
+@dataclass
+class Side:
+    """A cell for some time, with or without being attacked."""
+
+    what: str
+    seconds: float = 0.0
+    states: int = 0
+    computed: int = 0  # gaps
+    waited: int = 0
+    held: int = 0
+    lost: int = 0
+    longest: float = 0.0
+    computing: float = 0.0  # [s] of the executor
+    waiting: float = 0.0
+    own: list[str] = field(default_factory=list)  # gaps that were not the machine's load
+
+    @property
+    def gaps(self) -> int:
+        """All that are too long."""
+        return self.computed + self.waited + self.held + self.lost
+
+    def __str__(self) -> str:
+        share, wait = (100 * part / max(self.seconds, 1e-9) for part in (self.computing, self.waiting))
+        return (f"{self.what} {self.seconds:.0f} s: {self.states} joint states, {self.gaps} gaps above "
+                f"{1e3 * GAP:.0f} ms, the longest {1e3 * self.longest:.0f} ms; the executor waited for a processor in "
+                f"{self.waited}, computed in {self.computed}, was held up in {self.held}, and {self.lost} were lost on "
+                f"the way; it computed {share:.0f} % of the time and waited {wait:.0f} %")
+
+
 class Gaps:
     """Counts long gaps between the times at which joint states were taken, of those that arrive."""
 
-    def __init__(self, bus: Bus, cell: str) -> None:
+    def __init__(self, bus: Bus, cell: str, executor: int) -> None:
+        """Begin to; `executor` is the process that sends them."""
         self._taken: list[tuple[int, int]] = []  # stamp and number of each
+        self._spending = Spending(executor)
+        self._began = time.time_ns()
         self._subscribed = bus.raw_subscriber(f"{cell}/{topics.JOINT_STATES.key}", self._arrive)
 
     def _arrive(self, sample: RawSample) -> None:
@@ -150,35 +231,65 @@ class Gaps:
         if sent is not None and (stamp := stamp_of(sample.payload)):  # what is made up here says nothing of itself
             self._taken.append((stamp, sent.sequence))
 
-    def told(self, what: str) -> int:
-        """How many there were; no more are counted."""
+    def add_to(self, side: Side) -> None:
+        """Add what there was so far; no more is counted."""
         self._subscribed.undeclare()
-        gaps = [((after[0] - before[0]) * 1e-9, after[1] - before[1]) for before, after in pairwise(self._taken)]
-        count = sum(gap > GAP for gap, _ in gaps)
-        stood = sum(gap > GAP and steps == 1 for gap, steps in gaps)
-        print(f"{what}: {len(self._taken)} joint states, {count} gaps above {1e3 * GAP:.0f} ms, in {stood} none "
-              f"was taken, the longest {1e3 * max((gap for gap, _ in gaps), default=0.0):.0f} ms", flush=True)
-        return count
+        self._spending.end()
+        now = time.time_ns()
+        spent = self._spending.between(self._began, now)
+        side.computing, side.waiting = side.computing + spent[0], side.waiting + spent[1]
+        side.seconds += (now - self._began) * 1e-9
+        side.states += len(self._taken)
+        for (before, number), (after, following) in pairwise(self._taken):
+            gap = (after - before) * 1e-9
+            side.longest = max(side.longest, gap)
+            if gap <= GAP:
+                continue
+            computing, waiting = self._spending.between(before, after)
+            told = f"{side.what}: {1e3 * gap:.0f} ms, {1e3 * computing:.0f} computing, {1e3 * waiting:.0f} waiting"
+            if following - number != 1:
+                side.lost += 1
+            elif computing > gap / 2:
+                side.computed += 1
+                side.own.append(told)
+            elif computing + waiting > gap / 2:
+                side.waited += 1
+            else:
+                side.held += 1
+                side.own.append(told)
 
 
 async def live(options: argparse.Namespace, folder: Path) -> list[str]:
-    """Compare a cell that is attacked with itself before; a line for each thing that is worse."""
-    seconds, seed = options.live, options.seed
+    """Compare a cell that is attacked with itself in between; a line for each thing that is worse."""
+    rounds = max(1, round(options.live / ROUND))
+    seconds = options.live / rounds
+    calm, attacked = Side("left alone"), Side("attacked")
+    mutations = Mutations(options.seed)
     with RunningCell(folder, "up", "panda") as cell:
         async with cell.listen() as bus, cell.listen() as attacker:
             await until(bus.reader(topics.MOTION_STATUS), lambda status: status.progress > 0, 120.0)
-            before = {name: process.pid for name, process in cell.processes().items()}
-            gaps = Gaps(bus, "panda")
-            await asyncio.sleep(seconds)
-            calm = gaps.told("before")
-            gaps = Gaps(bus, "panda")
-            async with beside(attack(attacker, Mutations(seed), "panda", options.pause, acts=False)):
+            before = cell.processes()
+            memory = {name: process.memory_info().rss for name, process in before.items()}
+            executor = before["trajectory_executor"].pid
+            for _ in range(rounds):
+                gaps = Gaps(bus, "panda", executor)
                 await asyncio.sleep(seconds)
-            attacked = gaps.told("attacked")
-            after = {name: process.pid for name, process in cell.processes().items()}
-        wrong = [f"{name} ended: {folder}" for name, pid in before.items() if after.get(name) != pid]
-        if attacked > calm:
-            wrong.append(f"{attacked} gaps in joint states, {calm} before")
+                gaps.add_to(calm)
+                gaps = Gaps(bus, "panda", executor)
+                async with beside(attack(attacker, mutations, "panda", options.pause, acts=options.acts)):
+                    await asyncio.sleep(seconds)
+                gaps.add_to(attacked)
+                await asyncio.sleep(AFTER)  # until what was asked last is answered
+            after = cell.processes()
+            print(calm, attacked, *calm.own, *attacked.own, sep="\n")
+            print("memory [MB]: " + ", ".join(
+                f"{name} {memory[name] * 1e-6:.0f} -> {process.memory_info().rss * 1e-6:.0f}"
+                for name, process in after.items() if name in memory), flush=True)
+        wrong = [f"{name} ended: {folder}" for name, process in before.items()
+                 if name not in after or after[name].pid != process.pid]
+        own, own_before = len(attacked.own) + attacked.lost, len(calm.own) + calm.lost
+        if own > own_before:
+            wrong.append(f"{own} gaps in joint states without waiting for a processor, {own_before} when left alone")
         cell.interrupt()
         await cell.ended(30.0)
     return wrong
@@ -191,6 +302,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--runs", type=int, default=1, help="of each cell on the virtual clock")
     parser.add_argument("--live", type=float, default=0.0, metavar="SECONDS", help="against a cell of real processes")
+    parser.add_argument("--acts", action="store_true", help="ask what is still a valid request of it too")
     parser.add_argument("--pause", type=float, default=0.005, metavar="SECONDS", help="between two payloads of it")
     options = parser.parse_args()
     wrong = decoded(options.payloads, options.seed) if options.payloads else []
