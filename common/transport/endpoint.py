@@ -24,6 +24,8 @@ LEASE_MS = 2000  # a frozen process or cut link is noticed after this
 STUCK_MS = 1000  # so is a link that takes nothing
 ROUTER_STUCK_MS = 300  # the same in the router, where all that comes from the writer waits meanwhile
 LINK_RETRY_MS = (100, 1000)  # between two tries to reach the router of another host: at first, and at most
+LARGE_BYTES = 32 * 1024  # a stream with a larger message travels apart from then on: pictures and clouds
+LINKS = ("0-5", "6-7")  # priorities of each link between two: what is large has one of its own
 STREAM_BATCHES = 16  # of 64 kB that may wait in a link: a whole picture, so that what follows it is not dropped
 MOST_BYTES = 40 * 1024 * 1024  # of one message; the largest picture that is read has 32 MB
 MOST_BYTES_BESIDES = 8 * 1024 * 1024 + 4096  # of one that holds no picture: minutes of a trajectory have 1 MB
@@ -135,16 +137,33 @@ def is_encrypted(endpoint: str) -> bool:
     return endpoint.startswith(("tls/", "quic/"))
 
 
-def client_config(endpoint: str, *, connect_ms: int, credentials: Credentials | None = None) -> zenoh.Config:
-    """Configuration of a client of the router at an endpoint, which tries for `connect_ms` to reach it at first."""
+def client_config(
+    endpoint: str, *, connect_ms: int, credentials: Credentials | None = None, apart: bool = False
+) -> zenoh.Config:
+    """Configuration of a client of the router at an endpoint, which tries for `connect_ms` to reach it at first.
+
+    With `apart` it has a link of its own for what is large; the router must admit that, as ours does.
+    """
+    links: dict[str, Any] = {"connect__endpoints": [endpoint]}
+    if apart:
+        links["connect__endpoints"] = [{"strategy": "allOf", "locators": _apart(endpoint)}]
+        links["transport__unicast__max_links"] = len(LINKS)
     return _config(_settings(
         **({"transport__link__tls": credentials.tls()} if credentials else {}),
+        **links,
         mode="client",
         listen__endpoints=[],
-        connect__endpoints=[endpoint],
         connect__timeout_ms=connect_ms,
         connect__retry={"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
     ))
+
+
+def _apart(endpoint: str) -> list[str]:
+    """The endpoint once for each link, unless it says itself what travels there."""
+    place, mark, config = endpoint.partition("#")
+    if "prio=" in place:
+        return [endpoint]
+    return [f"{place}{';' if '?' in place else '?'}prio={priorities}{mark}{config}" for priorities in LINKS]
 
 
 def router_config(
@@ -171,21 +190,25 @@ def router_settings(
     first, most = LINK_RETRY_MS
     secure = {"transport__link__tls": credentials.tls(listens=True)} if credentials else {}
     controlled = {"access_control": access} if access else {}
-    # Small messages share a batch where they have to wait. They do wait (`block`): `block_first`, which keeps a reader
-    # that takes nothing from holding up the router, drops each message whose predecessor's thread was not scheduled
-    # within the time that a stream waits, on an idle machine one of some 20,000.
-    shared = {
-        "messages": ["put"], "flows": ["egress"], "qos": {"congestion_control": "block"},
-        "overwrite": {"express": False},
+    # Small messages share a batch where they have to wait. What must arrive does wait (`block`): `block_first`, which
+    # keeps a reader that takes nothing from holding up the router, drops each message whose predecessor's thread was
+    # not scheduled within the time that a stream waits, on an idle machine one of some 20,000.
+    shared = {"messages": ["put"], "flows": ["egress"], "overwrite": {"express": False}}
+    # Pictures of those who know nothing of a link for what is large.
+    apart = {
+        "messages": ["put"], "flows": ["egress"], "qos": {"congestion_control": "drop"},
+        "payload_size": f"{LARGE_BYTES}..", "overwrite": {"express": False, "priority": "data_low"},
     }
     return _settings(
-        qos__network=[shared],
+        qos__network=[apart, shared],
         transport__link__tx__queue__congestion_control__block__wait_before_close=ROUTER_STUCK_MS * 1000,
         transport__link__tx__queue__size__data_high=STATE_BATCHES,
-        mode="router", listen__endpoints=list(endpoints), connect__endpoints=list(links),
+        mode="router", listen__endpoints=list(endpoints),
+        connect__endpoints=[each for link in links for each in _apart(link)],
         connect__timeout_ms=-1, connect__exit_on_failure=False,
         connect__retry={"period_init_ms": first, "period_max_ms": most, "period_increase_factor": 1.5},
         low_pass_filter=size_limits(small),
+        transport__unicast__max_links=len(LINKS),
         transport__unicast__max_sessions=MOST_SESSIONS,
         transport__unicast__accept_pending=MOST_PENDING,
         transport__unicast__accept_timeout=ACCEPT_MS,
@@ -242,6 +265,7 @@ def _settings(**values: Any) -> dict[str, Any]:
         "transport__link__tx__queue__congestion_control__block__wait_before_close": STUCK_MS * 1000,
         # By default two batches and 1 ms: on a busy machine every hundredth joint state fell victim to a picture.
         "transport__link__tx__queue__size__data": STREAM_BATCHES,
+        "transport__link__tx__queue__size__data_low": STREAM_BATCHES,
         "transport__link__tx__queue__congestion_control__drop__wait_before_drop": STREAM_WAIT_US,
         # By default 50 ms, in which a busy machine does not take a point cloud: every second one was dropped.
         "transport__link__tx__queue__congestion_control__drop__max_wait_before_drop_fragments": PARTS_WAIT_US,

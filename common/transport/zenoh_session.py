@@ -11,7 +11,7 @@ from typing import Any
 import zenoh
 
 from common.transport.credentials import Credentials
-from common.transport.endpoint import client_config
+from common.transport.endpoint import LARGE_BYTES, client_config
 from common.transport.outbox import Outbox
 from common.transport.session import Declared, OnQuery, OnReply, OnSample, OnToken, RawReply, RawSample
 
@@ -38,8 +38,12 @@ def _sample(sample: zenoh.Sample) -> RawSample:
 
 
 class _Publisher:
-    def __init__(self, publisher: zenoh.Publisher, outbox: Outbox | None) -> None:
-        self._publisher = publisher
+    def __init__(self, declare: Callable[[zenoh.Priority], zenoh.Publisher], outbox: Outbox | None) -> None:
+        """Declare it, with an outbox for what must arrive, without one for a stream."""
+        # Apart from each other, so that nothing small queues behind a picture, nor what must arrive behind a stream.
+        self._publisher = declare(zenoh.Priority.DATA if outbox is None else zenoh.Priority.DATA_HIGH)
+        self._declare = declare
+        self._large: zenoh.Publisher | None = None  # of a stream, from its first large message on
         self._outbox = outbox
         self._undeclared = False
 
@@ -51,7 +55,9 @@ class _Publisher:
         if self._undeclared:
             return
         if self._outbox is None:
-            self._publisher.put(payload, attachment=attachment or None)
+            if self._large is None and len(payload) > LARGE_BYTES:
+                self._large = self._declare(zenoh.Priority.DATA_LOW)
+            (self._large or self._publisher).put(payload, attachment=attachment or None)
         else:
             self._outbox.post(lambda: self._publisher.put(payload, attachment=attachment or None))
 
@@ -60,7 +66,8 @@ class _Publisher:
             return
         self._undeclared = True
         if self._outbox is None:
-            self._publisher.undeclare()  # type: ignore[no-untyped-call]
+            for publisher in filter(None, (self._large, self._publisher)):
+                publisher.undeclare()  # type: ignore[no-untyped-call]
         else:  # which may be in the middle of a put; Zenoh refuses both at once
             self._outbox.post(self._publisher.undeclare)
 
@@ -126,15 +133,14 @@ class ZenohSession:
     def publisher(self, key: str, encoding: str, *, reliable: bool) -> _Publisher:
         """Declare a publisher; a stream is dropped by a network that cannot take it, the rest waits in the outbox."""
         control = zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP
-        # Apart from the streams, so that small messages do not queue behind pictures.
-        priority = zenoh.Priority.DATA_HIGH if reliable else zenoh.Priority.DATA
-        made = _Publisher(
-            self._session.declare_publisher(
-                key, encoding=encoding, express=True, congestion_control=control, priority=priority,
+
+        def declare(priority: zenoh.Priority) -> zenoh.Publisher:
+            return self._session.declare_publisher(
+                key, encoding=encoding, express=reliable, congestion_control=control, priority=priority,
                 reliability=zenoh.Reliability.RELIABLE,
-            ),
-            self._outbox if reliable else None,
-        )
+            )
+
+        made = _Publisher(declare, self._outbox if reliable else None)
         self._keep(made)
         return made
 
@@ -255,6 +261,27 @@ class ZenohSession:
         self._session.close()  # type: ignore[no-untyped-call]
 
 
+def _open(endpoint: str, credentials: Credentials | None) -> zenoh.Session:
+    """A session with a link of its own for what is large, where the router admits that.
+
+    Raises:
+        zenoh.ZError: nobody is there yet.
+    """
+
+    def opened(*, apart: bool, connect_ms: int = _CONNECT_MS) -> zenoh.Session:
+        return zenoh.open(client_config(endpoint, connect_ms=connect_ms, credentials=credentials, apart=apart))
+
+    try:
+        return opened(apart=True)
+    except zenoh.ZError:
+        opened(apart=False, connect_ms=0).close()  # type: ignore[no-untyped-call]
+    try:
+        return opened(apart=True)  # the router came meanwhile
+    except zenoh.ZError:
+        log.info("%s admits one link of each client: what is small shares it with pictures", endpoint)
+        return opened(apart=False)
+
+
 async def open_zenoh(endpoint: str, credentials: Credentials | None = None) -> ZenohSession:
     """A session with the router at the endpoint, for which it waits as long as it takes; may be cancelled at once."""
     loop = asyncio.get_running_loop()
@@ -270,7 +297,7 @@ async def open_zenoh(endpoint: str, credentials: Credentials | None = None) -> Z
     def work() -> None:
         while not stop.is_set():
             try:
-                session = zenoh.open(client_config(endpoint, connect_ms=_CONNECT_MS, credentials=credentials))
+                session = _open(endpoint, credentials)
             except zenoh.ZError as error:
                 log.debug("no router yet: %s", error)
                 stop.wait(0.02)
