@@ -10,8 +10,9 @@ from functools import cached_property
 import numpy as np
 
 from common.hardware.interface import Limits, Vector
-from common.messages import JointTrajectory
+from common.messages import JointTrajectory, JointTrajectoryPoint
 
+PIECE = 1000  # points that are made an array of at once: all else waits meanwhile
 ACCELERATION_MISMATCH = 0.3  # share of the velocity changes that the given accelerations may leave unexplained
 
 
@@ -86,12 +87,16 @@ def _interpolated(u: float | Vector, duration: float | Vector, coefficients: Vec
 def from_message(message: JointTrajectory, names: tuple[str, ...]) -> Trajectory:
     """The message's points with its joints, which must be the named ones, brought into their order."""
     order = [message.joint_names.index(name) for name in names]
-    points = message.points
+    pieces = [message.points[first : first + PIECE] for first in range(0, len(message.points), PIECE)]
+
+    def together(values: Callable[[JointTrajectoryPoint], float | list[float]]) -> Vector:
+        return np.concatenate([np.array([values(point) for point in piece], dtype=float) for piece in pieces])
+
     return Trajectory(
-        np.array([p.time_from_start for p in points], dtype=float),
-        np.array([p.positions for p in points], dtype=float)[:, order],
-        np.array([p.velocities for p in points], dtype=float)[:, order],
-        np.array([p.accelerations for p in points], dtype=float)[:, order],
+        together(lambda point: point.time_from_start),
+        together(lambda point: point.positions)[:, order],
+        together(lambda point: point.velocities)[:, order],
+        together(lambda point: point.accelerations)[:, order],
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from common.messages import WorldObject
 from common.robot.transforms import matrix_to_quaternion, quaternion_to_matrix, transform
-from common.sim.footprints import overlap
+from common.sim.footprints import apart, convex_parts, parts_meet
 from common.sim.interface import StandingObject
 from common.sim.objects import Solid, message_of
 from common.sim.places import Slot
@@ -126,9 +127,15 @@ class Block:
     high: float
     flat: bool  # its top carries things
 
-    def reaches(self, outline: Array) -> bool:
-        """Whether it covers some of an area seen from above."""
-        return overlap(outline, self.outline)
+    @cached_property
+    def parts(self) -> Array:
+        """Its outline in convex parts (n, K, 2) [m]."""
+        return convex_parts(self.outline)
+
+    def reaches(self, outline: Array, parts: Array | None = None) -> bool:
+        """Whether it covers some of an area seen from above, of which convex parts (m, N, 2) [m] may be given."""
+        return not apart(outline, self.outline) and parts_meet(
+            convex_parts(outline) if parts is None else parts, self.parts)
 
 
 def restored(name: str, kept: StandingObject, solid: Solid, color: tuple[float, float, float]) -> Body:

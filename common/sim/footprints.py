@@ -49,14 +49,24 @@ def within(inner: Array, outer: Array) -> bool:
 
 def overlap(a: Array, b: Array) -> bool:
     """Whether two outlines (N, 2) and (K, 2), anticlockwise, have an area in common; touching does not count."""
-    if (a.max(axis=0) < b.min(axis=0) + TOUCH).any() or (b.max(axis=0) < a.min(axis=0) + TOUCH).any():
-        return False
-    return any(_meet(p, q) for p in _convex_parts(a) for q in _convex_parts(b))
+    return not apart(a, b) and parts_meet(convex_parts(a), convex_parts(b))
 
 
-def _convex_parts(outline: Array) -> list[Array]:
-    """The outline itself if it is convex, else triangles, all anticlockwise."""
-    return [outline] if is_convex(outline) else list(triangulate(outline))
+def apart(a: Array, b: Array) -> bool:
+    """Whether the boxes around two outlines (N, 2) and (K, 2) have no area in common."""
+    return bool((a.max(axis=0) < b.min(axis=0) + TOUCH).any() or (b.max(axis=0) < a.min(axis=0) + TOUCH).any())
+
+
+def parts_meet(a: Array, b: Array) -> bool:
+    """Whether one of the convex parts (n, N, 2) of an outline has an area in common with one (m, K, 2) of another."""
+    low_a, high_a, low_b, high_b = a.min(axis=1), a.max(axis=1), b.min(axis=1), b.max(axis=1)
+    near = ((high_a[:, None] >= low_b + TOUCH) & (high_b >= low_a[:, None] + TOUCH)).all(axis=2)
+    return any(_meet(a[i], b[j]) for i, j in np.argwhere(near))
+
+
+def convex_parts(outline: Array) -> Array:
+    """The outline itself (1, N, 2) if it is convex, else triangles (n, 3, 2), all anticlockwise."""
+    return outline[None] if is_convex(outline) else triangulate(outline)
 
 
 def is_convex(outline: Array) -> bool:

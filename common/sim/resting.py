@@ -17,7 +17,7 @@ from common.config import Container, World
 from common.errors import Refused
 from common.robot.transforms import rpy_to_matrix, transform
 from common.sim.bodies import Block, Body, Rest, State
-from common.sim.footprints import covers_point, footprint, heights, within
+from common.sim.footprints import convex_parts, covers_point, footprint, heights, within
 from common.sim.places import Slot, Slots, Table, is_inside, is_over, tables
 
 Array = NDArray[np.float64]
@@ -114,7 +114,7 @@ class Ground:
         self, outline: Array, at: tuple[float, float], bottom: float, blocks: list[Block], box: Container | None
     ) -> tuple[float, float, float] | None:
         """The nearest place (x, y, height) where an outline about its own origin rests, within a container if given."""
-        inner = box.half_side - box.wall_thickness if box else 0.0
+        inner, parts = box.half_side - box.wall_thickness if box else 0.0, convex_parts(outline)
         carried = [b.high for b in blocks if b.flat and b.low < bottom and covers_point(b.outline, *at)]
         level = max(carried, default=self._world.table_height)  # it slides off to below its middle, never up
         for ring in range(int(FARTHEST / STEP)):
@@ -125,16 +125,18 @@ class Ground:
                     continue
                 if not box and any(is_over(c, x, y) for c in self._containers):
                     continue
-                height = self._height(there, x, y, bottom, blocks)
+                height = self._height(there, parts + np.array([x, y]), x, y, bottom, blocks)
                 if height is not None and (not ring or height < level + LEVEL):
                     return x, y, height
             if box and ring * STEP > 2 * box.half_side:
                 break
         return None
 
-    def _height(self, outline: Array, x: float, y: float, bottom: float, blocks: list[Block]) -> float | None:
-        """The height on which an outline rests there [m]; None where it would not stay."""
-        met = [block for block in blocks if block.low < bottom and block.reaches(outline)]
+    def _height(
+        self, outline: Array, parts: Array, x: float, y: float, bottom: float, blocks: list[Block]
+    ) -> float | None:
+        """The height on which an outline with these convex parts rests there [m]; None where it would not stay."""
+        met = [block for block in blocks if block.low < bottom and block.reaches(outline, parts)]
         if not met:
             return self._world.table_height if self._endless else None
         top = max(block.high for block in met)

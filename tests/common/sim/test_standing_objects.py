@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from common.config import ObjectConfig, World, check, config_root, read_yaml
 from common.errors import Refused
 from common.messages import Header, Vector3, WorldEdit, WorldObject
+from common.sim import footprints
 from common.sim.footprints import overlap, within
 from common.sim.interface import StandingObject
 from common.sim.kinematic import KinematicWorld
@@ -142,3 +144,15 @@ def test_object_fits_into_the_corner_of_another() -> None:
     corner = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], dtype=float)
     assert not overlap(corner, 0.9 * SQUARE + 1.05)
     assert overlap(corner, SQUARE + 0.95)
+
+
+def test_two_outlines_with_many_corners_cost_as_many_looks_as_there_are_corners(monkeypatch) -> None:
+    angles = np.linspace(0.0, 2 * math.pi, 60, endpoint=False)
+    star = np.column_stack([np.cos(angles), np.sin(angles)]) * np.where(np.arange(60) % 2, 1.0, 0.5)[:, None]
+    calls = Counter()
+    for name in ("triangulate", "_meet"):
+        was = getattr(footprints, name)
+        monkeypatch.setattr(footprints, name, lambda *a, was=was, name=name: (calls.update([name]), was(*a))[1])
+    assert overlap(star, star + 0.3)
+    assert not overlap(star, star + np.array([1.9, 0.5])), "one reaches between the teeth of the other"
+    assert calls["triangulate"] == 4 and calls["_meet"] < 60

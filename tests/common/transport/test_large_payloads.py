@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gc
 import threading
 from time import process_time
 from typing import Any
@@ -118,3 +119,22 @@ async def test_large_requests_are_read_beside_the_loop_and_in_order(monkeypatch:
     assert heard == [answer.id for answer in answers] == list(sizes)
     await client.close()
     await server.close()
+
+
+def test_garbage_collector_does_not_look_at_all_that_was_read_in_one_go() -> None:
+    payload = encode(execute(10_000))
+    looked: list[int] = []
+
+    def note(phase: str, _: dict[str, int]) -> None:
+        if phase == "start":
+            looked.append(len(gc.get_objects(0)))
+
+    gc.callbacks.append(note)
+    try:
+        request = decode(m.ExecuteRequest, payload)
+        kept = [[] for _ in range(2000)]  # what makes it look
+    finally:
+        gc.callbacks.remove(note)
+        gc.unfreeze()
+    assert len(request.trajectory.points) == 10_000 and kept
+    assert looked and max(looked) < 20_000, "and not at the lists of all points"
