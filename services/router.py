@@ -32,6 +32,7 @@ OPEN = (
 )
 _CLOSE_SECONDS = 0.4
 _ARENA_MAX = -8  # in malloc.h
+_READERS = 16  # threads that take what comes: each may wait for somebody who falls behind in pictures
 
 
 class _Parser(argparse.ArgumentParser):
@@ -48,6 +49,14 @@ def _share_memory() -> None:
         tell(_ARENA_MAX, 1)
 
 
+def _read_beside() -> None:
+    """Have more threads than Zenoh's two read what comes, before it is used for the first time.
+
+    With two, nobody hears anything while two writers of pictures wait for a reader that falls behind.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {_READERS}))")
+
+
 def main() -> NoReturn:
     """Be the router until SIGINT, SIGTERM or the end of the supervisor; exit 2 when it cannot listen."""
     parser = _Parser(prog="router")
@@ -62,6 +71,7 @@ def main() -> NoReturn:
     add_process_options(parser)
     options = parser.parse_args()
     _share_memory()
+    _read_beside()
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # a connection takes three files in a secured router
     lifeline = Lifeline(gate=options.gate)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from common.transport.endpoint import LINKS, client_config
+from common.transport.endpoint import LINKS, client_config, endpoint_of
 from common.transport.session import RawSample
 from common.transport.zenoh_session import ZenohSession, open_zenoh
 
@@ -110,6 +110,30 @@ async def test_over_one_link_no_small_message_is_lost_with_pictures(
     finally:
         behind.may.set()
         for session in (reader, writer):
+            await asyncio.to_thread(session.close)
+
+
+async def test_while_pictures_wait_for_a_reader_all_else_goes_on(domain: int, processes, behind: Behind, until) -> None:
+    processes.start("tests.common.transport.patient_router", "--domain", str(domain))
+    endpoint, came = endpoint_of(domain), Counter[str]()
+    sessions = [await one_link(endpoint), *[await open_zenoh(endpoint) for _ in range(5)]]
+    stuck, reader, arm, *cameras = sessions
+    try:
+        stuck.subscriber("cell/**", behind.on_sample)
+        pictures = [camera.publisher("cell/image", "", reliable=False) for camera in cameras]
+        states = arm.publisher("cell/joint_states", "", reliable=False)
+        await until(lambda: all(one.matched for one in (*pictures, states)))
+        for _ in range(PICTURES):
+            await asyncio.gather(*(asyncio.to_thread(one.put, PICTURE, b"") for one in pictures))
+        assert behind.busy.is_set()
+        reader.subscriber("cell/joint_states", lambda sample: came.update([sample.key]))
+        async with asyncio.timeout(PATIENCE):
+            while not came:  # its subscription is heard of somewhen
+                states.put(BYTES, b"")
+                await asyncio.sleep(0.01)
+    finally:
+        behind.may.set()
+        for session in sessions:
             await asyncio.to_thread(session.close)
 
 
