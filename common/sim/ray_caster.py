@@ -10,6 +10,7 @@ A ray that passes within rounding of the edge of two triangles meets one of them
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,8 +25,12 @@ Ints = npt.NDArray[np.int64]
 Picture = npt.NDArray[np.uint8]
 Depth = npt.NDArray[np.float32]
 
+log = logging.getLogger(__name__)
+
 NEAREST = 0.01  # triangles are cut off this far before the optical centre [m]
 SLACK = 1e-7  # [px] by which spans are widened, so that rounding leaves no gaps
+MOST_LAYERS = 100  # of triangles that fill the picture: what comes after them is not drawn
+MOST_AT_ONCE = 2_000_000  # pixels of triangles that are worked on together
 SAMPLES = 16  # rays through a pixel at the edge of something
 
 
@@ -73,6 +78,7 @@ def cast(meshes: Sequence[Mesh], camera: Pinhole, behind: View) -> View:
     palette = np.array([_bgr(mesh.color) for mesh in meshes], np.uint8)
     pixels, plane = _project(corners, camera)
     order = np.argsort(owner, kind="stable")
+    order = order[: _drawable(pixels[order], camera)]
     nearness, winner = _centres(pixels[order], plane[order], camera, depth)
     hit = np.flatnonzero(winner >= 0)
     mesh_of = np.full(winner.shape, -1, np.int64)
@@ -157,6 +163,33 @@ def _spans(pixels: Array, width: int, height: int, reach: float) -> tuple[Ints, 
     return triangle[full], row[full], start[full], end[full]
 
 
+def _areas(pixels: Array, width: int, height: int) -> Array:
+    """About how many pixels (n,) of the picture each triangle meets: never fewer."""
+    size = np.array([width, height])
+    low, high = np.clip(pixels.min(axis=1) - 1, 0, size), np.clip(pixels.max(axis=1) + 1, 0, size)
+    sides = np.roll(pixels, -1, axis=1) - pixels
+    own = np.abs(_cross(sides[:, 0], sides[:, 1])) / 2 + 2 * np.abs(sides).sum(axis=(1, 2)) + 4
+    return np.asarray(np.minimum(np.prod(high - low, axis=1), own) + 1)
+
+
+def _drawable(pixels: Array, camera: Pinhole) -> int:
+    """How many of the triangles, from the first on, can be drawn before so many layers of them fill the picture."""
+    areas = np.cumsum(_areas(pixels, camera.width, camera.height))
+    most = MOST_LAYERS * camera.width * camera.height
+    count = int(np.searchsorted(areas, most, side="right"))
+    if count < len(pixels):
+        log.warning("%d of %d triangles are not drawn: all together would fill the picture %.0f times",
+                    len(pixels) - count, len(pixels), areas[-1] / (camera.width * camera.height))
+    return count
+
+
+def _batches(pixels: Array, width: int, height: int) -> list[slice]:
+    """The triangles in order, so many at once that what is worked out for each pixel of them has room."""
+    batch = np.cumsum(_areas(pixels, width, height)) // MOST_AT_ONCE
+    ends = [*(np.flatnonzero(np.diff(batch)) + 1), len(pixels)]
+    return [slice(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True)]
+
+
 def _ramps(values: Ints, counts: Ints) -> tuple[Ints, Ints]:
     """Each value repeated as often as its count says, and beside it 0, 1, 2, ... up to that."""
     offsets = np.cumsum(counts) - counts
@@ -165,19 +198,20 @@ def _ramps(values: Ints, counts: Ints) -> tuple[Ints, Ints]:
 
 def _centres(pixels: Array, plane: Array, camera: Pinhole, depth: Depth) -> tuple[Array, Ints]:
     """1/depth (height * width,) at the centre of each pixel and the triangle met there; -1 where none is nearer."""
-    triangle, row, start, end = _spans(pixels, camera.width, camera.height, 0.0)
-    span, step = _ramps(np.arange(len(triangle)), end - start + 1)
-    of, column = triangle[span], start[span] + step
-    near = plane[of, 0] * column + plane[of, 1] * row[span] + plane[of, 2]
-    flat = row[span] * camera.width + column
     with np.errstate(divide="ignore"):
         best = (1.0 / depth.astype(np.float64)).ravel()
-    inside = near > best[flat]
-    of, near, flat = of[inside], near[inside], flat[inside]
-    np.maximum.at(best, flat, near)
     winner = np.full(best.shape, -1, np.int64)
-    won = near == best[flat]
-    winner[flat[won][::-1]] = of[won][::-1]  # of two at the same depth the mesh that was named first
+    for some in _batches(pixels, camera.width, camera.height):
+        triangle, row, start, end = _spans(pixels[some], camera.width, camera.height, 0.0)
+        span, step = _ramps(np.arange(len(triangle)), end - start + 1)
+        of, column = triangle[span] + some.start, start[span] + step
+        near = plane[of, 0] * column + plane[of, 1] * row[span] + plane[of, 2]
+        flat = row[span] * camera.width + column
+        inside = near > best[flat]
+        of, near, flat = of[inside], near[inside], flat[inside]
+        np.maximum.at(best, flat, near)
+        won = near == best[flat]
+        winner[flat[won][::-1]] = of[won][::-1]  # of two at the same depth the mesh that was named first
     return best, winner
 
 
@@ -192,33 +226,34 @@ def _soften(pixels: Array, plane: Array, colors: Picture, meshes: Ints, colour: 
     height, width = meshes.shape
     place = np.full(height * width, -1, np.int64)
     place[flat_edges] = np.arange(len(flat_edges))
-    triangle, row, start, end = _spans(pixels, width, height, 0.5)
-    some = np.cumsum(np.pad(edge, ((0, 0), (1, 0))), axis=1)
-    near_edge = some[row, end + 1] > some[row, start]
-    triangle, row, start, end = triangle[near_edge], row[near_edge], start[near_edge], end[near_edge]
-    span, step = _ramps(np.arange(len(triangle)), end - start + 1)
-    of, u, v = triangle[span], start[span] + step, row[span]
-    at = place[v * width + u]
-    wanted = at >= 0
-    of, u, v, at = of[wanted], u[wanted], v[wanted], at[wanted]
+    some_edge = np.cumsum(np.pad(edge, ((0, 0), (1, 0))), axis=1)
     offsets = _spread(SAMPLES)
     with np.errstate(divide="ignore"):
         best = np.repeat((1.0 / behind.depth.ravel()[flat_edges].astype(np.float64))[:, None], SAMPLES, axis=1)
-    a, b, c = (pixels[of, k] - np.stack([u, v], axis=1) for k in range(3))
-    turn = np.sign(_cross(b - a, c - a))
-    inside = np.ones((len(of), SAMPLES), bool)
-    for p, q in ((a, b), (b, c), (c, a)):
-        side = (q - p)[:, None]
-        inside &= turn[:, None] * _cross(side, offsets[None] - p[:, None]) >= -SLACK
-    hit, sample = np.nonzero(inside & (turn != 0)[:, None])
-    x, y = u[hit] + offsets[sample, 0], v[hit] + offsets[sample, 1]
-    near = plane[of[hit], 0] * x + plane[of[hit], 1] * y + plane[of[hit], 2]
-    nearer = near > best[at[hit], sample]
-    hit, sample, near = hit[nearer], sample[nearer], near[nearer]
-    np.maximum.at(best, (at[hit], sample), near)
     mixed = np.repeat(behind.colour.reshape(-1, 3)[flat_edges][:, None], SAMPLES, axis=1)
-    won = near == best[at[hit], sample]
-    mixed[at[hit][won][::-1], sample[won][::-1]] = colors[of[hit][won][::-1]]
+    for some in _batches(pixels, width, height):
+        triangle, row, start, end = _spans(pixels[some], width, height, 0.5)
+        near_edge = some_edge[row, end + 1] > some_edge[row, start]
+        triangle, row, start, end = triangle[near_edge] + some.start, row[near_edge], start[near_edge], end[near_edge]
+        span, step = _ramps(np.arange(len(triangle)), end - start + 1)
+        of, u, v = triangle[span], start[span] + step, row[span]
+        at = place[v * width + u]
+        wanted = at >= 0
+        of, u, v, at = of[wanted], u[wanted], v[wanted], at[wanted]
+        a, b, c = (pixels[of, k] - np.stack([u, v], axis=1) for k in range(3))
+        turn = np.sign(_cross(b - a, c - a))
+        inside = np.ones((len(of), SAMPLES), bool)
+        for p, q in ((a, b), (b, c), (c, a)):
+            side = (q - p)[:, None]
+            inside &= turn[:, None] * _cross(side, offsets[None] - p[:, None]) >= -SLACK
+        hit, sample = np.nonzero(inside & (turn != 0)[:, None])
+        x, y = u[hit] + offsets[sample, 0], v[hit] + offsets[sample, 1]
+        near = plane[of[hit], 0] * x + plane[of[hit], 1] * y + plane[of[hit], 2]
+        nearer = near > best[at[hit], sample]
+        hit, sample, near = hit[nearer], sample[nearer], near[nearer]
+        np.maximum.at(best, (at[hit], sample), near)
+        won = near == best[at[hit], sample]
+        mixed[at[hit][won][::-1], sample[won][::-1]] = colors[of[hit][won][::-1]]
     colour.reshape(-1, 3)[flat_edges] = np.rint(mixed.mean(axis=1)).astype(np.uint8)
 
 

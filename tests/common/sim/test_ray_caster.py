@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import rpy_to_matrix, transform
+from common.sim import ray_caster
 from common.sim.objects import object_mesh, world_object
 from common.sim.ray_caster import NEAREST, Mesh, cast, empty_view
 from common.sim.solids import fixture_mesh
@@ -134,3 +135,32 @@ def test_depth_outside_the_range_is_nan():
     assert np.isnan(empty_view(camera, GREY).depth_within(0.1, 2.25)).all()
     view = cast([], camera, empty_view(camera, GREY))
     assert (view.colour == 178).all()
+
+
+def test_view_is_the_same_however_many_triangles_are_worked_on_at_once(monkeypatch):
+    rng = np.random.default_rng(3)
+    meshes = [Mesh(triangles(seed, 20), tuple(rng.integers(0, 256, 3) / 255)) for seed in range(5)]
+    meshes.append(meshes[0])  # of what is as near as something else, the first is seen
+    whole = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
+    monkeypatch.setattr(ray_caster, "MOST_AT_ONCE", 100)
+    parts = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
+    assert np.array_equal(whole.colour, parts.colour) and np.array_equal(whole.depth, parts.depth)
+
+
+def test_work_for_a_view_is_bounded_whatever_there_is(monkeypatch, caplog):
+    wall = np.array([[(-9.0, -9.0, 1.0), (9.0, -9.0, 1.0), (0.0, 12.0, 1.0)]])
+    meshes = [Mesh(wall - (0, 0, 1e-3 * i), (i / 999, 0.0, 0.0)) for i in range(1000)]
+    pixels: list[int] = []
+    spans = ray_caster._spans
+
+    def counted(*arguments):
+        found = spans(*arguments)
+        pixels.append(int((found[3] - found[2] + 1).sum()))
+        return found
+
+    monkeypatch.setattr(ray_caster, "_spans", counted)
+    monkeypatch.setattr(ray_caster, "MOST_AT_ONCE", 20_000)
+    view = cast(meshes, CAMERA, empty_view(CAMERA, GREY))
+    assert view.depth[24, 32] == pytest.approx(1.0, rel=1e-6), "the first of them are seen"
+    assert sum(pixels) <= 2 * ray_caster.MOST_LAYERS * 64 * 48 and max(pixels) < 20_000 + 2 * 64 * 48
+    assert "901 of 1000 triangles are not drawn" in caplog.text
