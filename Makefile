@@ -47,7 +47,7 @@ chaos: setup  ## fifty runs, each under a plan of faults of its own: all of them
 	$(BIN)/python -m benchmarks.chaos
 
 fuzz: setup  ## a million changed payloads through every message, and thousands under the keys of both cells
-	$(BIN)/python -m benchmarks.fuzz
+	$(BIN)/python -m benchmarks.fuzz $(ARGS)
 
 soak: setup  ## thirty minutes of work beside a slow and a stuck subscriber: nothing may grow or get lost
 	$(BIN)/python -m benchmarks.soak

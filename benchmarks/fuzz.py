@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import os
 import tempfile
 import threading
 import time
@@ -147,11 +148,21 @@ def simulated(name: str, seed: int) -> list[str]:
 
 
 class Spent(NamedTuple):
-    """What the threads of a process have spent together until some time [ns]: computing, waiting for a processor."""
+    """What the threads of a process have spent together until some time [ns]: computing, waiting for a processor.
+
+    Waiting is also what a virtual machine does while its host has others run.
+    """
 
     at: int
     computing: int
     waiting: int
+
+
+def stolen() -> int:
+    """Time [ns] in which the host of a virtual machine gave its processors to others, all of them together."""
+    with suppress(OSError, IndexError):
+        return int(Path("/proc/stat").read_text().split(maxsplit=9)[8]) * 1_000_000_000 // os.sysconf("SC_CLK_TCK")
+    return 0
 
 
 class Spending:
@@ -176,6 +187,7 @@ class Spending:
                 with suppress(OSError):
                     told = (thread / "schedstat").read_text().split()
                     computing, waiting = computing + int(told[0]), waiting + int(told[1])
+            waiting += stolen()
             self.looks.append(Spent((began + time.time_ns()) // 2, computing, waiting))
 
     def between(self, begin: int, end: int) -> tuple[float, float]:
