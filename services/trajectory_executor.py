@@ -178,9 +178,18 @@ async def run(bus: Bus, config: Config) -> None:
         return await kept_answer(cycle.stop(request, bus.clock.now()))
 
     async def hold(request: HoldRequest) -> MotionStatus:
+        before = len(inhibits.all)
         status, let_go = cycle.hold(request)
         who = (request.owner or SOMEBODY) if request.by == "person" else request.by
-        bus.log.info("held by %s: %s" if request.hold else "let go by %s: %s", who, request.reason or "asked to")
+        why = request.reason or "asked to"
+        if request.hold:
+            bus.log.info("held by %s: %s", who, why)
+        elif status.inhibits:
+            told = "; ".join(inhibit.told for inhibit in status.inhibits)
+            part = "a part" if let_go or len(status.inhibits) < before else "nothing"
+            bus.log.info("%s let go of %s: %s; still %s", who, part, why, told)
+        else:
+            bus.log.info("let go by %s: %s", who, why)
         for inhibit in let_go:
             if inhibit.by != who:
                 bus.log.warning("%s let go of what another said: %s", who, inhibit.told)

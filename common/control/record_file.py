@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -54,13 +56,23 @@ class RecordFile:
     def load(self) -> tuple[Record, str]:
         """The record, and what is wrong with the file: then the record is one that keeps the robot from moving."""
         try:
-            with self.path.open("rb") as file:
-                return Record.model_validate_json(file.read(LARGEST)), ""
-        except FileNotFoundError:
-            return Record(), ""
-        except (OSError, ValidationError) as error:
-            why = error.strerror if isinstance(error, OSError) else "it is damaged, or of another version"
-            return damaged(f"{self.path}: {why}"), f"{self.path} cannot be read: {why}"
+            return Record.model_validate_json(self._text()), ""
+        except FileNotFoundError as error:
+            if not self.path.is_symlink():
+                return Record(), ""
+            why = f"it is a link to nothing ({error.strerror})"
+        except OSError as error:
+            why = error.strerror or str(error)
+        except ValidationError:
+            why = "it is damaged, or of another version"
+        return damaged(f"{self.path}: {why}"), f"{self.path} cannot be read: {why}"
+
+    def _text(self) -> bytes:
+        descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe would have us wait for a writer
+        with open(descriptor, "rb") as file:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise OSError(errno.EINVAL, "it is not a regular file")
+            return file.read(LARGEST)
 
     def save(self, record: Record) -> None:
         """Write a record so that it is there, or the one before it, whatever happens to the machine.

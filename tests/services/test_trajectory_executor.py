@@ -223,6 +223,22 @@ async def test_restarted_executor_holds_what_a_person_held_and_not_what_a_watchd
         assert not (await person.see(person.motion, lambda m: True)).inhibits
 
 
+async def test_log_says_whose_hold_stays_when_another_asks_to_let_go(caplog) -> None:
+    def told():
+        return [text for text in (record.getMessage() for record in caplog.records) if "let go" in text]
+
+    async with executor() as person:
+        await person.hold.call(HoldRequest(hold=True, owner="anna", reason="lunch"))
+        await person.hold.call(HoldRequest(hold=False, owner="bert"))
+        assert len(told()) == 1 and told()[0].startswith("bert let go of nothing: asked to; still held since ")
+        assert told()[0].endswith("by anna (lunch)")
+        await person.hold.call(HoldRequest(hold=True, owner="bert"))
+        await person.hold.call(HoldRequest(hold=False, owner="bert", reason="done"))
+        assert told()[1].startswith("bert let go of a part: done; still held since ")
+        await person.hold.call(HoldRequest(hold=False, owner="anna", reason="done"))
+        assert told()[2:] == ["let go by anna: done"]
+
+
 async def test_stopped_arm_and_fingers_stay_so_through_restarts_until_somebody_starts_them(robot: RobotModel) -> None:
     home = robot.named("home")
     there = move(robot, home, home + 0.2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -161,6 +162,26 @@ def test_record_that_cannot_be_read_counts_as_stopped_and_slow(tmp_path: Path, c
     assert refused is not None and str(path) in str(refused) and speed_of(inhibits.speed, 1.0) == SLOWEST
     inhibits.hold(HoldRequest(hold=False, stops=True))
     assert inhibits.objection("a") is None
+
+
+@pytest.mark.parametrize("kind", ["link to nothing", "pipe", "folder", "link in a circle"])
+def test_what_is_no_file_in_the_place_of_the_record_counts_as_stopped_and_keeps_nobody_waiting(
+    tmp_path: Path, kind: str
+) -> None:
+    path = tmp_path / "r"
+    {"link to nothing": lambda: path.symlink_to(tmp_path / "gone"), "pipe": lambda: os.mkfifo(path),
+     "folder": path.mkdir, "link in a circle": lambda: path.symlink_to(path)}[kind]()
+    record, problem = RecordFile(path).load()
+    assert problem.startswith(f"{path} cannot be read: ") and "\n" not in problem
+    assert Inhibits(record).objection("a")
+
+
+def test_link_to_a_record_is_read(tmp_path: Path) -> None:
+    inhibits = made()
+    inhibits.stop(StopRequest(owner="anna"))
+    RecordFile(tmp_path / "there").save(inhibits.record)
+    (tmp_path / "r").symlink_to(tmp_path / "there")
+    assert RecordFile(tmp_path / "r").load() == (inhibits.record, "")
 
 
 def test_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -> None:
