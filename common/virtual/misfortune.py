@@ -34,6 +34,7 @@ EXECUTOR = "trajectory_executor"
 VICTIM_SHARE = 0.7  # of task and executor, each, when a person has stopped the robot
 LOOKS_ON = 3.0, 8.0  # [s] for which it rests then
 PERSON_TIMEOUT = 2.0  # [s] of a person's request
+SURE = 2.5  # [s] after which a person looks again: what was read may have been older than the stop
 PERSON_SLOW = 0.3  # [s] that a message takes to or from a person on average, at most
 PERSON_LATE = 1.0  # [s] at most between a person's stop and what is done next, in two places at once
 
@@ -227,7 +228,9 @@ class Misfortune:
                 async with asyncio.timeout(PERSON_TIMEOUT):
                     while not _started(status.latest, motion.latest):  # noqa: ASYNC110 - time is free here
                         await asyncio.sleep(AGAIN)
-                    return
+            await asyncio.sleep(SURE)
+            if _started(status.latest, motion.latest):
+                return
 
     async def _be_person(self, session: VirtualSession) -> None:
         """Stop the task; then send the arm home and start the task, from two places that know nothing of each other."""
