@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import numpy as np
 from pydantic import Field
 
@@ -41,8 +43,9 @@ async def run(bus: Bus, config: Config) -> None:
     shown: Picture | None = None
     while True:
         header = bus.header(frame)  # the instant of exposure: what is drawn is where everything is now
-        drawn = renderer.see((truth.latest or WorldObjects()).objects).colour
-        picture = disturbed(drawn, config.noise_std, config.brightness, rng)
+        objects = (truth.latest or WorldObjects()).objects
+        view = await asyncio.to_thread(renderer.see, objects) if renderer.takes_long(objects) else renderer.see(objects)
+        picture = disturbed(view.colour, config.noise_std, config.brightness, rng)
         if sent is None or picture is not shown:
             sent, shown = array_to_image(picture, "bgr8", header), picture
         else:

@@ -32,6 +32,7 @@ Depth = npt.NDArray[np.float32]
 
 GROUND = (178 / 255, 178 / 255, 178 / 255)  # of a full picture
 ARM = (0.55, 0.55, 0.55)
+FEW = 32  # spheres that are drawn at once
 STILL = 1e-4  # joints that moved by less [rad] leave the picture as it is
 BASE = 128  # of a plain picture: all three channels
 GRID = 108
@@ -67,15 +68,21 @@ class Renderer:
         self._solid = [] if plain else _solid(around)
         self._behind = self._plain_background(around) if plain else empty_view(self.camera, GROUND)
         self._deep = bool(np.isfinite(self._behind.depth).any())  # something in the background may hide a sphere
+        self._asked: Sequence[WorldObject] | None = None
         self._objects: list[WorldObject] | None = None
         self._joints: Array | None = None
         self._still = self._seen = self._behind
+
+    def takes_long(self, objects: Sequence[WorldObject]) -> bool:
+        """Whether to `see` the objects may take longer than a moment: rays are cast at all but a few spheres."""
+        return objects != self._asked and (len(objects) > FEW or any(thing.shape != "sphere" for thing in objects))
 
     def see(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
         """The view of the objects and of the arm in that state; without a complete state, of the objects alone.
 
         The depth of a plain picture knows neither table nor spheres. What is "elsewhere" is out of sight.
         """
+        self._asked = objects
         hidden = ("held", "elsewhere") if self._plain else ("elsewhere",)
         seen = [thing for thing in objects if thing.state not in hidden]
         changed = self._objects is None or seen != self._objects

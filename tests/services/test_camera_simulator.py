@@ -1,4 +1,5 @@
 import asyncio
+import threading
 
 import numpy as np
 import pytest
@@ -6,12 +7,12 @@ import pytest
 from common import topics
 from common.clock import Clock
 from common.config import Run, Surroundings
-from common.messages import Header
+from common.messages import Header, Pose, Vector3, WorldObject, WorldObjects
 from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.process.wiring import wiring
-from common.sim.rendering import draw
+from common.sim.rendering import Renderer, draw
 from common.transport.local import LocalNetwork
 from services.camera_simulator import Config, run
 from tests.common.sim.spheres import spheres
@@ -114,3 +115,28 @@ async def test_it_is_the_only_one_here_that_reads_the_truth():
     assert found.reads == {topics.SCENE_OBJECTS}
     assert found.writes == {topics.CAMERA_IMAGE, topics.CAMERA_INFO}
     assert not found.serves and not found.calls
+
+
+async def test_loop_turns_while_a_picture_takes_long(monkeypatch):
+    net, loop = LocalNetwork(), asyncio.get_running_loop()
+    tester = net.bus()
+    images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_OBJECTS)
+    entered, go_on, see = asyncio.Event(), threading.Event(), Renderer.see
+
+    def slow(renderer, objects, *rest):
+        if any(thing.shape == "box" for thing in objects):
+            loop.call_soon_threadsafe(entered.set)
+            assert go_on.wait(10)
+        return see(renderer, objects, *rest)
+
+    monkeypatch.setattr(Renderer, "see", slow)
+    async with running_service(net, run, config):
+        truth.put(balls((0.5, -0.2, 0.03)))
+        before = await next_of(images)
+        there = Pose(position=Vector3(x=0.5))
+        box = WorldObject(id="box", shape="box", size=Vector3(x=0.05, y=0.05, z=0.05), pose=there)
+        truth.put(WorldObjects(objects=[box]))
+        await asyncio.wait_for(entered.wait(), 10)  # on the loop on which the camera runs
+        go_on.set()
+        while (await next_of(images)).data == before.data:
+            pass
