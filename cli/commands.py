@@ -139,7 +139,7 @@ def stop(cell: options.CellName = None, domain: options.Domain = None, connect: 
     from cli.schema import to_json
     from common import topics
     from common.errors import RequestFailed
-    from common.messages import StopRequest, TaskCommand
+    from common.messages import MotionStatus, StopRequest, TaskCommand
 
     by = options.person()
 
@@ -149,12 +149,16 @@ def stop(cell: options.CellName = None, domain: options.Domain = None, connect: 
             told: Message = await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="stop", by=by), TIMEOUT)
         except RequestFailed as error:
             with contextlib.suppress(RequestFailed):
-                await arm
+                tell_unkept(await arm)
                 raise ArmOnly(error) from None
             raise
         with contextlib.suppress(RequestFailed):
-            await arm
+            tell_unkept(await arm)
         return told
+
+    def tell_unkept(answer: MotionStatus) -> None:
+        if answer.not_kept:
+            echo(f"zencell: {answer.not_kept}", err=True)
 
     echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
 

@@ -46,6 +46,7 @@ from common.transport.bus import Bus
 T = TypeVar("T")
 
 MOST_CYCLES = 250.0  # per second of wall time
+TRY_AGAIN = 1.0  # [s] after what was decided could not be written
 REACH_MARGIN = 0.008  # [m] random places keep from the ends of the reach: what is seen is a few millimetres off
 
 
@@ -82,6 +83,9 @@ class Decisions:
         """Begin with what the file says."""
         self._file, self._log, self._writing = file, log, asyncio.Lock()
         self._written, problem = file.load()
+        self._unkept = ""  # why what was decided last is not written
+        self._trying: asyncio.Task[None] | None = None
+        self.on_change: Callable[[], None] = lambda: None  # what is written, and what is not
         self.inhibits = Inhibits(self._written)
         if problem:
             log.error("%s; the robot counts as stopped: look at the cell, then `zencell task start`", problem)
@@ -93,16 +97,38 @@ class Decisions:
         """What is wrong, once all that was decided so far is written; empty when it is."""
         async with self._writing:
             record = self.inhibits.record
-            if record == self._written:
+            if record == self._written and not self._unkept:
                 return ""
+            before = self._unkept
             try:
                 await asyncio.to_thread(self._file.save, record)
             except OSError as error:
-                told = f"{self._file.path} cannot be written ({error.strerror}): this does not outlive the executor"
-                self._log.error("%s", told)
-                return told
-            self._written = record
-            return ""
+                why = error.strerror or str(error)
+                self._unkept = f"{self._file.path} cannot be written ({why}): this does not outlive the executor"
+                self.inhibits.note_kept(self._written, why)
+                if self._unkept != before:
+                    self._log.error("%s; it is tried again every second", self._unkept)
+                if self._trying is None:
+                    self._trying = asyncio.create_task(self._try_again(), name="keep")
+            else:
+                self._written, self._unkept = record, ""
+                self.inhibits.note_kept(record)
+                if before:
+                    self._log.warning("%s is written again: what was decided outlives the executor", self._file.path)
+            if before or self._unkept:
+                self.on_change()
+            return self._unkept
+
+    async def _try_again(self) -> None:
+        while self._unkept:
+            await asyncio.sleep(TRY_AGAIN)
+            await self.keep()
+        self._trying = None
+
+    def close(self) -> None:
+        """Try no longer."""
+        if self._trying is not None:
+            self._trying.cancel()
 
 
 def make_cycle(
@@ -198,7 +224,8 @@ async def run(bus: Bus, config: Config) -> None:
     async def kept_answer(status: MotionStatus) -> MotionStatus:
         """The answer, which is given once what was decided outlives us."""
         if problem := await decisions.keep():
-            status = status.model_copy(update={"message": f"{status.message}; {problem}".removeprefix("; ")})
+            message = f"{status.message}; {problem}".removeprefix("; ")
+            status = status.model_copy(update={"message": message, "inhibits": inhibits.all})
         return status.model_copy(update={"header": bus.header()})
 
     async def keep_speed() -> None:
@@ -260,6 +287,7 @@ async def run(bus: Bus, config: Config) -> None:
         make_cycle, config, simulated, kept, bus.clock.now(), inhibits, period * bus.clock.speed
     )
     cycle.beside = True
+    decisions.on_change = cycle.tell_inhibits
     memory = SavedBeside(standing_file) if standing_file and bus.has_threads else standing_file
     if kept is not None:
         bus.log.info("the arm and what is about it are as they were")
@@ -306,6 +334,7 @@ async def run(bus: Bus, config: Config) -> None:
     finally:
         if moving is not None:
             moving.cancel()
+        decisions.close()
         cycle.close()
         if memory is not None:
             memory.close()

@@ -110,7 +110,7 @@ class ControlCycle:
         self._kept: object = None
         self._waits = False  # held by ourselves
         self._inhibits = inhibits or Inhibits()
-        self._inhibit()
+        self.tell_inhibits()
 
     def step(self, header: Header) -> Report:
         """Do one cycle at the header's time and say what is new."""
@@ -189,7 +189,7 @@ class ControlCycle:
         stopped = [goal for goal in (running if request.by == "person" or not request.id else "", request.id) if goal]
         # One that runs must not come to life again should its request come once more after a restart.
         self._inhibits.never(goal for goal in stopped if goal == running or not self._arm.knows(goal))
-        self._inhibit()
+        self.tell_inhibits()
         status = self._arm.cancel(request.id, request.reason, now)
         if known:
             return status
@@ -203,7 +203,7 @@ class ControlCycle:
         let_go = self._inhibits.hold(request)
         if request.by != "person":
             self._arm.hold(request.hold, request.reason, request.by)
-        self._inhibit()
+        self.tell_inhibits()
         return self._arm.status, let_go
 
     def wait(self, wait: bool, reason: str = "") -> None:
@@ -212,9 +212,9 @@ class ControlCycle:
             self._waits = wait
             self._inhibits.hold_ourselves("controller", wait, reason)
             self._arm.hold(wait, reason, "controller")
-            self._inhibit()
+            self.tell_inhibits()
 
-    def _inhibit(self) -> None:
+    def tell_inhibits(self) -> None:
         """Have the arm held as persons say, and told of all who keep it."""
         reasons = [hold.reason for hold in self._inhibits.holds]
         self._arm.inhibits = self._inhibits.all

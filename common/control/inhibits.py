@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from common.errors import Refused
 from common.messages import HoldRequest, Inhibit, StopRequest
+from common.messages.execution import NOT_KEPT
 from common.sources import wall_ns
 
 SOMEBODY = "person"  # who gave no name: everybody lets go of that hold
@@ -55,6 +56,7 @@ class Inhibits:
         self._goals = dict.fromkeys(record.goals)
         self._newest = record.newest
         self._now = now
+        self._problem, self._kept = "", record.inhibits
         self.speed = record.speed
 
     @property
@@ -65,7 +67,11 @@ class Inhibits:
     @property
     def all(self) -> list[Inhibit]:
         """All that keeps the robot from moving."""
-        return [*self._persons.values(), *self._own.values()]
+        return [*map(self._as_kept, self._persons.values()), *self._own.values()]
+
+    def note_kept(self, record: Record, problem: str = "") -> None:
+        """Take note of what outlives the process, and of why the rest does not: `all` says so from now on."""
+        self._problem, self._kept = problem, record.inhibits
 
     @property
     def holds(self) -> list[Inhibit]:
@@ -125,6 +131,12 @@ class Inhibits:
         passes = (owner, SOMEBODY) if owner and heard is not None else ()
         stops = [stop for stop in self.stops if stop.by not in passes or stop.since > (heard or 0)]
         return Refused(STOPPED, "; ".join(stop.told for stop in stops)) if stops else None
+
+    def _as_kept(self, inhibit: Inhibit) -> Inhibit:
+        if not self._problem or inhibit in self._kept:
+            return inhibit
+        reason = f"{NOT_KEPT} ({self._problem}), lost if the executor ends{inhibit.reason and f'; {inhibit.reason}'}"
+        return inhibit.model_copy(update={"reason": reason[:MOST_REASON]})
 
     def _put(self, kind: Literal["stopped", "held"], owner: str, reason: str) -> None:
         by = owner or SOMEBODY

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import stat
@@ -15,6 +16,7 @@ from common.errors import ConfigError
 from common.sim.standing import STATE_VARIABLE
 
 LARGEST = 1_000_000  # [bytes]
+ROOM = 128 * 1024  # [bytes] that each file takes: more than the largest record there can be
 
 
 def lasting_folder(environ: Mapping[str, str] = os.environ) -> Path:
@@ -32,25 +34,31 @@ def lasting_folder(environ: Mapping[str, str] = os.environ) -> Path:
 
 
 class RecordFile:
-    """A record that is always whole: a new file takes the place of the old one."""
+    """A record that is always whole: a new file takes the place of the old one, which is the next new one.
+
+    Both have room for any record from the start: a disk that becomes full later still takes what is decided.
+    """
 
     def __init__(self, path: Path) -> None:
         """Use this file, which need not be there yet."""
         self.path = path
         self._new = path.with_name(f"{path.name}.new")
+        self._last = path.with_name(f"{path.name}.last")  # second name of the old file while it is replaced
 
     def require_writable(self) -> None:
-        """Return when the file can be written.
+        """Return when the file can be written, from now on also on a disk that is full.
 
         Raises:
             ConfigError: it cannot.
         """
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self._new, os.O_WRONLY | os.O_CREAT, 0o600)
-            os.close(descriptor)
+            record, problem = self.load()
+            if not problem:  # else it stays to be looked at
+                self.save(record)
+            self._write(record)
         except OSError as error:
-            told = f"cannot be written ({error.strerror}): stops and holds would not outlive a restart"
+            told = f"cannot be written ({error.strerror or error}): stops and holds would not outlive a restart"
             raise ConfigError(STATE_VARIABLE, str(self.path.parent), told) from None
 
     def load(self) -> tuple[Record, str]:
@@ -80,20 +88,36 @@ class RecordFile:
         Raises:
             OSError: it could not be written.
         """
-        descriptor = os.open(self._new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-        try:
-            text = record.model_dump_json(indent=1).encode()
-            while text:
-                text = text[os.write(descriptor, text):]
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        self._write(record)
+        self._last.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # there is none yet, or no second names: then the next one needs new room
+            os.link(self.path, self._last, follow_symlinks=False)
         self._new.replace(self.path)
+        with contextlib.suppress(FileNotFoundError):
+            self._last.replace(self._new)
         folder = os.open(self.path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+    def _write(self, record: Record) -> None:
+        """Write the new file, over what it holds: a file that is made shorter gives its room away."""
+        with contextlib.suppress(FileNotFoundError):
+            if not os.path.lexists(self._new):
+                self._last.replace(self._new)  # we were ended between the two
+            found = self._new.lstat()
+            if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+                self._new.unlink()  # writing over it would change something else
+        left = record.model_dump_json(indent=1).encode().ljust(ROOM - 1) + b"\n"
+        descriptor = os.open(self._new, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        try:
+            while left:
+                left = left[os.write(descriptor, left):]
+            os.ftruncate(descriptor, os.lseek(descriptor, 0, os.SEEK_CUR))
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def record_file(cell: str, environ: Mapping[str, str] = os.environ) -> RecordFile:

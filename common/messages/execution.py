@@ -15,6 +15,7 @@ Holder = Literal["person", "watchdog", "controller"]
 Who = Label
 Since = Annotated[int, Field(ge=0, le=MOST_STAMP)]
 MOST_INHIBITS = 32  # that are told of
+NOT_KEPT = "not kept on disk"  # begins the reason of an inhibit that would not outlive its process
 
 
 class ExecuteRequest(Message):
@@ -108,6 +109,11 @@ class MotionStatus(Message):
     def stopped(self) -> str:
         """By whom and since when no motion begins, in words; empty when one may."""
         return "; ".join(inhibit.told for inhibit in self.inhibits if inhibit.kind == "stopped")
+
+    @property
+    def not_kept(self) -> str:
+        """What a person decided and would be lost with the executor, in words; empty when there is nothing."""
+        return "; ".join(inhibit.told for inhibit in self.inhibits if inhibit.reason.startswith(NOT_KEPT))
 
     @property
     def newest(self) -> int:

@@ -1,5 +1,7 @@
 import asyncio
+import errno
 import json
+import os
 import threading
 from contextlib import asynccontextmanager
 
@@ -291,6 +293,40 @@ async def test_executor_that_cannot_keep_what_persons_decide_does_not_start(
     with pytest.raises(ConfigError, match=r"ZENCELL_STATE: .* cannot be written"):
         async with executor():
             pass
+
+
+async def test_stop_that_cannot_be_kept_says_so_everywhere_until_it_is(monkeypatch, caplog) -> None:
+    monkeypatch.setattr(trajectory_executor, "TRY_AGAIN", 0.01)
+    save, full = RecordFile.save, True
+
+    def refuse(self, record):
+        if full:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        save(self, record)
+
+    def told():
+        return [record.getMessage() for record in caplog.records if "inhibits.json" in record.getMessage()]
+
+    async with executor() as person:
+        monkeypatch.setattr(RecordFile, "save", refuse)
+        for _ in range(2):
+            answer = await person.stop.call(StopRequest(owner="anna", reason="smoke"))
+            assert answer.message.count("inhibits.json cannot be written (No space left on device)") == 1
+            assert "not kept on disk (No space left on device)" in answer.stopped and "smoke" in answer.stopped
+        await person.see(person.motion, lambda m: m.not_kept)
+        held = await person.hold.call(HoldRequest(hold=True, owner="bert"))
+        assert "cannot be written" in held.message and held.not_kept.count("not kept on disk") == 2
+        await goes_on(person)
+        assert len(told()) == 1, "said once, however often it is tried"
+        full = False
+        status = await person.see(person.motion, lambda m: len(m.inhibits) == 2 and not m.not_kept)
+        assert status.stopped.endswith("by anna (smoke)")
+        assert len(told()) == 2 and told()[1].endswith("is written again: what was decided outlives the executor")
+        answer = await person.stop.call(StopRequest(owner="anna", reason="smoke"))
+        assert "written" not in answer.message
+    async with executor() as person:
+        found = await person.see(person.motion, lambda m: True)
+        assert {one.by for one in found.inhibits} == {"anna", "bert"}
 
 
 async def test_speed_scaling_that_is_set_while_it_moves_slows_the_arm_down(robot: RobotModel) -> None:

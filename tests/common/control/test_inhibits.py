@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -13,7 +17,7 @@ from hypothesis import strategies as st
 from common.control.inhibits import MOST, MOST_GOALS, SLOWEST, Inhibits, Record, Speed, speed_of
 from common.control.record_file import RecordFile, lasting_folder, record_file
 from common.errors import ConfigError
-from common.messages import HoldRequest, StopRequest
+from common.messages import HoldRequest, MotionStatus, StopRequest
 
 T0 = 1_700_000_000_000_000_000
 
@@ -149,6 +153,139 @@ def test_save_that_is_cut_off_anywhere_leaves_the_record_before_it(tmp_path: Pat
     for size in (0, 10, 200):
         (tmp_path / "r.new").write_bytes((tmp_path / "r").read_bytes()[:size])
         assert file.load() == (inhibits.record, "")
+
+
+class PowerCut(Exception):
+    pass
+
+
+def step_or_cut(steps: Iterator[int], step: Callable[..., Any], *args: Any, **named: Any) -> Any:
+    if next(steps, None) is None:
+        raise PowerCut
+    return step(*args, **named)
+
+
+@pytest.mark.parametrize("step", range(12))
+def test_save_that_is_cut_off_between_any_two_steps_leaves_one_of_both_records_and_room_for_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full_disk: Callable[[], None], step: int
+) -> None:
+    file, inhibits = RecordFile(tmp_path / "r"), made()
+    file.require_writable()
+    inhibits.stop(StopRequest(owner="anna"))
+    file.save(inhibits.record)
+    before = inhibits.record
+    inhibits.stop(StopRequest(owner="bert"))
+    steps = iter(range(step))
+    with monkeypatch.context() as patched:
+        for name in ("open", "write", "fsync", "unlink", "link", "replace"):
+            patched.setattr(os, name, partial(step_or_cut, steps, getattr(os, name)))
+        with suppress(PowerCut):
+            file.save(inhibits.record)
+    assert file.load() in ((before, ""), (inhibits.record, ""))
+    full_disk()
+    again = RecordFile(tmp_path / "r")
+    again.require_writable()
+    again.save(inhibits.record)
+    assert again.load() == (inhibits.record, "")
+
+
+@pytest.fixture
+def full_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Has no more room from the call on than the files have."""
+    honest = os.write
+
+    def write(descriptor: int, data: bytes) -> int:
+        if os.lseek(descriptor, 0, os.SEEK_CUR) + len(data) > os.fstat(descriptor).st_size:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return honest(descriptor, data)
+
+    return lambda: monkeypatch.setattr(os, "write", write)
+
+
+def largest() -> Inhibits:
+    inhibits = made()
+    for number in range(MOST + 1):
+        inhibits.stop(StopRequest(owner=f"{number}".rjust(120, "\U0001f916"), reason="\U0001f916" * 300))
+    inhibits.never(f"{number}".rjust(120, "\U0001f916") for number in range(MOST_GOALS))
+    inhibits.speed = Speed(scaling=1 / 3, configured=2 / 3)
+    return inhibits
+
+
+def test_disk_that_becomes_full_takes_any_record_again_and_again(
+    tmp_path: Path, full_disk: Callable[[], None]
+) -> None:
+    file, inhibits = RecordFile(tmp_path / "r"), made()
+    file.require_writable()
+    full_disk()
+    for state in (largest(), inhibits, largest()):
+        file.save(state.record)
+        assert file.load() == (state.record, "")
+    file.require_writable()
+    assert file.load() == (largest().record, ""), "also for the next executor"
+    assert {entry.name for entry in tmp_path.iterdir()} == {"r", "r.new"}
+
+
+def test_record_that_was_written_without_room_is_read_and_has_it_from_then_on(
+    tmp_path: Path, full_disk: Callable[[], None]
+) -> None:
+    path, inhibits = tmp_path / "r", made()
+    inhibits.stop(StopRequest(owner="anna"))
+    path.write_text(inhibits.record.model_dump_json(indent=1))
+    (tmp_path / "r.new").write_bytes(b"")
+    file = RecordFile(path)
+    file.require_writable()
+    assert file.load() == (inhibits.record, "")
+    full_disk()
+    file.save(largest().record)
+    file.save(inhibits.record)
+    assert file.load() == (inhibits.record, "")
+
+
+@pytest.mark.parametrize("left", [(), ("r.new",), ("r",)])
+def test_disk_that_is_full_from_the_start_is_refused_in_one_line(
+    tmp_path: Path, full_disk: Callable[[], None], left: tuple[str, ...]
+) -> None:
+    for name in left:
+        (tmp_path / name).write_text(Record().model_dump_json())
+    full_disk()
+    with pytest.raises(ConfigError, match=r"cannot be written \(No space left on device\): stops") as caught:
+        RecordFile(tmp_path / "r").require_writable()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["second name of the record", "link to another file", "pipe"])
+def test_what_else_lies_in_the_place_of_the_next_record_is_never_written_over(tmp_path: Path, kind: str) -> None:
+    file, other = RecordFile(tmp_path / "r"), tmp_path / "other"
+    file.save(largest().record)
+    other.write_text("mine")
+    new = tmp_path / "r.new"
+    {"second name of the record": lambda: os.link(tmp_path / "r", new), "pipe": lambda: os.mkfifo(new),
+     "link to another file": lambda: new.symlink_to(other)}[kind]()
+    file.require_writable()
+    assert file.load() == (largest().record, "") and other.read_text() == "mine"
+
+
+def test_record_that_cannot_be_read_stays_to_be_looked_at_until_something_is_decided(tmp_path: Path) -> None:
+    path = tmp_path / "r"
+    path.write_bytes(b"{")
+    RecordFile(path).require_writable()
+    assert path.read_bytes() == b"{"
+
+
+def test_what_is_not_kept_is_told_so_and_what_was_before_is_not() -> None:
+    inhibits = made()
+    inhibits.stop(StopRequest(owner="anna", reason="smoke"))
+    kept = inhibits.record
+    inhibits.stop(StopRequest(owner="bert", reason="fire"))
+    inhibits.hold(HoldRequest(hold=True, by="watchdog", reason="no joint states"))
+    inhibits.note_kept(kept, "No space left on device")
+    status = MotionStatus(inhibits=inhibits.all)
+    lost = "not kept on disk (No space left on device), lost if the executor ends"
+    assert [one.reason for one in status.inhibits] == ["smoke", f"{lost}; fire", "no joint states"]
+    assert status.not_kept.endswith(f"by bert ({lost}; fire)")
+    assert inhibits.record.inhibits[1].reason == "fire"
+    inhibits.note_kept(inhibits.record)
+    assert not MotionStatus(inhibits=inhibits.all).not_kept
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff" * 99, b'{"version": 2}', b'{"version": 1, "inhibits": [{}]}'])
