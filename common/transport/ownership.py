@@ -7,21 +7,27 @@ they started, see each other when it is whole again: the one that was ready firs
 from __future__ import annotations
 
 import asyncio
+import threading
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from common.errors import ConfigError
 from common.sources import new_id, wall_ns
 from common.topics import general_key
+from common.transport.handoff import Doorbell
 from common.transport.keys import owns_key
 from common.transport.session import Declared, Session
-from common.transport.tokens import TokenWatch, tokens_now
+from common.transport.tokens import tokens_now
 
 # What the supervisors of linked hosts say under one key; the readers tell them apart.
 SHARED = ("log/supervisor", "counters/supervisor", "supervisor/status")
 GIVE_UP = 3.0  # [s] longer than a link that was cut stands: the one before may be gone and its tokens not yet
 LOOK_PERIOD = 0.2  # [s]
 MEET = 0.5  # [s] that somebody else must own what is ours before one of the two ends: tokens of who is gone go at once
+MOST_OTHERS = 16  # that are known to own a key of ours too: those that were there first
+MOST_TOLD = 8  # of whom a line of the log tells in TELL_SECONDS
+TELL_SECONDS = 60.0
 _ASKS = "f" * 16  # instead of a time: later than everybody who is ready
 
 
@@ -66,7 +72,7 @@ class Owner:
     @classmethod
     def of(cls, token: str) -> Owner:
         """Who holds a token."""
-        key, own, service, process = token.split("/")[2:]
+        _, _, key, own, service, process, *_ = *token.split("/"), "", "", "", ""  # of a pattern, which may be shorter
         return cls(key.replace("|", "/"), own.replace("|", "/"), service, process)
 
 
@@ -103,9 +109,13 @@ class Ownership:
         self._mine: dict[str, Owner] = {}  # by key
         self._tokens: list[Declared] = []
         self._settled = False
-        self._all: TokenWatch | None = None
-        self._others: set[Owner] = set()  # of keys of ours, as far as they have shown up since
-        self._told: set[str] = set()  # of whom, by process
+        self._lock = threading.Lock()
+        # Of each key of ours, as far as they have shown up since; when, or None once that was judged.
+        self._others: dict[str, dict[Owner, float | None]] = {}
+        self._bell = Doorbell(loop, self._look)
+        self._next_look: asyncio.TimerHandle | None = None
+        self._told: deque[tuple[float, str]] = deque(maxlen=64)  # when, of whom by process
+        self._untold = 0
 
     def claim(self, key: str, own: str) -> None:
         """Take note that a key is written or served here, under a word of our own; it is ours from `settle` on."""
@@ -115,6 +125,7 @@ class Ownership:
         self._mine[key] = Owner(key, own, self._service, process_name(self._life, since))
         if since is not None:
             self._declare(self._mine[key])
+            self._watch(key)
 
     async def settle(self) -> None:
         """Return when all that was claimed is ours; from then on look out for others who own it too.
@@ -133,33 +144,31 @@ class Ownership:
         for token in asked:
             token.undeclare()
         self._settled = True
-        if self._mine:
-            self._all = TokenWatch(self._session, owns_key(self._cell), self._loop, name=str)
-            self._all.on_change(self._hear)
+        for key in self._mine:
+            self._watch(key)
 
-    async def owners(self) -> list[Owner]:
-        """Who writes or serves what in the cell now: services that are ready or just become so."""
-        if self._all is None:
-            tokens = frozenset(await tokens_now(self._session, owns_key(self._cell), self._loop, 1.0))
-        else:  # while they are watched, Zenoh would only tell of those that the watch has seen so far
-            await self._all.known(1.0)
-            tokens = self._all.names
-        return who_owns(tokens)
+    async def owners(self, *keys: str) -> list[Owner]:
+        """Who writes or serves these keys in the cell now, or any: services that are ready or just become so."""
+        asked = [owns_key(self._cell, key) for key in keys or "*"]
+        found = await asyncio.gather(*(tokens_now(self._session, key, self._loop, 1.0) for key in asked))
+        return who_owns(token for tokens in found for token in tokens)
 
     def close(self) -> None:
         """Own nothing any more."""
         for token in reversed(self._tokens):
             token.undeclare()
         self._mine.clear()
-        self._others.clear()
+        with self._lock:
+            self._others.clear()
 
     def _declare(self, owner: Owner) -> None:
         self._tokens.append(self._session.token(f"{self._cell}{owner.token}"))
 
     async def _require_only(self) -> None:
         deadline = self._loop.time() + GIVE_UP
-        while True:
-            others = [each for each in await self.owners() if each.key in self._mine and each.life != self._life]
+        while self._mine:
+            found = await self.owners(*self._mine)  # not of all keys: of some there may be any number
+            others = [each for each in found if each.key in self._mine and each.life != self._life]
             if not others:
                 return
             if self._loop.time() > deadline:
@@ -167,28 +176,61 @@ class Ownership:
                 raise ConfigError(f"services.{self._service}", ..., refusal(self._mine[other.key], other))
             await asyncio.sleep(LOOK_PERIOD)
 
+    def _watch(self, key: str) -> None:
+        """Look out for others who own a key of ours; what goes on under other keys never comes here."""
+        self._session.watch_tokens(owns_key(self._cell, key), self._hear, lambda _: None, lambda: None)
+
     def _hear(self, token: str, there: bool) -> None:
-        """Take note of a token; of another owner of what is ours it is looked at again in a moment."""
+        """Take note of a token, on any thread; of another owner of what is ours it is looked at again in a moment."""
         other = Owner.of(token)
         if other.key not in self._mine or other.life == self._life:
             return
-        (self._others.add if there else self._others.discard)(other)
-        if there:
-            self._loop.call_later(MEET, self._judge, other)
+        with self._lock:
+            others = self._others.setdefault(other.key, {})
+            if not there:
+                others.pop(other, None)
+            elif other not in others:
+                others[other] = self._loop.time()
+                if len(others) > MOST_OTHERS:  # who was there first matters most
+                    del others[max(others, key=lambda each: each.process)]
+        self._bell.ring()
 
-    def _judge(self, other: Owner) -> None:
+    def _look(self) -> None:
+        """Judge whoever has owned a key of ours for long enough; look again when the next one has."""
+        now = self._loop.time()
+        due: list[Owner] = []
+        later: list[float] = []
+        with self._lock:
+            for others in self._others.values():
+                for other, since in others.items():
+                    if since is not None and since + MEET <= now:
+                        due.append(other)
+                        others[other] = None
+                    elif since is not None:
+                        later.append(since + MEET)
+        if self._next_look is not None:
+            self._next_look.cancel()
+        self._next_look = self._loop.call_at(min(later), self._look) if later else None
+        for other in due:
+            if other.key in self._mine:  # not closed
+                self._judge(other, now)
+
+    def _judge(self, other: Owner, now: float) -> None:
         """Say who of the two stays, if that is news; lose if it is the other."""
-        if other not in self._others:
-            return
         mine = self._mine[other.key]
         who = f"another {other.service}" if other.service == self._service else other.service
         who = f"{who} (process {other.life})"
         if not mine.was_before(other):
             told = f"{who} has {mine.key} and was there first: this one ends"
             self._lose(ConfigError(f"services.{self._service}", ..., told))
-        elif other.life not in self._told:
-            self._warn(f"{who} claims {mine.key} too and gives way: this one was there first")
-        self._told.add(other.life)
+        elif not any(life == other.life for _, life in self._told):
+            if sum(then > now - TELL_SECONDS for then, _ in self._told) >= MOST_TOLD:
+                self._untold += 1
+                return
+            untold, self._untold = self._untold, 0
+            also = f"; so did {untold} before" if untold else ""
+            self._warn(f"{who} claims {mine.key} too and gives way: this one was there first{also}")
+        self._told.append((now, other.life))
 
 
 def refusal(mine: Owner, other: Owner) -> str:

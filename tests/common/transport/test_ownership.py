@@ -84,8 +84,8 @@ async def test_second_writer_waits_for_the_first_to_go(new_bus: NewBus, monkeypa
     await before.ready()
     looked, look = asyncio.Event(), Ownership.owners
 
-    async def owners(ownership: Ownership) -> list[Owner]:
-        found = await look(ownership)
+    async def owners(ownership: Ownership, *keys: str) -> list[Owner]:
+        found = await look(ownership, *keys)
         looked.set()
         return found
 
