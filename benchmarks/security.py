@@ -17,6 +17,7 @@ from pathlib import Path
 import psutil
 import zenoh
 
+from common.supervision.launch import free_endpoints
 from common.transport.credentials import Credentials, credentials_of
 from common.transport.endpoint import client_config, endpoint_of
 from tests.harness import command_line, environment, free_domain
@@ -53,13 +54,17 @@ def latencies(endpoint: str, folder: Path | None, size: int) -> list[float]:
     return sorted(taken)
 
 
-def measure(folder: Path | None) -> dict[str, object]:
-    """The figures of a router in a process of its own."""
+def measure(folder: Path | None, *, near: bool = False) -> dict[str, object]:
+    """The figures of a router in a process of its own; with certificates through its front, or near it."""
     domain = free_domain()
     secured = {"ZENCELL_SECURE": str(folder)} if folder else {}
     endpoint = endpoint_of(domain, environ=secured)
+    command = [sys.executable, "-m", "services.router", "--domain", str(domain)]
+    if near:
+        (endpoint,) = free_endpoints(1)
+        command += ["--near", endpoint]
     router = subprocess.Popen(
-        [sys.executable, "-m", "services.router", "--domain", str(domain)], stdin=subprocess.PIPE,
+        command, stdin=subprocess.PIPE,
         stderr=subprocess.DEVNULL, env={**environment(), **secured},
     )
     try:
@@ -91,8 +96,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "certificates"
         subprocess.run(command_line("secure", "init", str(folder)), env=environment(), check=True, capture_output=True)
-        for label, given in (("open", None), ("with certificates", folder)):
-            print(label, json.dumps(measure(given), indent=1))
+        for label, given in (("open", None), ("with certificates", folder), ("near", folder)):
+            print(label, json.dumps(measure(given, near=label == "near"), indent=1), flush=True)
 
 
 if __name__ == "__main__":

@@ -95,6 +95,7 @@ class Operation:
             require_free_port(endpoint_of(number))
         self.cell = share.part_of(loaded)
         securing.require_secured(self.launch, self.cell)
+        self.launch = securing.with_near(self.launch)
         self._supervisor: Supervisor | None = None
         self._collector: Collector | None = None
         self._screen: Screen | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,6 +41,14 @@ def choose(folder: str | None) -> None:
     if not folder or not Path(folder).is_dir():
         raise ConfigError("--secure", folder, "is not a folder; make one with `zencell secure init DIR`")
     os.environ[SECURE_VARIABLE] = str(Path(folder).absolute())
+
+
+def with_near(launch: Launch) -> Launch:
+    """The launch with a router of its own in a secured cell listening near what is started with it, too."""
+    from common.supervision.launch import free_endpoints
+    from common.transport.credentials import secure_folder
+
+    return replace(launch, near=free_endpoints(2)) if secure_folder() and not launch.connect else launch
 
 
 def require_secured(launch: Launch, cell: Cell) -> None:

@@ -65,6 +65,9 @@ def main() -> NoReturn:
                         help="instead of 127.0.0.1; repeatable (ZENCELL_LISTEN)")
     parser.add_argument("--link", metavar="ENDPOINT", action="append", default=[],
                         help="router of another host to be linked with; repeatable (ZENCELL_LINK)")
+    parser.add_argument("--near", metavar="ENDPOINT", action="append", default=[],
+                        help="with certificates: where to listen besides, for services of this host, who need no "
+                             "front there; repeatable, taken by turns with each renewal")
     parser.add_argument("--small", metavar="KEY", action="append", default=[],
                         help="without the cell: drop what is too large for it, as on the keys of small messages that "
                              "are known; repeatable")
@@ -89,7 +92,7 @@ def main() -> NoReturn:
         endpoints = endpoints_of("--listen", options.listen, LISTEN_VARIABLE) or [endpoint_of(domain)]
         links = endpoints_of("--link", options.link, LINK_VARIABLE)
         secured = secure_folder()
-        router = Router(endpoints, secured, links, options.small)
+        router = Router(endpoints, secured, links, options.small, options.near)
     except ZencellError as error:
         fail(error)
     log.info("listening at %s", " and ".join(endpoints))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import socket
@@ -15,6 +16,7 @@ from common.application import look_where_one_stands
 from common.clock import MAX_SPEED, MIN_SPEED, Clock
 from common.config import Cell, ServiceEntry
 from common.errors import ConfigError
+from common.transport.endpoint import NEAR_VARIABLE, endpoint_of
 
 ROUTER_MODULE = "services.router"
 PROJECT_ROOT = Path(__file__).resolve().parent.parent.parent
@@ -32,6 +34,7 @@ class Launch:
     connect: str | None = None  # endpoint of a router that runs already
     listen: tuple[str, ...] = ()  # where our router listens, when not for its own host only
     link: tuple[str, ...] = ()  # routers of other hosts that it is linked with
+    near: tuple[str, ...] = ()  # where it listens besides, for what we start, by turns
     log_json: bool = False
     clock: Clock = field(default_factory=Clock)
     extra: Mapping[str, str] = field(default_factory=dict, repr=False)  # environment that no command line may show
@@ -39,7 +42,9 @@ class Launch:
     def router_command(self, small: Sequence[str] = ()) -> list[str]:
         """Command line of the router; `small` are keys of the cell's own under which nothing large travels."""
         command = [*python_module(ROUTER_MODULE), "--domain", str(self.domain)]
-        for option, values in (("--listen", self.listen), ("--link", self.link), ("--small", small)):
+        for option, values in (
+            ("--listen", self.listen), ("--link", self.link), ("--near", self.near), ("--small", small),
+        ):
             for value in values:
                 command += [option, value]
         return [*command, *self._process_options()]
@@ -60,8 +65,9 @@ class Launch:
         return ["--gate", "--log-json"] if self.log_json else ["--gate"]
 
     def environment(self, inherited: Mapping[str, str] = os.environ) -> dict[str, str]:
-        """Environment of every process: the caller's, what is extra, the cell's clock, and where packages are found."""
-        return {**inherited, **self.extra, **self.clock.environment(), "PYTHONPATH": python_path(inherited)}
+        """Environment of every process: the caller's, what is extra, where the router is near, clock, and packages."""
+        near = {NEAR_VARIABLE: f"{endpoint_of(self.domain)}={','.join(self.near)}"} if self.near else {}
+        return {**inherited, **self.extra, **near, **self.clock.environment(), "PYTHONPATH": python_path(inherited)}
 
 
 def clock_of(speed: float, epoch: int | None = None) -> Clock:
@@ -128,6 +134,13 @@ def require_module(key: str, entry: ServiceEntry) -> None:
         found = False
     if not found:
         raise ConfigError(f"services.{key}", entry.module, "is not a module that can be found from here")
+
+
+def free_endpoints(count: int) -> tuple[str, ...]:
+    """So many endpoints of a secured router on this host only, where nobody listens."""
+    with contextlib.ExitStack() as held:
+        probes = [held.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
+        return tuple(f"tls/127.0.0.1:{probe.getsockname()[1]}" for probe in probes)
 
 
 def require_free_port(endpoint: str) -> None:

@@ -97,7 +97,7 @@ async def _work(
 
     timeout = CONNECT_TIMEOUT if launch.connect else None  # our own router is watched by the supervisor
     connecting = connect(cell=cell.name, service=NAME, endpoint=endpoint, clock=launch.clock, timeout=timeout,
-                         identity=SUPERVISOR)
+                         identity=SUPERVISOR, near=launch.near)
     bus = await supervisor.reach_router(connecting.__aenter__())
     to_topic = BusLog(bus)
     log.addHandler(to_topic)

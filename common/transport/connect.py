@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
 from common.clock import Clock
@@ -18,7 +18,7 @@ _CLOSE_SECONDS = 0.5
 @asynccontextmanager
 async def connect(
     *, cell: str, service: str, endpoint: str, clock: Clock | None = None, timeout: float | None = 3.0,
-    identity: str = OPERATOR,
+    identity: str = OPERATOR, near: Sequence[str] | None = None,
 ) -> AsyncIterator[Bus]:
     """A bus at the router of an endpoint.
 
@@ -29,6 +29,7 @@ async def connect(
         clock: the cell's clock; one at speed 1 when not given.
         timeout: how long to wait for the router [s]; None waits for ever.
         identity: whose certificate it shows in a secured cell.
+        near: endpoints of the same router to be tried first; those that a supervisor handed down when not given.
 
     Raises:
         NoRouter: no router was there in time.
@@ -37,7 +38,7 @@ async def connect(
     credentials = credentials_of(common_name(cell, identity), folder) if folder else None
     try:
         async with asyncio.timeout(timeout):
-            session = await open_zenoh(endpoint, credentials)
+            session = await open_zenoh(endpoint, credentials, near)
     except TimeoutError:
         raise NoRouter(endpoint) from None
     bus = Bus(session, service=service, cell=cell, clock=clock or Clock())

@@ -20,6 +20,8 @@ DOMAIN_VARIABLE = "ZENCELL_DOMAIN"
 CONNECT_VARIABLE = "ZENCELL_CONNECT"
 LISTEN_VARIABLE = "ZENCELL_LISTEN"
 LINK_VARIABLE = "ZENCELL_LINK"
+NEAR_VARIABLE = "ZENCELL_NEAR"  # ENDPOINT=OTHER,OTHER, set by a supervisor for what it starts
+NEAR_MS = 2000  # in which a try to connect ends where there is another way: a loaded machine takes 1 s
 LEASE_MS = 2000  # a frozen process or cut link is noticed after this
 STUCK_MS = 1000  # so is a link that takes nothing
 ROUTER_STUCK_MS = 300  # the same in the router, where all that comes from the writer waits meanwhile
@@ -137,23 +139,33 @@ def is_encrypted(endpoint: str) -> bool:
     return endpoint.startswith(("tls/", "quic/"))
 
 
+def near_of(endpoint: str, environ: Mapping[str, str] = os.environ) -> list[str]:
+    """Where the router of an endpoint listens for the services of its own host besides, as their supervisor says."""
+    known, _, near = environ.get(NEAR_VARIABLE, "").partition("=")
+    return near.split(",") if near and known == endpoint else []
+
+
 def client_config(
-    endpoint: str, *, connect_ms: int, credentials: Credentials | None = None, apart: bool = False
+    endpoint: str, *, connect_ms: int, credentials: Credentials | None = None, apart: bool = False,
+    near: Sequence[str] = (),
 ) -> zenoh.Config:
     """Configuration of a client of the router at an endpoint, which tries for `connect_ms` to reach it at first.
 
-    With `apart` it has a link of its own for what is large; the router must admit that, as ours does.
+    With `apart` it has a link of its own for what is large; the router must admit that, as ours does. With other
+    endpoints of that router, that are `near`, each is tried once, these first.
     """
-    links: dict[str, Any] = {"connect__endpoints": [endpoint]}
+    links: dict[str, Any] = {"connect__endpoints": [*near, endpoint]}
     if apart:
-        links["connect__endpoints"] = [{"strategy": "allOf", "locators": _apart(endpoint)}]
+        links["connect__endpoints"] = [{"strategy": "allOf", "locators": _apart(each)} for each in (*near, endpoint)]
         links["transport__unicast__max_links"] = len(LINKS)
+    if near:
+        links["transport__unicast__open_timeout"] = NEAR_MS
     return _config(_settings(
         **({"transport__link__tls": credentials.tls()} if credentials else {}),
         **links,
         mode="client",
         listen__endpoints=[],
-        connect__timeout_ms=connect_ms,
+        connect__timeout_ms=0 if near else connect_ms,  # else Zenoh spends all of it on the first
         connect__retry={"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
     ))
 

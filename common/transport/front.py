@@ -57,13 +57,13 @@ class Front:
     """Listens at endpoints and passes connections on to a router; one thread of its own. A `with` block."""
 
     def __init__(self, endpoints: Iterable[str]) -> None:
-        """Listen, and pass nobody on before `open`.
+        """Take the endpoints; nobody is heard before `open`, by when the router listens where services come in near it.
 
         Raises:
             OSError: it cannot listen there; its `filename` is the endpoint.
         """
         self._selector = selectors.DefaultSelector()
-        self._listeners: list[socket.socket] = []
+        self._listeners: dict[str, socket.socket] = {}  # by endpoint
         self._waiting: dict[str, deque[_End]] = {}  # by address, oldest first
         self._young: deque[_End] = deque()
         self._failed: dict[str, tuple[float, float]] = {}  # how many of an address, and when that was so
@@ -76,13 +76,11 @@ class Front:
         self.refused = 0
         for endpoint in endpoints:
             try:
-                self._listeners.append(_listener(*address_of(endpoint)))
+                self._listeners[endpoint] = _bound(*address_of(endpoint))
             except OSError as error:
                 self.close()
                 error.filename = endpoint
                 raise
-        for each in self._listeners:
-            self._selector.register(each, selectors.EVENT_READ)
 
     def __enter__(self) -> Front:
         return self
@@ -91,17 +89,29 @@ class Front:
         self.close()
 
     def open(self, host: str, port: int) -> None:
-        """Pass connections on to a router that listens there; those that are passed on already stay where they are."""
+        """Pass connections on to a router that listens there; those that are passed on already stay where they are.
+
+        Raises:
+            OSError: somebody else listens at an endpoint by now; its `filename` is that.
+        """
         self._behind = host, port
-        if not self._thread.is_alive():
-            self._thread.start()
+        if self._thread.is_alive():
+            return
+        for endpoint, listener in self._listeners.items():
+            try:
+                listener.listen(_BACKLOG)
+            except OSError as error:
+                error.filename = endpoint
+                raise
+            self._selector.register(listener, selectors.EVENT_READ)
+        self._thread.start()
 
     def close(self) -> None:
         """End every connection, and listen no more."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
-        for each in (*self._listeners, *self._sockets):
+        for each in (*self._listeners.values(), *self._sockets):
             each.close()
         self._selector.close()
 
@@ -285,8 +295,15 @@ def _is_gone(client: socket.socket) -> bool:
     return bool(poll.poll(0))
 
 
-def _listener(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    made = socket.create_server((host, port), family=family, backlog=_BACKLOG, dualstack_ipv6=host == "::")
+def _bound(host: str, port: int) -> socket.socket:
+    made = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    try:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if made.family == socket.AF_INET6:
+            made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, host != "::")
+        made.bind((host, port))
+    except OSError:
+        made.close()
+        raise
     made.setblocking(False)
     return made

@@ -6,7 +6,9 @@ import errno
 import logging
 import socket
 import threading
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import zenoh
@@ -64,21 +66,23 @@ class Router:
 
     def __init__(
         self, endpoints: Sequence[str], secured: Path | None = None, links: Sequence[str] = (),
-        small: Sequence[str] = (),
+        small: Sequence[str] = (), near: Sequence[str] = (),
     ) -> None:
-        """Listen.
+        """Listen; a secured one also at one of the `near` endpoints, without a front: another after each renewal.
 
         Raises:
             PortInUse, ConfigError: as `open_router`.
         """
         self._front: Front | None = None
         self._secured, self._links, self._small = secured, links, small
+        self._near = deque(near if secured is not None else ())
         self._besides = [*endpoints]
         if secured is not None:
             _require_encrypted(endpoints, links)
             shown = [endpoint for endpoint in endpoints if endpoint.startswith("tls/")]
             self._besides = [endpoint for endpoint in endpoints if endpoint not in shown]
-            self._front = _front(shown)
+            with _named():
+                self._front = Front(shown)
         try:
             self._files = self._seen = self._files_now()
             self.session = self._open()
@@ -103,8 +107,18 @@ class Router:
         if self._front is None:
             return open_router(self._besides, self._secured, self._links, self._small)
         host, port = "127.0.0.1", _free_port()
-        session = open_router([f"tls/{host}:{port}", *self._besides], self._secured, self._links, self._small)
-        self._front.open(host, port)
+        behind = [f"tls/{host}:{port}", *self._besides]
+        self._near.rotate(1)  # the one of before is still listened at
+        try:
+            session = open_router([*behind, *[*self._near][:1]], self._secured, self._links, self._small)
+        except PortInUse:
+            if not self._near:
+                raise
+            log.warning("%s is in use by %s: services of this host come in with all others", self._near[0],
+                        holder_of(address_of(self._near[0])[1]))
+            session = open_router(behind, self._secured, self._links, self._small)
+        with _named():
+            self._front.open(host, port)
         return session
 
     def _files_now(self) -> dict[str, bytes]:
@@ -137,9 +151,11 @@ class Router:
         return True
 
 
-def _front(endpoints: Sequence[str]) -> Front:
+@contextmanager
+def _named() -> Iterator[None]:
+    """Say of an endpoint of the front that cannot be had who has it, or why."""
     try:
-        return Front(endpoints)
+        yield
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise PortInUse(error.filename, holder_of(address_of(error.filename)[1])) from None

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import zenoh
 
 from common.transport.credentials import Credentials
-from common.transport.endpoint import LARGE_BYTES, client_config
+from common.transport.endpoint import LARGE_BYTES, client_config, near_of
 from common.transport.outbox import Outbox
 from common.transport.session import Declared, OnQuery, OnReply, OnSample, OnToken, RawReply, RawSample
 
@@ -261,7 +261,7 @@ class ZenohSession:
         self._session.close()  # type: ignore[no-untyped-call]
 
 
-def _open(endpoint: str, credentials: Credentials | None) -> zenoh.Session:
+def _open(endpoint: str, credentials: Credentials | None, near: Sequence[str] = ()) -> zenoh.Session:
     """A session with a link of its own for what is large, where the router admits that.
 
     Raises:
@@ -269,8 +269,11 @@ def _open(endpoint: str, credentials: Credentials | None) -> zenoh.Session:
     """
 
     def opened(*, apart: bool, connect_ms: int = _CONNECT_MS) -> zenoh.Session:
-        return zenoh.open(client_config(endpoint, connect_ms=connect_ms, credentials=credentials, apart=apart))
+        return zenoh.open(
+            client_config(endpoint, connect_ms=connect_ms, credentials=credentials, apart=apart, near=near))
 
+    if near:  # of our own router, which admits it
+        return opened(apart=True)
     try:
         return opened(apart=True)
     except zenoh.ZError:
@@ -282,8 +285,14 @@ def _open(endpoint: str, credentials: Credentials | None) -> zenoh.Session:
         return opened(apart=False)
 
 
-async def open_zenoh(endpoint: str, credentials: Credentials | None = None) -> ZenohSession:
-    """A session with the router at the endpoint, for which it waits as long as it takes; may be cancelled at once."""
+async def open_zenoh(
+    endpoint: str, credentials: Credentials | None = None, near: Sequence[str] | None = None
+) -> ZenohSession:
+    """A session with the router at the endpoint, for which it waits as long as it takes; may be cancelled at once.
+
+    It is reached at its `near` endpoints where that is possible: those that a supervisor has handed down by default.
+    """
+    near = near_of(endpoint) if near is None else near
     loop = asyncio.get_running_loop()
     opened: asyncio.Future[ZenohSession] = loop.create_future()
     stop = threading.Event()
@@ -297,7 +306,7 @@ async def open_zenoh(endpoint: str, credentials: Credentials | None = None) -> Z
     def work() -> None:
         while not stop.is_set():
             try:
-                session = _open(endpoint, credentials)
+                session = _open(endpoint, credentials, near)
             except zenoh.ZError as error:
                 log.debug("no router yet: %s", error)
                 stop.wait(0.02)

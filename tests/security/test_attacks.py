@@ -449,10 +449,21 @@ def test_nothing_listens_but_the_router_and_the_page_and_only_on_this_machine(se
                 listening.add((name, found.laddr.ip, found.laddr.port))
     port = int(secured.cell.endpoint.rpartition(":")[2])
     shown = {("router", "127.0.0.1", port), ("viewer", "127.0.0.1", secured.page)}
-    ((name, address, _),) = listening - shown  # what the router's front passes on to
-    assert (name, address) == ("router", "127.0.0.1")
+    inner = listening - shown  # what the router's front passes on to, and where services of this host come in
+    assert [(name, address) for name, address, _ in inner] == [("router", "127.0.0.1")] * 2
     assert listening > shown
     assert datagrams == []
+
+
+def test_what_the_supervisor_starts_comes_in_near_the_router_and_not_through_its_front(secured: Secured) -> None:
+    processes = {**secured.cell.processes(), "supervisor": psutil.Process(secured.cell.process.pid)}
+    router = processes.pop("router")
+    front = int(secured.cell.endpoint.rpartition(":")[2])
+    listening = {each.laddr.port for each in router.net_connections("tcp") if each.status == psutil.CONN_LISTEN}
+    for name, process in processes.items():
+        made = [each.raddr.port for each in process.net_connections("tcp")
+                if each.status == psutil.CONN_ESTABLISHED and each.raddr.port in listening]
+        assert made and front not in made, name
 
 
 def test_tools_show_the_certificate_of_the_operator(secured: Secured) -> None:

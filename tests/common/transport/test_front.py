@@ -95,3 +95,15 @@ def test_silent_ones_do_not_keep_out_who_speaks(port: int, echo: Echo) -> None:
         with each, suppress(ConnectionResetError):
             assert each.recv(1) == b""
     assert echo.came == 1
+
+
+def test_endpoint_that_somebody_else_has_by_now_is_named(echo: Echo) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        endpoint = f"tls/127.0.0.1:{probe.getsockname()[1]}"
+    with Front([endpoint]) as first, Front([endpoint]) as second:
+        first.open(*echo.listener.getsockname())
+        with pytest.raises(OSError, match="in use") as taken:
+            second.open(*echo.listener.getsockname())
+        assert taken.value.filename == endpoint
+    with echo.listener, pytest.raises(OSError, match="in use") as taken:
+        Front([f"tls/127.0.0.1:{echo.listener.getsockname()[1]}"])
