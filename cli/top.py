@@ -90,7 +90,8 @@ def render(view: View) -> Group:
 
     lost = "" if view.connected else "; the router is lost"
     head = f"{view.cell} at speed {view.speed:g}; this tool takes {view.own_cpu:.1f} %{lost}"
-    return Group(Text(printable(head), style="bold" if view.connected else "bold red"), Text(),
+    notices = [Text(printable(line), style="red" if urgent else "yellow") for urgent, line in view.notices]
+    return Group(Text(printable(head), style="bold" if view.connected else "bold red"), *notices, Text(),
                  services_table(view.services), Text(), topics_table(view.topics))
 
 

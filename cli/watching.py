@@ -61,6 +61,7 @@ class View:
     own_cpu: float  # [%] of one core, of this tool
     services: list[ServiceRow] = field(default_factory=list)
     topics: list[TopicRow] = field(default_factory=list)
+    notices: list[tuple[bool, str]] = field(default_factory=list)  # whether urgent, and a line
 
     def as_dict(self) -> dict[str, Any]:
         """The view as JSON can hold it."""
@@ -141,6 +142,7 @@ class Watch:
         found = View(self._bus.cell, self._clock.speed, self._bus.connected, self._processes.own_cpu())
         found.services = [self._service_row(each) for each in statuses(status, alive, self._bus.connected)]
         found.topics = list(self._topic_rows())
+        found.notices = [(each.urgent, each.message) for each in (status.notices if status else ())]
         return found
 
     def _service_row(self, status: ServiceStatus) -> ServiceRow:

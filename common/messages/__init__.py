@@ -35,6 +35,7 @@ from common.messages.planning import (
 )
 from common.messages.processes import (
     LogLine,
+    Notice,
     Parameter,
     ParameterReply,
     ParameterRequest,

@@ -24,6 +24,14 @@ class ServiceStatus(Message):
     host: Label = Field("", description="name of the computer that it runs on")
 
 
+class Notice(Message):
+    """Something about a host that a person should know, such as a certificate that ends soon."""
+
+    urgent: bool = False
+    message: Text
+    host: Label = Field("", description="name of the computer that it is about")
+
+
 class SupervisorStatus(Message):
     """All processes of the cell."""
 
@@ -46,6 +54,7 @@ class SupervisorStatus(Message):
     overrides: list[Text] = Field(
         [], max_length=1000, description="PATH=VALUE, as they were asked for; secrets are left out"
     )
+    notices: list[Notice] = Field([], max_length=1000, description="certificates that end soon or have ended")
 
 
 class LogLine(Message):

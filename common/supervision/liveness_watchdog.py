@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from common.config import Watchdogs
-from common.messages import ServiceStatus, SupervisorStatus
+from common.messages import Notice, ServiceStatus, SupervisorStatus
 from common.transport.keys import ROUTER
 from common.waking import Waking
 
@@ -114,11 +114,14 @@ class Elsewhere:
         """
         self.host, self._own = host, frozenset(own)
         self._heard: dict[str, ServiceStatus] = {}
+        self._notices: dict[str, list[Notice]] = {}  # by host
         self._first = host  # of the hosts that were heard of
 
     def hear(self, status: SupervisorStatus) -> None:
         """Take note of what a supervisor says of its own part; what it passes on is not news."""
         self._first = min(self._first, status.host)
+        if status.host != self.host:
+            self._notices[status.host] = [each for each in status.notices if each.host == status.host]
         for service in status.services:
             if service.name not in self._own and service.host == status.host:
                 self._heard[service.name] = service
@@ -135,6 +138,11 @@ class Elsewhere:
             })
             for service in self._heard.values()
         ]
+
+    @property
+    def notices(self) -> list[Notice]:
+        """What there is to know of other hosts."""
+        return [each for host in sorted(self._notices) for each in self._notices[host]]
 
     def is_told_here(self, service: str) -> bool:
         """Whether it is for this host, and for one only, to repeat what a service says: what nobody keeps is shared."""

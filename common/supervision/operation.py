@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from common import topics
 from common.config import Cell
 from common.errors import ConfigError, DecodeError, ZencellError
-from common.messages import ServiceStatus, SupervisorStatus
+from common.messages import Notice, ServiceStatus, SupervisorStatus
 from common.sources import monotonic
 from common.supervision.interrupts import Interrupts
 from common.supervision.launch import Launch
 from common.supervision.liveness_watchdog import PERIOD, Elsewhere, LivenessWatchdog
 from common.supervision.supervisor import Supervisor
 from common.transport.credentials import SUPERVISOR
+from common.transport.expiry import EndWatch
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -30,6 +31,7 @@ NAME = "supervisor"
 CONNECT_TIMEOUT = 5.0  # [s] to reach somebody else's router
 LOOK_TIMEOUT = 1.0  # [s] to hear who is up there
 SECRET = "token"  # in the path of an override: is not told
+NOTICE_PERIOD = 60.0  # [s] between looks at certificates
 STATUS_PERIOD = 0.25  # [s] between looks at the connection to the router
 
 log = logging.getLogger(NAME)
@@ -164,18 +166,23 @@ async def _hear_elsewhere(bus: Bus, elsewhere: Elsewhere) -> None:
 async def _publish(bus: Bus, cell: Cell, launch: Launch, supervisor: Supervisor, elsewhere: Elsewhere) -> None:
     """Say on supervisor/status whenever something has changed; take note of a router that is back."""
     out = bus.writer(topics.SUPERVISOR_STATUS)
-    told: list[ServiceStatus] = []
+    told: tuple[list[ServiceStatus], list[Notice]] = [], []
+    ends, notices, looked = EndWatch(), list[Notice](), -NOTICE_PERIOD
     while True:
         supervisor.mark_connected(bus.connected)
-        away = elsewhere.statuses(bus.alive.names)
+        if monotonic() - looked >= NOTICE_PERIOD:
+            looked = monotonic()
+            notices = [Notice(urgent=urgent, message=line, host=elsewhere.host) for urgent, line in ends.ending()]
+        away = elsewhere.statuses(bus.alive.names), [*notices, *elsewhere.notices]
         if supervisor.changed.is_set() or away != told:
             supervisor.changed.clear()
             told = away
             out.put(SupervisorStatus(
                 header=bus.header(), cell=bus.cell, host=elsewhere.host,
-                services=[*elsewhere.ours(supervisor.statuses), *away],
+                services=[*elsewhere.ours(supervisor.statuses), *away[0]],
                 speed=bus.clock.speed, epoch=bus.clock.epoch_ns, booted=bus.clock.booted_ns,
                 seed=cell.run.seed, world=launch.world or "",
+                notices=away[1],
                 overrides=[text for text in launch.overrides if SECRET not in text.partition("=")[0]],
             ))
         with contextlib.suppress(TimeoutError):

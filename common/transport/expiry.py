@@ -76,19 +76,22 @@ class EndWatch:
             for urgent, line in self.look():
                 log.log(logging.ERROR if urgent else logging.WARNING, "%s", line)
 
+    def ending(self, now: datetime.datetime | None = None) -> list[tuple[bool, str]]:
+        """All that there is to say: whether it is urgent, and a line."""
+        return [(urgent, line) for urgent, line, _, _ in self._ending(now or datetime.datetime.now(datetime.UTC))]
+
     def look(self, now: datetime.datetime | None = None) -> list[tuple[bool, str]]:
-        """What is to be said now: whether it is urgent, and a line."""
-        at = now or datetime.datetime.now(datetime.UTC)
-        lines = []
+        """What is to be said now and was not said before: whether it is urgent, and a line."""
+        found = self._ending(now or datetime.datetime.now(datetime.UTC))
+        news = [(urgent, line) for urgent, line, name, ended in found if self._said.get(name) != (urgent, ended)]
+        self._said = {name: (urgent, ended) for urgent, _, name, ended in found}
+        return news
+
+    def _ending(self, at: datetime.datetime) -> list[tuple[bool, str, str, bool]]:
+        """Urgent, line, name, and whether it has ended, of each certificate that is watched and ends soon."""
+        found = []
         for name, until in (ends_in(self._folder) if self._folder else {}).items():
-            if self._names is not None and name not in self._names:
-                continue
-            found = warning_of(name, until, at)
-            state = (found[0], until <= at) if found else None
-            if found and self._said.get(name) != state:
-                lines.append((found[0], f"{found[1]}: `zencell secure renew {self._folder}` (docs/security.md)"))
-            if state is None:
-                self._said.pop(name, None)
-            else:
-                self._said[name] = state
-        return lines
+            if (self._names is None or name in self._names) and (said := warning_of(name, until, at)):
+                line = f"{said[1]}: `zencell secure renew {self._folder}` (docs/security.md)"
+                found.append((said[0], line, name, until <= at))
+        return found

@@ -54,7 +54,10 @@ class HealthPanel:
             rows = [self._row(s.name, s.state, s.pid, s.restarts, s.message) for s in supervisor.services]
         else:
             rows = [self._row(name, "ready" if name in alive else "gone", None, 0, "") for name in self._services]
-        content = block(table(HEAD, rows, "small") + LEGEND, "health")
+        notices = "".join(
+            f"<div>{span(each.message, 'bad' if each.urgent else 'busy')}</div>"
+            for each in (supervisor.notices if supervisor is not None else ()))
+        content = block(notices + table(HEAD, rows, "small") + LEGEND, "health")
         if content != self._html.content:
             self._html.content = content
 
