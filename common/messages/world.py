@@ -95,6 +95,18 @@ class WorldObject(Message):
             return values
         return {**values, **_from_outline(values)}
 
+    @model_validator(mode="after")
+    def _has_a_shape(self) -> WorldObject:
+        if self.shape == "mesh":
+            count = len(self.vertices)
+            if not self.triangles:
+                raise ValueError("a mesh has triangles")
+            if any(not 0 <= corner < count for triangle in self.triangles for corner in triangle):
+                raise ValueError(f"triangles are of vertices 0 to {count - 1}")
+        if self.shape == "prism" and len(self.polygon) < 3:
+            raise ValueError("the polygon of a prism has at least 3 corners")
+        return self
+
 
 class WorldObjects(Message):
     """All solids of the simulated world: the truth."""

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 
 from common.config import Fixture, Surroundings, World
-from common.errors import ConfigError
-from common.messages import Color, Header, WorldObject
+from common.errors import ConfigError, DecodeError
+from common.messages import Color, Header, WorldObject, WorldObjects
 from common.perception.pinhole import Pinhole
 from common.sim.kinematic import KinematicWorld
 from common.sim.layout import layout
 from common.sim.objects import solid_of_message, world_object
 from common.sim.rendering import Renderer
+from common.transport.codec import decode
 from tests.common.sim.spheres import spheres
 
 TABLE = Fixture(id="table", dimensions=[1.0, 1.0, 0.05], position=(0.5, 0.0, -0.025), color=(0.55, 0.35, 0.1))
@@ -126,3 +128,14 @@ def test_objects_without_a_place_are_laid_out_apart_by_the_seed() -> None:
         assert one.state == "table" and math.hypot(one.pose.position.x, one.pose.position.y) < 0.75
     with pytest.raises(ConfigError, match=r"world\.objects: 8 objects find no random layout"):
         layout(world, 3, lambda x, y, z: False)
+
+
+@pytest.mark.parametrize("wrong", [
+    {"shape": "mesh"}, {"shape": "mesh", "vertices": [(0.0, 0.0, 0.0)] * 3},
+    {"shape": "mesh", "vertices": [(0.0, 0.0, 0.0)] * 3, "triangles": [(0, 1, 3)]},
+    {"shape": "mesh", "vertices": [(0.0, 0.0, 0.0)] * 3, "triangles": [(0, 1, -1)]},
+    {"shape": "prism"}, {"shape": "prism", "polygon": [(0.0, 0.0), (1.0, 0.0)]},
+])
+def test_object_that_has_no_shape_is_no_message(wrong):
+    with pytest.raises(DecodeError, match=r"WorldObjects\.objects\.0"):
+        decode(WorldObjects, msgpack.packb({"objects": [{"id": "a", **wrong}]}))
