@@ -1,8 +1,9 @@
 """A Panda cell that works for a long time beside a slow and a stuck subscriber: does anything grow or get lost?
 
 `python -m benchmarks.soak` takes 30 minutes at speed 1 with the camera at 30 Hz. Exit code 1 unless, after the first
-5 minutes, memory grows by less than 2 % and descriptors not at all, nothing of a state or event topic is lost, joint
-states keep their rate and the task goes on placing.
+5 minutes, memory grows by less than 2 % and descriptors not at all, nothing of a state or event topic is lost, nor a
+joint state or transform, joint states keep their rate and the task goes on placing. The machine must have room: at a
+load of 20 on two cores nothing is lost, but joint states are written at 89 Hz.
 
 Memory is what a process has for itself (anonymous and shared pages, also those swapped out): pages of files, such as
 libraries, come and go with whatever else runs on the machine. Growth is the lower quartile of the last fifth of the
@@ -170,7 +171,7 @@ def report(seen: Seen, losses: Losses, settle: float, period: float) -> tuple[li
         if more > MOST_GROWTH:
             wrong.append(f"memory grew by {more:.2%}")
     lines += ["", *losses.table(), "", *_counted(seen, wrong)]
-    lost = {key: one.lost for key, one in losses.of.items() if one.lost and losses.kind(key) in ("state", "event")}
+    lost = {key: one.lost for key, one in losses.of.items() if one.lost}
     wrong += [f"{number} messages of {key} were lost on the way" for key, number in lost.items()]
     joints = losses.of[topics.JOINT_STATES.key]
     if joints.rate < LEAST_RATE * JOINT_RATE:

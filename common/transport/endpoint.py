@@ -36,8 +36,10 @@ MOST_SESSIONS = 512  # at one router: 50 cells of ten services
 MOST_PENDING = 32  # of these that have not shown who they are yet
 ACCEPT_MS = 3000  # in which they must; a loaded machine takes 1 s
 STATE_BATCHES = 16  # of states and events, the most there can be: seconds of them for a reader that is held up
-STREAM_WAIT_US = 5000  # that a stream's message waits for room before it is dropped, once until there is room again
-PARTS_WAIT_US = 100_000  # that one of several batches does, in all: a point cloud of 12 MB has 192 of them
+STREAM_WAIT_US = 20_000  # that a stream's message waits for room before it is dropped, once until there is room again
+PARTS_WAIT_US = 300_000  # that one of several batches does, in all: a point cloud of 12 MB has 192 of them
+# The same in the router, where other readers of that writer's pictures wait meanwhile: less than makes a picture old.
+ROUTER_PARTS_WAIT_US = 500_000
 
 
 def parse_domain(value: object, field: str = "--domain") -> int:
@@ -214,6 +216,7 @@ def router_settings(
     return _settings(
         qos__network=[apart, shared],
         transport__link__tx__queue__congestion_control__block__wait_before_close=ROUTER_STUCK_MS * 1000,
+        transport__link__tx__queue__congestion_control__drop__max_wait_before_drop_fragments=ROUTER_PARTS_WAIT_US,
         transport__link__tx__queue__size__data_high=STATE_BATCHES,
         mode="router", listen__endpoints=list(endpoints),
         connect__endpoints=[each for link in links for each in _apart(link)],
@@ -275,11 +278,11 @@ def _settings(**values: Any) -> dict[str, Any]:
         # A message that must arrive and that a link does not take for so long ends the link. By default it is 5 s, and
         # Zenoh does not see meanwhile that the lease of a frozen router has run out, nor that it is back.
         "transport__link__tx__queue__congestion_control__block__wait_before_close": STUCK_MS * 1000,
-        # By default two batches and 1 ms: on a busy machine every hundredth joint state fell victim to a picture.
+        # By default two batches and 1 ms: a busy machine does not take a picture then.
         "transport__link__tx__queue__size__data": STREAM_BATCHES,
         "transport__link__tx__queue__size__data_low": STREAM_BATCHES,
         "transport__link__tx__queue__congestion_control__drop__wait_before_drop": STREAM_WAIT_US,
-        # By default 50 ms, in which a busy machine does not take a point cloud: every second one was dropped.
+        # By default 50 ms: on a busy machine every second point cloud was dropped.
         "transport__link__tx__queue__congestion_control__drop__max_wait_before_drop_fragments": PARTS_WAIT_US,
         # Shared memory goes round the size limits of a link, and queries over it were lost when a receiver stalled.
         "transport__shared_memory__enabled": False,
