@@ -266,12 +266,6 @@ async def run(bus: Bus, config: Config) -> None:
     file = record_file(bus.cell)
     if not bus.declares_only:
         file.require_writable()
-    decisions = Decisions(file, bus.log)
-    inhibits, configured = decisions.inhibits, config.speed_scaling
-    config.speed_scaling = speed_of(inhibits.speed, configured)
-    if config.speed_scaling != configured:
-        bus.log.warning("speed is at %.0f %%, as it was set while the cell ran: `zencell param set "
-                        "services.trajectory_executor.speed_scaling=1` ends that", 100 * config.speed_scaling)
     bus.keep_parameters = keep_speed
     bus.serve(topics.MOTION_EXECUTE, execute)
     bus.serve(topics.MOTION_STOP, stop)
@@ -280,6 +274,13 @@ async def run(bus: Bus, config: Config) -> None:
         bus.serve(topics.GRIPPER_COMMAND, command)
     if simulated:
         bus.serve(topics.WORLD_EDIT, edit)
+    await bus.owned()  # until then another executor may change what is read now
+    decisions = Decisions(file, bus.log)
+    inhibits, configured = decisions.inhibits, config.speed_scaling
+    config.speed_scaling = speed_of(inhibits.speed, configured)
+    if config.speed_scaling != configured:
+        bus.log.warning("speed is at %.0f %%, as it was set while the cell ran: `zencell param set "
+                        "services.trajectory_executor.speed_scaling=1` ends that", 100 * config.speed_scaling)
     standing_file = state_file(bus.cell) if simulated else None
     kept = standing_file.load() if standing_file else None
     period = 1 / bus.clock.wall_rate(config.joint_state_rate, MOST_CYCLES)

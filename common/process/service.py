@@ -271,6 +271,7 @@ class Ending(Protocol):
 async def serve(run: Run[P], bus: Bus, config: P, lifeline: Ending) -> int:
     """Be the service on a bus; the exit code of its process."""
     try:
+        bus.hold_back()
         serve_parameters(bus, config)
         await bus.run(run(bus, config))
     except (ConfigError, UnknownName) as error:  # found only by using it: a description that is not there

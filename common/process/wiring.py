@@ -97,6 +97,9 @@ class Recorder(Bus):
         self.wiring.calls.add(self._in_cell(topic))
         return super().client(topic)
 
+    async def owned(self) -> None:
+        """Go on: nobody else is there."""
+
     async def ready(self) -> None:
         """Wait to be ended: all is declared."""
         self._remapping.require_used(self.service)

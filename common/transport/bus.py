@@ -82,6 +82,7 @@ class Bus:
         self._tokens: list[Declared] = []
         self._ownership = Ownership(
             session, cell, service, loop=self._loop, warn=lambda told: self.log.warning("%s", told), lose=self._lose)
+        self._holds = self._owns = False
         self._lost = False  # what is ours to somebody else
         self._watches: dict[str, TokenWatch] = {}
         self._heard: dict[Reader[Any], Declared] = {}  # readers that are subscribed
@@ -132,7 +133,7 @@ class Bus:
         """A writer of the topic."""
         topic = of_service(topic, self.service)
         written = self._in_cell(topic)
-        writer = Writer(self._session, self.cell, self.service, written)
+        writer = Writer(self._session, self.cell, self.service, written, held=self._holds and not self._owns)
         self._ownership.claim(written.key, topic.key)
         self._writers.append(writer)
         return writer
@@ -176,16 +177,37 @@ class Bus:
         for callback in self._retuned:
             callback()
 
+    def hold_back(self) -> None:
+        """Send nothing that is put by writers declared from now on before what they write is ours: see `owned`."""
+        self._holds = True
+
+    async def owned(self) -> None:
+        """Return when all that was declared is ours and nobody else's; then what was put is sent.
+
+        `ready` waits for it too. A service that keeps something on disk reads it after this: until then another one
+        of its name may change it.
+
+        Raises:
+            ConfigError: somebody else writes or serves the same, or a key was to be renamed that the service has not.
+        """
+        if self._owns:
+            return
+        self._remapping.require_used(self.service)
+        counters = of_service(topics.COUNTERS, self.service)
+        self._ownership.claim(counters.key, counters.key)
+        await self._ownership.settle()
+        self._owns = True
+        for writer in self._writers:
+            writer.release()
+
     async def ready(self) -> None:
         """Tell the cell that this service is ready: what it writes and serves first, its own token last.
 
         Raises:
             ConfigError: somebody else writes or serves the same, or a key was to be renamed that the service has not.
         """
-        self._remapping.require_used(self.service)
+        await self.owned()
         counters = of_service(topics.COUNTERS, self.service)
-        self._ownership.claim(counters.key, counters.key)
-        await self._ownership.settle()
         self._counters = Writer(self._session, self.cell, self.service, counters)
         for server in self._servers:
             server.open()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from typing import Generic, TypeVar
 
 from common.messages import Message
@@ -14,13 +15,16 @@ from common.transport.trace import current_trace
 
 M = TypeVar("M", bound=Message)
 
+MOST_HELD = 1000  # events that wait until they may be sent
+
 
 class Writer(Generic[M]):
     """Puts messages of one topic; from any thread."""
 
-    def __init__(self, session: Session, cell: str, service: str, topic: Topic[M]) -> None:
+    def __init__(self, session: Session, cell: str, service: str, topic: Topic[M], *, held: bool = False) -> None:
         self.topic = topic
-        self._raw = RawWriter(session, f"{cell}/{topic.key}", encoding_of(topic.message), topic.kind, service)
+        key = f"{cell}/{topic.key}"
+        self._raw = RawWriter(session, key, encoding_of(topic.message), topic.kind, service, held=held)
 
     @property
     def matched(self) -> bool:
@@ -37,6 +41,10 @@ class Writer(Generic[M]):
             raise TypeError(f"{self.topic.key} carries {self.topic.message.__name__}, not {type(message).__name__}")
         self._raw.put(encode(message), current_trace())
 
+    def release(self) -> None:
+        """Send what was put so far, and from now on at once."""
+        self._raw.release()
+
     def repeat(self) -> None:
         """Put the value of a state again under the same number: readers that have it ignore it."""
         self._raw.repeat()
@@ -49,7 +57,9 @@ class Writer(Generic[M]):
 class RawWriter:
     """Puts payloads under a full key; from any thread."""
 
-    def __init__(self, session: Session, key: str, encoding: str, kind: PublishedKind, service: str) -> None:
+    def __init__(
+        self, session: Session, key: str, encoding: str, kind: PublishedKind, service: str, *, held: bool = False
+    ) -> None:
         """Declare the key.
 
         Args:
@@ -58,8 +68,12 @@ class RawWriter:
             encoding: what the payloads are, as `encoding_of` says it.
             kind: stream, event or state.
             service: who writes, the first part of the writer id.
+            held: whether nothing is sent, not even to who asks, before `release`: then the newest payload, or events.
         """
         self.kind = kind
+        self._held: deque[tuple[bytes, str]] | None = None
+        if held:
+            self._held = deque(maxlen=MOST_HELD if kind == "event" else 1)
         self._key = key
         self._encoding = encoding
         # Of this writer alone: a service that was restarted counts from the start again.
@@ -78,6 +92,9 @@ class RawWriter:
     def put(self, payload: bytes, trace: str = "") -> None:
         """Send a payload, caused by what has the trace id; never blocks."""
         with self._lock:
+            if self._held is not None:
+                self._held.append((payload, trace))
+                return
             self._sequence += 1
             attachment = encode_attachment(
                 Attachment(self._id, self._sequence, trace=trace, checksum=checksum_of(self._key, payload))
@@ -85,6 +102,13 @@ class RawWriter:
             if self.kind == "state":
                 self._last = (payload, attachment)
             self._publisher.put(payload, attachment)
+
+    def release(self) -> None:
+        """Send what was put so far, and from now on at once."""
+        with self._lock:
+            held, self._held = self._held or (), None
+        for payload, trace in held:
+            self.put(payload, trace)
 
     def repeat(self) -> None:
         """Put the value of a state again under the same number: readers that have it ignore it."""

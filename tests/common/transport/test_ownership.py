@@ -11,9 +11,10 @@ import pytest
 
 from common import topics
 from common.errors import ConfigError
-from common.messages import TaskCommand, TaskStatus
+from common.messages import Header, PlanningScene, TaskCommand, TaskStatus
 from common.transport import ownership
 from common.transport.bus import Bus
+from common.transport.codec import decode
 from common.transport.local import LocalNetwork
 from common.transport.ownership import Owner, Ownership, process_name, who_owns
 
@@ -49,6 +50,31 @@ async def test_second_server_is_refused_and_so_is_a_second_process_of_one_name(n
     await first.ready()
     with pytest.raises(ConfigError, match=r"services\.task: another task is up, which has task/command already"):
         await second.ready()
+
+
+async def test_what_is_put_before_a_key_is_ours_reaches_nobody_who_listens_or_asks(
+    new_bus: NewBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second, listener = await new_bus("scene"), await new_bus("scene"), await new_bus("listener")
+    heard = listener.reader(topics.PLANNING_SCENE)
+    await listener.ready()
+    key = f"{first.cell}/{topics.PLANNING_SCENE.key}"
+    for number, bus in enumerate((first, second), 1):
+        bus.hold_back()
+        writer = bus.writer(topics.PLANNING_SCENE)
+        for stamp in (1, 10 * number):  # of a state the newest counts
+            writer.put(PlanningScene(header=Header(stamp=stamp)))
+    await first.ready()
+    assert (await heard.next()).header.stamp == 10
+    with pytest.raises(ConfigError):
+        await second.ready()
+    asked = [decode(PlanningScene, sample.payload) for sample in await listener.raw_get(key, 1.0)]
+    assert [scene.header.stamp for scene in asked] == [10]
+    assert heard.latest is not None and heard.latest.header.stamp == 10
+    monkeypatch.setattr(ownership, "GIVE_UP", 10.0)  # the tokens of who ends take their time
+    await first.close()
+    await second.owned()
+    assert (await heard.next()).header.stamp == 20
 
 
 async def test_what_all_services_write_each_owns_for_itself_and_readers_own_nothing(new_bus: NewBus) -> None:
