@@ -22,6 +22,7 @@ task = typer.Typer(help="Tell the task what to do.", no_args_is_help=True)
 world = typer.Typer(help="Change the simulated world.", no_args_is_help=True)
 
 TIMEOUT = 5.0  # [s]
+FIRST_WORD = 1.0  # [s] in which a state that there is has arrived
 X = Annotated[str, typer.Argument(metavar="X", help="[m] in world")]
 Y = Annotated[str, typer.Argument(metavar="Y", help="[m] in world")]
 Id = Annotated[str, typer.Argument(metavar="ID", help="as in `zencell topic echo scene_objects`")]
@@ -83,15 +84,31 @@ def send(
     """Send a request to a cell that is up and print the answer as JSON."""
     from cli.inspection import cell_clock, inspect
     from cli.schema import to_json
-    from common.messages import Header
+    from common.messages import Header, TaskCommand
 
     async def visit(bus: Bus) -> Message:
         if isinstance(header := getattr(message, "header", None), Header) and not header.stamp:
             header.stamp = (await cell_clock(bus)).now_ns()  # decided now
+        if isinstance(message, TaskCommand) and message.command in ("start", "resume") and message.heard is None:
+            message.heard = await newest_heard(bus)
         answer: Message = await bus.client(request).call(message, timeout)
         return answer
 
     echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
+
+
+async def newest_heard(bus: Bus) -> int:
+    """`since` of the newest stop or hold that can be known now: a start lets go of nothing later, 0 of nothing."""
+    from common import topics
+    from common.errors import DecodeError
+    from common.messages import MotionStatus
+    from common.transport.codec import decode
+
+    newest = 0
+    for sample in await bus.raw_get(f"{bus.cell}/{topics.MOTION_STATUS.key}", FIRST_WORD):
+        with contextlib.suppress(DecodeError):
+            newest = max(newest, decode(MotionStatus, sample.payload).newest)
+    return newest
 
 
 # --- task -------------------------------------------------------------------------------------------------------

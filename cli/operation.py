@@ -291,7 +291,8 @@ class Operation:
         if not self._simulated:
             self._tell_kept(kept)
         if (self._simulated and kept) or (not self.cell.run.autostart and not kept):  # who says `run` says start
-            start = TaskCommand(command="start", by=options.person(), override=bool(kept))
+            heard = max((inhibit.since for inhibit in kept), default=0)  # a stop that comes now stays
+            start = TaskCommand(command="start", by=options.person(), override=bool(kept), heard=heard)
             await bus.client(topics.TASK_COMMAND).call(start, START_REQUEST_TIMEOUT)
             for inhibit in kept:
                 self._note(f"Let go: {self.cell.name} was {inhibit.told}")
