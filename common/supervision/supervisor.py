@@ -229,6 +229,11 @@ class Supervisor:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
+    def abandon(self) -> None:
+        """Look after no process any more and leave them as they are, as when this one is killed: for simulations."""
+        for task in self._tasks:
+            task.cancel()
+
     # --- one process ----------------------------------------------------------------------------------------------
 
     async def _keep(self, watched: Watched) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,12 +10,16 @@ import numpy as np
 
 from common.virtual.network import FAIR, Weather
 
-Kind = Literal["crash", "restart", "cut", "router lost", "stalled", "late goal", "person", "clock step", "ended"]
+Kind = Literal[
+    "crash", "restart", "cut", "router lost", "stalled", "late goal", "person", "clock step", "ended", "slowed",
+    "supervisor lost", "second instance", "hostile",
+]
 Amid = Literal["", "asker", "asked"]
 
 # At least, and soon: in short runs as well.
 FIRST: tuple[Kind, ...] = ("crash", "crash", "crash", "cut", "stalled", "late goal", "late goal")
 LATER: tuple[Kind, ...] = ("crash", "crash", "restart", "cut", "stalled", "late goal", "person")
+LAST: tuple[Kind, ...] = ("slowed", "supervisor lost", "second instance", "hostile")
 FIRST_GAPS = 0.0, 1.5  # [s] of cell time between those
 LATER_GAP = 12.0  # [s] of cell time on average to each further fault
 LONGEST = 60.0  # [s] of cell time from the cell being ready; what comes after is left to it to finish
@@ -26,6 +30,8 @@ AMID_TURNS = 12  # of a process, from a goal being asked for to where it crashes
 CUT_SECONDS = 0.3, 4.0
 LATE_SECONDS = 0.3, 3.0  # two links, each of which holds something up for less than its lease
 STALL_SECONDS = 0.2, 1.6  # less than Zenoh's lease of 2 s, after which a link is cut
+SECOND_SECONDS = 2.0, 6.0  # for which a second instance is there at most
+SLOW_SECONDS = 2.0, 5.0
 SECONDS = {"cut": CUT_SECONDS, "stalled": STALL_SECONDS, "late goal": LATE_SECONDS}
 STEP_SECONDS = 60.0, 3600.0  # by which somebody sets the system clock, forth or back
 STEP_SOON = 2.0  # [s] of cell time in which it happens
@@ -33,6 +39,11 @@ SKEW = 0.09  # [s] by which clocks are wrong at most; two of them differ by less
 ROUTER_SHARE = 0.25  # of the cuts but for the first
 ENDED_SHARE = 0.5  # of the runs: somebody stops or pauses the task, and processes die then
 ENDED_LATEST = 15.0  # [s] of cell time from the cell being ready
+SLOWED_SHARE = 0.25  # of the runs: somebody sets the speed
+SUPERVISOR_SHARE = 0.25  # of the runs: the supervisor dies, and the cell is brought up again
+SECOND_SHARE = 0.5  # of the runs: somebody starts a service that is up
+MOST_HOSTILE = 3  # of a run
+MEANWHILE = 10.0  # [s] of cell time from the cell being ready, in which these happen
 PERSON_SHARE = 0.5  # of the runs: somebody stops the task early on
 SPEEDS = 0.5, 2.0, 3.0  # cell time per wall time of those runs that have another than 1
 OTHER_SPEED = 0.3  # share of those
@@ -47,12 +58,15 @@ class Fault:
         kind: an end without `finally`; SIGTERM; a link that is cut; all links that are cut; a link on which everything
             comes late; a goal that is asked for, or the answer, comes late; a person who stops the task, moves the
             arm and starts the task again; the system clock of the host is set; a person who stops or pauses it, upon
-            which task or executor or both crash, and who starts it later.
-        target: name of the process; empty for the router, for a person and for the system clock.
+            which task or executor or both crash, and who starts it later or leaves it so; a person who sets the speed;
+            the supervisor ends without `finally`, and somebody brings the cell up again; somebody starts a service
+            that is up; payloads that nobody can read under all keys.
+        target: name of the process; empty for the router, for a person, the supervisor and the system clock.
         amid: it hits who next asks for a plan or a goal of arm or fingers, or who is asked for it, instead of the
             target; of a late goal it is the request, or the answer.
         turns: of the process from then on until it crashes.
-        seconds: for which a link is cut or stalled, or by which something is late or the clock is set.
+        seconds: for which a link is cut or stalled, a second instance is there or the speed is low, or by which
+            something is late or the clock is set.
     """
 
     at: float
@@ -74,13 +88,14 @@ class Plan:
     shuffled: bool = False  # the processes take the turns that are due at once in any order
 
 
-def make_plan(seed: int, services: Sequence[str], sooner: float = 1.0) -> Plan:
+def make_plan(seed: int, services: Sequence[str], sooner: float = 1.0, without: Collection[str] = ()) -> Plan:
     """At least three crashes and a cut, messages that change places, are lost and doubled, and clocks that are wrong.
 
     Args:
         seed: decides all of it.
         services: names of those that may be hit.
         sooner: share of the usual time between faults, in a cell whose task takes less time than usual.
+        without: of `LAST`, which do not happen; the rest of the plan is the same.
     """
     random = np.random.default_rng([seed, 5])
     first = [*FIRST, *(("person",) if random.random() < PERSON_SHARE else ())]
@@ -118,8 +133,28 @@ def make_plan(seed: int, services: Sequence[str], sooner: float = 1.0) -> Plan:
     ends = np.random.default_rng([seed, 9])  # of its own, so that it leaves the other faults as they are
     if ends.random() < ENDED_SHARE:
         faults.append(Fault(float(sooner * ends.uniform(0.0, ENDED_LATEST)), "ended"))
+    faults += [fault for fault in _strange(seed, services, sooner) if fault.kind not in without]
     faults.sort(key=lambda fault: fault.at)
     return Plan(tuple(faults), weather, skews, speed, shuffled=True)
+
+
+def _strange(seed: int, services: Sequence[str], sooner: float) -> list[Fault]:
+    """What else persons and strangers do; from a generator of its own, which leaves the other faults as they are."""
+    random = np.random.default_rng([seed, 11])
+    kinds: list[Kind] = ["hostile"] * int(random.integers(1, MOST_HOSTILE + 1))
+    shares: dict[Kind, float] = {
+        "slowed": SLOWED_SHARE, "supervisor lost": SUPERVISOR_SHARE, "second instance": SECOND_SHARE,
+    }
+    kinds += [kind for kind, share in shares.items() if random.random() < share]
+    faults = []
+    for kind in kinds:
+        at, target, seconds = sooner * float(random.uniform(0.0, MEANWHILE)), "", 0.0
+        if kind == "slowed":
+            seconds = float(random.uniform(*SLOW_SECONDS))
+        elif kind == "second instance":
+            target, seconds = str(random.choice(list(services))), float(random.uniform(*SECOND_SECONDS))
+        faults.append(Fault(at, kind, target, seconds=seconds))
+    return faults
 
 
 def _amid(random: np.random.Generator, kind: Kind) -> Amid:

@@ -25,6 +25,7 @@ from common.messages import (
     LogLine,
     Message,
     MotionStatus,
+    ParameterRequest,
     PlanRequest,
     PointCloud2,
     ServiceCounters,
@@ -52,7 +53,8 @@ MOVED = 2e-3  # [m] farther from where it lay, a thing was moved
 JUMP = 2.0  # [rad/s] times a period: from where the arm was to the first set-point of another process
 AT_REST = 2.0  # [s] of cell time after which an arm that is held is at rest
 STILL = 1e-9  # [rad]
-ENDS = ("stop", "pause")
+ENDS = ("stop", "pause", "hold")
+PERSON = "person"
 EXECUTOR, RATE = "trajectory_executor", 100.0  # [Hz] its cycles, if the cell does not say
 UNTOLD = 3  # set-points that may come before it is told of the goal, or of being let go
 CYCLES = 2.5  # periods at most between two cycles of a controller in time; a late one moves no further
@@ -66,6 +68,9 @@ LIMITS = "every set-point within limits"
 FRESH = "no motion begins that was decided long ago"
 GOAL = "the arm moves for a goal only"
 HELD = "an arm that is held rests"
+SLOW = "never faster than a person allows"
+NEVER = "a goal that was stopped before it began never moves"
+ALONE = "one of each name speaks"
 ASKED = "no motion that nobody asked for since the last stop"
 TRUTH = "nothing that decides saw the truth"
 OUTCOMES = "every request ends in one of five ways"
@@ -127,6 +132,12 @@ class Invariants:
         self._ended_at: float | None = None  # cell time of the first set-point since
         self._unasked = 0  # set-points that moved nevertheless
         self._by_persons: set[str] = set()  # goals
+        self._cap = 1.0  # share of the velocity that a person allows
+        self._cap_at: float | None = None  # cell time of the first set-point since
+        self._speaks: dict[str, str] = {}  # by service: the process that said anything last
+        self._never: set[str] = set()  # goals that were stopped before anybody said that they move
+        self._silent: dict[str, str] = {}  # processes whose place another one has taken: it
+        self._parted: set[str] = set()  # processes that were cut off
         self._strange = 0
 
     def _broke(self, holds: object, what: str) -> bool:
@@ -144,14 +155,23 @@ class Invariants:
         if any(intersects(key, truth) for truth in self._truth):
             self.truth_readers.add(service)
 
-    def on_put(self, service: str, life: str, sample: RawSample) -> None:
+    def on_put(self, service: str, life: str, sample: RawSample, parted: bool = False) -> None:
         """Look at what a process puts.
 
         Args:
             service: name of the process.
             life: name and number of it, another after each start.
             sample: as it travels.
+            parted: whether it was cut off from the others before, so that another may have taken its place meanwhile.
         """
+        self._parted |= {life} if parted else set()
+        if f"/{topics.LOG.expression.partition('/')[0]}/" not in sample.key:  # who is refused may say so
+            speaks = self._speaks.setdefault(service, life)
+            after = self._silent.get(life, "")
+            if self._broke(not after or self._parted & {life, after}, ALONE):
+                self._tell(ALONE, f"{life} says {sample.key} after {after} did")
+            if life != speaks:
+                self._silent[speaks], self._speaks[service] = life, life
         if service in self.truth_readers and service not in self._doubles:
             model = self._messages.get(sample.encoding.rpartition(";")[2], Message)
             if self._broke(issubclass(model, SEEN_BY_CAMERAS), TRUTH):
@@ -182,6 +202,8 @@ class Invariants:
             # The fingers' newer goal ends the older one.
             if self._broke(not known.active or goal == known.active or key == self._gripper, TWO):
                 self._tell(TWO, f"{key}: {goal} is active while {known.active} is")
+            if goal != known.active and self._broke(goal not in self._never, NEVER):
+                self._tell(NEVER, goal)
             if goal != known.active and goal in self._decided:
                 age = self._now() - self._decided[goal]
                 if self._broke(age <= OLDEST, FRESH):
@@ -209,6 +231,20 @@ class Invariants:
             legal = touched or state in CARRIED or was in CARRIED or (state == was and way < MOVED)
             if self._broke(legal and state != LOST, OBJECTS):
                 self._tell(OBJECTS, f"{name} went from {was} to {state} by itself, {way:.3f} m")
+
+    def on_clock(self, step: float) -> None:
+        """Take note that cell time goes on from another time, later by so much [s]: the cell was brought up again."""
+        if self._held_since is not None:
+            self._held_since += step
+        if self._ended_at is not None:
+            self._ended_at += step
+        if self._cap_at is not None:
+            self._cap_at += step
+
+    @property
+    def ended_by_person(self) -> bool:
+        """Whether the last word of a person was that the robot is to rest."""
+        return self._last_word in ENDS
 
     # --- the arm ------------------------------------------------------------------------------------------------------
 
@@ -243,6 +279,12 @@ class Invariants:
         self._restless = self._restless + 1 if resting else 0
         if self._broke(self._restless <= UNTOLD, HELD):
             self._tell(HELD, f"it moves {way.max():.4f} rad")
+        if self._cap_at is None:
+            self._cap_at = now
+        if self._cap < 1 and now - self._cap_at >= AT_REST:
+            too_fast = np.abs(dq) > fastest * self._cap + 1e-3
+            if self._broke(not too_fast.any(), SLOW):
+                self._tell(SLOW, f"dq {np.round(dq, 3).tolist()} at {self._cap:.0%}")
         if self._ended and self._ended_at is None:
             self._ended_at = now
         unasked = self._ended_at is not None and now - self._ended_at >= AT_REST
@@ -253,7 +295,7 @@ class Invariants:
 
     # --- requests -----------------------------------------------------------------------------------------------------
 
-    def _on_ask(self, request: Message) -> None:
+    def _on_ask(self, service: str, request: Message) -> None:
         """An id stands for one thing, whoever asks for it and however often."""
         if isinstance(request, WITH_ID):
             known = self._asked.setdefault(request.id, request)
@@ -264,6 +306,8 @@ class Invariants:
             self._last_word = request.command
         elif isinstance(request, StopRequest) and request.owner:  # of the task's own it has none
             self._last_word = "stop"
+        elif isinstance(request, HoldRequest) and request.hold and service == PERSON:
+            self._last_word = "hold"
         if self._last_word not in ENDS:
             self._ended, self._ended_at = False, None
         if isinstance(request, ExecuteRequest) and request.owner:
@@ -275,6 +319,14 @@ class Invariants:
 
     def _on_serve(self, life: str, request: Message, answer: Message) -> None:
         """Who asks for a goal again hears what became of it: what was accepted stays so, and what was refused too."""
+        if isinstance(request, StopRequest) and request.id:
+            known = [goals.active for goals in self._goals.values()]
+            if request.id not in known and (self._motion, request.id) not in self._over:
+                self._never.add(request.id)
+        if isinstance(request, ParameterRequest):
+            for path, value in request.set.items():
+                if path.endswith(".speed_scaling") and isinstance(value, float):
+                    self._cap, self._cap_at = value, None
         stop = isinstance(request, StopRequest) or (isinstance(request, HoldRequest) and request.hold)
         if stop and getattr(request, "by", "") == "person" and self._last_word in ENDS:
             self._ended, self._ended_at = True, None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,10 @@ import numpy as np
 
 from common import messages as m
 from common import topics
+from common.application import find_application
+from common.chaos.agent import Chaos
+from common.chaos.plan import Fault as Bad
+from common.chaos.plan import Form
 from common.errors import RequestFailed
 from common.process.operator_motion import MotionFailed, OperatorMotion
 from common.process.persist import persist
@@ -29,8 +33,14 @@ NEXT_GOAL = 1.5  # [s] for which the next goal is waited for
 TURN = 0.0005  # [s] that stands for a turn where something is to happen just when a goal is asked for
 GOALS = (topics.MOTION_EXECUTE.key, topics.GRIPPER_COMMAND.key)
 PLAN = topics.MOTION_PLAN.key
-PERSON, PAGE = "person", "page"
+PERSON, PAGE, STRANGER = "person", "page", "stranger"
 EXECUTOR = "trajectory_executor"
+SPEED = f"services.{EXECUTOR}.speed_scaling"
+SLOWEST, SLOW = 0.1, 0.4  # share of the speed that a person sets
+FORMS: tuple[Form, ...] = ("truncated", "flipped", "noise", "wrong type")
+BAD_MESSAGES = 4  # under one key, at most
+HOLD_SHARE = 0.25  # of those who end motion: with a hold of their own
+LEFT_SHARE = 0.2  # of those who end motion: nobody starts the task again
 VICTIM_SHARE = 0.7  # of task and executor, each, when a person has stopped the robot
 LOOKS_ON = 3.0, 8.0  # [s] for which it rests then
 PERSON_TIMEOUT = 2.0  # [s] of a person's request
@@ -55,6 +65,10 @@ class Misfortune:
             tell: is called with a line for each fault.
         """
         self.made: Counter[str] = Counter()
+        self.leave: Callable[[], None] = lambda: None  # is called when whoever ended motion goes away
+        self.lose_supervisor: Callable[[], Awaitable[object]] = asyncio.Event().wait  # and bring the cell up again
+        self._seconds: list[VirtualProcess] = []
+        self._strange = np.random.default_rng([seed, 10])
         self._host, self._plan, self._status, self._tell = host, plan, status, tell
         self._network = host.network
         self._random = np.random.default_rng([seed, 6])
@@ -63,14 +77,17 @@ class Misfortune:
     async def run(self) -> None:
         """Return when all has happened; cancelled, nothing more does."""
         loop, speed = self._host.loop, self._plan.speed
-        began, persons = loop.time(), []
+        began, persons = loop.time(), list[asyncio.Task[None]]()
+        begins = {"person": self._begin_person, "ended": self._begin_ending, "slowed": self._begin_slowing,
+                  "second instance": self._begin_second, "hostile": self._begin_strange}
         try:
             for fault in self._plan.faults:
                 await asyncio.sleep(max(0.0, began + fault.at / speed - loop.time()))
-                if fault.kind == "person":
-                    persons.append(self._begin_person())
-                elif fault.kind == "ended":
-                    persons.append(self._begin_ending())
+                if fault.kind in begins:
+                    self.made[fault.kind] += 1
+                    persons.append(begins[fault.kind](fault))
+                elif fault.kind == "supervisor lost":
+                    persons.append(asyncio.create_task(self._lose_supervisor()))
                 else:
                     await self._hit(fault)
             await asyncio.gather(*persons)
@@ -102,6 +119,9 @@ class Misfortune:
         if fault.amid:
             await asyncio.sleep(fault.turns * TURN)
         self._note(fault, process.name if fault.target else "")
+        if fault.kind in ("router lost", "cut"):
+            # Of one that was let in while the network was split there would be two arms: that is no single cell.
+            self._end_seconds(process.name if fault.kind == "cut" else "")
         if fault.kind == "router lost":
             network.lose_router()
             loop.call_later(fault.seconds, network.find_router)
@@ -175,21 +195,100 @@ class Misfortune:
         if not session.detached and not self._network.router_lost:
             self._network.mend([session])
 
+    # --- what nobody should do ----------------------------------------------------------------------------------------
+
+    async def _lose_supervisor(self) -> None:
+        self._tell("FAULT supervisor lost: the cell is brought up again")
+        self.made["supervisor lost"] += 1
+        self._end_seconds("")
+        await self.lose_supervisor()
+
+    def _begin_second(self, fault: Fault) -> asyncio.Task[None]:
+        self._tell(f"FAULT second instance {fault.target} for {fault.seconds:.1f} s")
+        return asyncio.create_task(self._be_second(fault))
+
+    async def _be_second(self, fault: Fault) -> None:
+        """Start a service that is up, as somebody might by hand; it is to end by itself, or when it is not needed."""
+        entry = next(entry for entry in self._host.cell.services.values() if entry.name == fault.target)
+        while (session := self._host.processes[fault.target].session) is None or session.cut:  # noqa: ASYNC110
+            await asyncio.sleep(AGAIN)
+        second = VirtualProcess(self._host, entry, lambda name, line: self._tell(f"second {name}: {line}"), beside=True)
+        self._seconds.append(second)
+        second.start()
+        second.release()
+        try:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(fault.seconds):
+                    await second.wait()
+        finally:
+            second.terminate()
+            self._seconds.remove(second)
+
+    def _end_seconds(self, name: str) -> None:
+        """End the second instances of a service, or all of them."""
+        for second in self._seconds:
+            if name in ("", second.name):
+                second.kill()
+
+    def _begin_strange(self, _fault: Fault) -> asyncio.Task[None]:
+        self._tell("FAULT hostile: messages that nobody can read under all keys")
+        context = context_of(Life(STRANGER))
+        session = self._network.attach(context, STRANGER, self.made["hostile"])
+        return context.run(lambda: asyncio.create_task(self._be_strange(session)))
+
+    async def _be_strange(self, session: VirtualSession) -> None:
+        """Put damaged messages and nonsense under every key, and ask for nonsense."""
+        host, random = self._host, self._strange
+        bus = VirtualBus(session, STRANGER, host.cell.name, host.clock, host.requests)
+        known = {**topics.platform_topics(), **find_application(host.cell.application).topics}
+        keys = [key for key in known if topics.SERVICE not in key]
+        bad = [
+            Bad(0.0, "corrupt", key, form=FORMS[int(random.integers(len(FORMS)))],
+                count=int(random.integers(1, BAD_MESSAGES + 1)), seed=int(random.integers(2**31)))
+            for key in [keys[i] for i in random.permutation(len(keys))]
+        ]
+        try:
+            await Chaos(bus, bad, dict, None, known=known).run()
+        finally:
+            await bus.close()
+            self._network.detach(session)
+
     # --- a person -----------------------------------------------------------------------------------------------------
 
-    def _begin_person(self) -> asyncio.Task[None]:
+    def _begin_person(self, _fault: Fault) -> asyncio.Task[None]:
         self._tell("FAULT person: stops the task, moves the arm home, and starts the task again")
-        self.made[PERSON] += 1
         context = context_of(Life(PERSON))
         session = self._network.attach(context, PERSON, self.made[PERSON])
         session.slow = float(self._random.uniform(0.0, PERSON_SLOW))
         return context.run(lambda: asyncio.create_task(self._be_person(session)))
 
-    def _begin_ending(self) -> asyncio.Task[None]:
-        self.made["ended"] += 1
+    def _begin_ending(self, _fault: Fault) -> asyncio.Task[None]:
         context = context_of(Life(PERSON))
         session = self._network.attach(context, PERSON, 1000 + self.made["ended"])
         return context.run(lambda: asyncio.create_task(self._end_and_start(session)))
+
+    def _begin_slowing(self, fault: Fault) -> asyncio.Task[None]:
+        context = context_of(Life(PERSON))
+        session = self._network.attach(context, PERSON, 2000 + self.made["slowed"])
+        return context.run(lambda: asyncio.create_task(self._slow_down(session, fault.seconds)))
+
+    async def _slow_down(self, session: VirtualSession, seconds: float) -> None:
+        """Set the speed, and set it back some time later."""
+        host = self._host
+        bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
+        executor = next(entry.name for entry in host.cell.services.values() if entry.kind == EXECUTOR)
+        client = bus.client(topics.parameters_of(executor))
+        share = float(self._strange.uniform(SLOWEST, SLOW))
+        self._tell(f"FAULT slowed: to {share:.0%} for {seconds:.1f} s")
+        try:
+            for speed in (share, 1.0):
+                asked = m.ParameterRequest(set={SPEED.replace(EXECUTOR, executor): speed})
+                await persist(client, asked, PERSON_TIMEOUT,
+                              lambda error: m.ParameterReply(service=executor, parameters=[]), lambda problem: None)
+                await asyncio.sleep(seconds)
+        finally:
+            await bus.close()
+            self._network.detach(session)
 
     async def _end_and_start(self, session: VirtualSession) -> None:
         """Stop or pause the robot; let those crash who could start it again; start it some time later."""
@@ -197,11 +296,18 @@ class Misfortune:
         bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
         heard_of = bus.reader(topics.MOTION_STATUS)
         executor = next(entry.name for entry in host.cell.services.values() if entry.kind == EXECUTOR)
-        ends = random.choice(["stop", "task stop", "task pause"])
+        ends = str(random.choice(["stop", "task stop", "task pause"]))
+        if self._strange.random() < HOLD_SHARE:
+            ends = "hold"
+        leaves = self._strange.random() < LEFT_SHARE
         victims = [name for name in (executor, host.cell.task) if random.random() < VICTIM_SHARE]
-        self._tell(f"FAULT ended: {ends}, then {' and '.join(victims) or 'nobody'} crashes")
+        self._tell(f"FAULT ended: {ends}, then {' and '.join(victims) or 'nobody'} crashes"
+                   f"{'; nobody starts it again' if leaves else ''}")
         try:
-            if ends == "stop":
+            if ends == "hold":
+                await persist(bus.client(topics.MOTION_HOLD), m.HoldRequest(hold=True), PERSON_TIMEOUT,
+                              lambda error: m.MotionStatus(), lambda problem: None)
+            elif ends == "stop":
                 await persist(bus.client(topics.MOTION_STOP), m.StopRequest(owner=PAGE), PERSON_TIMEOUT,
                               lambda error: m.MotionStatus(), lambda problem: None)
             else:
@@ -211,6 +317,10 @@ class Misfortune:
             for name in victims:
                 host.processes[name].kill()
             await asyncio.sleep(float(random.uniform(*LOOKS_ON)))
+            if leaves:
+                self.made["left so"] += 1
+                self.leave()
+                return
             await self._start(bus, heard_of)
         finally:
             await bus.close()
@@ -220,7 +330,7 @@ class Misfortune:
         """Start the task as a person does: again, as long as the robot stays stopped."""
         status = bus.reader(self._status)
         while True:
-            heard = motion.latest.newest if motion.latest else None
+            heard = motion.latest.newest if motion.latest else 0  # who has heard nothing lets go of nothing
             start = m.TaskCommand(command="start", heard=heard)
             await persist(bus.client(topics.TASK_COMMAND), start, PERSON_TIMEOUT, lambda error: m.TaskStatus(),
                           lambda problem: None)

@@ -31,7 +31,7 @@ M = TypeVar("M", bound=Message)
 
 BOOT = 0.4, 1.2  # [s] from the start of a process to its first declaration
 TAIL_LINES = 50
-SIGKILL, SIGTERM_CODE = -9, 0
+SIGKILL, SIGTERM_CODE, REFUSED = -9, 0, 2
 OUTCOMES: dict[type[BaseException], str] = {
     RemoteError: "refused", NoResponder: "no responder", RequestLost: "lost", RequestTimeout: "time-out",
 }
@@ -60,7 +60,7 @@ class Requests:
     read: int = 0  # messages
     begun: int = 0
     on_begin: Callable[[str, str, str], None] = lambda asker, asked, key: None
-    on_ask: Callable[[Message], None] = lambda request: None
+    on_ask: Callable[[str, Message], None] = lambda service, request: None
     on_serve: Callable[[str, Message, Message], None] = lambda life, request, answer: None
     on_answer: Callable[[str, Message, Message], None] = lambda service, request, answer: None
 
@@ -74,7 +74,7 @@ class _WatchedClient(Client[Q, A]):
         """The answer to a request."""
         noted = self.noted
         noted.on_begin(self._service, self.server, self.topic.key)
-        noted.on_ask(request)
+        noted.on_ask(self._service, request)
         number = noted.begun = noted.begun + 1
         noted.open[number] = self._service, self.topic.key, monotonic() + timeout
         try:
@@ -167,6 +167,8 @@ class Host:
     started: int = 0
     skews: dict[str, float] = field(default_factory=dict)  # by service [s]
     crashes: list[str] = field(default_factory=list)  # of services, by themselves
+    twice: Counter[str] = field(default_factory=Counter)  # instances that were started beside those of the supervisor
+    refused: int = 0  # instances, because another one was up
 
     def clear_away(self) -> list[asyncio.Task[int]]:
         """Let everything that was cut off come to its end, far from the network; returns what has to end."""
@@ -192,8 +194,10 @@ class _Ending:
 class VirtualProcess:
     """A child of the supervisor that is a task of this process."""
 
-    def __init__(self, host: Host, entry: ServiceEntry, on_line: Callable[[str, str], None]) -> None:
-        """Describe a process without starting it."""
+    def __init__(
+        self, host: Host, entry: ServiceEntry, on_line: Callable[[str, str], None], *, beside: bool = False
+    ) -> None:
+        """Describe a process without starting it; `beside` that of the supervisor, which knows nothing of it."""
         self.name = entry.name
         self.tail: deque[str] = deque(maxlen=TAIL_LINES)
         self.life = Life(self.name)
@@ -206,7 +210,10 @@ class VirtualProcess:
         self._task: asyncio.Task[int] | None = None
         self._session: VirtualSession | None = None
         self._ending = _Ending()
-        host.processes[self.name] = self
+        if beside:
+            host.twice[self.name] += 1
+        else:
+            host.processes[self.name] = self
 
     @property
     def pid(self) -> int | None:
@@ -264,7 +271,9 @@ class VirtualProcess:
         elif (error := task.exception()) is not None:
             code = 1
             self._host.crashes.append(f"{self.name}: {type(error).__name__}: {error}")
-        elif (code := task.result()) and not self._ending.stopping:
+        elif (code := task.result()) == REFUSED and self._host.twice[self.name]:
+            self._host.refused += 1
+        elif code and not self._ending.stopping:
             self._host.crashes.append(f"{self.name}: {self.tail[-1] if self.tail else f'exit code {code}'}")
         self._gone(code)
 

@@ -4,10 +4,16 @@ from functools import cache
 
 import pytest
 
+from cli.commands import newest_heard
+from common import topics
 from common.config import Cell, load_cell
 from common.errors import ConfigError
+from common.messages import StopRequest, TaskCommand
+from common.transport.bus import Bus
 from common.virtual.doubles import settings_of, with_doubles
+from common.virtual.faults import LAST, make_plan
 from common.virtual.simulation import Outcome, Simulation
+from tests.harness import until
 from tests.simulated.known_bugs import BUGS
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
@@ -23,12 +29,45 @@ def outcome_of(name: str, seed: int, faults: bool = True) -> Outcome:
     return Simulation(cell_of(name), seed, faults=faults, digest=True).run()
 
 
-@pytest.mark.parametrize("name", ["panda", "ur5"])
-def test_cell_with_doubles_ends_well_whatever_goes_wrong(name):
-    outcome = outcome_of(name, 1)
+@pytest.mark.parametrize(("name", "seed"), [
+    ("panda", 1), ("ur5", 1),
+    ("panda", 21),  # a start is on its way when the robot is held
+    ("panda", 22),  # a second instance puts what it knows before it is refused
+    ("ur5", 31),  # the robot is stopped and started while the next executor waits for the end of another
+    ("ur5", 39),  # the arm moves meanwhile
+])
+def test_cell_with_doubles_ends_well_whatever_goes_wrong(name, seed):
+    outcome = outcome_of(name, seed)
     assert outcome.ok and not outcome.broken and not outcome.crashes, outcome
-    assert outcome.faults["crash"] >= 3 and outcome.faults["cut"] >= 1
-    assert all(count > 0 for count in outcome.checked.values()) and len(outcome.checked) >= 9
+    assert outcome.faults["crash"] >= 2 and outcome.faults["hostile"] >= 1
+    assert all(count > 0 for count in outcome.checked.values()) and len(outcome.checked) >= 10
+
+
+def test_every_plan_has_hostile_payloads_and_some_have_each_other_fault():
+    plans = [make_plan(seed, ["one", "two"], 0.5) for seed in range(100)]
+    kinds = [{fault.kind for fault in plan.faults} for plan in plans]
+    assert all("hostile" in each for each in kinds)
+    assert all(5 < sum(kind in each for each in kinds) < 90 for kind in LAST if kind != "hostile")
+    assert make_plan(1, ["one"], without=LAST).faults == tuple(
+        fault for fault in make_plan(1, ["one"]).faults if fault.kind not in LAST)
+
+
+def test_run_that_a_person_stops_for_good_ends_with_the_robot_at_rest():
+    outcome = outcome_of("panda", 10)
+    assert (outcome.state, outcome.ok, outcome.faults["left so"]) == ("LEFT", True, 1)
+
+
+def test_newest_stop_is_heard_of_before_a_start_is_asked_for():
+    async def visit(bus: Bus) -> None:
+        assert await newest_heard(bus) == 0
+        stopped = await bus.client(topics.MOTION_STOP).call(StopRequest(owner="anna"))
+        await until(bus.reader(topics.MOTION_STATUS), lambda said: bool(said.inhibits))
+        assert await newest_heard(bus) == stopped.newest > 0
+        await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start", heard=stopped.newest - 1))
+        assert await newest_heard(bus) == stopped.newest, "a start that is late lets go of nothing"
+        await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start", heard=stopped.newest))
+
+    assert Simulation(cell_of("panda"), 1, visit=visit).run().ok
 
 
 def test_doubles_stand_for_perception_and_planner_and_leave_task_and_executor_as_they_are():
