@@ -24,6 +24,7 @@ from common.transport.tokens import tokens_now
 SHARED = ("log/supervisor", "counters/supervisor", "supervisor/status")
 GIVE_UP = 3.0  # [s] longer than a link that was cut stands: the one before may be gone and its tokens not yet
 LOOK_PERIOD = 0.2  # [s]
+LOOK = 3.0  # [s] for an answer: longer than a link holds anything up before it is cut, so that no answer means nobody
 MEET = 0.5  # [s] that somebody else must own what is ours before one of the two ends: tokens of who is gone go at once
 MOST_OTHERS = 16  # that are known to own a key of ours too: those that were there first
 MOST_TOLD = 8  # of whom a line of the log tells in TELL_SECONDS
@@ -150,7 +151,7 @@ class Ownership:
     async def owners(self, *keys: str) -> list[Owner]:
         """Who writes or serves these keys in the cell now, or any: services that are ready or just become so."""
         asked = [owns_key(self._cell, key) for key in keys or "*"]
-        found = await asyncio.gather(*(tokens_now(self._session, key, self._loop, 1.0) for key in asked))
+        found = await asyncio.gather(*(tokens_now(self._session, key, self._loop, LOOK) for key in asked))
         return who_owns(token for tokens in found for token in tokens)
 
     def close(self) -> None:
