@@ -6,6 +6,7 @@ With simulated hardware the true world lives here too, because whether a grasp s
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from common.control.cycle import ControlCycle
 from common.control.inhibits import SOMEBODY, Inhibits, Speed, speed_of
 from common.control.record_file import RecordFile, record_file
 from common.control.requester import Alone, WhenAlone, objection
+from common.control.sole_use import sole_use
 from common.hardware.interface import Limits
 from common.hardware.loading import find_backend, load_hardware
 from common.messages import (
@@ -178,6 +180,12 @@ def within_reach(
 
 async def run(bus: Bus, config: Config) -> None:
     """Control the arm until cancelled."""
+    async with contextlib.AsyncExitStack() as ours:
+        await control(bus, config, ours)
+
+
+async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> None:
+    """Control the arm until cancelled; what is ours alone meanwhile is let go of afterwards."""
     simulated = find_backend(config.robot).simulated
     joints, motion = bus.writer(topics.JOINT_STATES), bus.writer(topics.MOTION_STATUS)
     gripper = bus.writer(topics.GRIPPER_STATE) if config.robot.gripper else None
@@ -263,9 +271,6 @@ async def run(bus: Bus, config: Config) -> None:
             moving = asyncio.create_task(in_world(cycle.due), name="world")
             cycle.due = None
 
-    file = record_file(bus.cell)
-    if not bus.declares_only:
-        file.require_writable()
     bus.keep_parameters = keep_speed
     bus.serve(topics.MOTION_EXECUTE, execute)
     bus.serve(topics.MOTION_STOP, stop)
@@ -275,6 +280,11 @@ async def run(bus: Bus, config: Config) -> None:
     if simulated:
         bus.serve(topics.WORLD_EDIT, edit)
     await bus.owned()  # until then another executor may change what is read now
+    file = record_file(bus.cell)
+    if not bus.declares_only:
+        if bus.has_process:  # nor may one of another cell of that name
+            await ours.enter_async_context(sole_use(file.path, f"{bus.service} of {bus.cell}"))
+        file.require_writable()
     decisions = Decisions(file, bus.log)
     inhibits, configured = decisions.inhibits, config.speed_scaling
     config.speed_scaling = speed_of(inhibits.speed, configured)

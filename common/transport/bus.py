@@ -49,6 +49,7 @@ class Bus:
     make_reader: type[Reader[Any]] = Reader  # a simulation has its own, which look on
     make_client: type[Client[Any, Any]] = Client
     has_threads = True  # in a simulation nothing is done beside the loop
+    has_process = True  # in a simulation nobody lets go of the files of who is killed
     declares_only = False  # whether a service is only to say what it reads and writes, and to do nothing
 
     def __init__(

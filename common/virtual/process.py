@@ -114,7 +114,7 @@ class VirtualBus(Bus):
     """A bus of whose requests is noted how they end, with a log of its own."""
 
     make_reader, make_client = _WatchedReader, _WatchedClient
-    has_threads = False
+    has_threads = has_process = False
 
     def __init__(
         self, session: VirtualSession, service: str, cell: str, clock: Clock, noted: Requests,

@@ -14,6 +14,7 @@ from common import topics
 from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.config import load_cell, service_config
+from common.control import sole_use
 from common.control.cycle import ControlCycle
 from common.control.record_file import RecordFile
 from common.errors import ConfigError, RemoteError, UnknownName
@@ -295,6 +296,23 @@ async def test_executor_that_cannot_keep_what_persons_decide_does_not_start(
             pass
 
 
+async def test_second_executor_that_would_keep_the_stops_of_another_cell_in_one_file_is_refused(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sole_use, "PATIENCE", 0.1)
+    async with executor() as person:
+        await person.stop.call(StopRequest(owner="anna"))
+        who = rf"ZENCELL_STATE: .* is in use by trajectory_executor of {CELL}, process {os.getpid()} on .+: a stop"
+        with pytest.raises(ConfigError, match=who) as caught:
+            async with executor():
+                pass
+        assert "\n" not in str(caught.value)
+        await goes_on(person)
+        monkeypatch.setenv(STATE_VARIABLE, os.environ["XDG_STATE_HOME"])
+        async with executor() as other:
+            assert not (await other.see(other.motion, lambda m: True)).inhibits
+
+
 async def test_stop_that_cannot_be_kept_says_so_everywhere_until_it_is(monkeypatch, caplog) -> None:
     monkeypatch.setattr(trajectory_executor, "TRY_AGAIN", 0.01)
     save, full = RecordFile.save, True
@@ -483,10 +501,13 @@ async def test_impossible_layout_stops_it_with_the_place() -> None:
 
 
 async def test_random_layout_follows_the_seed_and_is_within_reach() -> None:
-    async with executor("world.layout=random", "seed=4") as first, executor("world.layout=random", "seed=4") as again:
-        one, two = [await p.see(p.balls, lambda b: True) for p in (first, again)]
-        assert one.poses == two.poses and len(one.ids) == 7
-        assert all(0.18 <= np.hypot(p.position.x, p.position.y) <= 0.82 for p in one.poses)
+    seen = []
+    for _ in range(2):  # one after the other: they are one cell
+        async with executor("world.layout=random", "seed=4") as person:
+            seen.append(await person.see(person.balls, lambda b: True))
+    one, two = seen
+    assert one.poses == two.poses and len(one.ids) == 7
+    assert all(0.18 <= np.hypot(p.position.x, p.position.y) <= 0.82 for p in one.poses)
 
 
 async def test_random_layout_keeps_to_the_limits_of_reach_of_the_cells_own_services() -> None:
