@@ -38,6 +38,7 @@ from common.transport.codec import decode
 from common.transport.local import intersects
 from common.transport.session import RawSample
 from common.virtual.doubles import is_double
+from common.virtual.loop import Life, current_life
 from common.virtual.process import Requests
 
 Place = tuple[float, float, float]  # x, y, z [m]
@@ -85,6 +86,11 @@ def rate_of(cell: Cell) -> float:
                  if "joint_state_rate" in entry.parameters), RATE)
 
 
+def _speeds(request: ParameterRequest) -> list[float]:
+    """The share of the speed that it sets, if it does."""
+    return [value for path, value in request.set.items() if path.endswith(".speed_scaling") and isinstance(value, float)]
+
+
 @dataclass
 class _Goals:
     """What one controller said of its goals."""
@@ -125,6 +131,7 @@ class Invariants:
         self._decided: dict[str, float] = {}  # by goal: when it was asked for first
         self._asked: dict[str, Message] = {}  # by id
         self._told: dict[tuple[str, str], bool] = {}  # by controller's process and goal: whether it was accepted
+        self._moves: Life | None = None  # the process whose set-points they are
         self._stray = 0  # set-points that moved without a goal
         self._restless = 0  # set-points that moved although the arm is held
         self._last_word = ""  # of persons: what they told the task, or "stop" to the executor
@@ -260,7 +267,8 @@ class Invariants:
         if last is None:
             return
         passed, way = now - last[2], np.abs(q - last[0])
-        if passed <= 0 or passed > STALL:  # another process, or one that stood still
+        before, self._moves = self._moves, current_life()
+        if passed <= 0 or passed > STALL or before is not self._moves:  # another process, or one that stood still
             if self._broke((way <= JUMP * self._cycle / CYCLES).all(), LIMITS):
                 self._tell(LIMITS, f"a jump of {way.max():.3f} rad after {passed:.3f} s")
             return
@@ -304,6 +312,8 @@ class Invariants:
                                  f"{type(request).__name__}, which are not the same")
         if isinstance(request, TaskCommand):
             self._last_word = request.command
+        elif isinstance(request, ParameterRequest):  # it holds before it is answered, and slower counts from then on
+            self._cap = max([self._cap, *_speeds(request)])
         elif isinstance(request, StopRequest) and request.owner:  # of the task's own it has none
             self._last_word = "stop"
         elif isinstance(request, HoldRequest) and request.hold and service == PERSON:
@@ -324,9 +334,8 @@ class Invariants:
             if request.id not in known and (self._motion, request.id) not in self._over:
                 self._never.add(request.id)
         if isinstance(request, ParameterRequest):
-            for path, value in request.set.items():
-                if path.endswith(".speed_scaling") and isinstance(value, float):
-                    self._cap, self._cap_at = value, None
+            for speed in _speeds(request):
+                self._cap, self._cap_at = speed, None
         stop = isinstance(request, StopRequest) or (isinstance(request, HoldRequest) and request.hold)
         if stop and getattr(request, "by", "") == "person" and self._last_word in ENDS:
             self._ended, self._ended_at = True, None

@@ -42,6 +42,11 @@ class Life:
 _life: ContextVar[Life | None] = ContextVar("life", default=None)
 
 
+def current_life() -> Life | None:
+    """The life whose turn it is."""
+    return _life.get()
+
+
 def context_of(life: Life) -> Context:
     """A context of its own for what belongs to a life; whatever is started in it does too."""
     context = Context()
