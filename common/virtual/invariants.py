@@ -88,7 +88,8 @@ def rate_of(cell: Cell) -> float:
 
 def _speeds(request: ParameterRequest) -> list[float]:
     """The share of the speed that it sets, if it does."""
-    return [value for path, value in request.set.items() if path.endswith(".speed_scaling") and isinstance(value, float)]
+    values = [value for path, value in request.set.items() if path.endswith(".speed_scaling")]
+    return [value for value in values if isinstance(value, float)]
 
 
 @dataclass
@@ -330,7 +331,7 @@ class Invariants:
     def _on_serve(self, life: str, request: Message, answer: Message) -> None:
         """Who asks for a goal again hears what became of it: what was accepted stays so, and what was refused too."""
         if isinstance(request, StopRequest) and request.id:
-            known = [goals.active for goals in self._goals.values()]
+            known = [getattr(answer, "id", ""), *(goals.active for goals in self._goals.values())]
             if request.id not in known and (self._motion, request.id) not in self._over:
                 self._never.add(request.id)
         if isinstance(request, ParameterRequest):
