@@ -1,0 +1,79 @@
+"""Bugs about what persons decided, to put back one at a time; and in how many seeds with doubles each is found.
+
+`python -m tests.simulated.lost_decisions [SEEDS] [NAMES]` prints the table.
+"""
+
+import contextlib
+import sys
+from unittest.mock import patch
+
+from common.config import load_cell
+from common.control.inhibits import Inhibits, Record
+from common.control.record_file import RecordFile
+from common.transport.bus import Bus
+from common.transport.ownership import Ownership
+from common.virtual.doubles import settings_of, with_doubles
+from common.virtual.simulation import Simulation
+from services import trajectory_executor
+
+
+def _without(**left_out):
+    honest = RecordFile.load
+
+    def load(self):
+        record, problem = honest(self)
+        return record.model_copy(update=left_out | (
+            {"inhibits": [i for i in record.inhibits if i.kind != "held"]} if "inhibits" in left_out else {})), problem
+
+    return patch.object(RecordFile, "load", load)
+
+
+def _let_in():
+    async def nobody(self, *_):
+        return None
+
+    return patch.object(Ownership, "_require_only", nobody)
+
+
+def _not_held_back():
+    return patch.object(Bus, "hold_back", lambda self: None)
+
+
+def _late_start_counts():
+    return patch("common.control.inhibits._lets_go", lambda request, inhibit: (
+        request.override or (request.stops if inhibit.kind == "stopped" else True)))
+
+
+DECISIONS = {
+    "a restart forgets the stop": lambda: patch.object(RecordFile, "load", lambda self: (Record(), "")),
+    "the hold's record is not read": lambda: _without(inhibits=[]),
+    "a remembered stop of an unknown goal is forgotten": lambda: patch.object(
+        Inhibits, "never", lambda self, goals: None),
+    "the speed is forgotten": lambda: patch.object(
+        trajectory_executor, "speed_of", lambda kept, configured: configured),
+    "a second instance is let in": _let_in,
+    "a second instance puts before it is refused": _not_held_back,
+    "a start undoes a later stop": _late_start_counts,
+}
+
+
+def found_in(name, bug, seeds):
+    """Seeds that told of the bug, and what the first told."""
+    application = load_cell(name).application
+    cell, found, first = with_doubles(load_cell(name, settings_of(application))), [], ""
+    for seed in seeds:
+        with DECISIONS[bug]():
+            outcome = Simulation(cell, seed, faults=True, limit=60.0).run()
+        if not outcome.ok or outcome.crashes:
+            found.append(seed)
+            first = first or f"{outcome.state} {outcome.message}"
+    return found, first
+
+
+if __name__ == "__main__":
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 100
+    for bug in sys.argv[2:] or DECISIONS:
+        seeds, told = found_in("panda", bug, range(1, count + 1))
+        with contextlib.suppress(BrokenPipeError):
+            sys.stdout.write(f"{bug}: {len(seeds)} of {count}, first {seeds[:1]}: {told}\n")
+            sys.stdout.flush()
