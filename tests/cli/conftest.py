@@ -49,7 +49,7 @@ import asyncio
 from common import topics
 from common.config import Parameters
 from common.errors import Refused
-from common.messages import Image, TaskStatus
+from common.messages import Image, Inhibit, MotionStatus, TaskStatus
 from common.process.service import main
 
 class Config(Parameters):
@@ -62,8 +62,12 @@ async def run(bus, config):
         if request.command == "resume":
             await asyncio.Event().wait()
         return TaskStatus(header=bus.header(), paused=request.command == "pause")
+    async def stop(request):
+        lost = Inhibit(kind="stopped", by="anna", reason="not kept on disk (it is full)", since=1)
+        return MotionStatus(header=bus.header(), inhibits=[lost])
     images = bus.writer(topics.CAMERA_IMAGE)
     bus.serve(topics.TASK_COMMAND, answer)
+    bus.serve(topics.MOTION_STOP, stop)
     await bus.ready()
     while True:
         images.put(Image(header=bus.header("camera"), height=3, width=4, encoding="bgr8", data=bytes(36)))
