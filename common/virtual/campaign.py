@@ -65,10 +65,15 @@ def run_seeds(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: 
         jobs: how many at a time.
         limit: virtual time in which each has to end [s].
     """
+    some = SEEDS_A_PROCESS * min(jobs, len(seeds))
+    # Not `max_tasks_per_child`: in Python 3.11 who is to be begun anew may never be (gh-115634), and all wait for ever.
+    for first in range(0, len(seeds), some):
+        yield from _run_some(cell, seeds[first:first + some], faults, jobs, limit)
+
+
+def _run_some(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: float) -> Iterator[Outcome]:
     pool = ProcessPoolExecutor(
-        min(jobs, len(seeds)), multiprocessing.get_context("spawn"), _begin, (cell, faults, limit),
-        max_tasks_per_child=SEEDS_A_PROCESS,
-    )
+        min(jobs, len(seeds)), multiprocessing.get_context("spawn"), _begin, (cell, faults, limit))
     running: dict[Future[Outcome], int] = {}
     try:
         running |= {pool.submit(_run, seed): seed for seed in seeds}

@@ -50,6 +50,12 @@ def test_run_of_a_campaign_is_repeated_by_its_seed():
         alone.messages, alone.seconds, alone.requests, alone.faults)
 
 
+def test_campaign_goes_on_after_a_process_has_had_its_seeds(monkeypatch):
+    monkeypatch.setattr("common.virtual.campaign.SEEDS_A_PROCESS", 1)
+    outcomes = [*run_seeds(PANDA, [1, 2, 3], False, 1, 1.0)]  # none ends within that time
+    assert [outcome.seed for outcome in outcomes] == [1, 2, 3]
+
+
 AT_ONCE = ["what is not newer is read", "the task reads the truth", "a request that waits without end"]
 
 
