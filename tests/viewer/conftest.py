@@ -102,12 +102,13 @@ Bring = Callable[..., Awaitable[Viewed]]
 Opened = Callable[..., AbstractAsyncContextManager[Watched]]
 
 
-@pytest_asyncio.fixture(scope="session", loop_scope="session")
+@pytest_asyncio.fixture(scope="module", loop_scope="session")
 async def bring(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Bring]:
     """Brings a cell up with its page: `await bring("up", "panda", "--set", "autostart=false")`.
 
-    Who asks for the cell that is up already, in the same words, gets that one; another ends it first. So tests share
-    a cell, should leave it as they found it, and are best put in an order in which few are needed.
+    Who asks for the cell that is up already, in the same words, gets that one; another ends it first. So tests of a
+    file share a cell, should leave it as they found it, and are best put in an order in which few are needed. It ends
+    with the file: the tests that come after need the processor.
     """
     current: dict[tuple[str, ...], Viewed] = {}
 

@@ -46,7 +46,7 @@ def test_what_vanishes_moves_or_comes_by_itself_is_told(later: dict[str, float])
 def test_what_somebody_changes_is_not_whether_it_is_said_before_the_answer_or_after_it(answered: bool) -> None:
     told = Told()
     told.say(ball_1=0.3)
-    told.requests.on_ask(EDIT)
+    told.requests.on_ask("visitor", EDIT)
     if answered:
         told.answer()
     assert told.say(ball_1=0.5) == []
@@ -55,7 +55,7 @@ def test_what_somebody_changes_is_not_whether_it_is_said_before_the_answer_or_af
 def test_after_the_change_it_has_to_stay_again() -> None:
     told = Told()
     told.say(ball_1=0.3)
-    told.requests.on_ask(EDIT)
+    told.requests.on_ask("visitor", EDIT)
     told.answer()
     assert told.say(ball_1=0.5) == []
     assert any(OBJECTS in line for line in told.say(ball_1=0.3))

@@ -52,6 +52,6 @@ def test_executor_that_was_started_again_knows_no_goals(seen):
 ])
 def test_an_id_stands_for_one_thing(seen, other, holds):
     invariants, requests = seen
-    requests.on_ask(MOTION)
-    requests.on_ask(other)
+    requests.on_ask("task", MOTION)
+    requests.on_ask("task", other)
     assert (invariants.broken == []) == holds
