@@ -1,6 +1,6 @@
 """Everything of the page that reaches inside viser, and what viser would have to offer in its place.
 
-Three things have no public call in viser 1.1; whoever updates viser reads this file, and nothing else of the page.
+Four things have no public call in viser 1.1; whoever updates viser reads this file, and nothing else of the page.
 
 - **Who may open the page, and at which socket.** viser has no authentication, takes a WebSocket from any web page, and
   tries the next port when one is taken. Its server is one call of `websockets`' `serve`, which can ask a function about
@@ -13,6 +13,9 @@ Three things have no public call in viser 1.1; whoever updates viser reads this 
   contents in it, it compiles while it loads, and a browser keeps what it has compiled for the next opening.
   Upstream requests: a client build in separate files; `configure_environment_map(hdri=None)` and the antialiasing of
   edges as options that are known before the client begins.
+- **Messages from any thread.** viser wakes its loop by an `asyncio.Event` that it sets from the thread that asks, which
+  may fail or wake nobody; it sets it a second time on its loop, which is enough (`_Event`).
+  Upstream request: leave the first one out.
 
 The style sheets in markup.py and task_panel.py name two of the client's CSS classes; without them the page only looks
 different. Upstream requests: a large and sticky button, and a checkbox whose label stands behind it.
@@ -20,6 +23,7 @@ different. Upstream requests: a large and sticky button, and a checkbox whose la
 
 from __future__ import annotations
 
+import asyncio
 import gzip
 import hashlib
 import json
@@ -44,6 +48,7 @@ from viser._messages import (
     ShareUrlRequest,
     ViewerCameraMessage,
 )
+from viser.infra._async_message_buffer import AsyncMessageBuffer
 from websockets.http11 import Request, Response
 
 if TYPE_CHECKING:
@@ -52,6 +57,30 @@ if TYPE_CHECKING:
 Process = Callable[[websocket_server.ServerConnection, Request], "Awaitable[Response | None] | Response | None"]
 
 _replacing = threading.Lock()
+
+# --- messages from any thread ---
+
+
+class _Event(asyncio.Event):
+    """An event that any thread may set: those who wait for it are woken where they wait, when it is set there."""
+
+    def set(self) -> None:
+        here, self._value = asyncio._get_running_loop(), False  # it may have been set elsewhere, which woke nobody
+        if here is not None and here is self._loop:  # type: ignore[attr-defined]
+            super().set()
+        else:
+            self._value = True
+
+
+_begin = AsyncMessageBuffer.__init__
+
+
+def _begin_safely(buffer: AsyncMessageBuffer, *args: Any, **more: Any) -> None:
+    _begin(buffer, *args, **more)
+    buffer.message_event = _Event()
+
+
+AsyncMessageBuffer.__init__ = _begin_safely  # type: ignore[method-assign, assignment]
 
 # --- the server ---
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gzip
 import re
 from pathlib import Path
@@ -10,6 +11,8 @@ import pytest
 import viser
 from hypothesis import given
 from hypothesis import strategies as st
+from viser._messages import RunJavascriptMessage
+from viser.infra._async_message_buffer import AsyncMessageBuffer
 
 from common.viewer.viser_inside import ALPHABET, client_files, decoded, files_of
 
@@ -59,3 +62,23 @@ def test_page_that_is_packed_in_another_way_is_sent_as_it_is(page: str) -> None:
     assert set(files) == {"/", "/index.html"}
     sent = gzip.decompress(files["/"].body).decode()
     assert re.sub(r"<head><script>.*?</script>", "<head>", sent, count=1, flags=re.DOTALL) == page
+
+
+async def test_messages_from_another_thread_wake_who_waits_for_them_and_nobody_elsewhere() -> None:
+    buffer = AsyncMessageBuffer(asyncio.get_running_loop(), persistent_messages=False)
+    for number in range(100):
+        waiting = asyncio.create_task(buffer.message_event.wait())
+        await asyncio.sleep(0)
+        woken = list(buffer.message_event._waiters)  # type: ignore[attr-defined]
+        seen = await asyncio.to_thread(_pushed, buffer, number, woken)
+        await asyncio.wait_for(waiting, 10.0)
+        assert seen == [False]
+        buffer.message_event.clear()
+
+
+def _pushed(buffer: AsyncMessageBuffer, number: int, woken: list[asyncio.Future[bool]]) -> list[bool]:
+    """Whether who waits was woken by this thread instead of by the loop."""
+    buffer.message_event.set()
+    found = [future.done() for future in woken]
+    buffer.push(RunJavascriptMessage(f"{number}"))
+    return found
