@@ -124,8 +124,9 @@ def access_control(cells: Mapping[str, Mapping[str, Rights]]) -> dict[str, Any]:
 def _rules(cell: str, process: str, rights: Rights) -> Iterable[dict[str, Any]]:
     in_cell = {kind: sorted(f"{cell}/{key}" for key in getattr(rights, kind)) for kind in Rights.__dataclass_fields__}
     written, answered = in_cell["write"] + in_cell["keep"], in_cell["keep"] + in_cell["serve"]
-    # The router passes a subscription on as it was made: who reads the logs of all is not heard of under that of one.
-    heard = [*written, *(f"{cell}/{topic.expression}" for topic in (LOG, COUNTERS) if rights.write)]
+    # A client sends only what the router has told it that somebody reads, and the router passes a later subscription on
+    # as it was made: who reads `cell/**` would not be heard of under a key of this process.
+    heard = ["**"] if written else []
     asked = sorted({*in_cell["get"], *in_cell["call"]})
     own = [alive_key(cell, process), *(serves_key(cell, key, process) for key in sorted(rights.serve))]
     own += [owns_key(cell, key, service=process) for key in sorted({*rights.write, *rights.keep, *rights.serve})]

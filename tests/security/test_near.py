@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import shutil
 import socket
@@ -73,6 +74,29 @@ async def test_who_is_near_passes_no_front_and_has_the_rights_of_his_certificate
         assert heard.keys == {"panda/camera/camera_info"}
     for each in (session, far):
         each.close()
+
+
+@pytest.mark.parametrize("expression", ["panda/camera/camera_info", "panda/camera/*", "panda/**", "*/camera/**"])
+async def test_whoever_reads_after_a_writer_has_begun_hears_it_whatever_expression_he_reads(
+    door: Door, expression: str
+) -> None:
+    writer, _ = await door.enter(near=True)
+    answered = asyncio.get_running_loop().create_future()
+    publisher = writer.publisher("panda/camera/camera_info", "", reliable=True)
+    # Answered after all that was declared before: the router knows by then that nobody reads.
+    writer.get_tokens("panda/alive/*", lambda _: None, lambda: answered.get_loop().call_soon_threadsafe(
+        answered.set_result, None), timeout=WITHIN)
+    await answered
+    assert not publisher.matched
+    with Holder(door.endpoint, credentials_of("operator", door.certificates)) as operator:
+        heard = operator.hear(expression)
+        for _ in range(100):
+            publisher.put(b"by the camera", b"")
+            if heard.samples:
+                break
+            heard.soon(0.1)
+        assert heard.keys == {"panda/camera/camera_info"}
+    writer.close()
 
 
 @pytest.mark.parametrize("flooded", ["near", "front"])
