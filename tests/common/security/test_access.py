@@ -59,12 +59,14 @@ def test_who_calls_may_ask_and_who_serves_may_answer() -> None:
     assert "asks" not in both["panda.executor"]
 
 
-def test_everything_else_is_denied_and_every_rule_names_its_cell() -> None:
+def test_everything_else_is_denied_and_every_rule_names_its_cell_but_to_hear_of_readers() -> None:
     control = access_control({"panda": {**cell(camera=CAMERA), "supervisor": rights_of_supervisor()}})
     assert control["enabled"] and control["default_permission"] == "deny"
     for rule in control["rules"]:
         assert rule["permission"] == "allow"
-        if rule["id"].startswith("panda."):
+        if rule["id"].endswith(" hears of readers"):  # in whatever expression they read
+            assert (rule["flows"], rule["messages"], rule["key_exprs"]) == (["egress"], ["declare_subscriber"], ["**"])
+        elif rule["id"].startswith("panda."):
             assert all(key.startswith("panda/") for key in rule["key_exprs"])
 
 
