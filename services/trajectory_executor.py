@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import math
 from collections.abc import Callable
 from typing import TypeVar
@@ -21,8 +20,9 @@ from common.config import Grasp, Members, Parameters, Reach, RobotConfig, Run, T
 from common.control.checks import Tolerances
 from common.control.controller import PERIOD
 from common.control.cycle import ControlCycle
+from common.control.decisions import Decisions
 from common.control.inhibits import SOMEBODY, Inhibits, Speed, speed_of
-from common.control.record_file import RecordFile, record_file
+from common.control.record_file import record_file
 from common.control.requester import Alone, WhenAlone, objection
 from common.control.sole_use import sole_use
 from common.hardware.interface import Limits
@@ -48,7 +48,6 @@ from common.transport.bus import Bus
 T = TypeVar("T")
 
 MOST_CYCLES = 250.0  # per second of wall time
-TRY_AGAIN = 1.0  # [s] after what was decided could not be written
 REACH_MARGIN = 0.008  # [m] random places keep from the ends of the reach: what is seen is a few millimetres off
 
 
@@ -76,61 +75,6 @@ class Config(Parameters):
     )
     tolerances: Tolerances = Tolerances()
     grasp_tolerances: GraspTolerances = Field(GraspTolerances(), description="simulated hardware only")
-
-
-class Decisions:
-    """What persons decided, in memory and in its file."""
-
-    def __init__(self, file: RecordFile, log: logging.Logger) -> None:
-        """Begin with what the file says."""
-        self._file, self._log, self._writing = file, log, asyncio.Lock()
-        self._written, problem = file.load()
-        self._unkept = ""  # why what was decided last is not written
-        self._trying: asyncio.Task[None] | None = None
-        self.on_change: Callable[[], None] = lambda: None  # what is written, and what is not
-        self.inhibits = Inhibits(self._written)
-        if problem:
-            log.error("%s; the robot counts as stopped: look at the cell, then `zencell task start`", problem)
-        for inhibit in self.inhibits.all:
-            log.warning("%s: `zencell task %s` lets it go", inhibit.told,
-                        "start" if inhibit.kind == "stopped" else "resume")
-
-    async def keep(self) -> str:
-        """What is wrong, once all that was decided so far is written; empty when it is."""
-        async with self._writing:
-            record = self.inhibits.record
-            if record == self._written and not self._unkept:
-                return ""
-            before = self._unkept
-            try:
-                await asyncio.to_thread(self._file.save, record)
-            except OSError as error:
-                why = error.strerror or str(error)
-                self._unkept = f"{self._file.path} cannot be written ({why}): this does not outlive the executor"
-                self.inhibits.note_kept(self._written, why)
-                if self._unkept != before:
-                    self._log.error("%s; it is tried again every second", self._unkept)
-                if self._trying is None:
-                    self._trying = asyncio.create_task(self._try_again(), name="keep")
-            else:
-                self._written, self._unkept = record, ""
-                self.inhibits.note_kept(record)
-                if before:
-                    self._log.warning("%s is written again: what was decided outlives the executor", self._file.path)
-            if before or self._unkept:
-                self.on_change()
-            return self._unkept
-
-    async def _try_again(self) -> None:
-        while self._unkept:
-            await asyncio.sleep(TRY_AGAIN)
-            await self.keep()
-        self._trying = None
-
-    def close(self) -> None:
-        """Try no longer."""
-        if self._trying is not None:
-            self._trying.cancel()
 
 
 def make_cycle(

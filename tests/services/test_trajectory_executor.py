@@ -14,7 +14,7 @@ from common import topics
 from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.config import load_cell, service_config
-from common.control import sole_use
+from common.control import decisions, sole_use
 from common.control.cycle import ControlCycle
 from common.control.record_file import RecordFile
 from common.errors import ConfigError, RemoteError, UnknownName
@@ -314,7 +314,7 @@ async def test_second_executor_that_would_keep_the_stops_of_another_cell_in_one_
 
 
 async def test_stop_that_cannot_be_kept_says_so_everywhere_until_it_is(monkeypatch, caplog) -> None:
-    monkeypatch.setattr(trajectory_executor, "TRY_AGAIN", 0.01)
+    monkeypatch.setattr(decisions, "TRY_AGAIN", 0.01)
     save, full = RecordFile.save, True
 
     def refuse(self, record):
