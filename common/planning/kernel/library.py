@@ -1,0 +1,54 @@
+"""The kernel's library: found beside this file, loaded once, for the processor at hand."""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import c_double, c_int, c_void_p
+from functools import cache
+from pathlib import Path
+
+from common.planning.kernel.build import FOLDER, NAME
+
+VERSION = 2
+
+_SIGNATURES: dict[str, tuple[object, list[object]]] = {
+    "zk_version": (c_int, []),
+    "zk_has_avx2": (c_int, []),
+    "zk_world": (c_void_p, [c_int] + [c_void_p] * 6),
+    "zk_add": (c_int, [c_void_p, c_int, c_int, c_void_p, c_void_p, c_int, c_void_p, c_void_p]),
+    "zk_place": (None, [c_void_p, c_int, c_void_p]),
+    "zk_pairs": (c_int, [c_void_p, c_int, c_void_p, c_void_p]),
+    "zk_rules": (None, [c_void_p, c_void_p, c_void_p, c_int, c_void_p, c_void_p, c_double]),
+    "zk_free": (None, [c_void_p]),
+    "zk_scratch": (c_void_p, [c_void_p]),
+    "zk_scratch_free": (None, [c_void_p]),
+    "zk_refresh": (None, [c_void_p]),
+    "zk_state": (c_int, [c_void_p, c_void_p]),
+    "zk_edge": (c_int, [c_void_p] * 4),
+    "zk_cubics": (c_int, [c_void_p, c_int, c_void_p, c_void_p]),
+    "zk_distances": (None, [c_void_p] * 4),
+    "zk_forward": (None, [c_void_p] * 3),
+    "zk_counters": (None, [c_void_p] * 2),
+}
+
+
+def _open(path: Path) -> ctypes.CDLL | None:
+    try:
+        found = ctypes.CDLL(str(path))
+    except OSError:
+        return None
+    for name, (result, arguments) in _SIGNATURES.items():
+        function = getattr(found, name, None)
+        if function is None:
+            return None
+        function.restype, function.argtypes = result, arguments
+    return found if found.zk_version() == VERSION else None
+
+
+@cache
+def library() -> ctypes.CDLL | None:
+    """The library, or None where it was not built, cannot be loaded or is of another version."""
+    plain = _open(FOLDER / f"{NAME}.so")
+    if plain is None or not plain.zk_has_avx2():
+        return plain
+    return _open(FOLDER / f"{NAME}_avx2.so") or plain

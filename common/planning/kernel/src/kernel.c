@@ -1,0 +1,302 @@
+/* What Python calls. No function keeps a pointer of the caller; a world may be read by several threads at once when each
+   has a scratch of its own, and changed by one while no other uses it. */
+#include "edges.h"
+
+#if defined(_WIN32)
+#define API __declspec(dllexport)
+#else
+#define API __attribute__((visibility("default")))
+#endif
+
+#define VERSION 2
+
+API int zk_version(void) { return VERSION; }
+
+/* 1 where the processor and its system have AVX2 and FMA, for which a second library is built. */
+API int zk_has_avx2(void) {
+#if defined(__x86_64__)
+    unsigned a, b, c, d;
+    __asm__ volatile("cpuid" : "=a"(a), "=b"(b), "=c"(c), "=d"(d) : "a"(0), "c"(0));
+    if (a < 7) return 0;
+    __asm__ volatile("cpuid" : "=a"(a), "=b"(b), "=c"(c), "=d"(d) : "a"(1), "c"(0));
+    int fma = c >> 12 & 1, saves = c >> 27 & 1;
+    if (!fma || !saves) return 0;
+    unsigned low, high;
+    __asm__ volatile("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
+    if ((low & 6) != 6) return 0;
+    __asm__ volatile("cpuid" : "=a"(a), "=b"(b), "=c"(c), "=d"(d) : "a"(7), "c"(0));
+    return b >> 5 & 1;
+#else
+    return 0;
+#endif
+}
+
+static void matrix_pose(const double *m, pose *T) { /* (3, 4) row by row */
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j < 3; j++) T->R[3 * i + j] = m[4 * i + j];
+        T->p[i] = m[4 * i + 3];
+    }
+}
+
+static void *aligned(size_t bytes) {
+    bytes = (bytes + 63) & ~(size_t)63;
+    char *raw = malloc(bytes + 64 + sizeof(void *));
+    if (!raw) return NULL;
+    char *at = (char *)(((size_t)(raw + sizeof(void *)) + 63) & ~(size_t)63);
+    ((void **)at)[-1] = raw;
+    return at;
+}
+
+static void aligned_free(void *at) {
+    if (at) free(((void **)at)[-1]);
+}
+
+/* A rotation that takes z to a unit axis. */
+static void turn_z(const double *axis, double *R) {
+    double x[3] = {fabs(axis[0]) < 0.9 ? 1.0 : 0.0, fabs(axis[0]) < 0.9 ? 0.0 : 1.0, 0.0}, y[3];
+    double along = dot3(x, axis);
+    for (int k = 0; k < 3; k++) x[k] -= along * axis[k];
+    double length = norm3(x);
+    for (int k = 0; k < 3; k++) x[k] /= length;
+    cross3(axis, x, y);
+    for (int k = 0; k < 3; k++) R[3 * k] = x[k], R[3 * k + 1] = y[k], R[3 * k + 2] = axis[k];
+}
+
+/* A robot of `dof` joints: parents (0 the world, joints count from 1), kinds (1 turns, 2 slides), placements (dof, 3, 4)
+   in the parents' frames, unit axes (dof, 3), limits. NULL when it does not fit. */
+API world *zk_world(int dof, const int *parents, const int *kinds, const double *placements, const double *axes,
+                    const double *lower, const double *upper) {
+    if (dof < 1 || dof >= MOST_JOINTS) return NULL;
+    world *w = calloc(1, sizeof *w);
+    if (!w) return NULL;
+    w->dof = dof, w->joints = dof + 1;
+    for (int k = 0; k < 9; k++) w->joint[0].turned[k] = k % 4 == 0;
+    for (int j = 1; j <= dof; j++) {
+        joint *J = &w->joint[j];
+        J->parent = parents[j - 1], J->kind = kinds[j - 1];
+        if (J->parent < 0 || J->parent >= j) {
+            free(w);
+            return NULL;
+        }
+        const joint *up = &w->joint[J->parent];
+        turn_z(axes + 3 * (j - 1), J->turned);
+        pose given, turn = {{0}, {0}}, back = {{0}, {0}};
+        matrix_pose(placements + 12 * (j - 1), &given);
+        memcpy(turn.R, J->turned, sizeof turn.R);
+        for (int r = 0; r < 3; r++)
+            for (int k = 0; k < 3; k++) back.R[3 * r + k] = up->turned[3 * k + r];
+        compose(&back, &given, &given);
+        compose(&given, &turn, &J->place);
+        J->depth = up->depth + 1;
+        memcpy(J->chain, up->chain, sizeof J->chain);
+        J->chain[J->depth - 1] = j;
+        w->lower[j - 1] = lower[j - 1], w->upper[j - 1] = upper[j - 1];
+    }
+    return w;
+}
+
+static void place(world *w, int i, const double *placement) {
+    shape *s = &w->shape[i];
+    pose given, back = {{0}, {0}};
+    matrix_pose(placement, &given);
+    const double *turned = w->joint[s->joint].turned;
+    for (int r = 0; r < 3; r++)
+        for (int k = 0; k < 3; k++) back.R[3 * r + k] = turned[3 * k + r];
+    compose(&back, &given, &s->placed);
+    measure(w, i);
+}
+
+/* Adds a shape to a joint's body (0: an obstacle). size: box full sides; cylinder, capsule radius and length; sphere
+   radius. points (count, 3) of a hull. ball: middle (3) and radius of a ball about a hull. Returns its index or -1. */
+API int zk_add(world *w, int kind, int jointed, const double *size, const double *points, int count, const double *ball,
+               const double *placement) {
+    if (jointed < 0 || jointed >= w->joints || kind < SPHERE || kind > HULL || (kind == HULL && count < 1)) return -1;
+    if (w->shapes == w->room) {
+        int room = w->room ? 2 * w->room : 64;
+        shape *more = realloc(w->shape, sizeof(shape) * room);
+        if (!more) return -1;
+        w->shape = more;
+        void *lever = realloc(w->lever, sizeof(*w->lever) * room);
+        if (!lever) return -1;
+        w->lever = lever;
+        void *reach = realloc(w->reach, sizeof(*w->reach) * room);
+        if (!reach) return -1;
+        w->reach = reach, w->room = room;
+    }
+    shape *s = &w->shape[w->shapes];
+    memset(s, 0, sizeof *s);
+    s->kind = kind, s->joint = jointed;
+    switch (kind) {
+    case SPHERE:
+        s->radius = s->ball = size[0];
+        break;
+    case BOX:
+        for (int k = 0; k < 3; k++) s->size[k] = 0.5 * size[k];
+        s->ball = norm3(s->size);
+        break;
+    case CYLINDER:
+        s->size[0] = size[0], s->size[1] = 0.5 * size[1];
+        s->ball = sqrt(s->size[0] * s->size[0] + s->size[1] * s->size[1]);
+        break;
+    case CAPSULE:
+        s->size[0] = s->radius = size[0], s->size[1] = 0.5 * size[1];
+        s->ball = s->size[0] + s->size[1];
+        break;
+    default:
+        s->blocks = (count + 3) / 4;
+        s->x = aligned(sizeof(v4) * 3 * s->blocks);
+        if (!s->x) return -1;
+        s->y = s->x + s->blocks, s->z = s->y + s->blocks;
+        for (int k = 0; k < 4 * s->blocks; k++) {
+            const double *p = points + 3 * (k < count ? k : 0);
+            ((double *)s->x)[k] = p[0], ((double *)s->y)[k] = p[1], ((double *)s->z)[k] = p[2];
+        }
+        memcpy(s->middle, ball, sizeof s->middle);
+        s->ball = ball[3];
+    }
+    place(w, w->shapes, placement);
+    return w->shapes++;
+}
+
+/* Puts a shape at a placement (3, 4) in its joint's frame. */
+API void zk_place(world *w, int i, const double *placement) { place(w, i, placement); }
+
+/* Which shapes may not touch: (count,) first and second. Returns 0 when there is no memory. */
+API int zk_pairs(world *w, int count, const int *first, const int *second) {
+    pair *pairs = realloc(w->pair, sizeof(pair) * (count + 1));
+    if (!pairs) return 0;
+    w->pair = pairs;
+    double *far = realloc(w->far, sizeof(double) * (count + 1));
+    if (!far) return 0;
+    w->far = far;
+    double *near = realloc(w->near, sizeof(double) * (count + 1));
+    if (!near) return 0;
+    w->near = near, w->pairs = count;
+    for (int i = 0; i < count; i++) {
+        int a = first[i], b = second[i];
+        const joint *A = &w->joint[w->shape[a].joint], *B = &w->joint[w->shape[b].joint];
+        int common = 0;
+        while (common < A->depth && common < B->depth && A->chain[common] == B->chain[common]) common++;
+        if (A->depth < B->depth) {
+            int swap = a;
+            a = b, b = swap, A = B;
+        }
+        pairs[i] = (pair){a, b, common ? A->chain[common - 1] : 0, 0};
+        pairs[i].fixed = w->shape[b].joint == pairs[i].common;
+        far[i] = near[i] = 0.0;
+    }
+    return 1;
+}
+
+/* Margins [m] of the pairs, EXCUSED or less for none, far from the start and near it: within `leash` [m] of `origin` by
+   the tool point at `tip` (3,) in the frame of joint `tool`. near may be NULL. */
+API void zk_rules(world *w, const double *far, const double *near, int tool, const double *tip, const double *origin,
+                  double leash) {
+    memcpy(w->far, far, sizeof(double) * w->pairs);
+    memcpy(w->near, near ? near : far, sizeof(double) * w->pairs);
+    w->excuses = near && memcmp(far, near, sizeof(double) * w->pairs) != 0;
+    if (!w->excuses) return;
+    w->tool = tool, w->leash = leash;
+    unrotate(w->joint[tool].turned, tip, w->tip);
+    memcpy(w->origin, origin, sizeof w->origin);
+    levers_of(w, tool, w->tip, 0.0, w->tip_lever);
+}
+
+API void zk_free(world *w) {
+    if (!w) return;
+    for (int i = 0; i < w->shapes; i++) aligned_free(w->shape[i].x);
+    free(w->shape), free(w->lever), free(w->reach), free(w->pair), free(w->far), free(w->near), free(w);
+}
+
+API void zk_scratch_free(scratch *c) {
+    if (!c) return;
+    free(c->middle), free(c->T_shape), free(c->stamp), free(c->axis), free(c->order), free(c->list), free(c->span);
+    free(c);
+}
+
+/* Working memory for one thread; to be made anew when shapes or pairs were added. */
+API scratch *zk_scratch(const world *w) {
+    scratch *c = calloc(1, sizeof *c);
+    if (!c) return NULL;
+    c->w = w;
+    c->middle = calloc(w->shapes + 1, sizeof *c->middle);
+    c->T_shape = calloc(w->shapes + 1, sizeof *c->T_shape);
+    c->stamp = calloc(w->shapes + 1, sizeof *c->stamp);
+    c->axis = calloc(w->pairs + 1, sizeof *c->axis);
+    c->order = calloc(w->pairs + 1, sizeof *c->order);
+    if (!c->middle || !c->T_shape || !c->stamp || !c->axis || !c->order) {
+        zk_scratch_free(c);
+        return NULL;
+    }
+    for (int k = 0; k < 3; k++) c->T[0].R[4 * k] = 1.0;
+    for (int i = 0; i < w->pairs; i++) c->order[i] = i, c->axis[i][2] = 1.0;
+    return c;
+}
+
+/* Takes over where obstacles stand now: after zk_place, before the next question. */
+API void zk_refresh(scratch *c) {
+    const world *w = c->w;
+    for (int i = 0; i < w->shapes; i++)
+        if (!w->shape[i].joint) {
+            c->T_shape[i] = w->shape[i].placed;
+            act(&c->T_shape[i], w->shape[i].middle, c->middle[i]);
+        }
+    c->now++;
+}
+
+/* -1 when the robot is free at q, else a pair that is too close. */
+API int zk_state(scratch *c, const double *q) { return state_free(c, q) ? -1 : c->hit_pair; }
+
+/* -1 when the straight line in joint space is free, proved all along; else a pair, and where on it (0 to 1). */
+API int zk_edge(scratch *c, const double *a, const double *b, double *at) {
+    curve e;
+    line_curve(c->w->dof, a, b, &e);
+    if (curve_free(c, &e)) return -1;
+    *at = c->hit_at;
+    return c->hit_pair;
+}
+
+/* The same for the cubics q(t) = c0 + c1 t + c2 t^2 + c3 t^3, 0 <= t <= 1, one after the other: (count, 4, dof). */
+API int zk_cubics(scratch *c, int count, const double *coefficients, double *at) {
+    curve e;
+    for (int i = 0; i < count; i++) {
+        cubic_curve(c->w->dof, coefficients + 4 * c->w->dof * i, &e);
+        if (!curve_free(c, &e)) {
+            *at = i + c->hit_at;
+            return c->hit_pair;
+        }
+    }
+    return -1;
+}
+
+/* Bounds (pairs,) [m] on the distances at q: points that are this far apart, planes that hold this far apart. */
+API void zk_distances(scratch *c, const double *q, double *above, double *below) {
+    forward(c, q);
+    middles(c);
+    for (int i = 0; i < c->w->pairs; i++) {
+        gjk_answer found;
+        pair_distance(c, i, INFINITY, -INFINITY, 2.0, &found);
+        above[i] = found.above, below[i] = found.below;
+    }
+}
+
+/* Poses (joints, 3, 4) of the joints' frames as they were given. */
+API void zk_forward(scratch *c, const double *q, double *out) {
+    forward(c, q);
+    for (int j = 1; j < c->w->joints; j++) {
+        pose back = {{0}, {0}}, T;
+        const double *turned = c->w->joint[j].turned;
+        for (int r = 0; r < 3; r++)
+            for (int k = 0; k < 3; k++) back.R[3 * r + k] = turned[3 * k + r];
+        compose(&c->T[j], &back, &T);
+        for (int r = 0; r < 3; r++) {
+            for (int k = 0; k < 3; k++) out[12 * (j - 1) + 4 * r + k] = T.R[3 * r + k];
+            out[12 * (j - 1) + 4 * r + 3] = T.p[r];
+        }
+    }
+}
+
+/* How much was done: states, looks at pairs, searches of GJK, their iterations. */
+API void zk_counters(const scratch *c, long long *out) {
+    out[0] = c->states, out[1] = c->checks, out[2] = c->searches, out[3] = c->iterations;
+}

@@ -1,0 +1,215 @@
+"""The robot among obstacles as the kernel knows it, made from pinocchio's models."""
+
+from __future__ import annotations
+
+from ctypes import byref, c_double
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from common.errors import ZencellError
+from common.planning.kernel.library import library
+
+Array = NDArray[np.float64]
+
+EXCUSED = -1e9  # [m] the margin of a pair that may touch
+_SPHERE, _BOX, _CYLINDER, _CAPSULE, _HULL = range(5)
+
+
+class NoKernel(ZencellError):
+    """The kernel is not built here, or does not know a joint or a shape."""
+
+
+class KernelWorld:
+    """Answers of the compiled kernel for one robot among obstacles. Not for several threads at once.
+
+    Pairs are those of the geometry model, in its order.
+    """
+
+    def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
+        """Copy joints, shapes, placements and pairs.
+
+        Raises:
+            NoKernel: there is no library, or something in the models is not known to it.
+        """
+        found = library()
+        if found is None:
+            raise NoKernel("the planning kernel is not built")
+        self._library = found
+        self.dof: int = model.nq
+        self.pair_count = len(geometry.collisionPairs)
+        self._world = self._scratch = None
+        kinds, axes = _joints(model)
+        parents = np.array(list(model.parents)[1:], dtype=np.int32)
+        placements = np.array([placement.homogeneous[:3] for placement in list(model.jointPlacements)[1:]])
+        lower, upper = (np.array(limit, dtype=float) for limit in (model.lowerPositionLimit, model.upperPositionLimit))
+        self._world = found.zk_world(
+            self.dof, _at(parents), _at(kinds), _at(placements), _at(axes), _at(lower), _at(upper)
+        )
+        if not self._world:
+            raise NoKernel(f"the planning kernel takes 31 joints at most, not {self.dof}")
+        for item in geometry.geometryObjects:
+            self._add(item)
+        pairs = np.array([(pair.first, pair.second) for pair in geometry.collisionPairs], dtype=np.int32).reshape(-1, 2)
+        first, second = pairs[:, 0].copy(), pairs[:, 1].copy()
+        if not found.zk_pairs(self._world, self.pair_count, _at(first), _at(second)):
+            raise MemoryError
+        self._scratch = found.zk_scratch(self._world)
+        if not self._scratch:
+            raise MemoryError
+        found.zk_refresh(self._scratch)
+        self._where = c_double()
+
+    def __del__(self) -> None:
+        if self._scratch:
+            self._library.zk_scratch_free(self._scratch)
+        if self._world:
+            self._library.zk_free(self._world)
+
+    def _add(self, item: pin.GeometryObject) -> None:
+        kind, size, points = _shape(item.geometry)
+        ball = _ball(points) if len(points) else np.zeros(4)
+        placement = np.ascontiguousarray(item.placement.homogeneous[:3])
+        index = self._library.zk_add(
+            self._world, kind, item.parentJoint, _at(size), _at(points), len(points), _at(ball), _at(placement)
+        )
+        if index < 0:
+            raise NoKernel(f"{item.name}: the planning kernel takes no such shape")
+
+    def place(self, index: int, pose: Array) -> None:
+        """Put a shape at a (4, 4) pose in the frame of its joint; call `placed` after the last."""
+        self._library.zk_place(self._world, index, _at(np.ascontiguousarray(pose[:3], dtype=float)))
+
+    def placed(self) -> None:
+        """Take over where obstacles stand now."""
+        self._library.zk_refresh(self._scratch)
+
+    def set_rules(
+        self,
+        far: Array,
+        near: Array | None = None,
+        tool: int = 0,
+        tip: ArrayLike = (0, 0, 0),
+        origin: ArrayLike = (0, 0, 0),
+        leash: float = 0.0,
+    ) -> None:
+        """Set the least distance (pairs,) [m] of each pair, EXCUSED for none.
+
+        Args:
+            far: what holds in general.
+            near: what holds while the tool point is within `leash` [m] of `origin` (3,), world.
+            tool: joint that carries the tool point; tip: (3,) the point in that joint's frame.
+        """
+        arrays = [np.ascontiguousarray(a, dtype=float) for a in (far, tip, origin)]
+        other = None if near is None else np.ascontiguousarray(near, dtype=float)
+        if len(arrays[0]) != self.pair_count or (other is not None and len(other) != self.pair_count):
+            raise ValueError(f"{len(arrays[0])} margins for {self.pair_count} pairs")
+        self._library.zk_rules(
+            self._world, _at(arrays[0]), None if other is None else _at(other), tool, _at(arrays[1]), _at(arrays[2]), leash
+        )
+
+    def colliding(self, q: Array) -> int:
+        """Index of a pair that is too close at q (dof,) [rad], -1 when the robot is free."""
+        return int(self._library.zk_state(self._scratch, self._q(q)))
+
+    def edge_collision(self, a: Array, b: Array) -> tuple[int, float]:
+        """A pair that is too close on the straight line in joint space from a to b, and where: 0 to 1.
+
+        -1 when the whole line is proved free.
+        """
+        hit = int(self._library.zk_edge(self._scratch, self._q(a), self._q(b), byref(self._where)))
+        return hit, self._where.value
+
+    def edge_free(self, a: Array, b: Array) -> bool:
+        """Whether the straight line in joint space from a to b (dof,) [rad] is proved free."""
+        return bool(self._library.zk_edge(self._scratch, self._q(a), self._q(b), byref(self._where)) < 0)
+
+    def cubics_collision(self, coefficients: Array) -> tuple[int, float]:
+        """The same for cubics (N, 4, dof), c0 + c1 t + c2 t^2 + c3 t^3 with t from 0 to 1: pair, piece and where in it."""
+        given = np.ascontiguousarray(coefficients, dtype=float)
+        if given.ndim != 3 or given.shape[1:] != (4, self.dof):
+            raise ValueError(f"coefficients have shape {given.shape}")
+        hit = int(self._library.zk_cubics(self._scratch, len(given), _at(given), byref(self._where)))
+        return hit, self._where.value
+
+    def distances(self, q: Array) -> tuple[Array, Array]:
+        """(pairs,) [m] how far apart points of each pair are at q, and how far a plane holds them apart.
+
+        Both are the distance within rounding where shapes are apart. Where they are not the first is 0 or less.
+        """
+        above, below = np.empty(self.pair_count), np.empty(self.pair_count)
+        self._library.zk_distances(self._scratch, self._q(q), _at(above), _at(below))
+        return above, below
+
+    def joint_poses(self, q: Array) -> Array:
+        """(joints, 3, 4) poses of the joints' frames, world."""
+        out = np.empty((self.dof, 3, 4))
+        self._library.zk_forward(self._scratch, self._q(q), _at(out))
+        return out
+
+    def counters(self) -> dict[str, int]:
+        """How much was done so far."""
+        out = np.zeros(4, dtype=np.int64)
+        self._library.zk_counters(self._scratch, _at(out))
+        return dict(zip(("states", "looks", "searches", "iterations"), out.tolist(), strict=True))
+
+    def _q(self, q: Array) -> int:
+        if q.dtype != np.float64 or q.shape != (self.dof,) or not q.flags.c_contiguous:
+            raise ValueError(f"joint positions are {q.dtype} of shape {q.shape}")
+        return _at(q)
+
+
+def _at(array: NDArray[Any]) -> int:
+    return array.ctypes.data
+
+
+def _joints(model: pin.Model) -> tuple[NDArray[np.int32], Array]:
+    """Kind (joints,) of each joint, 1 turns and 2 slides, and its unit axis (joints, 3) in its own frame."""
+    if model.nq != model.njoints - 1 or model.nv != model.nq:
+        raise NoKernel("the planning kernel takes joints of one degree of freedom with limits")
+    data = model.createData()
+    jacobian = np.array(pin.computeJointJacobians(model, data, pin.neutral(model)))
+    kinds, axes = np.zeros(model.nq, dtype=np.int32), np.zeros((model.nq, 3))
+    for joint in range(1, model.njoints):
+        column = jacobian[:, model.joints[joint].idx_v]
+        turns = np.linalg.norm(column[3:]) > 0.5
+        axis = np.array(data.oMi[joint].rotation).T @ (column[3:] if turns else column[:3])
+        kinds[joint - 1], axes[joint - 1] = (1 if turns else 2), axis / np.linalg.norm(axis)
+        if model.joints[joint].idx_q != joint - 1:
+            raise NoKernel("the planning kernel takes joints in the order of their positions")
+    return kinds, axes
+
+
+def _shape(shape: coal.CollisionGeometry) -> tuple[int, Array, Array]:
+    """Kind, dimensions (3,) and vertices (N, 3) of a shape.
+
+    Raises:
+        NoKernel: it is none of these.
+    """
+    none = np.zeros((0, 3))
+    if isinstance(shape, coal.Sphere):
+        return _SPHERE, np.array([shape.radius, 0, 0]), none
+    if isinstance(shape, coal.Box):
+        return _BOX, 2 * np.array(shape.halfSide), none
+    if isinstance(shape, coal.Cylinder | coal.Capsule):
+        kind = _CYLINDER if isinstance(shape, coal.Cylinder) else _CAPSULE
+        return kind, np.array([shape.radius, 2 * shape.halfLength, 0]), none
+    if isinstance(shape, coal.Convex):
+        points = np.array([shape.point(i) for i in range(shape.num_points)], dtype=float)
+        return _HULL, np.zeros(3), np.ascontiguousarray(points)
+    raise NoKernel(f"the planning kernel takes no {type(shape).__name__}")
+
+
+def _ball(points: Array) -> Array:
+    """(4,) middle and radius [m] of a small ball about points (N, 3): Ritter's, then moved towards the farthest."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    best, least = middle, float(np.linalg.norm(points - middle, axis=1).max())
+    for i in range(1, 200):  # Badoiu and Clarkson, "Smaller core-sets for balls" (2003)
+        away = np.linalg.norm(points - middle, axis=1)
+        if away.max() < least:
+            best, least = middle, float(away.max())
+        middle = middle + (points[int(away.argmax())] - middle) / (i + 1)
+    return np.array([*best, least * (1 + 1e-12)])
