@@ -9,7 +9,7 @@ from pathlib import Path
 
 from common.planning.kernel.build import FOLDER, NAME
 
-VERSION = 2
+VERSION = 3
 
 _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_version": (c_int, []),
@@ -28,6 +28,7 @@ _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_cubics": (c_int, [c_void_p, c_int, c_void_p, c_void_p]),
     "zk_distances": (None, [c_void_p] * 4),
     "zk_forward": (None, [c_void_p] * 3),
+    "zk_plan": (c_int, [c_void_p, c_void_p, c_int, c_void_p, c_void_p, c_void_p, c_int, c_void_p, c_void_p]),
     "zk_counters": (None, [c_void_p] * 2),
 }
 

@@ -38,16 +38,16 @@ class KernelWorld:
         found = library()
         if found is None:
             raise NoKernel("the planning kernel is not built")
-        self._library = found
+        self.library = found
         self.dof: int = model.nq
         self.pair_count = len(geometry.collisionPairs)
-        self._world = self._scratch = None
+        self._world = self.scratch = None
         kinds, axes = _joints(model)
         parents = np.array(list(model.parents)[1:], dtype=np.int32)
         placements = np.array([placement.homogeneous[:3] for placement in list(model.jointPlacements)[1:]])
         lower, upper = (np.array(limit, dtype=float) for limit in (model.lowerPositionLimit, model.upperPositionLimit))
         self._world = found.zk_world(
-            self.dof, _at(parents), _at(kinds), _at(placements), _at(axes), _at(lower), _at(upper)
+            self.dof, address(parents), address(kinds), address(placements), address(axes), address(lower), address(upper)
         )
         if not self._world:
             raise NoKernel(f"the planning kernel takes 31 joints at most, not {self.dof}")
@@ -55,37 +55,37 @@ class KernelWorld:
             self._add(item)
         pairs = np.array([(pair.first, pair.second) for pair in geometry.collisionPairs], dtype=np.int32).reshape(-1, 2)
         first, second = pairs[:, 0].copy(), pairs[:, 1].copy()
-        if not found.zk_pairs(self._world, self.pair_count, _at(first), _at(second)):
+        if not found.zk_pairs(self._world, self.pair_count, address(first), address(second)):
             raise MemoryError
-        self._scratch = found.zk_scratch(self._world)
-        if not self._scratch:
+        self.scratch = found.zk_scratch(self._world)
+        if not self.scratch:
             raise MemoryError
-        found.zk_refresh(self._scratch)
+        found.zk_refresh(self.scratch)
         self._where = c_double()
 
     def __del__(self) -> None:
-        if self._scratch:
-            self._library.zk_scratch_free(self._scratch)
+        if self.scratch:
+            self.library.zk_scratch_free(self.scratch)
         if self._world:
-            self._library.zk_free(self._world)
+            self.library.zk_free(self._world)
 
     def _add(self, item: pin.GeometryObject) -> None:
         kind, size, points = _shape(item.geometry)
         ball = _ball(points) if len(points) else np.zeros(4)
         placement = np.ascontiguousarray(item.placement.homogeneous[:3])
-        index = self._library.zk_add(
-            self._world, kind, item.parentJoint, _at(size), _at(points), len(points), _at(ball), _at(placement)
+        index = self.library.zk_add(
+            self._world, kind, item.parentJoint, address(size), address(points), len(points), address(ball), address(placement)
         )
         if index < 0:
             raise NoKernel(f"{item.name}: the planning kernel takes no such shape")
 
     def place(self, index: int, pose: Array) -> None:
         """Put a shape at a (4, 4) pose in the frame of its joint; call `placed` after the last."""
-        self._library.zk_place(self._world, index, _at(np.ascontiguousarray(pose[:3], dtype=float)))
+        self.library.zk_place(self._world, index, address(np.ascontiguousarray(pose[:3], dtype=float)))
 
     def placed(self) -> None:
         """Take over where obstacles stand now."""
-        self._library.zk_refresh(self._scratch)
+        self.library.zk_refresh(self.scratch)
 
     def set_rules(
         self,
@@ -107,32 +107,32 @@ class KernelWorld:
         other = None if near is None else np.ascontiguousarray(near, dtype=float)
         if len(arrays[0]) != self.pair_count or (other is not None and len(other) != self.pair_count):
             raise ValueError(f"{len(arrays[0])} margins for {self.pair_count} pairs")
-        self._library.zk_rules(
-            self._world, _at(arrays[0]), None if other is None else _at(other), tool, _at(arrays[1]), _at(arrays[2]), leash
+        self.library.zk_rules(
+            self._world, address(arrays[0]), None if other is None else address(other), tool, address(arrays[1]), address(arrays[2]), leash
         )
 
     def colliding(self, q: Array) -> int:
         """Index of a pair that is too close at q (dof,) [rad], -1 when the robot is free."""
-        return int(self._library.zk_state(self._scratch, self._q(q)))
+        return int(self.library.zk_state(self.scratch, self._q(q)))
 
     def edge_collision(self, a: Array, b: Array) -> tuple[int, float]:
         """A pair that is too close on the straight line in joint space from a to b, and where: 0 to 1.
 
         -1 when the whole line is proved free.
         """
-        hit = int(self._library.zk_edge(self._scratch, self._q(a), self._q(b), byref(self._where)))
+        hit = int(self.library.zk_edge(self.scratch, self._q(a), self._q(b), byref(self._where)))
         return hit, self._where.value
 
     def edge_free(self, a: Array, b: Array) -> bool:
         """Whether the straight line in joint space from a to b (dof,) [rad] is proved free."""
-        return bool(self._library.zk_edge(self._scratch, self._q(a), self._q(b), byref(self._where)) < 0)
+        return bool(self.library.zk_edge(self.scratch, self._q(a), self._q(b), byref(self._where)) < 0)
 
     def cubics_collision(self, coefficients: Array) -> tuple[int, float]:
         """The same for cubics (N, 4, dof), c0 + c1 t + c2 t^2 + c3 t^3 with t from 0 to 1: pair, piece and where in it."""
         given = np.ascontiguousarray(coefficients, dtype=float)
         if given.ndim != 3 or given.shape[1:] != (4, self.dof):
             raise ValueError(f"coefficients have shape {given.shape}")
-        hit = int(self._library.zk_cubics(self._scratch, len(given), _at(given), byref(self._where)))
+        hit = int(self.library.zk_cubics(self.scratch, len(given), address(given), byref(self._where)))
         return hit, self._where.value
 
     def distances(self, q: Array) -> tuple[Array, Array]:
@@ -141,28 +141,28 @@ class KernelWorld:
         Both are the distance within rounding where shapes are apart. Where they are not the first is 0 or less.
         """
         above, below = np.empty(self.pair_count), np.empty(self.pair_count)
-        self._library.zk_distances(self._scratch, self._q(q), _at(above), _at(below))
+        self.library.zk_distances(self.scratch, self._q(q), address(above), address(below))
         return above, below
 
     def joint_poses(self, q: Array) -> Array:
         """(joints, 3, 4) poses of the joints' frames, world."""
         out = np.empty((self.dof, 3, 4))
-        self._library.zk_forward(self._scratch, self._q(q), _at(out))
+        self.library.zk_forward(self.scratch, self._q(q), address(out))
         return out
 
     def counters(self) -> dict[str, int]:
         """How much was done so far."""
         out = np.zeros(4, dtype=np.int64)
-        self._library.zk_counters(self._scratch, _at(out))
+        self.library.zk_counters(self.scratch, address(out))
         return dict(zip(("states", "looks", "searches", "iterations"), out.tolist(), strict=True))
 
     def _q(self, q: Array) -> int:
         if q.dtype != np.float64 or q.shape != (self.dof,) or not q.flags.c_contiguous:
             raise ValueError(f"joint positions are {q.dtype} of shape {q.shape}")
-        return _at(q)
+        return address(q)
 
 
-def _at(array: NDArray[Any]) -> int:
+def address(array: NDArray[Any]) -> int:
     return array.ctypes.data
 
 

@@ -1,6 +1,6 @@
 /* What Python calls. No function keeps a pointer of the caller; a world may be read by several threads at once when each
    has a scratch of its own, and changed by one while no other uses it. */
-#include "edges.h"
+#include "planner.h"
 
 #if defined(_WIN32)
 #define API __declspec(dllexport)
@@ -8,7 +8,7 @@
 #define API __attribute__((visibility("default")))
 #endif
 
-#define VERSION 2
+#define VERSION 3
 
 API int zk_version(void) { return VERSION; }
 
@@ -299,4 +299,13 @@ API void zk_forward(scratch *c, const double *q, double *out) {
 /* How much was done: states, looks at pairs, searches of GJK, their iterations. */
 API void zk_counters(const scratch *c, long long *out) {
     out[0] = c->states, out[1] = c->checks, out[2] = c->searches, out[3] = c->iterations;
+}
+
+/* Waypoints (room, dof) of a path from the start to one of goals (goals, dof), all of them free: their number, or -1 when
+   there are too many nodes, -2 out of time, -3 cancelled, -4 no room. `cancel` may be NULL, or set by another thread. */
+API int zk_plan(scratch *c, const double *start, int goals, const double *goal, const plan_options *options,
+                const volatile int *cancel, int room, double *path, plan_report *report) {
+    memset(report, 0, sizeof *report);
+    run r = {c, options, cancel, now() + options->seconds};
+    return plan(&r, start, goals, goal, room, path, report);
 }
