@@ -68,7 +68,7 @@ def find_path(
     seed: int = 0,
     seconds: float = 10.0,
     reach: float = 1.0,
-    domain: float = 3.0,
+    domain: float = 100.0,
     nodes: int = 1_000_000,
     shortcuts: int = 300,
     patience: int = 60,

@@ -35,13 +35,13 @@ class KernelWorld:
         Raises:
             NoKernel: there is no library, or something in the models is not known to it.
         """
+        self._world = self.scratch = None
         found = library()
         if found is None:
             raise NoKernel("the planning kernel is not built")
         self.library = found
         self.dof: int = model.nq
         self.pair_count = len(geometry.collisionPairs)
-        self._world = self.scratch = None
         kinds, axes = _joints(model)
         parents = np.array(list(model.parents)[1:], dtype=np.int32)
         placements = np.array([placement.homogeneous[:3] for placement in list(model.jointPlacements)[1:]])
@@ -152,9 +152,9 @@ class KernelWorld:
 
     def counters(self) -> dict[str, int]:
         """How much was done so far."""
-        out = np.zeros(4, dtype=np.int64)
+        out = np.zeros(5, dtype=np.int64)
         self.library.zk_counters(self.scratch, address(out))
-        return dict(zip(("states", "looks", "searches", "iterations"), out.tolist(), strict=True))
+        return dict(zip(("states", "looks", "searches", "iterations", "edges"), out.tolist(), strict=True))
 
     def _q(self, q: Array) -> int:
         if q.dtype != np.float64 or q.shape != (self.dof,) or not q.flags.c_contiguous:

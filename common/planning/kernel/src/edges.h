@@ -18,6 +18,16 @@
 
 #define SHORTEST_MOTION 1e-6 /* [m] no piece is cut in which no point moves farther: what is not proved then is not free */
 
+#ifndef KEEP
+#define KEEP 0.5 /* a group's ball that proves less of a span than this gives way to its pairs */
+#endif
+#ifndef SHARE
+#define SHARE 0.9 /* of the distance that a plane shows; GJK need not look for a better one */
+#endif
+#ifndef PROBES
+#define PROBES 7
+#endif
+
 /* q(t) = c[0] + c[1] t + c[2] t^2 + c[3] t^3, 0 <= t <= 1 */
 typedef struct {
     double c[4][MOST_JOINTS];
@@ -92,44 +102,86 @@ static inline double shape_speed(scratch *c, int i, const double *spin, const do
     return sign * dot3(n, slide) + dot3(m, p);
 }
 
-/* The interval about t0 in which a pair keeps its margin; 0 where it does not at t0. After forward, twists, middles. */
-static int proved(scratch *c, const curve *e, int i, double margin, double t0, double from, double to, double *since,
-                  double *until) {
+/* Twist of one joint's body relative to another's. */
+static inline void relative_twist(const scratch *c, int tip, int above, double *spin, double *slide) {
+    sub3(c->spin[tip], c->spin[above], spin);
+    sub3(c->slide[tip], c->slide[above], slide);
+}
+
+/* The interval about t0 in which a group's balls keep its margin; 0 where they do not at t0. After forward, twists,
+   middles. */
+static int group_proved(scratch *c, const curve *e, const group *g, double margin, double t0, double *since,
+                        double *until) {
+    const world *w = c->w;
+    const pair *p = &g->balls;
+    double n[3], s0 = group_apart(c, g, n) - margin - TOUCHING;
+    c->checks++;
+    *since = *until = t0;
+    if (s0 <= 0) return 0;
+    double spin[3], slide[3], M, K, Mb = 0, Kb = 0;
+    relative_twist(c, p->a, p->common, spin, slide);
+    double v = speed_at(spin, slide, c->body_middle[p->a], n);
+    bounds(w, e, p->a, p->common, w->body[p->a].reach, &M, &K);
+    if (g->moving && !p->fixed) {
+        relative_twist(c, p->b, p->common, spin, slide);
+        v -= speed_at(spin, slide, c->body_middle[p->b], n);
+        bounds(w, e, p->b, p->common, w->body[p->b].reach, &Mb, &Kb);
+    }
+    *until = t0 + lasts(s0, v, K + Kb, M + Mb);
+    *since = t0 - lasts(s0, -v, K + Kb, M + Mb);
+    return 1;
+}
+
+/* M and K of a pair's balls and of its shapes on a curve. */
+static void pair_bounds(scratch *c, const curve *e, int i) {
+    const world *w = c->w;
+    const pair *p = &w->pair[i];
+    double *out = c->bound[i], M, K;
+    int tip = w->shape[p->a].joint;
+    bounds(w, e, tip, p->common, w->reach[p->a], &out[0], &out[1]);
+    bounds(w, e, tip, p->common, w->lever[p->a], &out[2], &out[3]);
+    if (p->fixed) return;
+    tip = w->shape[p->b].joint;
+    bounds(w, e, tip, p->common, w->reach[p->b], &M, &K);
+    out[0] += M, out[1] += K;
+    bounds(w, e, tip, p->common, w->lever[p->b], &M, &K);
+    out[2] += M, out[3] += K;
+}
+
+/* The same of a pair, first by the ball of its first shape and then by the shapes. */
+static int proved(scratch *c, int i, double margin, double t0, double from, double to, double *since, double *until) {
     const world *w = c->w;
     const pair *p = &w->pair[i];
     const shape *A = &w->shape[p->a], *B = &w->shape[p->b];
-    double M, K, Mb = 0, Kb = 0, need = margin + TOUCHING;
-    double spin[3], slide[3], spin_b[3] = {0}, slide_b[3] = {0}, n[3];
+    const double *bound = c->bound[i];
+    double spin[3], slide[3], spin_b[3] = {0}, slide_b[3] = {0}, n[3], need = margin + TOUCHING;
     c->checks++;
-    sub3(c->spin[A->joint], c->spin[p->common], spin);
-    sub3(c->slide[A->joint], c->slide[p->common], slide);
-    if (!p->fixed) {
-        sub3(c->spin[B->joint], c->spin[p->common], spin_b);
-        sub3(c->slide[B->joint], c->slide[p->common], slide_b);
-        bounds(w, e, B->joint, p->common, w->reach[p->b], &Mb, &Kb);
-    }
-    double s0 = ball_distance(c, p, n) - need;
+    relative_twist(c, A->joint, p->common, spin, slide);
+    if (!p->fixed) relative_twist(c, B->joint, p->common, spin_b, slide_b);
+    double s0 = pair_apart(c, p, n) - need;
     *since = *until = t0;
     if (s0 > 0) {
-        bounds(w, e, A->joint, p->common, w->reach[p->a], &M, &K);
         double v = speed_at(spin, slide, c->middle[p->a], n);
         if (!p->fixed) v -= speed_at(spin_b, slide_b, c->middle[p->b], n);
-        *until = t0 + lasts(s0, v, K + Kb, M + Mb);
-        *since = t0 - lasts(s0, -v, K + Kb, M + Mb);
+        *until = t0 + lasts(s0, v, bound[1], bound[0]);
+        *since = t0 - lasts(s0, -v, bound[1], bound[0]);
         if (*since <= from && *until >= to) return 1;
     }
+    double M = bound[2], K = bound[3], v, wanted = 0, ahead = to - t0, back = t0 - from;
+    rotate(shape_pose(c, p->b)->R, c->axis[i], n); /* about how far apart they have to be */
+    v = speed_at(spin, slide, c->middle[p->a], n);
+    if (!p->fixed) v -= speed_at(spin_b, slide_b, c->middle[p->b], n);
+    wanted = fmax(ahead * (v + 0.5 * K * ahead), back * (0.5 * K * back - v));
+    wanted = fmax(fmin(wanted, fmax(ahead, back) * M), 0.0);
     gjk_answer found;
-    bounds(w, e, A->joint, p->common, w->lever[p->a], &M, &K);
-    if (!p->fixed) bounds(w, e, B->joint, p->common, w->lever[p->b], &Mb, &Kb);
-    M += Mb, K += Kb;
-    double half = fmax(to - t0, t0 - from);
-    pair_distance(c, i, need + half * M, margin, 0.9, &found);
+    pair_distance(c, i, need + 1.01 * wanted, margin, SHARE, &found);
     s0 = found.below - need;
     if (s0 <= 0) return *until > t0;
     rotate(shape_pose(c, p->b)->R, found.n, n);
     for (int side = 0; side < 2; side++) {
         double sign = side ? -1.0 : 1.0;
-        double v = shape_speed(c, p->a, spin, slide, n, sign);
+        if (side ? *since <= from : *until >= to) continue;
+        v = shape_speed(c, p->a, spin, slide, n, sign);
         if (!p->fixed) v += shape_speed(c, p->b, spin_b, slide_b, n, -sign);
         double t = lasts(s0, v, K, M);
         if (side)
@@ -137,6 +189,20 @@ static int proved(scratch *c, const curve *e, int i, double margin, double t0, d
         else
             *until = fmax(*until, t0 + t);
     }
+    return 1;
+}
+
+/* The same of a pair whose margin changes with the distance of the tool from its start: by the larger margin, and by the
+   smaller one as long as that one counts. inside: how much of its leash the tool has left [m]; tip: M of its point. */
+static int proved_leashed(scratch *c, int i, double inside, double tip, double t0, double from, double to, double *since,
+                          double *until) {
+    const world *w = c->w;
+    double large = fmax(w->near[i], w->far[i]), small = fmin(w->near[i], w->far[i]);
+    int ok = proved(c, i, large, t0, from, to, since, until);
+    if ((inside > 0 ? w->near[i] : w->far[i]) != small || (ok && *since <= from && *until >= to)) return ok;
+    double time = tip > 0 ? fabs(inside) / tip : INFINITY, a = -INFINITY, b = INFINITY;
+    if (small > EXCUSED && !proved(c, i, small, t0, from, to, &a, &b)) return ok;
+    *since = fmin(*since, fmax(a, t0 - time)), *until = fmax(*until, fmin(b, t0 + time));
     return 1;
 }
 
@@ -162,11 +228,47 @@ static void at_time(const world *w, const curve *e, double t, double *q, double 
     }
 }
 
+/* What one span leaves to its two halves. */
+typedef struct {
+    int *list, lefts, rights;
+    double from, to, until_left, since_right;
+} halves;
+
+static inline void leave(halves *h, int right, int entry, double since, double until, double t0) {
+    if (since > h->from) {
+        h->list[h->lefts++] = entry;
+        h->until_left = fmax(h->until_left, fmin(since, t0));
+    }
+    if (until < h->to) {
+        h->list[right + h->rights++] = entry;
+        h->since_right = fmin(h->since_right, fmax(until, t0));
+    }
+}
+
+/* Whether a few states of a curve are free of the collisions that were found last. */
+static int probes_free(scratch *c, const curve *e) {
+    static const double times[PROBES] = {0.5, 0.25, 0.75, 0.875, 0.125, 0.625, 0.375};
+    const world *w = c->w;
+    double q[MOST_JOINTS], dq[MOST_JOINTS];
+    if (c->hot[0] < 0) return 1;
+    for (int k = 0; k < PROBES; k++) {
+        at_time(w, e, times[k], q, dq);
+        forward(c, q);
+        middles(c);
+        const double *margin = w->excuses && tool_travel(c) < w->leash ? w->near : w->far;
+        if (hot_free(c, margin)) continue;
+        c->hit_at = times[k];
+        return 0;
+    }
+    return 1;
+}
+
 /* Whether the whole curve is free. Else `hit_pair` and `hit_at` say what touches or cannot be proved, and where. */
 static int curve_free(scratch *c, const curve *e) {
     const world *w = c->w;
-    double q[MOST_JOINTS], dq[MOST_JOINTS];
-    double most = 0; /* how fast any point moves */
+    double q[MOST_JOINTS], dq[MOST_JOINTS], most = 0; /* how fast any point moves */
+    c->edges++;
+    if (!probes_free(c, e)) return 0;
     for (int i = 0; i < w->shapes; i++)
         if (w->shape[i].joint) {
             double M, K;
@@ -176,67 +278,65 @@ static int curve_free(scratch *c, const curve *e) {
     double M_tip = 0, K_tip = 0;
     if (w->excuses) bounds(w, e, w->tool, 0, w->tip_lever, &M_tip, &K_tip);
     int used = 0, head = 0, tail = 1;
-    if (!grow(c, w->pairs, 64)) return 0;
-    for (int k = 0; k < w->pairs; k++)
-        if (w->far[c->order[k]] > EXCUSED || w->near[c->order[k]] > EXCUSED) c->list[used++] = c->order[k];
+    if (!grow(c, w->groups, 64)) return 0;
+    for (int g = 0; g < w->groups; g++) /* entries below zero are groups */
+        if (w->group[g].far > EXCUSED || w->group[g].near > EXCUSED) c->list[used++] = -1 - g;
     c->span[0] = (span){0.0, 1.0, 0, used};
     while (head < tail) {
         span s = c->span[head++];
-        double t0 = 0.5 * (s.from + s.to);
+        double t0 = 0.5 * (s.from + s.to), since, until;
         at_time(w, e, t0, q, dq);
         forward(c, q);
         twists(c, dq);
         middles(c);
-        double inside = 0; /* how long the tool surely stays within, negative: beyond, its leash */
+        double inside = 0; /* how much of its leash the tool has left */
         if (w->excuses) inside = w->leash - tool_travel(c);
-        if (!grow(c, used + 2 * s.count, tail + 2)) return 0;
-        int left = used, lefts = 0, right = used + s.count, rights = 0;
-        double until_left = s.from, since_right = s.to;
+        int most_pairs = s.count + w->pairs; /* that can be left */
+        if (!grow(c, used + 2 * most_pairs, tail + 2)) return 0;
+        int right = most_pairs;
+        halves h = {c->list + used, 0, 0, s.from, s.to, s.from, s.to};
         for (int k = 0; k < s.count; k++) {
-            int i = c->list[s.first + k];
-            double since = t0, until = t0, a, b;
-            if (w->excuses && w->near[i] != w->far[i]) {
-                /* the larger margin first; where only the smaller one is kept, as long as that one counts */
-                double large = fmax(w->near[i], w->far[i]), small = fmin(w->near[i], w->far[i]);
-                double counting = inside > 0 ? w->near[i] : w->far[i];
-                int ok = proved(c, e, i, large, t0, s.from, s.to, &since, &until);
-                if (counting == small && !(ok && since <= s.from && until >= s.to)) {
-                    double time = M_tip > 0 ? fabs(inside) / M_tip : INFINITY;
-                    int also = small <= EXCUSED;
-                    a = -INFINITY, b = INFINITY;
-                    if (!also) also = proved(c, e, i, small, t0, s.from, s.to, &a, &b);
-                    if (also) {
-                        since = fmin(since, fmax(a, t0 - time)), until = fmax(until, fmin(b, t0 + time));
-                        ok = 1;
+            int entry = c->list[s.first + k], first = entry, count = 1;
+            const int *members = &first;
+            if (entry < 0) {
+                const group *g = &w->group[-1 - entry];
+                if (group_proved(c, e, g, fmax(g->far, g->near), t0, &since, &until)) {
+                    if (since <= s.from && until >= s.to) continue;
+                    if (fmin(until, s.to) - fmax(since, s.from) > KEEP * (s.to - s.from)) {
+                        leave(&h, right, entry, since, until, t0);
+                        continue;
                     }
                 }
+                members = w->member + g->first, count = g->count;
+            }
+            for (int m = 0; m < count; m++) {
+                int i = members[m], ok;
+                if (entry < 0) {
+                    if (w->far[i] <= EXCUSED && w->near[i] <= EXCUSED) continue;
+                    pair_bounds(c, e, i);
+                }
+                if (w->excuses && w->near[i] != w->far[i])
+                    ok = proved_leashed(c, i, inside, M_tip, t0, s.from, s.to, &since, &until);
+                else
+                    ok = proved(c, i, w->far[i], t0, s.from, s.to, &since, &until);
                 if (!ok) {
-                    c->hit_pair = i, c->hit_at = t0;
-                    to_front(c, i);
+                    remember(c, i);
+                    c->hit_at = t0;
                     return 0;
                 }
-            } else if (!proved(c, e, i, w->far[i], t0, s.from, s.to, &since, &until)) {
-                c->hit_pair = i, c->hit_at = t0;
-                to_front(c, i);
-                return 0;
-            }
-            if (since > s.from) {
-                c->list[left + lefts++] = i;
-                until_left = fmax(until_left, fmin(since, t0));
-            }
-            if (until < s.to) {
-                c->list[right + rights++] = i;
-                since_right = fmin(since_right, fmax(until, t0));
+                leave(&h, right, i, since, until, t0);
             }
         }
-        if ((lefts || rights) && 0.5 * (s.to - s.from) * most < SHORTEST_MOTION) {
-            c->hit_pair = lefts ? c->list[left] : c->list[right], c->hit_at = t0;
-            to_front(c, c->hit_pair);
+        if ((h.lefts || h.rights) && 0.5 * (s.to - s.from) * most < SHORTEST_MOTION) {
+            int entry = h.list[h.lefts ? 0 : right];
+            remember(c, entry < 0 ? w->member[w->group[-1 - entry].first] : entry);
+            c->hit_at = t0;
             return 0;
         }
-        if (lefts) c->span[tail++] = (span){s.from, until_left, left, lefts};
-        if (rights) c->span[tail++] = (span){since_right, s.to, right, rights};
-        used = rights ? right + rights : left + lefts;
+        memmove(h.list + h.lefts, h.list + right, sizeof(int) * h.rights);
+        if (h.lefts) c->span[tail++] = (span){s.from, h.until_left, used, h.lefts};
+        if (h.rights) c->span[tail++] = (span){h.since_right, s.to, used + h.lefts, h.rights};
+        used += h.lefts + h.rights;
     }
     return 1;
 }

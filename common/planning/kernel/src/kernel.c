@@ -8,7 +8,7 @@
 #define API __attribute__((visibility("default")))
 #endif
 
-#define VERSION 3
+#define VERSION 4
 
 API int zk_version(void) { return VERSION; }
 
@@ -158,33 +158,91 @@ API int zk_add(world *w, int kind, int jointed, const double *size, const double
     return w->shapes++;
 }
 
+/* A ball about all shapes of each joint's body. */
+static void enclose(world *w) {
+    for (int j = 0; j < w->joints; j++) {
+        body *B = &w->body[j];
+        B->ball = -1;
+        for (int i = 0; i < w->shapes; i++) {
+            const shape *s = &w->shape[i];
+            double at[3], to[3];
+            if (s->joint != j) continue;
+            act(&s->placed, s->middle, at);
+            if (B->ball < 0) {
+                memcpy(B->middle, at, sizeof at);
+                B->ball = s->ball;
+                continue;
+            }
+            sub3(at, B->middle, to);
+            double far = norm3(to);
+            if (far + s->ball <= B->ball) continue;
+            if (far + B->ball <= s->ball) {
+                memcpy(B->middle, at, sizeof at);
+                B->ball = s->ball;
+                continue;
+            }
+            double ball = 0.5 * (far + s->ball + B->ball) * (1 + 1e-12), way = (ball - B->ball) / far;
+            for (int k = 0; k < 3; k++) B->middle[k] += way * to[k];
+            B->ball = ball * (1 + 1e-12);
+        }
+        levers_of(w, j, B->middle, 0.0, B->reach);
+    }
+}
+
 /* Puts a shape at a placement (3, 4) in its joint's frame. */
-API void zk_place(world *w, int i, const double *placement) { place(w, i, placement); }
+API void zk_place(world *w, int i, const double *placement) {
+    place(w, i, placement);
+    if (w->shape[i].joint) enclose(w);
+}
+
+static pair related(const world *w, int a, int b, int joint_a, int joint_b) {
+    const joint *A = &w->joint[joint_a], *B = &w->joint[joint_b];
+    int common = 0;
+    while (common < A->depth && common < B->depth && A->chain[common] == B->chain[common]) common++;
+    int last = common ? A->chain[common - 1] : 0;
+    if (A->depth < B->depth) return (pair){b, a, last, joint_a == last};
+    return (pair){a, b, last, joint_b == last};
+}
 
 /* Which shapes may not touch: (count,) first and second. Returns 0 when there is no memory. */
 API int zk_pairs(world *w, int count, const int *first, const int *second) {
-    pair *pairs = realloc(w->pair, sizeof(pair) * (count + 1));
-    if (!pairs) return 0;
-    w->pair = pairs;
-    double *far = realloc(w->far, sizeof(double) * (count + 1));
-    if (!far) return 0;
-    w->far = far;
-    double *near = realloc(w->near, sizeof(double) * (count + 1));
-    if (!near) return 0;
-    w->near = near, w->pairs = count;
-    for (int i = 0; i < count; i++) {
-        int a = first[i], b = second[i];
-        const joint *A = &w->joint[w->shape[a].joint], *B = &w->joint[w->shape[b].joint];
-        int common = 0;
-        while (common < A->depth && common < B->depth && A->chain[common] == B->chain[common]) common++;
-        if (A->depth < B->depth) {
-            int swap = a;
-            a = b, b = swap, A = B;
-        }
-        pairs[i] = (pair){a, b, common ? A->chain[common - 1] : 0, 0};
-        pairs[i].fixed = w->shape[b].joint == pairs[i].common;
-        far[i] = near[i] = 0.0;
+    free(w->pair), free(w->far), free(w->near), free(w->group), free(w->member);
+    w->pair = malloc(sizeof(pair) * (count + 1));
+    w->far = calloc(count + 1, sizeof(double)), w->near = calloc(count + 1, sizeof(double));
+    w->group = malloc(sizeof(group) * (count + 1)), w->member = malloc(sizeof(int) * (count + 1));
+    int *owner = malloc(sizeof(int) * (count + 1));
+    w->pairs = w->groups = 0;
+    if (!w->pair || !w->far || !w->near || !w->group || !w->member || !owner) {
+        free(owner);
+        return 0;
     }
+    enclose(w);
+    for (int i = 0; i < count; i++) {
+        w->pair[i] = related(w, first[i], second[i], w->shape[first[i]].joint, w->shape[second[i]].joint);
+        int a = w->shape[w->pair[i].a].joint, b = w->shape[w->pair[i].b].joint, obstacle = w->pair[i].b;
+        int g = 0, found = 0; /* what does not move has an obstacle's group, unless it is the robot's base */
+        for (; g < w->groups && !found; g++)
+            found = w->group[g].balls.a == a && (b ? w->group[g].moving && w->group[g].balls.b == b
+                                                   : !w->group[g].moving && w->group[g].balls.b == obstacle);
+        if (found) {
+            g--;
+        } else {
+            group *G = &w->group[w->groups++];
+            *G = (group){related(w, a, b, a, b), b != 0, 0, 0, 0.0, 0.0};
+            if (!b) G->balls.b = obstacle;
+        }
+        owner[i] = g, w->group[g].count++;
+    }
+    for (int g = 0, at = 0; g < w->groups; g++) {
+        w->group[g].first = at, at += w->group[g].count;
+        w->group[g].count = 0;
+    }
+    for (int i = 0; i < count; i++) {
+        group *G = &w->group[owner[i]];
+        w->member[G->first + G->count++] = i;
+    }
+    free(owner);
+    w->pairs = count;
     return 1;
 }
 
@@ -194,6 +252,14 @@ API void zk_rules(world *w, const double *far, const double *near, int tool, con
                   double leash) {
     memcpy(w->far, far, sizeof(double) * w->pairs);
     memcpy(w->near, near ? near : far, sizeof(double) * w->pairs);
+    for (int g = 0; g < w->groups; g++) {
+        group *G = &w->group[g];
+        G->far = G->near = EXCUSED;
+        for (int k = 0; k < G->count; k++) {
+            G->far = fmax(G->far, w->far[w->member[G->first + k]]);
+            G->near = fmax(G->near, w->near[w->member[G->first + k]]);
+        }
+    }
     w->excuses = near && memcmp(far, near, sizeof(double) * w->pairs) != 0;
     if (!w->excuses) return;
     w->tool = tool, w->leash = leash;
@@ -205,13 +271,14 @@ API void zk_rules(world *w, const double *far, const double *near, int tool, con
 API void zk_free(world *w) {
     if (!w) return;
     for (int i = 0; i < w->shapes; i++) aligned_free(w->shape[i].x);
-    free(w->shape), free(w->lever), free(w->reach), free(w->pair), free(w->far), free(w->near), free(w);
+    free(w->shape), free(w->lever), free(w->reach), free(w->pair), free(w->far), free(w->near);
+    free(w->group), free(w->member), free(w);
 }
 
 API void zk_scratch_free(scratch *c) {
     if (!c) return;
-    free(c->middle), free(c->T_shape), free(c->stamp), free(c->axis), free(c->order), free(c->list), free(c->span);
-    free(c);
+    free(c->middle), free(c->T_shape), free(c->stamp), free(c->axis), free(c->list), free(c->span);
+    free(c->body_middle), free(c->bound), free(c);
 }
 
 /* Working memory for one thread; to be made anew when shapes or pairs were added. */
@@ -223,13 +290,15 @@ API scratch *zk_scratch(const world *w) {
     c->T_shape = calloc(w->shapes + 1, sizeof *c->T_shape);
     c->stamp = calloc(w->shapes + 1, sizeof *c->stamp);
     c->axis = calloc(w->pairs + 1, sizeof *c->axis);
-    c->order = calloc(w->pairs + 1, sizeof *c->order);
-    if (!c->middle || !c->T_shape || !c->stamp || !c->axis || !c->order) {
+    c->body_middle = calloc(w->joints, sizeof *c->body_middle);
+    c->bound = calloc(w->pairs + 1, sizeof *c->bound);
+    if (!c->middle || !c->T_shape || !c->stamp || !c->axis || !c->body_middle || !c->bound) {
         zk_scratch_free(c);
         return NULL;
     }
     for (int k = 0; k < 3; k++) c->T[0].R[4 * k] = 1.0;
-    for (int i = 0; i < w->pairs; i++) c->order[i] = i, c->axis[i][2] = 1.0;
+    for (int i = 0; i < w->pairs; i++) c->axis[i][2] = 1.0;
+    for (int k = 0; k < HOT; k++) c->hot[k] = -1;
     return c;
 }
 
@@ -299,6 +368,7 @@ API void zk_forward(scratch *c, const double *q, double *out) {
 /* How much was done: states, looks at pairs, searches of GJK, their iterations. */
 API void zk_counters(const scratch *c, long long *out) {
     out[0] = c->states, out[1] = c->checks, out[2] = c->searches, out[3] = c->iterations;
+    out[4] = c->edges;
 }
 
 /* Waypoints (room, dof) of a path from the start to one of goals (goals, dof), all of them free: their number, or -1 when

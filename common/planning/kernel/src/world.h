@@ -6,6 +6,7 @@
 
 #define MOST_JOINTS 32 /* the first stands for the world */
 #define EXCUSED (-1e9) /* [m] a margin that every distance keeps */
+#define HOT 8
 #define TOUCHING 1e-9  /* [m] shapes this close touch: what cannot be told apart from contact is contact */
 
 enum { FIXED, REVOLUTE, PRISMATIC };
@@ -24,6 +25,20 @@ typedef struct {
     int fixed;  /* whether b rests in the frame of `common` */
 } pair;
 
+/* Pairs of the shapes of one joint's body with one obstacle, or with the shapes of another body: a ball about the body
+   settles most of them at once. */
+typedef struct {
+    pair balls;        /* a: the body; b: the obstacle's shape, or a body where `moving` */
+    int moving;
+    int first, count;  /* of `member` */
+    double far, near;  /* largest margin of its pairs */
+} group;
+
+typedef struct {
+    double middle[3], ball;        /* in the frame of the joint */
+    double reach[MOST_JOINTS];     /* levers of the middle */
+} body;
+
 typedef struct {
     int dof, joints, shapes, pairs, room;
     joint joint[MOST_JOINTS]; /* joint i > 0 is moved by q[i - 1] */
@@ -32,6 +47,9 @@ typedef struct {
     double (*lever)[MOST_JOINTS]; /* of each shape about each joint [m]: as far from the axis as it ever gets */
     double (*reach)[MOST_JOINTS]; /* the same of the middle of its ball */
     pair *pair;
+    group *group;
+    int groups, *member;
+    body body[MOST_JOINTS];
     double *far, *near; /* margins [m] of the pairs; near holds while the tool is near its start */
     int excuses;        /* whether near and far differ */
     int tool;           /* joint that carries the tool point */
@@ -48,13 +66,15 @@ typedef struct {
     pose *T_shape;
     unsigned *stamp, now;
     double (*axis)[3]; /* direction that held a pair apart the last time, frame of b */
-    int *order;        /* pairs, those that touched last first */
+    int hot[HOT];      /* pairs that touched last, the last one first */
+    double (*body_middle)[3];
+    double (*bound)[4]; /* of each pair on a curve: M and K of the ball, M and K of the shape */
     /* edges */
     int *list, list_room;
     struct span *span;
     int span_room;
     /* what happened */
-    long states, checks, searches, iterations;
+    long long states, checks, searches, iterations, edges;
     int hit_pair;
     double hit_at;
 } scratch;
@@ -154,6 +174,8 @@ static inline const pose *shape_pose(scratch *c, int i) {
 
 static inline void middles(scratch *c) {
     const world *w = c->w;
+    for (int j = 1; j < w->joints; j++)
+        if (w->body[j].ball >= 0) act(&c->T[j], w->body[j].middle, c->body_middle[j]);
     for (int i = 0; i < w->shapes; i++)
         if (w->shape[i].joint) {
             double at[3];
@@ -162,27 +184,44 @@ static inline void middles(scratch *c) {
         }
 }
 
-/* Distance [m] of the ball about a from b, at most the pair's; n: unit, world, from a to b. */
-static inline double ball_distance(scratch *c, const pair *p, double *n) {
-    const world *w = c->w;
-    const shape *A = &w->shape[p->a], *B = &w->shape[p->b];
-    if (B->kind == HULL || B->kind == SPHERE || !p->fixed) {
-        sub3(c->middle[p->b], c->middle[p->a], n);
-        double far = norm3(n);
-        if (far < 1e-12) {
-            n[0] = n[1] = 0, n[2] = 1;
-            return -A->ball - B->ball;
-        }
-        for (int k = 0; k < 3; k++) n[k] /= far;
-        return far - A->ball - B->ball;
+/* Distance [m] of a ball from a ball; n: unit, from the first to the second. */
+static inline double balls_apart(const double *a, double ra, const double *b, double rb, double *n) {
+    sub3(b, a, n);
+    double far = norm3(n);
+    if (far < 1e-12) {
+        n[0] = n[1] = 0, n[2] = 1;
+        return -ra - rb;
     }
-    const pose *T = shape_pose(c, p->b);
+    for (int k = 0; k < 3; k++) n[k] /= far;
+    return far - ra - rb;
+}
+
+/* Distance [m] of a ball (world) from a shape, at most the true one; n: unit, world, from the ball to the shape. */
+static inline double ball_apart(scratch *c, const double *middle, double ball, int b, double *n) {
+    const shape *B = &c->w->shape[b];
+    if (B->kind == HULL || B->kind == SPHERE) return balls_apart(middle, ball, c->middle[b], B->ball, n);
+    const pose *T = shape_pose(c, b);
     double d[3], at[3], m[3];
-    sub3(c->middle[p->a], T->p, d);
+    sub3(middle, T->p, d);
     unrotate(T->R, d, at);
     double far = point_distance(B, at, m);
     rotate(T->R, m, n);
-    return far - A->ball;
+    return far - ball;
+}
+
+/* The same of the ball about the first shape of a pair. What moves itself counts with its ball, too, so that its turning
+   is of no account. */
+static inline double pair_apart(scratch *c, const pair *p, double *n) {
+    const world *w = c->w;
+    if (!p->fixed) return balls_apart(c->middle[p->a], w->shape[p->a].ball, c->middle[p->b], w->shape[p->b].ball, n);
+    return ball_apart(c, c->middle[p->a], w->shape[p->a].ball, p->b, n);
+}
+
+static inline double group_apart(scratch *c, const group *g, double *n) {
+    const body *A = &c->w->body[g->balls.a];
+    const double *middle = c->body_middle[g->balls.a];
+    if (!g->moving) return ball_apart(c, middle, A->ball, g->balls.b, n);
+    return balls_apart(middle, A->ball, c->body_middle[g->balls.b], c->w->body[g->balls.b].ball, n);
 }
 
 /* Bounds on the distance of a pair, stopping as `gjk` does; begins with the direction that served last. */
@@ -195,12 +234,11 @@ static inline void pair_distance(scratch *c, int i, double enough, double near, 
     if (out->below > -1e9) memcpy(c->axis[i], out->n, sizeof out->n);
 }
 
-static void to_front(scratch *c, int i) {
+static void remember(scratch *c, int i) {
     int k = 0;
-    while (c->order[k] != i) k++;
-    int to = k / 2;
-    memmove(c->order + to + 1, c->order + to, sizeof(int) * (k - to));
-    c->order[to] = i;
+    while (k < HOT - 1 && c->hot[k] != i) k++;
+    memmove(c->hot + 1, c->hot, sizeof(int) * k);
+    c->hot[0] = c->hit_pair = i;
 }
 
 static inline double tool_travel(scratch *c) {
@@ -210,25 +248,46 @@ static inline double tool_travel(scratch *c) {
     return norm3(at);
 }
 
+/* Whether a pair keeps its margin where the robot is now. */
+static inline int pair_free(scratch *c, int i, double margin) {
+    double n[3], need = margin + TOUCHING;
+    c->checks++;
+    if (pair_apart(c, &c->w->pair[i], n) > need) return 1;
+    gjk_answer found;
+    pair_distance(c, i, need, margin, 2.0, &found);
+    return found.below > need;
+}
+
+/* Whether the pairs that touched last keep their margins where the robot is now. */
+static inline int hot_free(scratch *c, const double *margin) {
+    for (int k = 0; k < HOT && c->hot[k] >= 0; k++)
+        if (margin[c->hot[k]] > EXCUSED && !pair_free(c, c->hot[k], margin[c->hot[k]])) {
+            remember(c, c->hot[k]);
+            return 0;
+        }
+    return 1;
+}
+
 /* Whether the robot is free at q; else `hit_pair` is a pair that is not. */
 static int state_free(scratch *c, const double *q) {
     const world *w = c->w;
     forward(c, q);
     middles(c);
-    const double *margin = w->excuses && tool_travel(c) < w->leash ? w->near : w->far;
-    for (int k = 0; k < w->pairs; k++) {
-        int i = c->order[k];
-        if (margin[i] <= EXCUSED) continue;
-        double n[3];
+    int starting = w->excuses && tool_travel(c) < w->leash;
+    const double *margin = starting ? w->near : w->far;
+    if (!hot_free(c, margin)) return 0;
+    for (int g = 0; g < w->groups; g++) {
+        const group *G = &w->group[g];
+        double most = starting ? G->near : G->far, n[3];
+        if (most <= EXCUSED) continue;
         c->checks++;
-        double need = margin[i] + TOUCHING;
-        if (ball_distance(c, &w->pair[i], n) > need) continue;
-        gjk_answer found;
-        pair_distance(c, i, need, margin[i], 2.0, &found);
-        if (found.below > need) continue;
-        c->hit_pair = i;
-        to_front(c, i);
-        return 0;
+        if (group_apart(c, G, n) > most + TOUCHING) continue;
+        for (int k = 0; k < G->count; k++) {
+            int i = w->member[G->first + k];
+            if (margin[i] <= EXCUSED || pair_free(c, i, margin[i])) continue;
+            remember(c, i);
+            return 0;
+        }
     }
     return 1;
 }
