@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.errors import UnknownName
 from common.messages import CollisionObject, PlanningScene, Pose
+from common.planning.kernel.world import EXCUSED, KernelWorld
 from common.planning.obstacles import MARGINS, ObstacleBank, ObstacleCache, Rules, Solid
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
@@ -97,7 +98,11 @@ class CollisionWorld:
         disabled = self._pairs_named((*scene.allowed_collisions, *allowed))
         self._far = self._bank.far
         self._far.set(disabled, margins)
+        self._kernel = self._bank.kernel()
+        if self._kernel is not None:
+            self._kernel.set_rules(_least(self._far))
         self._near = self._rules_at_start(disabled, margins)
+        self._hand_over_rules()
         self._lever = self._bank.lever
         # The TCP need not be within the hulls, so it has a lever of its own.
         tcp = robot.model.frames[robot.tcp_frame]
@@ -134,16 +139,33 @@ class CollisionWorld:
         names = {item.id for item, _, _ in held}
         return [o for o in environment if o.id not in names], held
 
+    def _hand_over_rules(self) -> None:
+        """Tell the kernel what counts, and where."""
+        if self._kernel is None or self._near is self._far:
+            return
+        tool = self.robot.model.frames[self.robot.tcp_frame]
+        self._kernel.set_rules(
+            _least(self._far), _least(self._near), tool.parentJoint, np.array(tool.placement.translation), self._origin,
+            self.contact_distance,
+        )
+
+    def _close_at_start(self, level: int) -> list[int]:
+        """Pairs that are closer at the start than they may be, with the level's margin on top."""
+        if self._kernel is None:
+            return self._far.pairs(self.start, level) if self._far.hit(self.start, level) else []
+        least = _least(self._far)
+        more = np.where(least > EXCUSED, MARGINS[level] * self._bank.shares, 0.0)
+        return np.flatnonzero(self._kernel.distances(self.start)[0] <= least + more).tolist()
+
     def _rules_at_start(self, disabled: frozenset[int], margins: Array) -> Rules:
         """Rules while the TCP is near its start: the far ones, but for what is excused there."""
-        if not self._far.hit(self.start, _CONTACT_SLACK):
+        close = self._close_at_start(_CONTACT_SLACK)
+        if not close:
             return self._far
         first, second = self._bank.first, self._bank.second
-        touching = frozenset(
-            i for i in self._far.pairs(self.start, _CONTACT_SLACK) if max(first[i], second[i]) >= self._held_from
-        )
+        touching = frozenset(i for i in close if max(first[i], second[i]) >= self._held_from)
         near_margins = margins.copy()
-        for i in self._far.pairs(self.start):
+        for i in self._close_at_start(0):
             near_margins[i] = 0.0
         if not touching and np.array_equal(near_margins, margins):
             return self._far
@@ -162,6 +184,11 @@ class CollisionWorld:
             either = (np.isin(first, one) & np.isin(second, other)) | (np.isin(first, other) & np.isin(second, one))
             found.update(np.flatnonzero(either).tolist())
         return frozenset(found)
+
+    @property
+    def kernel(self) -> KernelWorld | None:
+        """The compiled kernel with this world's rules; None where it cannot be used."""
+        return self._kernel
 
     @property
     def bank(self) -> ObstacleBank:
@@ -185,12 +212,20 @@ class CollisionWorld:
 
     def collides(self, q: Array) -> bool:
         """Whether the robot at q (dof,) [rad] touches itself or anything that it may not."""
+        if self._kernel is not None:
+            return self._kernel.colliding(q) >= 0
         if self._near is self._far:
             return self._far.hit(q)
         return (self._near if self._travel(q) < self.contact_distance else self._far).hit(q)
 
     def colliding_pair(self, q: Array) -> Pair | None:
         """Names of a link or attached object and of what it touches at q; None when nothing touches."""
+        if self._kernel is not None:
+            hit = self._kernel.colliding(q)
+            if hit < 0:
+                return None
+            close = self._kernel.distances(q)[0] <= _least(self.rules_at(q))
+            return self.pair(int(close.argmax()) if close.any() else hit)
         rules = self.rules_at(q)
         if not rules.hit(q):
             return None
@@ -217,6 +252,8 @@ class CollisionWorld:
         Bisects: the middle being free with a margin of at least the way of any point to the ends proves the whole
         piece. Where nothing can be proved the pieces end at ways of 1 mm, and their middles decide.
         """
+        if self._kernel is not None:
+            return self._kernel.edge_free(a, b)
         span = b - a
         whole = float(np.abs(span) @ self._lever)
         tcp_whole = float(np.abs(span) @ self._tcp_lever)
@@ -239,6 +276,9 @@ class CollisionWorld:
 
     def first_collision(self, path: Array) -> Hit | None:
         """The first of the positions (N, dof) [rad] that collides; pieces between that are proved free are skipped."""
+        if self._kernel is not None:
+            index, hit = self._kernel.first_collision(path)
+            return None if index < 0 else Hit(index, path[index].copy(), self.colliding_pair(path[index]) or self.pair(hit))
         stack = [(0, len(path) - 1)]
         while stack:
             i, j = stack.pop()
@@ -260,6 +300,13 @@ class CollisionWorld:
     def edge_collision(self, a: Array, b: Array, step: float = 0.005) -> Hit | None:
         """The first collision on the straight line from a to b (dof,) [rad], looked for in steps [rad]."""
         return self.first_collision(interpolate([a, b], step))
+
+
+def _least(rules: Rules) -> Array:
+    """(pairs,) [m] how far apart pairs must be, EXCUSED for those that may touch."""
+    least = rules.margins.copy()
+    least[list(rules.disabled)] = EXCUSED
+    return least
 
 
 def interpolate(waypoints: Sequence[Array] | Array, step: float) -> Array:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from common.errors import ZencellError
 from common.messages import CollisionObject
+from common.planning.kernel.world import KernelWorld, NoKernel
 from common.planning.prism import is_line, prism
 from common.planning.robot_geometry import RobotGeometry, largest
 
@@ -163,6 +164,8 @@ class ObstacleBank:
         self.second = np.array([pair.second for pair in pairs], dtype=int)
         self._robot = robot
         self._solids = solids
+        self._kernel: KernelWorld | None = None
+        self._kernel_tried = self._kernel_placed = False
         self.near = Rules(self)
         self.far = Rules(self)
         self.lever = np.zeros(self.model.nq)
@@ -182,8 +185,25 @@ class ObstacleBank:
             placement = pin.SE3(pose)
             moved = moved or (solid.joint != 0 and not item.placement.isApprox(placement, 1e-9))
             item.placement = placement
+        self._kernel_placed = False
         if moved:
             self._measure()
+
+    def kernel(self) -> KernelWorld | None:
+        """The same geometry, where solids stand now, in the compiled kernel; None where it cannot be used."""
+        if not self._kernel_tried:
+            self._kernel_tried = True
+            try:
+                self._kernel = KernelWorld(self.model, self.geometry, self._robot.kernel_shapes)
+            except NoKernel:
+                return None
+        elif self._kernel is not None and not self._kernel_placed:
+            items = self.geometry.geometryObjects
+            for index in range(self.robot_count, len(items)):
+                self._kernel.place(index, items[index].placement.homogeneous)
+            self._kernel.placed()
+        self._kernel_placed = True
+        return self._kernel
 
     def _measure(self) -> None:
         """Levers, and each pair's share: joints between two links alone move them towards each other."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from common.planning.kernel.world import Shape
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -39,6 +41,15 @@ class RobotGeometry:
         self.joints: list[int] = [item.parentJoint for item in geometry.geometryObjects]
         self._axes = _joint_axes(robot.model)
         self.levers = [self.lever(item) for item in geometry.geometryObjects]
+
+    @cached_property
+    def kernel_shapes(self) -> list[Shape]:
+        """The hulls as the compiled kernel wants them.
+
+        Raises:
+            NoKernel: one is a shape that it does not know.
+        """
+        return [Shape.of(item.geometry) for item in self.geometry.geometryObjects]
 
     def lever(self, item: pin.GeometryObject) -> Array:
         """(dof,) [m]: while joint j turns by one radian no point of the shape moves farther than lever[j].

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from common.planning.kernel.build import FOLDER, NAME
 
-VERSION = 4
+VERSION = 5
 
 _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_version": (c_int, []),
@@ -26,6 +26,7 @@ _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_state": (c_int, [c_void_p, c_void_p]),
     "zk_edge": (c_int, [c_void_p] * 4),
     "zk_cubics": (c_int, [c_void_p, c_int, c_void_p, c_void_p]),
+    "zk_first": (c_int, [c_void_p, c_int, c_void_p, c_void_p]),
     "zk_distances": (None, [c_void_p] * 4),
     "zk_forward": (None, [c_void_p] * 3),
     "zk_plan": (c_int, [c_void_p, c_void_p, c_int, c_void_p, c_void_p, c_void_p, c_int, c_void_p, c_void_p]),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from ctypes import byref, c_double
+from collections.abc import Sequence
+from ctypes import byref, c_double, c_int
+from dataclasses import dataclass
 from typing import Any
 
 import coal
@@ -23,14 +25,48 @@ class NoKernel(ZencellError):
     """The kernel is not built here, or does not know a joint or a shape."""
 
 
+@dataclass(frozen=True)
+class Shape:
+    """A shape as the kernel wants it: kind, dimensions (3,), vertices (N, 3) of a hull and a ball (4,) about them."""
+
+    kind: int
+    size: Array
+    points: Array
+    ball: Array
+
+    @classmethod
+    def of(cls, shape: coal.CollisionGeometry) -> Shape:
+        """A shape of coal's.
+
+        Raises:
+            NoKernel: it is none that the kernel knows.
+        """
+        none, nothing = np.zeros((0, 3)), np.zeros(4)
+        if isinstance(shape, coal.Sphere):
+            return cls(_SPHERE, np.array([shape.radius, 0, 0]), none, nothing)
+        if isinstance(shape, coal.Box):
+            return cls(_BOX, 2 * np.array(shape.halfSide), none, nothing)
+        if isinstance(shape, coal.Cylinder | coal.Capsule):
+            kind = _CYLINDER if isinstance(shape, coal.Cylinder) else _CAPSULE
+            return cls(kind, np.array([shape.radius, 2 * shape.halfLength, 0]), none, nothing)
+        if isinstance(shape, coal.Convex):
+            points = np.array([shape.point(i) for i in range(shape.num_points)], dtype=float)
+            return cls(_HULL, np.zeros(3), points, _ball(points))
+        raise NoKernel(f"the planning kernel takes no {type(shape).__name__}")
+
+
 class KernelWorld:
     """Answers of the compiled kernel for one robot among obstacles. Not for several threads at once.
 
     Pairs are those of the geometry model, in its order.
     """
 
-    def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
+    def __init__(self, model: pin.Model, geometry: pin.GeometryModel, known: Sequence[Shape] = ()) -> None:
         """Copy joints, shapes, placements and pairs.
+
+        Args:
+            model: joints; geometry: shapes and pairs.
+            known: the first of the shapes, where they were read before: reading a hull takes a millisecond.
 
         Raises:
             NoKernel: there is no library, or something in the models is not known to it.
@@ -51,8 +87,8 @@ class KernelWorld:
         )
         if not self._world:
             raise NoKernel(f"the planning kernel takes 31 joints at most, not {self.dof}")
-        for item in geometry.geometryObjects:
-            self._add(item)
+        for i, item in enumerate(geometry.geometryObjects):
+            self._add(item, known[i] if i < len(known) else Shape.of(item.geometry))
         pairs = np.array([(pair.first, pair.second) for pair in geometry.collisionPairs], dtype=np.int32).reshape(-1, 2)
         first, second = pairs[:, 0].copy(), pairs[:, 1].copy()
         if not found.zk_pairs(self._world, self.pair_count, address(first), address(second)):
@@ -69,12 +105,11 @@ class KernelWorld:
         if self._world:
             self.library.zk_free(self._world)
 
-    def _add(self, item: pin.GeometryObject) -> None:
-        kind, size, points = _shape(item.geometry)
-        ball = _ball(points) if len(points) else np.zeros(4)
+    def _add(self, item: pin.GeometryObject, shape: Shape) -> None:
         placement = np.ascontiguousarray(item.placement.homogeneous[:3])
         index = self.library.zk_add(
-            self._world, kind, item.parentJoint, address(size), address(points), len(points), address(ball), address(placement)
+            self._world, shape.kind, item.parentJoint, address(shape.size), address(shape.points), len(shape.points),
+            address(shape.ball), address(placement),
         )
         if index < 0:
             raise NoKernel(f"{item.name}: the planning kernel takes no such shape")
@@ -113,19 +148,22 @@ class KernelWorld:
 
     def colliding(self, q: Array) -> int:
         """Index of a pair that is too close at q (dof,) [rad], -1 when the robot is free."""
-        return int(self.library.zk_state(self.scratch, self._q(q)))
+        given = self._q(q)
+        return int(self.library.zk_state(self.scratch, address(given)))
 
     def edge_collision(self, a: Array, b: Array) -> tuple[int, float]:
         """A pair that is too close on the straight line in joint space from a to b, and where: 0 to 1.
 
         -1 when the whole line is proved free.
         """
-        hit = int(self.library.zk_edge(self.scratch, self._q(a), self._q(b), byref(self._where)))
+        first, last = self._q(a), self._q(b)
+        hit = int(self.library.zk_edge(self.scratch, address(first), address(last), byref(self._where)))
         return hit, self._where.value
 
     def edge_free(self, a: Array, b: Array) -> bool:
         """Whether the straight line in joint space from a to b (dof,) [rad] is proved free."""
-        return bool(self.library.zk_edge(self.scratch, self._q(a), self._q(b), byref(self._where)) < 0)
+        first, last = self._q(a), self._q(b)
+        return bool(self.library.zk_edge(self.scratch, address(first), address(last), byref(self._where)) < 0)
 
     def cubics_collision(self, coefficients: Array) -> tuple[int, float]:
         """The same for cubics (N, 4, dof), c0 + c1 t + c2 t^2 + c3 t^3 with t from 0 to 1: pair, piece and where in it."""
@@ -135,19 +173,28 @@ class KernelWorld:
         hit = int(self.library.zk_cubics(self.scratch, len(given), address(given), byref(self._where)))
         return hit, self._where.value
 
+    def first_collision(self, path: Array) -> tuple[int, int]:
+        """The first of positions (N, dof) [rad] that is not free, and a pair that is too close there; -1 for none."""
+        given = np.ascontiguousarray(path, dtype=float)
+        if given.ndim != 2 or given.shape[1] != self.dof:
+            raise ValueError(f"positions have shape {given.shape}")
+        pair = c_int()
+        return int(self.library.zk_first(self.scratch, len(given), address(given), byref(pair))), pair.value
+
     def distances(self, q: Array) -> tuple[Array, Array]:
         """(pairs,) [m] how far apart points of each pair are at q, and how far a plane holds them apart.
 
         Both are the distance within rounding where shapes are apart. Where they are not the first is 0 or less.
         """
+        given = self._q(q)
         above, below = np.empty(self.pair_count), np.empty(self.pair_count)
-        self.library.zk_distances(self.scratch, self._q(q), address(above), address(below))
+        self.library.zk_distances(self.scratch, address(given), address(above), address(below))
         return above, below
 
     def joint_poses(self, q: Array) -> Array:
         """(joints, 3, 4) poses of the joints' frames, world."""
-        out = np.empty((self.dof, 3, 4))
-        self.library.zk_forward(self.scratch, self._q(q), address(out))
+        given, out = self._q(q), np.empty((self.dof, 3, 4))
+        self.library.zk_forward(self.scratch, address(given), address(out))
         return out
 
     def counters(self) -> dict[str, int]:
@@ -156,13 +203,15 @@ class KernelWorld:
         self.library.zk_counters(self.scratch, address(out))
         return dict(zip(("states", "looks", "searches", "iterations", "edges"), out.tolist(), strict=True))
 
-    def _q(self, q: Array) -> int:
-        if q.dtype != np.float64 or q.shape != (self.dof,) or not q.flags.c_contiguous:
-            raise ValueError(f"joint positions are {q.dtype} of shape {q.shape}")
-        return address(q)
+    def _q(self, q: ArrayLike) -> Array:
+        given = np.ascontiguousarray(q, dtype=float)
+        if given.shape != (self.dof,):
+            raise ValueError(f"joint positions have shape {given.shape}, not ({self.dof},)")
+        return given
 
 
 def address(array: NDArray[Any]) -> int:
+    """Where the numbers of an array are; the array has to live as long as they are used."""
     return array.ctypes.data
 
 
@@ -181,26 +230,6 @@ def _joints(model: pin.Model) -> tuple[NDArray[np.int32], Array]:
         if model.joints[joint].idx_q != joint - 1:
             raise NoKernel("the planning kernel takes joints in the order of their positions")
     return kinds, axes
-
-
-def _shape(shape: coal.CollisionGeometry) -> tuple[int, Array, Array]:
-    """Kind, dimensions (3,) and vertices (N, 3) of a shape.
-
-    Raises:
-        NoKernel: it is none of these.
-    """
-    none = np.zeros((0, 3))
-    if isinstance(shape, coal.Sphere):
-        return _SPHERE, np.array([shape.radius, 0, 0]), none
-    if isinstance(shape, coal.Box):
-        return _BOX, 2 * np.array(shape.halfSide), none
-    if isinstance(shape, coal.Cylinder | coal.Capsule):
-        kind = _CYLINDER if isinstance(shape, coal.Cylinder) else _CAPSULE
-        return kind, np.array([shape.radius, 2 * shape.halfLength, 0]), none
-    if isinstance(shape, coal.Convex):
-        points = np.array([shape.point(i) for i in range(shape.num_points)], dtype=float)
-        return _HULL, np.zeros(3), np.ascontiguousarray(points)
-    raise NoKernel(f"the planning kernel takes no {type(shape).__name__}")
 
 
 def _ball(points: Array) -> Array:

@@ -341,4 +341,71 @@ static int curve_free(scratch *c, const curve *e) {
     return 1;
 }
 
+/* Whether all positions are free that differ from q by at most `away` (dof,): balls and planes hold the pairs apart by
+   more than any of their points moves. */
+static int around_free(scratch *c, const double *q, const double *away) {
+    const world *w = c->w;
+    curve e;
+    double inside = 0, M, K, n[3];
+    for (int j = 0; j < w->dof; j++) e.speed[j] = away[j], e.bend[j] = 0;
+    forward(c, q);
+    middles(c);
+    if (w->excuses) {
+        bounds(w, &e, w->tool, 0, w->tip_lever, &M, &K);
+        double left = w->leash - tool_travel(c);
+        inside = left > M ? 1 : left + M <= 0 ? -1 : 0; /* near for sure, far for sure */
+    }
+    for (int g = 0; g < w->groups; g++) {
+        const group *G = &w->group[g];
+        double most = inside > 0 ? G->near : inside < 0 ? G->far : fmax(G->near, G->far);
+        if (most <= EXCUSED) continue;
+        double Mb = 0, Kb = 0;
+        bounds(w, &e, G->balls.a, G->balls.common, w->body[G->balls.a].reach, &M, &K);
+        if (G->moving && !G->balls.fixed)
+            bounds(w, &e, G->balls.b, G->balls.common, w->body[G->balls.b].reach, &Mb, &Kb);
+        c->checks++;
+        if (group_apart(c, G, n) > most + TOUCHING + M + Mb) continue;
+        for (int k = 0; k < G->count; k++) {
+            int i = w->member[G->first + k];
+            double margin = inside > 0 ? w->near[i] : inside < 0 ? w->far[i] : fmax(w->near[i], w->far[i]);
+            if (margin <= EXCUSED) continue;
+            pair_bounds(c, &e, i);
+            c->checks++;
+            if (pair_apart(c, &w->pair[i], n) > margin + TOUCHING + c->bound[i][0]) continue;
+            double need = margin + TOUCHING + c->bound[i][2];
+            gjk_answer found;
+            pair_distance(c, i, need, need, 2.0, &found);
+            if (!(found.below > need)) return 0;
+        }
+    }
+    return 1;
+}
+
+/* The first of positions (count, dof) that is not free, or -1; stretches about their middles are proved in one go. */
+static int first_hit(scratch *c, int count, const double *path) {
+    int dof = c->w->dof, top = 0, stack[128][2];
+    if (count < 1) return -1;
+    stack[top][0] = 0, stack[top++][1] = count - 1;
+    while (top) {
+        int i = stack[--top][0], j = stack[top][1], m = i + (j - i) / 2;
+        const double *q = path + (size_t)dof * m;
+        if (i == j) {
+            if (!state_free(c, q)) return i;
+            continue;
+        }
+        double away[MOST_JOINTS] = {0};
+        for (int k = i; k <= j; k++)
+            for (int d = 0; d < dof; d++) away[d] = fmax(away[d], fabs(path[(size_t)dof * k + d] - q[d]));
+        if (around_free(c, q, away)) continue;
+        if (j - i == 1) {
+            stack[top][0] = stack[top][1] = j, top++;
+            stack[top][0] = stack[top][1] = i, top++;
+        } else {
+            stack[top][0] = m + 1, stack[top++][1] = j;
+            stack[top][0] = i, stack[top++][1] = m;
+        }
+    }
+    return -1;
+}
+
 #endif

@@ -8,7 +8,7 @@
 #define API __attribute__((visibility("default")))
 #endif
 
-#define VERSION 4
+#define VERSION 5
 
 API int zk_version(void) { return VERSION; }
 
@@ -336,6 +336,13 @@ API int zk_cubics(scratch *c, int count, const double *coefficients, double *at)
         }
     }
     return -1;
+}
+
+/* The first of positions (count, dof) that is not free, -1 when all are; `hit` is a pair that is too close there. */
+API int zk_first(scratch *c, int count, const double *path, int *hit) {
+    int found = first_hit(c, count, path);
+    *hit = c->hit_pair;
+    return found;
 }
 
 /* Bounds (pairs,) [m] on the distances at q: points that are this far apart, planes that hold this far apart. */
