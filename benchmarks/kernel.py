@@ -60,7 +60,8 @@ def sliding_arm() -> Models:
         low, high, most = np.full(1, -1.0), np.full(1, 1.5), np.full(1, 10.0)
         joint = model.addJoint(min(parent, 5), kind, place, f"j{number}", most, most, low, high)
         parent = joint
-        shape = [coal.Capsule(0.05, 0.2), coal.Box(0.1, 0.2, 0.1), coal.Cylinder(0.06, 0.2), coal.Sphere(0.08)][number % 4]
+        shapes = [coal.Capsule(0.05, 0.2), coal.Box(0.1, 0.2, 0.1), coal.Cylinder(0.06, 0.2), coal.Sphere(0.08)]
+        shape = shapes[number % 4]
         geometry.addGeometryObject(pin.GeometryObject(f"s{number}", joint, 0, pin.SE3.Random(), shape))
         geometry.geometryObjects[number].placement.translation *= 0.1
     for one in range(7):

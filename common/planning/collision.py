@@ -278,7 +278,10 @@ class CollisionWorld:
         """The first of the positions (N, dof) [rad] that collides; pieces between that are proved free are skipped."""
         if self._kernel is not None:
             index, hit = self._kernel.first_collision(path)
-            return None if index < 0 else Hit(index, path[index].copy(), self.colliding_pair(path[index]) or self.pair(hit))
+            if index < 0:
+                return None
+            q = path[index].copy()
+            return Hit(index, q, self.colliding_pair(q) or self.pair(hit))
         stack = [(0, len(path) - 1)]
         while stack:
             i, j = stack.pop()

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.planning.collision import Pair
-from common.planning.problem import Cancel, Problem, Region
+from common.planning.problem import Cancel, Problem, Region, Result
 from common.robot.ik import solve_ik
 from common.robot.transforms import invert, transform
 
@@ -23,6 +23,16 @@ class GoalSamples:
     goals: list[Array] = field(default_factory=list)
     reached: int = 0
     colliding: Pair | None = None
+
+    def failure(self, stop: str) -> Result:
+        """Why there is no goal; `stop`: cancelled or timeout where that ended the search."""
+        if stop:
+            return Result(error=stop, message="planning was ended while goals were sampled")
+        if self.colliding:
+            one, other = self.colliding
+            message = f"all {self.reached} poses found in the goal region collide; {one} collides with {other}"
+            return Result(error="goal_in_collision", message=message, colliding=self.colliding)
+        return Result(error="no_ik", message="no pose of the goal region can be reached")
 
 
 def sample_pose(region: Region, rng: np.random.Generator) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 from dataclasses import dataclass, field
 
@@ -107,10 +108,12 @@ class Cancel:
 
     def __init__(self) -> None:
         self._event = threading.Event()
+        self.word = ctypes.c_int(0)  # not 0 once set: compiled code looks here
 
     def set(self) -> None:
         """Ask the planner to give up."""
         self._event.set()
+        self.word.value = 1
 
     @property
     def is_set(self) -> bool:

@@ -49,17 +49,6 @@ class Found:
     shorten_seconds: float
 
 
-class Flag:
-    """Ends a search when another thread sets it."""
-
-    def __init__(self) -> None:
-        self.value = ctypes.c_int(0)
-
-    def set(self) -> None:
-        """Ask for the end."""
-        self.value.value = 1
-
-
 def find_path(
     world: KernelWorld,
     start: Array,
@@ -72,7 +61,7 @@ def find_path(
     nodes: int = 1_000_000,
     shortcuts: int = 300,
     patience: int = 60,
-    flag: Flag | None = None,
+    cancel: ctypes.c_int | None = None,
 ) -> Found:
     """A path from start (dof,) to one of the goals (N, dof), all free [rad]; other threads run meanwhile.
 
@@ -81,7 +70,7 @@ def find_path(
         reach: longest edge of the trees; domain: how far from a node, once its extension failed, samples count [rad].
         nodes: of both trees at most.
         shortcuts: tries at most; patience: tries that fail in a row before the shortening ends.
-        flag: ends the search from another thread.
+        cancel: ends the search once another thread makes it something else than 0.
     """
     options = _Options(reach, domain, seconds, nodes, shortcuts, patience, seed)
     report = _Report()
@@ -91,7 +80,7 @@ def find_path(
         raise ValueError(f"start has shape {first.shape}, goals {last.shape}")
     count = world.library.zk_plan(
         world.scratch, address(first), len(last), address(last), byref(options),
-        byref(flag.value) if flag else None, len(path), address(path), byref(report),
+        None if cancel is None else byref(cancel), len(path), address(path), byref(report),
     )
     return Found(
         path[:count].copy() if count > 0 else None,

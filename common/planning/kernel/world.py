@@ -83,7 +83,7 @@ class KernelWorld:
         placements = np.array([placement.homogeneous[:3] for placement in list(model.jointPlacements)[1:]])
         lower, upper = (np.array(limit, dtype=float) for limit in (model.lowerPositionLimit, model.upperPositionLimit))
         self._world = found.zk_world(
-            self.dof, address(parents), address(kinds), address(placements), address(axes), address(lower), address(upper)
+            self.dof, *(address(a) for a in (parents, kinds, placements, axes, lower, upper))
         )
         if not self._world:
             raise NoKernel(f"the planning kernel takes 31 joints at most, not {self.dof}")
@@ -143,7 +143,8 @@ class KernelWorld:
         if len(arrays[0]) != self.pair_count or (other is not None and len(other) != self.pair_count):
             raise ValueError(f"{len(arrays[0])} margins for {self.pair_count} pairs")
         self.library.zk_rules(
-            self._world, address(arrays[0]), None if other is None else address(other), tool, address(arrays[1]), address(arrays[2]), leash
+            self._world, address(arrays[0]), None if other is None else address(other), tool, address(arrays[1]),
+            address(arrays[2]), leash,
         )
 
     def colliding(self, q: Array) -> int:
@@ -166,7 +167,7 @@ class KernelWorld:
         return bool(self.library.zk_edge(self.scratch, address(first), address(last), byref(self._where)) < 0)
 
     def cubics_collision(self, coefficients: Array) -> tuple[int, float]:
-        """The same for cubics (N, 4, dof), c0 + c1 t + c2 t^2 + c3 t^3 with t from 0 to 1: pair, piece and where in it."""
+        """The same for cubics (N, 4, dof), c0 + c1 t + c2 t^2 + c3 t^3 with t from 0 to 1: pair, piece + t."""
         given = np.ascontiguousarray(coefficients, dtype=float)
         if given.ndim != 3 or given.shape[1:] != (4, self.dof):
             raise ValueError(f"coefficients have shape {given.shape}")

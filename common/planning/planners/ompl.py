@@ -55,7 +55,7 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
         samples = sample_goals(problem, problem.goal, cancel, wanted=options.goals, tries=options.goal_tries)
         goals = samples.goals
         if not goals:
-            return _no_goal(cancel.reason(problem), samples.reached, samples.colliding)
+            return samples.failure(cancel.reason(problem))
     else:
         goals = [problem.goal]
     began = monotonic()
@@ -66,15 +66,6 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
             )
             return Result(waypoints=np.array([problem.start, goal]), fraction=1.0, attempts=[attempt])
     return _best(problem, options, cancel, goals)
-
-
-def _no_goal(stop: str, reached: int, pair: tuple[str, str] | None) -> Result:
-    if stop:
-        return Result(error=stop, message="planning was ended while goals were sampled")
-    if pair:
-        message = f"all {reached} poses found in the goal region collide; {pair[0]} collides with {pair[1]}"
-        return Result(error="goal_in_collision", message=message, colliding=pair)
-    return Result(error="no_ik", message="no pose of the goal region can be reached")
 
 
 def _best(problem: Problem, options: Options, cancel: Cancel, goals: Sequence[Array]) -> Result:

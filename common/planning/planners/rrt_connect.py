@@ -1,0 +1,88 @@
+"""A path through joint space by the compiled kernel's RRT-Connect, every edge of it proved free."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from common.config import Parameters
+from common.messages import PlanAttempt
+from common.planning.goal_sampling import least_time, sample_goals
+from common.planning.kernel.planner import find_path
+from common.planning.kernel.world import KernelWorld
+from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result
+from common.sources import monotonic
+
+Array = NDArray[np.float64]
+
+
+class Options(Parameters):
+    """How far the trees reach, how long paths are shortened, and how many goals there are to choose from."""
+
+    reach: float = Field(1.0, gt=0, le=10, description="longest edge of the trees [rad]")
+    shortcuts: int = Field(300, ge=0, le=100_000, description="tries to shorten a path")
+    patience: int = Field(60, ge=1, le=100_000, description="tries in a row that do not shorten it until that ends")
+    good_enough: float = Field(
+        0.05, ge=0, le=10, description="share by which a path may take longer than the straight edge to need no other"
+    )
+    goals: int = Field(6, ge=1, le=100, description="IK solutions of a pose goal to choose from")
+    goal_tries: int = Field(40, ge=1, le=1000, description="poses and seeds tried to find them")
+
+
+def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
+    """The best path of several attempts to a joint goal or into the region of a pose goal.
+
+    A straight edge to one of the goals is taken when there is one: it is free for most pairs and nothing is shorter.
+    """
+    if problem.straight or not isinstance(problem.goal, Region | np.ndarray):
+        return Result(error=NOT_APPLICABLE, message="a sampled path is no straight line of the tool")
+    if problem.world.kernel is None:
+        return Result(error=NOT_APPLICABLE, message="the planning kernel is not built")
+    goals = [problem.goal] if isinstance(problem.goal, np.ndarray) else []
+    if isinstance(problem.goal, Region):
+        samples = sample_goals(problem, problem.goal, cancel, wanted=options.goals, tries=options.goal_tries)
+        goals = samples.goals
+        if not goals:
+            return samples.failure(cancel.reason(problem))
+    began = monotonic()
+    for goal in goals:
+        if problem.world.edge_free(problem.start, goal):
+            straight = PlanAttempt(
+                planner="rrt_connect", seconds=monotonic() - began, fraction=1.0, message="straight edge in joint space"
+            )
+            return Result(waypoints=np.array([problem.start, goal]), fraction=1.0, attempts=[straight])
+    return _best(problem, options, cancel, problem.world.kernel, np.array(goals))
+
+
+def _best(problem: Problem, options: Options, cancel: Cancel, kernel: KernelWorld, goals: Array) -> Result:
+    best: Array | None = None
+    least = np.inf
+    attempts: list[PlanAttempt] = []
+    enough = (1 + options.good_enough) * min(least_time(problem.start, goal, problem.velocity) for goal in goals)
+    for _ in range(problem.attempts):
+        began = monotonic()
+        seed = int(problem.rng.integers(1, 2**62))
+        found = find_path(
+            kernel, problem.start, goals, seed=seed, seconds=max(0.0, problem.seconds_left), reach=options.reach,
+            shortcuts=options.shortcuts, patience=options.patience, cancel=cancel.word,
+        )
+        seconds = monotonic() - began
+        path = found.waypoints
+        if path is None:
+            error = cancel.reason(problem) or found.error
+            attempts.append(PlanAttempt(planner="rrt_connect", seconds=seconds, error=error, message="found no path"))
+        else:
+            time = sum(least_time(a, b, problem.velocity) for a, b in pairwise(path))
+            message = f"{len(path)} waypoints, {time:.2f} s at least, {found.nodes} nodes"
+            attempts.append(PlanAttempt(planner="rrt_connect", seconds=seconds, message=message, fraction=1.0))
+            if time < least:
+                best, least = path, time
+        if cancel.reason(problem) or least <= enough:
+            break
+    if best is None or cancel.is_set:
+        error = "cancelled" if cancel.is_set else attempts[-1].error or "no_path"
+        return Result(error=error, message="RRT-Connect found no path", attempts=attempts)
+    return Result(waypoints=best, fraction=1.0, attempts=attempts)
