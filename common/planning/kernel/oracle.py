@@ -110,7 +110,7 @@ def compare(
     samples: int = 40,
     margin: float = 0.0,
 ) -> Comparison:
-    """Ask both about random states, and about edges between them at random places.
+    """Ask both about random states, and about edges and cubics between them at random places.
 
     Args:
         states: random positions within the limits; edges: between free ones, long and short.
@@ -146,17 +146,22 @@ def compare(
             free.append(q)
     for _ in range(edges if len(free) > 1 else 0):
         i, j = rng.choice(len(free), 2, replace=False)
-        a, b = free[i], free[i] + (free[j] - free[i]) * rng.uniform() ** 2
-        hit, at = kernel.edge_collision(a, b)
+        span = (free[j] - free[i]) * rng.uniform() ** 2
+        bend, twist = rng.normal(size=(2, len(span))) * rng.choice([0.0, 0.3]) * np.linalg.norm(span)
+        cubic = np.array([free[i], span - bend - twist, bend, twist])
+        if bend.any():
+            hit, at = kernel.cubics_collision(cubic[None])
+        else:
+            hit, at = kernel.edge_collision(free[i], free[i] + span)
         if hit >= 0:
             found.blocked_edges += 1
-            least = float(oracle.distances(a + at * (b - a))[hit]) - margin
+            least = float(oracle.distances(at ** np.arange(4) @ cubic)[hit]) - margin
             if least > 1e-5:
                 found.faults.append(f"{_named(geometry, hit)}: edge not free where coal has {least:g} m to spare")
             continue
         found.free_edges += 1
         for share in rng.uniform(size=samples):
-            truth = oracle.distances(a + share * (b - a))
+            truth = oracle.distances(share ** np.arange(4) @ cubic)
             if truth.min(initial=np.inf) - margin < -DEPTH:
                 where = _named(geometry, int(truth.argmin()))
                 found.faults.append(f"{where}: edge free, coal has {truth.min():g} m at {share:.6f}")

@@ -302,7 +302,8 @@ static int curve_free(scratch *c, const curve *e) {
                 const group *g = &w->group[-1 - entry];
                 if (group_proved(c, e, g, fmax(g->far, g->near), t0, &since, &until)) {
                     if (since <= s.from && until >= s.to) continue;
-                    if (fmin(until, s.to) - fmax(since, s.from) > KEEP * (s.to - s.from)) {
+                    int small = (s.to - s.from) * most < 100 * SHORTEST_MOTION;
+                    if (!small && fmin(until, s.to) - fmax(since, s.from) > KEEP * (s.to - s.from)) {
                         leave(&h, right, entry, since, until, t0);
                         continue;
                     }
@@ -328,8 +329,7 @@ static int curve_free(scratch *c, const curve *e) {
             }
         }
         if ((h.lefts || h.rights) && 0.5 * (s.to - s.from) * most < SHORTEST_MOTION) {
-            int entry = h.list[h.lefts ? 0 : right];
-            remember(c, entry < 0 ? w->member[w->group[-1 - entry].first] : entry);
+            remember(c, h.list[h.lefts ? 0 : right]);
             c->hit_at = t0;
             return 0;
         }
@@ -374,7 +374,7 @@ static int around_free(scratch *c, const double *q, const double *away) {
             if (pair_apart(c, &w->pair[i], n) > margin + TOUCHING + c->bound[i][0]) continue;
             double need = margin + TOUCHING + c->bound[i][2];
             gjk_answer found;
-            pair_distance(c, i, need, need, 2.0, &found);
+            pair_distance(c, i, need, need, 1.0, &found);
             if (!(found.below > need)) return 0;
         }
     }

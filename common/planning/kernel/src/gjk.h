@@ -111,7 +111,7 @@ static inline void on_tetrahedron(const vertex *s, closest *c) {
 
    n: unit direction (frame of B) to begin with, from A to B.
    enough: stop when `below` is more than this [m]; near: stop when `above` is at most this [m].
-   share: stop when `below` is at least this share of `above` (both of the rounded shapes). */
+   share: stop when `below` is this share of the way from `near` to `above`; 1: go on to the end. */
 static inline void gjk(const shape *A, const shape *B, const pose *T_b_a, const double *begin, double enough, double near,
                        double share, gjk_answer *out) {
     vertex s[4];
@@ -139,7 +139,8 @@ static inline void gjk(const shape *A, const shape *B, const pose *T_b_a, const 
         }
         if (iteration) {
             double rest = out->above - out->below;
-            if (rest <= 1e-12 || (out->below > 0 && out->below >= share * out->above)) break;
+            if (rest <= 1e-12) break;
+            if (share < 1 && out->below > near && out->below - near >= share * (out->above - near)) break;
             int known = 0;
             for (int i = 0; i < count; i++)
                 if (w.w[0] == s[i].w[0] && w.w[1] == s[i].w[1] && w.w[2] == s[i].w[2]) known = 1;

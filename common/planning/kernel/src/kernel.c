@@ -351,7 +351,7 @@ API void zk_distances(scratch *c, const double *q, double *above, double *below)
     middles(c);
     for (int i = 0; i < c->w->pairs; i++) {
         gjk_answer found;
-        pair_distance(c, i, INFINITY, -INFINITY, 2.0, &found);
+        pair_distance(c, i, INFINITY, -INFINITY, 1.0, &found);
         above[i] = found.above, below[i] = found.below;
     }
 }

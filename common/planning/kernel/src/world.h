@@ -254,7 +254,7 @@ static inline int pair_free(scratch *c, int i, double margin) {
     c->checks++;
     if (pair_apart(c, &c->w->pair[i], n) > need) return 1;
     gjk_answer found;
-    pair_distance(c, i, need, margin, 2.0, &found);
+    pair_distance(c, i, need, margin, 1.0, &found);
     return found.below > need;
 }
 
