@@ -4,9 +4,9 @@
                              [--json F] [--paths F.npz]
 
 FOLDER holds `panda.tar.bz2` and `ur5.tar.bz2`: seven sets of problems by Rice University's Kavraki Lab (Chamzas et
-al., "MotionBenchMaker", RA-L 7(2), 2022), MoveIt's messages as YAML. The frame is the robot's base, the Panda's fingers stand
-at 0.065 m each as in the files, and starts and goals that lie a little beyond the limits are clipped. Of the robot the
-hulls and disabled pairs of the cell count, so that some problems are not valid: these are left out.
+al., "MotionBenchMaker", RA-L 7(2), 2022), MoveIt's messages as YAML. The frame is the robot's base, the
+Panda's fingers stand at 0.065 m each as in the files, and starts and goals that lie a little beyond the limits are
+clipped. Of the robot the hulls and disabled pairs of the cell count, so some problems are not valid and left out.
 
 Times are those of the whole pipeline (checks, planning, retiming, validation), of all valid problems. Every trajectory
 is checked again at 0.005 rad by coal on the hulls alone. --json writes {set: {valid, solved, colliding, median_ms,

@@ -1,10 +1,12 @@
 """How the kernel is compiled: by `setup.py` with ziglang, and by hand with `python -m common.planning.kernel.build`.
 
-Two libraries come of the same source on x86-64: one for every processor, one for those with AVX2 and FMA.
+Two libraries come of the same source on x86-64: one for every processor, one for those with AVX2 and FMA. Nothing is
+imported here but what comes with Python: `setup.py` runs this before anything is installed.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import platform
 import shutil
@@ -13,62 +15,57 @@ import sys
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent
-SOURCE = "kernel.c"
 NAME = "planning_kernel"
-_FLAGS = ("-std=gnu11", "-O3", "-shared", "-fPIC", "-fvisibility=hidden")
-# No -ffast-math: bounds have to hold, and a comparison with a number that is none has to say no.
-_LEVELS = {"": (), "_avx2": ("-mavx2", "-mfma")}
+# No -ffast-math: bounds have to hold, and a comparison with what is no number has to say no.
+_FLAGS = ("-std=gnu11", "-O3", "-s", "-shared", "-fPIC", "-fvisibility=hidden")
+_ZIG = "ziglang"
 
 
-def levels(machine: str = "") -> dict[str, tuple[str, ...]]:
-    """Suffix of each library for a kind of processor, and the compiler's flags for it."""
-    if (machine or platform.machine()).lower() in ("x86_64", "amd64"):
-        return _LEVELS
-    return {"": ()}
+def _levels(zig: bool) -> dict[str, list[str]]:
+    """Suffix of each library, and the flags that say for which processors it is."""
+    machine = platform.machine().lower()
+    if machine in ("x86_64", "amd64"):
+        if zig:  # which compiles for the processor at hand unless told
+            return {"": ["-mcpu=x86_64"], "_avx2": ["-mcpu=x86_64_v3"]}
+        return {"": [], "_avx2": ["-mavx2", "-mfma"]}
+    return {"": ["-mcpu=generic"] if zig and machine in ("aarch64", "arm64") else []}
 
 
 def compilers() -> list[list[str]]:
     """Commands that may compile C here, the preferred one first."""
-    found = []
-    if (own := os.environ.get("CC")):
-        found.append(own.split())
-    try:
-        import ziglang  # type: ignore[import-not-found]  # noqa: F401 - in the build's own environment, or not at all
-    except ImportError:
-        pass
-    else:
-        found.append([sys.executable, "-m", "ziglang", "cc"])
-    return found + [[path] for name in ("cc", "gcc", "clang") if (path := shutil.which(name))]
+    own = [os.environ["CC"].split()] if os.environ.get("CC") else []
+    zig = [[sys.executable, "-m", _ZIG, "cc"]] if importlib.util.find_spec(_ZIG) else []
+    return own + zig + [[path] for name in ("cc", "gcc", "clang") if (path := shutil.which(name))]
 
 
-def build(into: Path, cache: Path | None = None) -> list[Path]:
+def build(into: Path, cache: Path) -> list[Path]:
     """Compile the kernel into a folder; the libraries, or none where no compiler does it.
 
     Args:
         into: a folder that is there.
-        cache: where ziglang may keep what it makes; else in the user's cache.
+        cache: where ziglang may keep what it makes.
     """
-    environment = dict(os.environ)
-    if cache is not None:
-        environment["ZIG_GLOBAL_CACHE_DIR"] = environment["ZIG_LOCAL_CACHE_DIR"] = str(cache)
+    environment = dict(os.environ) | {"ZIG_GLOBAL_CACHE_DIR": str(cache), "ZIG_LOCAL_CACHE_DIR": str(cache)}
     for compiler in compilers():
-        libraries = []
-        for suffix, flags in levels().items():
+        running = []
+        for suffix, flags in _levels(_ZIG in compiler).items():
             target = into / f"{NAME}{suffix}.so"
-            if "ziglang" in compiler and suffix == "" and levels() is _LEVELS:
-                flags = ("-mcpu=x86_64",)  # ziglang compiles for the machine at hand unless told
-            command = [*compiler, *_FLAGS, *flags, "-o", str(target), str(FOLDER / "src" / SOURCE), "-lm"]
-            done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-            if done.returncode != 0:
-                sys.stderr.write(f"{' '.join(command)}\n{done.stderr}")
-                break
-            libraries.append(target)
-        else:
-            return libraries
+            target.unlink(missing_ok=True)  # a process that has it open keeps the old one
+            command = [*compiler, *_FLAGS, *flags, "-o", str(target), str(FOLDER / "src" / "kernel.c"), "-lm"]
+            process = subprocess.Popen(
+                command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+            )
+            running.append((target, process))
+        errors = [process.communicate()[1] for _, process in running]
+        if not any(process.returncode for _, process in running):
+            return [target for target, _ in running]
+        sys.stderr.write(f"{' '.join(compiler)} does not compile the planning kernel:\n{''.join(errors)[:2000]}\n")
+        for target, _ in running:
+            target.unlink(missing_ok=True)
     return []
 
 
 if __name__ == "__main__":
-    built = build(FOLDER)
+    built = build(FOLDER, FOLDER.parents[2] / "build" / "zig")
     sys.stdout.write("".join(f"{path}\n" for path in built) or "nothing was built: no C compiler\n")
     sys.exit(not built)

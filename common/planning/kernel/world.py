@@ -221,7 +221,7 @@ def _joints(model: pin.Model) -> tuple[NDArray[np.int32], Array]:
     if model.nq != model.njoints - 1 or model.nv != model.nq:
         raise NoKernel("the planning kernel takes joints of one degree of freedom with limits")
     data = model.createData()
-    jacobian = np.array(pin.computeJointJacobians(model, data, pin.neutral(model)))
+    jacobian = np.array(pin.computeJointJacobians(model, data, pin.neutral(model))).reshape(6, -1)
     kinds, axes = np.zeros(model.nq, dtype=np.int32), np.zeros((model.nq, 3))
     for joint in range(1, model.njoints):
         column = jacobian[:, model.joints[joint].idx_v]

@@ -1,0 +1,204 @@
+"""The compiled kernel: what it calls free is free for coal, all along edges, and its planner keeps to that."""
+
+import ctypes
+import threading
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from common.planning.collision import CollisionWorld, interpolate
+from common.planning.kernel import library
+from common.planning.kernel.build import build
+from common.planning.kernel.oracle import Oracle, compare, random_geometry
+from common.planning.kernel.planner import find_path
+from common.planning.kernel.world import EXCUSED, KernelWorld, NoKernel
+from common.planning.problem import Cancel
+from common.planning.robot_geometry import RobotGeometry
+from tests.common.planning.planning_scenes import BLOCK, GEOMETRY, HOME, ROBOT, SPREAD, above, cache, held_scene, scene
+from tests.common.planning.ur5_scene import ROBOT as UR5
+
+pytestmark = pytest.mark.skipif(library.library() is None, reason="the planning kernel is not built here")
+
+
+def robot_with(*shapes) -> tuple[pin.Model, pin.GeometryModel]:
+    """A joint that slides along x with a shape on it, and others at points [m]."""
+    model, geometry = pin.Model(), pin.GeometryModel()
+    one = np.ones(1)
+    model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slide", one, one, -one, one)
+    for number, (shape, at) in enumerate(shapes):
+        place = pin.SE3(np.eye(3), np.array(at))
+        geometry.addGeometryObject(pin.GeometryObject(str(number), 0 if number else 1, 0, place, shape))
+        if number:
+            geometry.addCollisionPair(pin.CollisionPair(0, number))
+    return model, geometry
+
+
+@pytest.mark.parametrize(("robot", "seed"), [("panda", 0), ("panda", 1), ("ur5", 0), ("ur5", 1)])
+def test_kernel_agrees_with_coal_on_random_worlds(robot, seed):
+    rng = np.random.default_rng(seed)
+    model, hulls = (ROBOT.model, GEOMETRY) if robot == "panda" else (UR5.model, RobotGeometry(UR5))
+    geometry = random_geometry(model, hulls.geometry, rng, obstacles=4, held=1 + seed)
+    found = compare(model, geometry, rng, states=40, edges=20, samples=30, margin=0.01 * seed)
+    assert found.faults == []
+    assert found.pairs > 1000 and found.free_edges > 0
+    assert found.worst_distance < 1e-6
+
+
+def test_joints_stand_where_pinocchio_puts_them():
+    kernel, data = KernelWorld(ROBOT.model, GEOMETRY.geometry), ROBOT.model.createData()
+    for q in np.random.default_rng(0).uniform(ROBOT.lower, ROBOT.upper, (20, ROBOT.dof)):
+        pin.forwardKinematics(ROBOT.model, data, q)
+        placed = np.array([placement.homogeneous[:3] for placement in list(data.oMi)[1:]])
+        np.testing.assert_allclose(kernel.joint_poses(q), placed, atol=1e-12)
+
+
+@pytest.mark.parametrize("gap", [1e-7, 1e-5, 1e-3])
+def test_edge_that_passes_closely_is_free_and_one_that_grazes_is_not(gap):
+    sphere, wall = coal.Sphere(0.1), coal.Box(0.2, 0.2, 0.2)
+    for sign, free in ((1, True), (-1, False)):
+        model, geometry = robot_with((sphere, (0, 0.2 + sign * gap, 0)), (wall, (0, 0, 0)))
+        kernel = KernelWorld(model, geometry)
+        assert kernel.edge_free(np.array([-1.0]), np.array([1.0])) == free
+
+
+def test_thin_wall_between_the_ends_of_an_edge_is_found():
+    model, geometry = robot_with((coal.Sphere(0.001), (0, 0, 0)), (coal.Box(1e-5, 1, 1), (0.3217, 0, 0)))
+    kernel = KernelWorld(model, geometry)
+    hit, at = kernel.edge_collision(np.array([-1.0]), np.array([1.0]))
+    assert hit == 0
+    assert 2 * at - 1 == pytest.approx(0.3217, abs=1.1e-3)
+
+
+def test_cubic_that_bulges_into_a_wall_is_not_free():
+    model, geometry = robot_with((coal.Sphere(0.1), (0, 0, 0)), (coal.Box(0.2, 1, 1), (0.7, 0, 0)))
+    kernel = KernelWorld(model, geometry)
+    bulge = np.array([[[0.0], [2.0], [-2.0], [0.0]]])  # from 0 to 0, by way of 0.5
+    assert kernel.edge_free(np.zeros(1), np.zeros(1))
+    assert kernel.cubics_collision(bulge)[0] == 0
+    assert kernel.cubics_collision(0.999 * bulge)[0] == -1
+    kernel.set_rules(np.full(1, EXCUSED))
+    assert kernel.cubics_collision(bulge)[0] == -1
+
+
+def test_margin_is_kept_and_pairs_are_excused():
+    model, geometry = robot_with((coal.Sphere(0.1), (0, 0, 0)), (coal.Capsule(0.1, 0.3), (0.25, 0, 0)))
+    kernel, q = KernelWorld(model, geometry), np.zeros(1)
+    for margin, hit in ((0.0, -1), (0.0499, -1), (0.0501, 0), (EXCUSED, -1)):
+        kernel.set_rules(np.full(1, margin))
+        assert kernel.colliding(q) == hit
+
+
+def test_contact_is_excused_while_the_tool_is_on_its_leash():
+    model, geometry = robot_with((coal.Sphere(0.1), (0, 0, 0)), (coal.Box(0.2, 0.2, 0.2), (0.19, 0, 0)))
+    kernel = KernelWorld(model, geometry)
+    start, away, beyond = np.zeros(1), np.array([-0.5]), np.array([0.03])
+    kernel.set_rules(np.zeros(1), np.full(1, EXCUSED), 1, np.zeros(3), np.zeros(3), 0.02)
+    assert kernel.colliding(start) == -1
+    assert kernel.edge_free(start, away)  # out of the contact before the leash ends
+    assert not kernel.edge_free(start, beyond)
+    kernel.set_rules(np.zeros(1), np.full(1, EXCUSED), 1, np.zeros(3), np.zeros(3), 0.005)
+    assert not kernel.edge_free(start, away)
+
+
+def test_first_position_that_collides_is_found_on_a_path():
+    kernel = CollisionWorld(ROBOT, scene(BLOCK), start=HOME, cache=cache()).kernel
+    path = interpolate([HOME, above(0.5, -0.1, 0.2), above(0.5, -0.1, 0.01)], 0.01)
+    colliding = [kernel.colliding(q) >= 0 for q in path]
+    assert any(colliding)
+    assert kernel.first_collision(path)[0] == colliding.index(True)
+    assert kernel.first_collision(path[: colliding.index(True)])[0] == -1
+
+
+def test_world_with_a_held_object_says_the_same_with_and_without_the_kernel(monkeypatch):
+    held = held_scene(scene(SPREAD), "ball_3")
+    fast = CollisionWorld(ROBOT, held, start=HOME, cache=cache())
+    monkeypatch.setattr("common.planning.obstacles.KernelWorld", _not_built)
+    plain = CollisionWorld(ROBOT, held, start=HOME, cache=cache())
+    assert fast.kernel is not None and plain.kernel is None
+    rng = np.random.default_rng(3)
+    for q in rng.uniform(ROBOT.lower, ROBOT.upper, (150, ROBOT.dof)):
+        assert fast.collides(q) == plain.collides(q)
+        edge = (HOME, HOME + 0.3 * (q - HOME))
+        if fast.edge_free(*edge):
+            assert all(not plain.collides(x) for x in interpolate(edge, 0.02))
+
+
+def _not_built(*_):
+    raise NoKernel("not built")
+
+
+def test_paths_are_free_end_where_they_should_and_the_seed_decides_them():
+    world = CollisionWorld(ROBOT, scene(SPREAD), start=HOME, cache=cache())
+    left, right = above(0.45, 0.35, 0.03), above(0.45, 0.12, 0.03)
+    assert not world.edge_free(left, right)
+    oracle = Oracle(world.bank.model, world.bank.geometry)
+    paths = [find_path(world.kernel, left, right[None], seed=seed).waypoints for seed in (1, 1, 2)]
+    for path in paths:
+        np.testing.assert_array_equal(path[[0, -1]], [left, right])
+        assert (path >= ROBOT.lower).all() and (path <= ROBOT.upper).all()
+        assert min(oracle.distances(q).min() for q in interpolate(path, 0.05)) > -1e-6
+    np.testing.assert_array_equal(paths[0], paths[1])
+    assert paths[2].shape != paths[0].shape or (paths[2] != paths[0]).any()
+
+
+def test_search_without_a_way_out_ends_on_time_and_when_it_is_cancelled():
+    model, geometry = robot_with((coal.Sphere(0.1), (0, 0, 0)), (coal.Box(0.1, 1, 1), (0, 0, 0)))
+    kernel = KernelWorld(model, geometry)
+    ends = np.array([-0.9]), np.array([[0.9]])
+    found = find_path(kernel, *ends, seconds=0.05)
+    assert found.waypoints is None and found.error == "timeout"
+    assert found.search_seconds < 5
+    cancel = Cancel()
+    timer = threading.Timer(0.05, cancel.set)
+    timer.start()
+    assert find_path(kernel, *ends, seconds=60, cancel=cancel.word).error == "cancelled"  # the timer's thread runs
+    timer.join()
+    assert find_path(kernel, *ends, nodes=10).error == "no_path"
+
+
+def test_shape_or_joint_that_the_kernel_does_not_know_is_refused():
+    with pytest.raises(NoKernel, match="Cone"):
+        KernelWorld(*robot_with((coal.Cone(0.1, 0.2), (0, 0, 0))))
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "base")
+    with pytest.raises(NoKernel, match="one degree of freedom"):
+        KernelWorld(model, pin.GeometryModel())
+
+
+def test_positions_of_another_length_are_refused():
+    kernel = KernelWorld(ROBOT.model, GEOMETRY.geometry)
+    with pytest.raises(ValueError, match="shape"):
+        kernel.colliding(np.zeros(6))
+    with pytest.raises(ValueError, match="margins"):
+        kernel.set_rules(np.zeros(3))
+
+
+def test_both_libraries_say_the_same(monkeypatch):
+    if not (library.FOLDER / f"{library.NAME}_avx2.so").exists():
+        pytest.skip("one library serves this processor")
+    rng = np.random.default_rng(5)
+    geometry = random_geometry(ROBOT.model, GEOMETRY.geometry, rng)
+    fast = KernelWorld(ROBOT.model, geometry)
+    plain = library._open(library.FOLDER / f"{library.NAME}.so")
+    monkeypatch.setattr("common.planning.kernel.world.library", lambda: plain)
+    slow = KernelWorld(ROBOT.model, geometry)
+    for q in rng.uniform(ROBOT.lower, ROBOT.upper, (50, ROBOT.dof)):
+        np.testing.assert_allclose(fast.distances(q)[0], slow.distances(q)[0], atol=1e-9)
+        assert (fast.colliding(q) < 0) == (slow.colliding(q) < 0)
+
+
+def test_nothing_is_built_without_a_compiler_and_a_library_of_another_version_is_not_used(tmp_path, monkeypatch):
+    monkeypatch.setattr("common.planning.kernel.build.compilers", lambda: [["false"]])
+    assert build(tmp_path, tmp_path) == []
+    assert library._open(tmp_path / "planning_kernel.so") is None
+    monkeypatch.setattr(library, "VERSION", -1)
+    assert library._open(library.FOLDER / f"{library.NAME}.so") is None
+
+
+def test_options_have_the_layout_of_the_source():
+    from common.planning.kernel import planner
+
+    assert ctypes.sizeof(planner._Options) == 7 * 8
+    assert ctypes.sizeof(planner._Report) == 6 * 8
