@@ -37,6 +37,7 @@ def examine(endpoint: str) -> Iterator[Finding]:
 
     yield software.python()
     yield from software.packages()
+    yield software.kernel()
     yield from configuration.robots()
     yield from configuration.cells()
     yield network.router(endpoint)

@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 from cli.doctor.finding import Finding, fail, ok, warn
+from common.planning.kernel.library import library_path
 
 INSTALL = "pip install -c constraints.txt -e ."
 CONSTRAINTS = Path(__file__).resolve().parents[2] / "constraints.txt"
@@ -46,6 +47,14 @@ def packages() -> Iterator[Finding]:
         yield warn(f"packages other than those tested: {', '.join(other)}", INSTALL)
     else:
         yield ok(f"packages: {', '.join(found)}")
+
+
+def kernel() -> Finding:
+    """Whether the compiled planning kernel is there."""
+    path = library_path()
+    if path is None:
+        return warn("the planning kernel is not compiled: planning takes many times longer", INSTALL)
+    return ok(f"planning kernel: {path.name}")
 
 
 def constraints(path: Path | None = None) -> dict[str, str]:

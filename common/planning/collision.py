@@ -16,6 +16,7 @@ from common.errors import UnknownName
 from common.messages import CollisionObject, PlanningScene, Pose
 from common.planning.kernel.world import EXCUSED, KernelWorld
 from common.planning.obstacles import MARGINS, ObstacleBank, ObstacleCache, Rules, Solid
+from common.planning.path import SmoothPath
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, pose_to_matrix
@@ -299,6 +300,16 @@ class CollisionWorld:
             if self.collides(q):
                 return Hit(m, q.copy(), self.colliding_pair(q) or ("unknown", "unknown"))
         return None
+
+    def bends_free(self, path: SmoothPath, step: float) -> bool:
+        """Whether the parabolas of a path are free whose straight lines are; looked for in steps [rad], or proved."""
+        bent = (path.d0 != path.d1).any(axis=1)
+        if self._kernel is None:
+            return self.first_collision(path.positions(step)) is None
+        lengths = path.lengths[bent, None]
+        d0, d1 = path.d0[bent] * lengths, path.d1[bent] * lengths
+        cubics = np.stack([path.starts[bent], d0, 0.5 * (d1 - d0), np.zeros_like(d0)], axis=1)
+        return self._kernel.cubics_collision(cubics)[0] < 0
 
     def edge_collision(self, a: Array, b: Array, step: float = 0.005) -> Hit | None:
         """The first collision on the straight line from a to b (dof,) [rad], looked for in steps [rad]."""

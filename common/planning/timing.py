@@ -62,7 +62,7 @@ def free_blends(waypoints: Array, world: CollisionWorld, blend: float, step: flo
         blends[i] = min(blend, half)
         while blends[i] > 0:
             corner = blended_path(np.array([a, b, c]), np.array([0.0, blends[i], 0.0]))
-            if len(corner) > 1 or world.first_collision(corner[0].positions(step)) is None:
+            if len(corner) > 1 or world.bends_free(corner[0], step):
                 break
             blends[i] = blends[i] / 2 if blends[i] / 2 >= _SMALLEST_BLEND else 0.0
     return blended_path(waypoints, blends)

@@ -103,6 +103,13 @@ def test_project_that_is_not_installed_is_a_warning(monkeypatch: pytest.MonkeyPa
     not_well(finding, "not installed", "pip install")
 
 
+def test_planning_kernel_that_is_not_compiled_is_named(monkeypatch):
+    monkeypatch.setattr(software, "library_path", lambda: software.Path("planning_kernel_avx2.so"))
+    assert software.kernel().level == "ok" and "planning_kernel_avx2.so" in software.kernel().what
+    monkeypatch.setattr(software, "library_path", lambda: None)
+    not_well(software.kernel(), software.INSTALL)
+
+
 # --- configuration ----------------------------------------------------------------------------------------------
 
 

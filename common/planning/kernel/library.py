@@ -47,6 +47,12 @@ def _open(path: Path) -> ctypes.CDLL | None:
     return found if found.zk_version() == VERSION else None
 
 
+def library_path() -> Path | None:
+    """The file that `library` loads."""
+    found = library()
+    return None if found is None else Path(found._name)
+
+
 @cache
 def library() -> ctypes.CDLL | None:
     """The library, or None where it was not built, cannot be loaded or is of another version."""
