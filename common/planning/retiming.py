@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from common.messages.robot import MOST_POINTS, MOST_SECONDS
+from common.planning.kernel.speeds import fastest
 from common.planning.path import SmoothPath
 from common.sources import monotonic
 
@@ -152,6 +153,13 @@ def _profile(
     up, down = (np.where(flat, np.inf, np.concatenate([limit, limit]) / safe) for limit in (limit_a, limit_b))
     B = np.where(flat, 0.0, sign * C / safe)  # -down - B x <= u <= up - B x
     most = _highest_x(grid, limit_v, np.minimum(limit_a, limit_b), bends, speed)
+    count, found = len(lengths), fastest(lengths, up, down, B, np.array(most))
+    if isinstance(found, tuple):
+        return found
+    if found is not None:
+        if found < count:
+            raise RetimingFailed(f"no feasible speed at grid point {found} of {count}")
+        raise RetimingFailed(f"the path cannot be left at grid point {found - count} of {count}")
     highest = _backward(most, lengths, down, B)
     return _forward(highest, lengths, up, B)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from common.planning.kernel.build import FOLDER, NAME
 
-VERSION = 5
+VERSION = 6
 
 _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_version": (c_int, []),
@@ -30,6 +30,7 @@ _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_distances": (None, [c_void_p] * 4),
     "zk_forward": (None, [c_void_p] * 3),
     "zk_plan": (c_int, [c_void_p, c_void_p, c_int, c_void_p, c_void_p, c_void_p, c_int, c_void_p, c_void_p]),
+    "zk_speeds": (c_int, [c_int, c_int] + [c_void_p] * 7),
     "zk_counters": (None, [c_void_p] * 2),
 }
 

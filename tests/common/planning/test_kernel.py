@@ -14,7 +14,9 @@ from common.planning.kernel.build import build
 from common.planning.kernel.oracle import Oracle, compare, random_geometry
 from common.planning.kernel.planner import find_path
 from common.planning.kernel.world import EXCUSED, KernelWorld, NoKernel
+from common.planning.path import blended_path
 from common.planning.problem import Cancel
+from common.planning.retiming import parametrise
 from common.planning.robot_geometry import RobotGeometry
 from tests.common.planning.planning_scenes import BLOCK, GEOMETRY, HOME, ROBOT, SPREAD, above, cache, held_scene, scene
 from tests.common.planning.ur5_scene import ROBOT as UR5
@@ -202,3 +204,13 @@ def test_options_have_the_layout_of_the_source():
 
     assert ctypes.sizeof(planner._Options) == 7 * 8
     assert ctypes.sizeof(planner._Report) == 6 * 8
+
+
+def test_paths_are_timed_the_same_with_and_without_the_kernel(monkeypatch):
+    rng = np.random.default_rng(2)
+    path = blended_path(rng.uniform(-1, 1, (6, 7)), np.full(6, 0.2))[0]
+    fast = parametrise(path, np.ones(7), np.full(7, 3.0))
+    monkeypatch.setattr("common.planning.retiming.fastest", lambda *_: None)
+    plain = parametrise(path, np.ones(7), np.full(7, 3.0))
+    for one, other in zip(vars(fast).values(), vars(plain).values(), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)

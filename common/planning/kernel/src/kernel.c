@@ -1,6 +1,7 @@
 /* What Python calls. No function keeps a pointer of the caller; a world may be read by several threads at once when each
    has a scratch of its own, and changed by one while no other uses it. */
 #include "planner.h"
+#include "speeds.h"
 
 #if defined(_WIN32)
 #define API __declspec(dllexport)
@@ -8,7 +9,7 @@
 #define API __attribute__((visibility("default")))
 #endif
 
-#define VERSION 5
+#define VERSION 6
 
 API int zk_version(void) { return VERSION; }
 
@@ -385,4 +386,10 @@ API int zk_plan(scratch *c, const double *start, int goals, const double *goal, 
     memset(report, 0, sizeof *report);
     run r = {c, options, cancel, now() + options->seconds};
     return plan(&r, start, goals, goal, room, path, report);
+}
+
+/* See speeds.h. */
+API int zk_speeds(int count, int rows, const double *lengths, const double *up, const double *down, const double *slope,
+                  double *highest, double *x, double *u) {
+    return speeds(count, rows, lengths, up, down, slope, highest, x, u);
 }
