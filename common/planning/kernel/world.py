@@ -27,12 +27,12 @@ class NoKernel(ZencellError):
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape as the kernel wants it: kind, dimensions (3,), vertices (N, 3) of a hull and a ball (4,) about them."""
+    """A shape as the kernel wants it: kind, dimensions (3,), vertices (N, 3) of a hull and a sphere (4,) about them."""
 
     kind: int
     size: Array
     points: Array
-    ball: Array
+    sphere: Array
 
     @classmethod
     def of(cls, shape: coal.CollisionGeometry) -> Shape:
@@ -51,7 +51,7 @@ class Shape:
             return cls(kind, np.array([shape.radius, 2 * shape.halfLength, 0]), none, nothing)
         if isinstance(shape, coal.Convex):
             points = np.array([shape.point(i) for i in range(shape.num_points)], dtype=float)
-            return cls(_HULL, np.zeros(3), points, _ball(points))
+            return cls(_HULL, np.zeros(3), points, _sphere(points))
         raise NoKernel(f"the planning kernel takes no {type(shape).__name__}")
 
 
@@ -109,7 +109,7 @@ class KernelWorld:
         placement = np.ascontiguousarray(item.placement.homogeneous[:3])
         index = self.library.zk_add(
             self._world, shape.kind, item.parentJoint, address(shape.size), address(shape.points), len(shape.points),
-            address(shape.ball), address(placement),
+            address(shape.sphere), address(placement),
         )
         if index < 0:
             raise NoKernel(f"{item.name}: the planning kernel takes no such shape")
@@ -233,11 +233,11 @@ def _joints(model: pin.Model) -> tuple[NDArray[np.int32], Array]:
     return kinds, axes
 
 
-def _ball(points: Array) -> Array:
-    """(4,) middle and radius [m] of a small ball about points (N, 3): Ritter's, then moved towards the farthest."""
+def _sphere(points: Array) -> Array:
+    """(4,) middle and radius [m] of a small sphere about points (N, 3): Ritter's, then moved towards the farthest."""
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     best, least = middle, float(np.linalg.norm(points - middle, axis=1).max())
-    for i in range(1, 200):  # Badoiu and Clarkson, "Smaller core-sets for balls" (2003)
+    for i in range(1, 200):  # Badoiu and Clarkson, "Smaller core-sets for spheres" (2003)
         away = np.linalg.norm(points - middle, axis=1)
         if away.max() < least:
             best, least = middle, float(away.max())

@@ -19,7 +19,7 @@
 #define SHORTEST_MOTION 1e-6 /* [m] no piece is cut in which no point moves farther: what is not proved then is not free */
 
 #ifndef KEEP
-#define KEEP 0.5 /* a group's ball that proves less of a span than this gives way to its pairs */
+#define KEEP 0.5 /* a group's sphere that proves less of a span than this gives way to its pairs */
 #endif
 #ifndef SHARE
 #define SHARE 0.9 /* of the distance that a plane shows; GJK need not look for a better one */
@@ -108,12 +108,12 @@ static inline void relative_twist(const scratch *c, int tip, int above, double *
     sub3(c->slide[tip], c->slide[above], slide);
 }
 
-/* The interval about t0 in which a group's balls keep its margin; 0 where they do not at t0. After forward, twists,
+/* The interval about t0 in which a group's spheres keep its margin; 0 where they do not at t0. After forward, twists,
    middles. */
 static int group_proved(scratch *c, const curve *e, const group *g, double margin, double t0, double *since,
                         double *until) {
     const world *w = c->w;
-    const pair *p = &g->balls;
+    const pair *p = &g->spheres;
     double n[3], s0 = group_apart(c, g, n) - margin - TOUCHING;
     c->checks++;
     *since = *until = t0;
@@ -132,7 +132,7 @@ static int group_proved(scratch *c, const curve *e, const group *g, double margi
     return 1;
 }
 
-/* M and K of a pair's balls and of its shapes on a curve. */
+/* M and K of a pair's spheres and of its shapes on a curve. */
 static void pair_bounds(scratch *c, const curve *e, int i) {
     const world *w = c->w;
     const pair *p = &w->pair[i];
@@ -148,7 +148,7 @@ static void pair_bounds(scratch *c, const curve *e, int i) {
     out[2] += M, out[3] += K;
 }
 
-/* The same of a pair, first by the ball of its first shape and then by the shapes. */
+/* The same of a pair, first by the sphere of its first shape and then by the shapes. */
 static int proved(scratch *c, int i, double margin, double t0, double from, double to, double *since, double *until) {
     const world *w = c->w;
     const pair *p = &w->pair[i];
@@ -341,7 +341,7 @@ static int curve_free(scratch *c, const curve *e) {
     return 1;
 }
 
-/* Whether all positions are free that differ from q by at most `away` (dof,): balls and planes hold the pairs apart by
+/* Whether all positions are free that differ from q by at most `away` (dof,): spheres and planes hold the pairs apart by
    more than any of their points moves. */
 static int around_free(scratch *c, const double *q, const double *away) {
     const world *w = c->w;
@@ -360,9 +360,9 @@ static int around_free(scratch *c, const double *q, const double *away) {
         double most = inside > 0 ? G->near : inside < 0 ? G->far : fmax(G->near, G->far);
         if (most <= EXCUSED) continue;
         double Mb = 0, Kb = 0;
-        bounds(w, &e, G->balls.a, G->balls.common, w->body[G->balls.a].reach, &M, &K);
-        if (G->moving && !G->balls.fixed)
-            bounds(w, &e, G->balls.b, G->balls.common, w->body[G->balls.b].reach, &Mb, &Kb);
+        bounds(w, &e, G->spheres.a, G->spheres.common, w->body[G->spheres.a].reach, &M, &K);
+        if (G->moving && !G->spheres.fixed)
+            bounds(w, &e, G->spheres.b, G->spheres.common, w->body[G->spheres.b].reach, &Mb, &Kb);
         c->checks++;
         if (group_apart(c, G, n) > most + TOUCHING + M + Mb) continue;
         for (int k = 0; k < G->count; k++) {

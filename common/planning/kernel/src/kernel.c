@@ -108,8 +108,8 @@ static void place(world *w, int i, const double *placement) {
 }
 
 /* Adds a shape to a joint's body (0: an obstacle). size: box full sides; cylinder, capsule radius and length; sphere
-   radius. points (count, 3) of a hull. ball: middle (3) and radius of a ball about a hull. Returns its index or -1. */
-API int zk_add(world *w, int kind, int jointed, const double *size, const double *points, int count, const double *ball,
+   radius. points (count, 3) of a hull. sphere: middle (3) and radius of a sphere about a hull. Returns its index or -1. */
+API int zk_add(world *w, int kind, int jointed, const double *size, const double *points, int count, const double *sphere,
                const double *placement) {
     if (jointed < 0 || jointed >= w->joints || kind < SPHERE || kind > HULL || (kind == HULL && count < 1)) return -1;
     if (w->shapes == w->room) {
@@ -129,19 +129,19 @@ API int zk_add(world *w, int kind, int jointed, const double *size, const double
     s->kind = kind, s->joint = jointed;
     switch (kind) {
     case SPHERE:
-        s->radius = s->ball = size[0];
+        s->radius = s->sphere = size[0];
         break;
     case BOX:
         for (int k = 0; k < 3; k++) s->size[k] = 0.5 * size[k];
-        s->ball = norm3(s->size);
+        s->sphere = norm3(s->size);
         break;
     case CYLINDER:
         s->size[0] = size[0], s->size[1] = 0.5 * size[1];
-        s->ball = sqrt(s->size[0] * s->size[0] + s->size[1] * s->size[1]);
+        s->sphere = sqrt(s->size[0] * s->size[0] + s->size[1] * s->size[1]);
         break;
     case CAPSULE:
         s->size[0] = s->radius = size[0], s->size[1] = 0.5 * size[1];
-        s->ball = s->size[0] + s->size[1];
+        s->sphere = s->size[0] + s->size[1];
         break;
     default:
         s->blocks = (count + 3) / 4;
@@ -152,39 +152,39 @@ API int zk_add(world *w, int kind, int jointed, const double *size, const double
             const double *p = points + 3 * (k < count ? k : 0);
             ((double *)s->x)[k] = p[0], ((double *)s->y)[k] = p[1], ((double *)s->z)[k] = p[2];
         }
-        memcpy(s->middle, ball, sizeof s->middle);
-        s->ball = ball[3];
+        memcpy(s->middle, sphere, sizeof s->middle);
+        s->sphere = sphere[3];
     }
     place(w, w->shapes, placement);
     return w->shapes++;
 }
 
-/* A ball about all shapes of each joint's body. */
+/* A sphere about all shapes of each joint's body. */
 static void enclose(world *w) {
     for (int j = 0; j < w->joints; j++) {
         body *B = &w->body[j];
-        B->ball = -1;
+        B->sphere = -1;
         for (int i = 0; i < w->shapes; i++) {
             const shape *s = &w->shape[i];
             double at[3], to[3];
             if (s->joint != j) continue;
             act(&s->placed, s->middle, at);
-            if (B->ball < 0) {
+            if (B->sphere < 0) {
                 memcpy(B->middle, at, sizeof at);
-                B->ball = s->ball;
+                B->sphere = s->sphere;
                 continue;
             }
             sub3(at, B->middle, to);
             double far = norm3(to);
-            if (far + s->ball <= B->ball) continue;
-            if (far + B->ball <= s->ball) {
+            if (far + s->sphere <= B->sphere) continue;
+            if (far + B->sphere <= s->sphere) {
                 memcpy(B->middle, at, sizeof at);
-                B->ball = s->ball;
+                B->sphere = s->sphere;
                 continue;
             }
-            double ball = 0.5 * (far + s->ball + B->ball) * (1 + 1e-12), way = (ball - B->ball) / far;
+            double sphere = 0.5 * (far + s->sphere + B->sphere) * (1 + 1e-12), way = (sphere - B->sphere) / far;
             for (int k = 0; k < 3; k++) B->middle[k] += way * to[k];
-            B->ball = ball * (1 + 1e-12);
+            B->sphere = sphere * (1 + 1e-12);
         }
         levers_of(w, j, B->middle, 0.0, B->reach);
     }
@@ -223,14 +223,14 @@ API int zk_pairs(world *w, int count, const int *first, const int *second) {
         int a = w->shape[w->pair[i].a].joint, b = w->shape[w->pair[i].b].joint, obstacle = w->pair[i].b;
         int g = 0, found = 0; /* what does not move has an obstacle's group, unless it is the robot's base */
         for (; g < w->groups && !found; g++)
-            found = w->group[g].balls.a == a && (b ? w->group[g].moving && w->group[g].balls.b == b
-                                                   : !w->group[g].moving && w->group[g].balls.b == obstacle);
+            found = w->group[g].spheres.a == a && (b ? w->group[g].moving && w->group[g].spheres.b == b
+                                                   : !w->group[g].moving && w->group[g].spheres.b == obstacle);
         if (found) {
             g--;
         } else {
             group *G = &w->group[w->groups++];
             *G = (group){related(w, a, b, a, b), b != 0, 0, 0, 0.0, 0.0};
-            if (!b) G->balls.b = obstacle;
+            if (!b) G->spheres.b = obstacle;
         }
         owner[i] = g, w->group[g].count++;
     }

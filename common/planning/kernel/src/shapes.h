@@ -22,8 +22,8 @@ typedef struct {
     int blocks;       /* of four vertices of a hull */
     v4 *x, *y, *z;    /* the last block repeats a vertex */
     pose placed;      /* in the frame of the joint */
-    double middle[3]; /* of a ball about the shape, in its own frame */
-    double ball;      /* radius of that ball, rounding included */
+    double middle[3]; /* of a sphere about the shape, in its own frame */
+    double sphere;      /* radius of that sphere, rounding included */
 } shape;
 
 #define select4(mask, yes, no) ((v4)(((mask) & (i4)(yes)) | (~(mask) & (i4)(no))))
@@ -83,7 +83,7 @@ static inline void support(const shape *s, const double *d, double *out) {
 }
 
 /* Distance [m] of a point p outside the shape from it, and the unit direction to it, both in the shape's own frame;
-   0 within. Of a hull, of the ball about it. */
+   0 within. Of a hull, of the sphere about it. */
 static inline double point_distance(const shape *s, const double *p, double *n) {
     double to[3] = {0, 0, 0}, less = s->radius;
     switch (s->kind) {
@@ -106,7 +106,7 @@ static inline double point_distance(const shape *s, const double *p, double *n) 
     }
     default:
         sub3(s->middle, p, to);
-        less = s->ball;
+        less = s->sphere;
     }
     double far = norm3(to);
     if (far <= less || far < 1e-12) {

@@ -25,17 +25,17 @@ typedef struct {
     int fixed;  /* whether b rests in the frame of `common` */
 } pair;
 
-/* Pairs of the shapes of one joint's body with one obstacle, or with the shapes of another body: a ball about the body
+/* Pairs of the shapes of one joint's body with one obstacle, or with the shapes of another body: a sphere about the body
    settles most of them at once. */
 typedef struct {
-    pair balls;        /* a: the body; b: the obstacle's shape, or a body where `moving` */
+    pair spheres;        /* a: the body; b: the obstacle's shape, or a body where `moving` */
     int moving;
     int first, count;  /* of `member` */
     double far, near;  /* largest margin of its pairs */
 } group;
 
 typedef struct {
-    double middle[3], ball;        /* in the frame of the joint */
+    double middle[3], sphere;        /* in the frame of the joint */
     double reach[MOST_JOINTS];     /* levers of the middle */
 } body;
 
@@ -45,7 +45,7 @@ typedef struct {
     double lower[MOST_JOINTS], upper[MOST_JOINTS];
     shape *shape;
     double (*lever)[MOST_JOINTS]; /* of each shape about each joint [m]: as far from the axis as it ever gets */
-    double (*reach)[MOST_JOINTS]; /* the same of the middle of its ball */
+    double (*reach)[MOST_JOINTS]; /* the same of the middle of its sphere */
     pair *pair;
     group *group;
     int groups, *member;
@@ -68,7 +68,7 @@ typedef struct {
     double (*axis)[3]; /* direction that held a pair apart the last time, frame of b */
     int hot[HOT];      /* pairs that touched last, the last one first */
     double (*body_middle)[3];
-    double (*bound)[4]; /* of each pair on a curve: M and K of the ball, M and K of the shape */
+    double (*bound)[4]; /* of each pair on a curve: M and K of the sphere, M and K of the shape */
     /* edges */
     int *list, list_room;
     struct span *span;
@@ -81,7 +81,7 @@ typedef struct {
 
 static double axis_distance(const double *p) { return sqrt(p[0] * p[0] + p[1] * p[1]); }
 
-/* Levers of a ball of radius r about a point of a joint's frame: for every joint above, the farthest that any of its
+/* Levers of a sphere of radius r about a point of a joint's frame: for every joint above, the farthest that any of its
    points can be from the axis, whatever the positions of the joints between. */
 static void levers_of(const world *w, int j, const double *at, double r, double *lever) {
     memset(lever, 0, sizeof(double) * MOST_JOINTS);
@@ -99,12 +99,12 @@ static void levers_of(const world *w, int j, const double *at, double r, double 
     }
 }
 
-/* The hull's own farthest point from the axis of the joint that carries it; for other shapes that of their ball. */
+/* The hull's own farthest point from the axis of the joint that carries it; for other shapes that of their sphere. */
 static void measure(world *w, int i) {
     shape *s = &w->shape[i];
     double at[3];
     act(&s->placed, s->middle, at);
-    levers_of(w, s->joint, at, s->ball, w->lever[i]);
+    levers_of(w, s->joint, at, s->sphere, w->lever[i]);
     levers_of(w, s->joint, at, 0.0, w->reach[i]);
     if (s->joint && s->kind == HULL) {
         double beyond = 0, most = 0;
@@ -175,7 +175,7 @@ static inline const pose *shape_pose(scratch *c, int i) {
 static inline void middles(scratch *c) {
     const world *w = c->w;
     for (int j = 1; j < w->joints; j++)
-        if (w->body[j].ball >= 0) act(&c->T[j], w->body[j].middle, c->body_middle[j]);
+        if (w->body[j].sphere >= 0) act(&c->T[j], w->body[j].middle, c->body_middle[j]);
     for (int i = 0; i < w->shapes; i++)
         if (w->shape[i].joint) {
             double at[3];
@@ -184,8 +184,8 @@ static inline void middles(scratch *c) {
         }
 }
 
-/* Distance [m] of a ball from a ball; n: unit, from the first to the second. */
-static inline double balls_apart(const double *a, double ra, const double *b, double rb, double *n) {
+/* Distance [m] of a sphere from a sphere; n: unit, from the first to the second. */
+static inline double spheres_apart(const double *a, double ra, const double *b, double rb, double *n) {
     sub3(b, a, n);
     double far = norm3(n);
     if (far < 1e-12) {
@@ -196,32 +196,32 @@ static inline double balls_apart(const double *a, double ra, const double *b, do
     return far - ra - rb;
 }
 
-/* Distance [m] of a ball (world) from a shape, at most the true one; n: unit, world, from the ball to the shape. */
-static inline double ball_apart(scratch *c, const double *middle, double ball, int b, double *n) {
+/* Distance [m] of a sphere (world) from a shape, at most the true one; n: unit, world, from the sphere to the shape. */
+static inline double sphere_apart(scratch *c, const double *middle, double sphere, int b, double *n) {
     const shape *B = &c->w->shape[b];
-    if (B->kind == HULL || B->kind == SPHERE) return balls_apart(middle, ball, c->middle[b], B->ball, n);
+    if (B->kind == HULL || B->kind == SPHERE) return spheres_apart(middle, sphere, c->middle[b], B->sphere, n);
     const pose *T = shape_pose(c, b);
     double d[3], at[3], m[3];
     sub3(middle, T->p, d);
     unrotate(T->R, d, at);
     double far = point_distance(B, at, m);
     rotate(T->R, m, n);
-    return far - ball;
+    return far - sphere;
 }
 
-/* The same of the ball about the first shape of a pair. What moves itself counts with its ball, too, so that its turning
+/* The same of the sphere about the first shape of a pair. What moves itself counts with its sphere, too, so that its turning
    is of no account. */
 static inline double pair_apart(scratch *c, const pair *p, double *n) {
     const world *w = c->w;
-    if (!p->fixed) return balls_apart(c->middle[p->a], w->shape[p->a].ball, c->middle[p->b], w->shape[p->b].ball, n);
-    return ball_apart(c, c->middle[p->a], w->shape[p->a].ball, p->b, n);
+    if (!p->fixed) return spheres_apart(c->middle[p->a], w->shape[p->a].sphere, c->middle[p->b], w->shape[p->b].sphere, n);
+    return sphere_apart(c, c->middle[p->a], w->shape[p->a].sphere, p->b, n);
 }
 
 static inline double group_apart(scratch *c, const group *g, double *n) {
-    const body *A = &c->w->body[g->balls.a];
-    const double *middle = c->body_middle[g->balls.a];
-    if (!g->moving) return ball_apart(c, middle, A->ball, g->balls.b, n);
-    return balls_apart(middle, A->ball, c->body_middle[g->balls.b], c->w->body[g->balls.b].ball, n);
+    const body *A = &c->w->body[g->spheres.a];
+    const double *middle = c->body_middle[g->spheres.a];
+    if (!g->moving) return sphere_apart(c, middle, A->sphere, g->spheres.b, n);
+    return spheres_apart(middle, A->sphere, c->body_middle[g->spheres.b], c->w->body[g->spheres.b].sphere, n);
 }
 
 /* Bounds on the distance of a pair, stopping as `gjk` does; begins with the direction that served last. */
