@@ -8,7 +8,10 @@ STAMP := $(VENV)/.up-to-date
 
 setup: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt
+# What the compiled planning kernel is made of: it is compiled anew when that changes.
+KERNEL := setup.py common/planning/kernel/build.py $(wildcard common/planning/kernel/src/*)
+
+$(STAMP): pyproject.toml constraints.txt $(KERNEL)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "zencell needs Python 3.11 or newer: make PYTHON=python3.11 ...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
