@@ -48,6 +48,58 @@ def test_kernel_agrees_with_coal_on_random_worlds(robot, seed):
     assert found.worst_distance < 1e-6
 
 
+def least_distance(kernel: KernelWorld, cubic: np.ndarray) -> float:
+    """The least distance of all pairs along a curve [m], to about 1e-7."""
+
+    def at(t: float) -> float:
+        return float(kernel.distances(t ** np.arange(4) @ cubic)[0].min())
+
+    times = np.linspace(0, 1, 1001)
+    found = np.array([at(t) for t in times])
+    least = float(found.min())
+    for i in np.argsort(found)[:3]:
+        low, high = times[max(0, i - 1)], times[min(1000, i + 1)]
+        for _ in range(30):
+            one, other = low + 0.382 * (high - low), low + 0.618 * (high - low)
+            low, high = (low, other) if at(one) < at(other) else (one, high)
+        least = min(least, at(low))
+    return least
+
+
+def beads() -> pin.GeometryModel:
+    """One or two spheres on each joint of the arm: here the spheres about bodies and shapes are the shapes."""
+    geometry = pin.GeometryModel()
+    for joint in range(1, ROBOT.model.njoints):
+        for side in (-0.1, 0.1)[: 1 + joint % 2]:
+            place = pin.SE3(np.eye(3), np.array([side, 0.0, 0.1]))
+            geometry.addGeometryObject(pin.GeometryObject(f"bead_{joint}_{side}", joint, 0, place, coal.Sphere(0.04)))
+    for one in range(geometry.ngeoms - 3):
+        geometry.addCollisionPair(pin.CollisionPair(one, geometry.ngeoms - 1))
+    return geometry
+
+
+@pytest.mark.parametrize("robot", ["hulls", "beads"])
+@pytest.mark.parametrize("bent", [False, True])
+def test_margin_up_to_which_an_edge_is_proved_is_the_least_distance_along_it(bent, robot):
+    rng = np.random.default_rng(6)
+    compared, shapes = 0, GEOMETRY.geometry if robot == "hulls" else beads()
+    while compared < 4:
+        kernel = KernelWorld(ROBOT.model, random_geometry(ROBOT.model, shapes, rng, obstacles=3, held=robot == "hulls"))
+        ends = rng.uniform(ROBOT.lower, ROBOT.upper, (2, ROBOT.dof))
+        span = 0.5 * (ends[1] - ends[0])
+        bend, twist = rng.normal(size=(2, ROBOT.dof)) * (0.5 if bent else 0.0)
+        cubic = np.array([ends[0], span - bend - twist, bend, twist])
+        if kernel.cubics_collision(cubic[None])[0] >= 0:
+            continue
+        least, low, high = least_distance(kernel, cubic), 0.0, 1.0
+        while high - low > 1e-7:
+            middle = 0.5 * (low + high)
+            kernel.set_rules(np.full(kernel.pair_count, middle))
+            low, high = (middle, high) if kernel.cubics_collision(cubic[None])[0] < 0 else (low, middle)
+        assert least - 1e-5 < low < least + 1e-6
+        compared += 1
+
+
 def test_joints_stand_where_pinocchio_puts_them():
     kernel, data = KernelWorld(ROBOT.model, GEOMETRY.geometry), ROBOT.model.createData()
     for q in np.random.default_rng(0).uniform(ROBOT.lower, ROBOT.upper, (20, ROBOT.dof)):
