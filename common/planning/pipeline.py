@@ -26,6 +26,7 @@ from common.sources import monotonic
 Array = NDArray[np.float64]
 
 CHECKS = "request_checks"
+FINISHING = 0.1  # of the time for planning, on top of it: for timing and checking a path that was found in time
 
 
 class PlanningPipeline:
@@ -86,7 +87,7 @@ class PlanningPipeline:
             result = self._ask(plan, problem, options, flag)
             trajectory = None
             if not result.error:
-                trajectory, result = self._finish(problem, result)
+                trajectory, result = self._finish(problem, result, flag)
             if result.error != NOT_APPLICABLE:
                 attempts += _recorded(name, result, monotonic() - since)
             if trajectory is not None:
@@ -155,6 +156,7 @@ class PlanningPipeline:
     ) -> Problem:
         robot, motion = self.robot, self._motion
         acceleration = request.acceleration_scaling or motion.acceleration_scaling
+        budget = request.planning_time or motion.planning_time
         return Problem(
             robot=robot,
             world=world,
@@ -165,7 +167,8 @@ class PlanningPipeline:
             acceleration=robot.acceleration * acceleration,
             jerk=robot.jerk * acceleration,
             attempts=request.planning_attempts or motion.planning_attempts,
-            deadline=began + (request.planning_time or motion.planning_time),
+            deadline=began + budget,
+            latest=began + (1 + FINISHING) * budget,
             rng=np.random.default_rng(self._seed if request.seed is None else abs(request.seed)),
         )
 
@@ -178,11 +181,13 @@ class PlanningPipeline:
         except TooLong as error:
             return Result(error=error.code, message=str(error))
 
-    def _finish(self, problem: Problem, result: Result) -> tuple[TimedPath | None, Result]:
+    def _finish(self, problem: Problem, result: Result, flag: Cancel) -> tuple[TimedPath | None, Result]:
         """The timed and validated trajectory and the result, or None and the result with what is wrong."""
         wrong = result
         try:
             for trajectory in self._timings(problem, result):
+                if flag.is_set:
+                    return None, replace(result, error="cancelled", message="planning was ended while a path was timed")
                 require_tellable(trajectory)
                 fault = self._fault(problem, trajectory)
                 if fault is None:

@@ -82,7 +82,8 @@ class Problem:
         straight: only a straight line of the TCP will do.
         velocity, acceleration, jerk: scaled limits (dof,).
         attempts: how many tries a sampling planner has.
-        deadline: on the monotonic clock of common.sources [s].
+        deadline: of the search; latest: when a path that was found in time is timed and checked. Both are on the
+            monotonic clock of common.sources [s].
     """
 
     robot: RobotModel
@@ -95,6 +96,7 @@ class Problem:
     jerk: Array
     attempts: int
     deadline: float
+    latest: float
     rng: np.random.Generator
 
     @property

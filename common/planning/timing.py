@@ -18,7 +18,6 @@ from common.planning.retiming import RetimingFailed, TimedPath, join, parametris
 Array = NDArray[np.float64]
 
 LIMIT_SHARE = 0.98  # of the limits: between two states the controller's cubic may exceed them a little
-FINISHING = 1.0  # [s] after the deadline of a plan, for timing and checking a path that was found in time
 # [rad] taken from both edges at a corner, where that is free. A blend that passes within a hair of something may be
 # found free here and not by validation, which looks at other positions: then smaller ones are tried, in the end none.
 BLENDS = (0.25, 0.06, 0.0)
@@ -42,7 +41,7 @@ def retime(problem: Problem, result: Result, blend: float = BLENDS[0]) -> TimedP
         still = np.zeros((2, problem.robot.dof))
         return TimedPath(np.array([0.0, 0.01]), np.array([waypoints[0], waypoints[0]]), still, still)
     velocity, acceleration = LIMIT_SHARE * problem.velocity, LIMIT_SHARE * problem.acceleration
-    deadline = problem.deadline + FINISHING
+    deadline = problem.latest
     if result.way is not None:
         if not np.abs(np.diff(result.waypoints, axis=0)).max(axis=1).all():
             raise RetimingFailed("two waypoints are one: the steps are finer than joint positions are solved")
@@ -122,7 +121,7 @@ def follow_in_time(problem: Problem, path: ToolWaypoints, limits: ToolLimits) ->
         np.concatenate([velocity, tool_v]),
         np.concatenate([acceleration, tool_a]),
         braking=np.concatenate([acceleration, tool_b]),
-        deadline=problem.deadline + FINISHING,
+        deadline=problem.latest,
     )
     dof = robot.dof
     return TimedPath(timed.times, timed.positions[:, :dof], timed.velocities[:, :dof], timed.accelerations[:, :dof])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -104,14 +104,16 @@ def _cost(path: Array, velocity: Array) -> float:
 class _EdgeValidator(ob.MotionValidator):  # type: ignore[misc]
     """Asks the collision world about whole edges, which it can prove free with few checks."""
 
-    def __init__(self, si: Any, world: CollisionWorld, dof: int) -> None:
+    def __init__(self, si: Any, world: CollisionWorld, dof: int, ended: Callable[[], bool]) -> None:
         super().__init__(si)
         self._world = world
         self._dof = dof
+        self._ended = ended
 
     def checkMotion(self, a: Any, b: Any, *rest: Any) -> bool:  # noqa: N802 - OMPL's name
-        """Whether the edge between two states is free."""
-        return self._world.edge_free(np.array(a[0 : self._dof]), np.array(b[0 : self._dof]))
+        """Whether the edge between two states is free; none is any longer once planning has to end."""
+        # OMPL's shortcuts know of no time limit: without an edge that is free they are through at once.
+        return not self._ended() and self._world.edge_free(np.array(a[0 : self._dof]), np.array(b[0 : self._dof]))
 
 
 def _space(robot: RobotModel) -> Any:
@@ -132,7 +134,14 @@ def _attempt(problem: Problem, options: Options, cancel: Cancel, goals: Sequence
     setup = og.SimpleSetup(space)
     si = setup.getSpaceInformation()
     setup.setStateValidityChecker(lambda state: not world.collides(np.array(state[0:dof])))
-    validator = _EdgeValidator(si, world, dof)
+    end = problem.deadline
+    if options.algorithm in _IMPROVING:
+        end = min(end, monotonic() + options.improving_time)
+
+    def searched_enough() -> bool:
+        return cancel.is_set or monotonic() >= end
+
+    validator = _EdgeValidator(si, world, dof, lambda: bool(cancel.reason(problem)))
     si.setMotionValidator(validator)
     setup.setPlanner(getattr(og, options.algorithm)(si))
     start = space.allocState()
@@ -144,11 +153,7 @@ def _attempt(problem: Problem, options: Options, cancel: Cancel, goals: Sequence
         state[0:dof] = goal.tolist()
         region.addState(state)
     setup.setGoal(region)
-    end = problem.deadline
-    if options.algorithm in _IMPROVING:
-        end = min(end, monotonic() + options.improving_time)
-    ended = ob.PlannerTerminationCondition(lambda: cancel.is_set or monotonic() >= end)
-    if setup.solve(ended).getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
+    if setup.solve(ob.PlannerTerminationCondition(searched_enough)).getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
         return None
     path = setup.getSolutionPath()
     simplifier = og.PathSimplifier(si)  # simplifySolution takes several times as long for the same length

@@ -6,10 +6,13 @@ import time
 
 import numpy as np
 import pytest
+from ompl import geometric as og
 
 from common.config import Pipeline
 from common.errors import ConfigError, UnknownName
 from common.messages import PlanningScene, PlanRequest, PlanResponse, Vector3
+from common.planning import retiming
+from common.planning.collision import CollisionWorld
 from common.planning.goal_sampling import in_region
 from common.planning.kernel.library import library
 from common.planning.kernel.world import NoKernel
@@ -245,6 +248,26 @@ def test_planning_ends_when_it_is_cancelled():
     with_planner("ompl", algorithm="AORRTC", improving_time=60).plan(request, wall(), cancel=cancel)
     assert time.monotonic() - began < 10
     assert PIPELINE.plan(to_joints(HOME, RIGHT), AROUND).ok
+
+
+def test_shortcuts_of_ompl_end_when_planning_is_cancelled_in_the_middle_of_them(monkeypatch):
+    cancel, asked = Cancel(), []
+
+    class CancelledAtOnce(og.PathSimplifier):
+        def reduceVertices(self, path):
+            cancel.set()
+            monkeypatch.setattr(CollisionWorld, "edge_free", lambda *ends: asked.append(ends))
+            return super().reduceVertices(path)
+
+    monkeypatch.setattr(og, "PathSimplifier", CancelledAtOnce)
+    response = PIPELINE.plan(to_joints(LEFT, RIGHT, planner="ompl"), wall(), cancel=cancel)
+    assert (response.error, asked) == ("cancelled", [])
+
+
+@pytest.mark.parametrize(("late", "error"), [(525, ""), (575, "timeout")])
+def test_path_is_timed_within_a_tenth_of_the_budget_on_top_of_it(monkeypatch, late, error):
+    monkeypatch.setattr(retiming, "monotonic", lambda: time.monotonic() + late)
+    assert PIPELINE.plan(to_joints(LEFT, RIGHT, planner="ompl", planning_time=500.0), wall()).error == error
 
 
 @pytest.mark.parametrize("planner", ["cartesian", "ompl"])
