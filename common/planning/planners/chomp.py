@@ -1,8 +1,16 @@
 """Covariant gradient descent: a smooth path that obstacles push away, after CHOMP.
 
 Ratliff, Zucker, Bagnell, Srinivasa: "CHOMP: Gradient Optimization Techniques for Efficient Motion Planning" (ICRA
-2009). Distances are those between convex hulls, to the nearest obstacle of each link, instead of a distance field
-about spheres. It finds a path that is near its first guess or none, so there are a few guesses.
+2009). It finds a path that is near its first guess or none, so there are a few guesses. Where it departs from the paper:
+
+- Distances are those between convex hulls, to the nearest obstacle of each link, instead of a distance field about
+  spheres; links of the robot push each other apart in the same way.
+- The cost of obstacles is summed over waypoints, not integrated over the way of each point: its gradient has neither
+  the speed of the point as a factor, nor the projection across the way, nor the term of curvature.
+- Smoothness is the squared accelerations alone. Joint limits cut an update off instead of bending the whole path, and
+  no joint moves by more than 0.1 rad in an iteration.
+- The first guess is a quintic instead of a straight line. The descent ends as soon as the path is free all along, by
+  the same check as that of every other planner, or after its iterations: free, not optimal.
 """
 
 from __future__ import annotations
