@@ -1,7 +1,9 @@
 """Covariant gradient descent: a smooth path that obstacles push away, after CHOMP.
 
 Ratliff, Zucker, Bagnell, Srinivasa: "CHOMP: Gradient Optimization Techniques for Efficient Motion Planning" (ICRA
-2009). It finds a path that is near its first guess or none, so there are a few guesses. Where it departs from the paper:
+2009). It finds a path that is near its first guess or none, so there are a few guesses.
+
+Where it departs from the paper:
 
 - Distances are those between convex hulls, to the nearest obstacle of each link, instead of a distance field about
   spheres; links of the robot push each other apart in the same way.
