@@ -5,13 +5,22 @@ COPY pyproject.toml constraints.txt ./
 # The packages first: they change less often than the code. An index of your own: --secret id=pip,src=pip.conf
 RUN --mount=type=cache,target=/root/.cache/pip --mount=type=secret,id=pip,target=/etc/pip.conf \
     python -m venv /opt/zencell \
- && mkdir zencell && touch zencell/__init__.py README.md \
- && /opt/zencell/bin/python -m pip install --disable-pip-version-check -c constraints.txt . \
- && /opt/zencell/bin/python -m pip uninstall --yes --quiet zencell
+ && python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["dependencies"], sep="\n")' > needed \
+ && /opt/zencell/bin/python -m pip install --disable-pip-version-check -c constraints.txt -r needed
 COPY deploy/slim.py deploy/slim.py
 COPY config config
 # What only builds other programs, and the robots that no file of config/robots names.
 RUN /usr/local/bin/python deploy/slim.py /opt/zencell config/robots
+
+# The planning kernel, compiled as wherever the package is installed; the compiler stays behind in this stage.
+FROM python:3.11-slim AS kernel
+WORKDIR /src
+COPY pyproject.toml setup.py ./
+COPY common/planning/kernel/build.py common/planning/kernel/
+COPY common/planning/kernel/src common/planning/kernel/src
+RUN --mount=type=cache,target=/root/.cache/pip --mount=type=secret,id=pip,target=/etc/pip.conf \
+    mkdir zencell && touch zencell/__init__.py README.md \
+ && python -m pip install --disable-pip-version-check --no-deps --editable .
 
 FROM python:3.11-slim AS run
 RUN apt-get update -q && apt-get install -q -y --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/* /var/cache/apt/*.bin
@@ -21,6 +30,7 @@ ENV PATH=/opt/zencell/bin:$PATH PYTHONPATH=/app PYTHONUNBUFFERED=1 PYTHONDONTWRI
 WORKDIR /app
 COPY --chmod=755 deploy/zencell /opt/zencell/bin/zencell
 COPY common common
+COPY --from=kernel /src/common/planning/kernel/*.so common/planning/kernel/
 COPY services services
 COPY cli cli
 COPY zencell zencell

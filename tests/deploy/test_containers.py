@@ -66,13 +66,19 @@ def test_only_the_page_is_published_and_only_to_this_machine(cell: Containers) -
 def test_image_is_small_and_has_no_tools_to_build_with(cell: Containers) -> None:
     size = int(run("docker", "image", "inspect", "-f", "{{.Size}}", "zencell"))
     assert size < MOST_MEGABYTES * 1e6
-    missing = cell.compose("exec", "-T", "router", "sh", "-c", "command -v gcc cc make pip; true").strip()
+    missing = cell.compose("exec", "-T", "router", "sh", "-c", "command -v gcc cc make pip zig; true").strip()
     assert missing.replace("/usr/local/bin/pip", "") == ""
     robots = cell.compose(
         "exec", "-T", "router", "sh", "-c", "ls $(python -c 'import pathlib, cmeel; print(pathlib.Path("
         "cmeel.__file__).parents[1])')/cmeel.prefix/share/example-robot-data/robots",
     ).split()
     assert sorted(robots) == ["panda_description", "ur_description"]
+
+
+def test_planning_kernel_is_in_the_image_and_what_compiled_it_is_not(cell: Containers) -> None:
+    assert "ok    planning kernel: planning_kernel" in cell.compose("exec", "-T", "router", "zencell", "doctor")
+    packages = cell.compose("exec", "-T", "router", "sh", "-c", "ls /opt/zencell/lib/python3*/site-packages")
+    assert "pydantic" in packages and "ziglang" not in packages
 
 
 def test_configuration_can_not_be_changed_from_inside(cell: Containers) -> None:

@@ -15,7 +15,8 @@ pytestmark = [pytest.mark.container, pytest.mark.timeout(900)]
 
 SERVICE, OTHER = "panda-vision_detector", "panda-workspace_validator"
 SOURCE = ("common", "services", "cli", "zencell", "config", "deploy")
-FILES = ("compose.yaml", "compose.dev.yaml", "Dockerfile", ".dockerignore", ".env", "pyproject.toml", "constraints.txt")
+FILES = ("compose.yaml", "compose.dev.yaml", "Dockerfile", ".dockerignore", ".env", "pyproject.toml", "setup.py",
+         "constraints.txt")
 PATIENCE = 120.0  # [s] only ever waited for by a test that fails
 
 
