@@ -33,7 +33,7 @@ def _levels(zig: bool) -> dict[str, list[str]]:
 
 def compilers() -> list[list[str]]:
     """Commands that may compile C here, the preferred one first."""
-    own = [os.environ["CC"].split()] if os.environ.get("CC") else []
+    own = [command] if (command := os.environ.get("CC", "").split()) and shutil.which(command[0]) else []
     zig = [[sys.executable, "-m", _ZIG, "cc"]] if importlib.util.find_spec(_ZIG) else []
     return own + zig + [[path] for name in ("cc", "gcc", "clang") if (path := shutil.which(name))]
 
@@ -46,11 +46,12 @@ def build(into: Path, cache: Path) -> list[Path]:
         cache: where ziglang may keep what it makes.
     """
     environment = dict(os.environ) | {"ZIG_GLOBAL_CACHE_DIR": str(cache), "ZIG_LOCAL_CACHE_DIR": str(cache)}
+    for old in into.glob(f"{NAME}*.so"):  # a process that has it open keeps it
+        old.unlink()
     for compiler in compilers():
         running = []
         for suffix, flags in _levels(_ZIG in compiler).items():
             target = into / f"{NAME}{suffix}.so"
-            target.unlink(missing_ok=True)  # a process that has it open keeps the old one
             command = [*compiler, *_FLAGS, *flags, "-o", str(target), str(FOLDER / "src" / "kernel.c"), "-lm"]
             process = subprocess.Popen(
                 command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True

@@ -10,7 +10,7 @@ import pytest
 
 from common.planning.collision import CollisionWorld, interpolate
 from common.planning.kernel import library
-from common.planning.kernel.build import build
+from common.planning.kernel.build import build, compilers
 from common.planning.kernel.oracle import Oracle, compare, random_geometry
 from common.planning.kernel.planner import find_path
 from common.planning.kernel.world import EXCUSED, KernelWorld, NoKernel
@@ -244,8 +244,12 @@ def test_both_libraries_say_the_same(monkeypatch):
 
 
 def test_nothing_is_built_without_a_compiler_and_a_library_of_another_version_is_not_used(tmp_path, monkeypatch):
-    monkeypatch.setattr("common.planning.kernel.build.compilers", lambda: [["false"]])
-    assert build(tmp_path, tmp_path) == []
+    monkeypatch.setenv("CC", "a-compiler-that-is-not-there")
+    assert ["a-compiler-that-is-not-there"] not in compilers()
+    for none in ([], [["false"]]):
+        (tmp_path / "planning_kernel.so").write_bytes(b"of older sources")
+        monkeypatch.setattr("common.planning.kernel.build.compilers", lambda none=none: none)
+        assert build(tmp_path, tmp_path) == [] == list(tmp_path.iterdir())
     assert library._open(tmp_path / "planning_kernel.so") is None
     monkeypatch.setattr(library, "VERSION", -1)
     assert library._open(library.FOLDER / f"{library.NAME}.so") is None
