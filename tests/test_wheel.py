@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import sysconfig
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("common", "services", "cli", "zencell")
+KERNEL = Path("common", "planning", "kernel")
 DOMAIN = 110
 
 pytestmark = pytest.mark.timeout(300)
@@ -61,6 +63,26 @@ task: task
 motion: {}
 services: {mine.task: }
 """
+# What the doctor says of the kernel, and who plans around a wall.
+PLAN = """
+import zencell
+from cli.doctor.software import kernel
+from common.config import load_cell
+from common.messages import CollisionObject, Header, JointGoal, PlanningScene, PlanRequest, Pose, Vector3
+from common.planning.pipeline import PlanningPipeline
+from common.robot.ik import solve_ik
+from common.robot.model import RobotModel
+from common.robot.transforms import tool_down
+
+cell = load_cell("panda")
+robot = RobotModel.load(cell.robot)
+left, right = (solve_ik(robot, tool_down(0.5, y, 0.2), robot.named("home")).tolist() for y in (0.3, -0.3))
+wall = CollisionObject(id="wall", role="fixture", shape="box", dimensions=[0.5, 0.02, 0.4],
+                       pose=Pose(position=Vector3(x=0.55, y=0.0, z=0.2)))
+request = PlanRequest(id="1", start=left, goal=JointGoal(positions=right), planning_attempts=1)
+scene = PlanningScene(header=Header(frame_id="world"), objects=[wall])
+print(kernel().level, kernel().what, PlanningPipeline(robot, cell.motion, cell.pipeline).plan(request, scene).planner)
+"""
 
 
 @dataclass(frozen=True)
@@ -70,6 +92,7 @@ class Installation:
     command: list[str]
     modules: Path
     site: Path | None = None  # the site-packages, of a wheel
+    file: str = ""  # its name
 
     def run(self, folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
         """A verb, run in a folder."""
@@ -79,26 +102,34 @@ class Installation:
         assert done.returncode == 0, done.stdout + done.stderr
         return done
 
+    def python(self, folder: Path, *arguments: str) -> str:
+        """What its Python prints, run in a folder."""
+        own = str(Path(self.command[0]).with_name("python"))
+        return Installation([own], self.modules).run(folder, *arguments).stdout
+
 
 CLONE = Installation([sys.executable, "-m", "zencell"], ROOT)
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Installation:
-    """The wheel that pip makes of what the clone tracks, installed without the clone in reach."""
-    folder = tmp_path_factory.mktemp("wheel")
+def installed(folder: Path, compiler: bool) -> Installation:
+    """The wheel that pip makes of what the clone tracks, with no compiler but the one that the build brings, if any."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=False)
     if listed.returncode:
         pytest.skip("not a git checkout")
     for name in filter(None, listed.stdout.decode().split("\0")):
         (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, folder / "source" / name)
+    if not compiler:
+        project = folder / "source" / "pyproject.toml"
+        lines = project.read_text(encoding="utf-8").splitlines(keepends=True)
+        project.write_text("".join(line for line in lines if '"ziglang' not in line), encoding="utf-8")
     bare = folder / "bare"
     subprocess.run([sys.executable, "-m", "venv", bare], check=True)
     site, = bare.glob("lib/python*/site-packages")
     empty = {path.name for path in site.iterdir()}
     pip = [bare / "bin" / "python", "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "CC")}
+    environment["PATH"] = str(bare / "bin")
     subprocess.run([*pip, "wheel", "./source", "--no-deps", "-w", "dist"], cwd=folder, env=environment, check=True)
     made, = (folder / "dist").iterdir()
     subprocess.run([*pip, "install", "--no-deps", made], cwd=folder, env=environment, check=True)
@@ -108,7 +139,13 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Installation:
     # installation of the clone) counts.
     here = [path for path in sys.path if Path(path).name == "site-packages"]
     (site / "dependencies.pth").write_text("\n".join(here) + "\n", encoding="utf-8")
-    return Installation([str(bare / "bin" / "zencell")], site / "zencell" / "top-level", site)
+    return Installation([str(bare / "bin" / "zencell")], site / "zencell" / "top-level", site, made.name)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Installation:
+    """The wheel, installed without the clone in reach."""
+    return installed(tmp_path_factory.mktemp("wheel"), compiler=True)
 
 
 def watched(folder: Path) -> dict[str, str]:
@@ -177,8 +214,7 @@ def test_modules_of_ones_own_import_the_project_of_a_wheel(wheel: Installation, 
     assert "DONE" in done.stdout and "mine.task" in mains(tmp_path, wheel)
     script = "import zencell\nfrom common.config import load_cell\nprint(load_cell('ur5').name)\n"
     (tmp_path / "script.py").write_text(script, encoding="utf-8")
-    python = Installation([str(Path(wheel.command[0]).with_name("python"))], wheel.modules)
-    assert python.run(tmp_path, "script.py").stdout == "ur5\n"
+    assert wheel.python(tmp_path, "script.py") == "ur5\n"
 
 
 @pytest.mark.slow
@@ -189,5 +225,21 @@ for kind in ("decoders", "encoders"):
     found, = entry_points(group=f"zenoh_cli.codecs.{kind}", name="msgpack")
     print(found.load().__name__)
 """
-    python = Installation([str(Path(wheel.command[0]).with_name("python"))], wheel.modules)
-    assert python.run(tmp_path, "-c", script).stdout.split() == ["decode", "encode"]
+    assert wheel.python(tmp_path, "-c", script).split() == ["decode", "encode"]
+
+
+@pytest.mark.slow
+def test_wheel_holds_the_kernel_and_is_for_one_kind_of_machine(wheel: Installation, tmp_path: Path) -> None:
+    assert wheel.file.endswith(f"-py3-none-{sysconfig.get_platform().replace('-', '_')}.whl")
+    assert list((wheel.modules / KERNEL).glob("*.so"))
+    told = wheel.python(tmp_path, "-c", PLAN)
+    assert told.startswith("ok planning kernel: planning_kernel") and told.endswith(" rrt_connect\n")
+
+
+@pytest.mark.slow
+def test_wheel_that_no_compiler_was_there_for_plans_without_the_kernel_and_says_so(tmp_path: Path) -> None:
+    wheel = installed(tmp_path, compiler=False)
+    assert wheel.file.endswith("-py3-none-any.whl")
+    assert list((wheel.modules / KERNEL).glob("*.so")) == []
+    told = wheel.python(tmp_path, "-c", PLAN)
+    assert told.startswith("warn the planning kernel is not compiled") and told.endswith(" ompl\n")
