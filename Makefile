@@ -62,5 +62,5 @@ deploy: setup  ## write the compose files and Kubernetes manifests again
 	$(BIN)/python -m deploy.generate
 
 clean:
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis common/planning/kernel/*.so
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
