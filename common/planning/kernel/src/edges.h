@@ -16,6 +16,7 @@
 
 #include "world.h"
 
+#define FARTHEST 1e4           /* [rad], [m] a curve that leads farther away, or nowhere, is not free */
 #define SHORTEST_MOTION 1e-6 /* [m] no piece is cut in which no point moves farther: what is not proved then is not free */
 
 /* Tuned by processor time on the benchmarks' edges; correctness does not depend on them. */
@@ -28,6 +29,7 @@
 typedef struct {
     double c[4][MOST_JOINTS];
     double speed[MOST_JOINTS], bend[MOST_JOINTS]; /* largest |q'| and |q''| */
+    double beyond; /* [m] at most by which joints slide out of their limits, where levers are longer */
 } curve;
 
 typedef struct span {
@@ -35,19 +37,30 @@ typedef struct span {
     int first, count; /* pairs that are not proved in it, in the list */
 } span;
 
-static void line_curve(int dof, const double *a, const double *b, curve *out) {
-    for (int j = 0; j < dof; j++) {
+/* By how much [m] positions as large as |q| are out of the strokes. */
+static inline double beyond_stroke(const world *w, int j, double q) {
+    return w->joint[j + 1].kind == PRISMATIC ? fmax(fabs(q) - w->stroke[j + 1], 0.0) : 0.0;
+}
+
+static void line_curve(const world *w, const double *a, const double *b, curve *out) {
+    out->beyond = 0;
+    for (int j = 0; j < w->dof; j++) {
         out->c[0][j] = a[j], out->c[1][j] = b[j] - a[j], out->c[2][j] = out->c[3][j] = 0.0;
         out->speed[j] = fabs(b[j] - a[j]), out->bend[j] = 0.0;
+        out->beyond += beyond_stroke(w, j, fmax(fabs(a[j]), fabs(b[j])));
     }
 }
 
-static void cubic_curve(int dof, const double *c, curve *out) {
+static void cubic_curve(const world *w, const double *c, curve *out) {
+    int dof = w->dof;
+    out->beyond = 0;
     for (int j = 0; j < dof; j++) {
         double c1 = c[dof + j], c2 = c[2 * dof + j], c3 = c[3 * dof + j];
         for (int k = 0; k < 4; k++) out->c[k][j] = c[k * dof + j];
         out->bend[j] = fmax(fabs(2 * c2), fabs(2 * c2 + 6 * c3));
         out->speed[j] = fmax(fabs(c1), fabs(c1 + 2 * c2 + 3 * c3));
+        double most = fabs(c[j]) + fabs(c1) + fabs(c2) + fabs(c3);
+        out->beyond += beyond_stroke(w, j, most);
         double turn = c3 != 0.0 ? -c2 / (3 * c3) : -1.0; /* where the velocity of a cubic has its extreme */
         if (turn > 0 && turn < 1) out->speed[j] = fmax(out->speed[j], fabs(c1 + turn * (2 * c2 + 3 * c3 * turn)));
     }
@@ -59,9 +72,9 @@ static inline void bounds(const world *w, const curve *e, int tip, int above, co
     double before = 0, first = 0, second = 0;
     for (int k = w->joint[above].depth; k < J->depth; k++) {
         int j = J->chain[k];
-        double v = e->speed[j - 1];
-        first += v * lever[j];
-        second += v * (v + 2 * before) * lever[j] + e->bend[j - 1] * lever[j];
+        double v = e->speed[j - 1], far = lever[j] + e->beyond;
+        first += v * far;
+        second += v * (v + 2 * before) * far + e->bend[j - 1] * far;
         before += w->joint[j].kind == REVOLUTE ? v : 0.0;
     }
     *M = first, *K = second;
@@ -75,7 +88,8 @@ static inline double lasts(double s0, double v, double K, double M) {
     else
         curved = K > 1e-300 ? (root - v) / K : INFINITY;
     double plain = M > 1e-300 ? s0 / M : INFINITY;
-    return curved > plain ? curved : plain;
+    double most = curved > plain ? curved : plain;
+    return most > 0 ? most : 0.0;
 }
 
 /* Speed of the point at x (world) of a body that moves relative to another, along n. */
@@ -113,7 +127,7 @@ static int group_proved(scratch *c, const curve *e, const group *g, double margi
     double n[3], s0 = group_apart(c, g, n) - margin - TOUCHING;
     c->checks++;
     *since = *until = t0;
-    if (s0 <= 0) return 0;
+    if (!(s0 > 0)) return 0;
     double spin[3], slide[3], M, K, Mb = 0, Kb = 0;
     relative_twist(c, p->a, p->common, spin, slide);
     double v = speed_at(spin, slide, c->body_middle[p->a], n);
@@ -204,7 +218,11 @@ static int proved_leashed(scratch *c, int i, double inside, double tip, double t
     return 1;
 }
 
+#define MOST_ENTRIES (1 << 26)
+#define MOST_SPANS (1 << 24)
+
 static int grow(scratch *c, int list, int spans) {
+    if (list > MOST_ENTRIES || spans > MOST_SPANS) return 0;
     if (list > c->list_room) {
         int *more = realloc(c->list, sizeof(int) * 2 * list);
         if (!more) return 0;
@@ -265,7 +283,12 @@ static int probes_free(scratch *c, const curve *e) {
 static int curve_free(scratch *c, const curve *e) {
     const world *w = c->w;
     double q[MOST_JOINTS], dq[MOST_JOINTS], most = 0; /* how fast any point moves */
+    double far = 0;
     c->edges++;
+    for (int j = 0; j < w->dof; j++)
+        for (int k = 0; k < 4; k++) far += fabs(e->c[k][j]);
+    c->hit_at = 0;
+    if (!(far < FARTHEST)) return 0;
     if (!probes_free(c, e)) return 0;
     for (int i = 0; i < w->shapes; i++)
         if (w->shape[i].joint) {
@@ -345,7 +368,11 @@ static int around_free(scratch *c, const double *q, const double *away) {
     const world *w = c->w;
     curve e;
     double inside = 0, M, K, n[3];
-    for (int j = 0; j < w->dof; j++) e.speed[j] = away[j], e.bend[j] = 0;
+    e.beyond = 0;
+    for (int j = 0; j < w->dof; j++) {
+        e.speed[j] = away[j], e.bend[j] = 0;
+        e.beyond += beyond_stroke(w, j, fabs(q[j]) + away[j]);
+    }
     forward(c, q);
     middles(c);
     if (w->excuses) {
@@ -392,9 +419,14 @@ static int first_hit(scratch *c, int count, const double *path) {
             continue;
         }
         double away[MOST_JOINTS] = {0};
+        int known = 1; /* all are numbers */
         for (int k = i; k <= j; k++)
-            for (int d = 0; d < dof; d++) away[d] = fmax(away[d], fabs(path[(size_t)dof * k + d] - q[d]));
-        if (around_free(c, q, away)) continue;
+            for (int d = 0; d < dof; d++) {
+                double way = fabs(path[(size_t)dof * k + d] - q[d]);
+                if (!(way < FARTHEST)) known = 0;
+                away[d] = fmax(away[d], way);
+            }
+        if (known && around_free(c, q, away)) continue;
         if (j - i == 1) {
             stack[top][0] = stack[top][1] = j, top++;
             stack[top][0] = stack[top][1] = i, top++;

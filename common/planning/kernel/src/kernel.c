@@ -92,6 +92,8 @@ API world *zk_world(int dof, const int *parents, const int *kinds, const double 
         memcpy(J->chain, up->chain, sizeof J->chain);
         J->chain[J->depth - 1] = j;
         w->lower[j - 1] = lower[j - 1], w->upper[j - 1] = upper[j - 1];
+        double stroke = fmax(fabs(lower[j - 1]), fabs(upper[j - 1])); /* without limits all of the way is beyond them */
+        w->stroke[j] = J->kind == PRISMATIC && stroke < 1e6 ? stroke : 0.0;
     }
     return w;
 }
@@ -320,7 +322,7 @@ API int zk_state(scratch *c, const double *q) { return state_free(c, q) ? -1 : c
 /* -1 when the straight line in joint space is free, proved all along; else a pair, and where on it (0 to 1). */
 API int zk_edge(scratch *c, const double *a, const double *b, double *at) {
     curve e;
-    line_curve(c->w->dof, a, b, &e);
+    line_curve(c->w, a, b, &e);
     if (curve_free(c, &e)) return -1;
     *at = c->hit_at;
     return c->hit_pair;
@@ -330,7 +332,7 @@ API int zk_edge(scratch *c, const double *a, const double *b, double *at) {
 API int zk_cubics(scratch *c, int count, const double *coefficients, double *at) {
     curve e;
     for (int i = 0; i < count; i++) {
-        cubic_curve(c->w->dof, coefficients + 4 * c->w->dof * i, &e);
+        cubic_curve(c->w, coefficients + 4 * c->w->dof * i, &e);
         if (!curve_free(c, &e)) {
             *at = i + c->hit_at;
             return c->hit_pair;

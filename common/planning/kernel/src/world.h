@@ -43,6 +43,7 @@ typedef struct {
     int dof, joints, shapes, pairs, room;
     joint joint[MOST_JOINTS]; /* joint i > 0 is moved by q[i - 1] */
     double lower[MOST_JOINTS], upper[MOST_JOINTS];
+    double stroke[MOST_JOINTS]; /* [m] how far each joint slides within its limits */
     shape *shape;
     double (*lever)[MOST_JOINTS]; /* of each shape about each joint [m]: as far from the axis as it ever gets */
     double (*reach)[MOST_JOINTS]; /* the same of the middle of its sphere */
@@ -82,16 +83,15 @@ typedef struct {
 static double axis_distance(const double *p) { return sqrt(p[0] * p[0] + p[1] * p[1]); }
 
 /* Levers of a sphere of radius r about a point of a joint's frame: for every joint above, the farthest that any of its
-   points can be from the axis, whatever the positions of the joints between. */
+   points can be from the axis, whatever the positions within limits of the joints between. */
 static void levers_of(const world *w, int j, const double *at, double r, double *lever) {
     memset(lever, 0, sizeof(double) * MOST_JOINTS);
     if (!j) return;
     double beyond = norm3(at) + r;
     lever[j] = w->joint[j].kind == PRISMATIC ? 1.0 : axis_distance(at) + r;
     while (w->joint[j].parent) {
-        double stroke = w->joint[j].kind == PRISMATIC ? fmax(fabs(w->lower[j - 1]), fabs(w->upper[j - 1])) : 0.0;
         const double *offset = w->joint[j].place.p;
-        beyond += stroke;
+        beyond += w->stroke[j];
         int up = w->joint[j].parent;
         lever[up] = w->joint[up].kind == PRISMATIC ? 1.0 : axis_distance(offset) + beyond;
         beyond += norm3(offset);
@@ -218,6 +218,7 @@ static inline double pair_apart(scratch *c, const pair *p, double *n) {
 }
 
 static inline double group_apart(scratch *c, const group *g, double *n) {
+    if (!g->spheres.a) return -INFINITY; /* neither moves: the pairs decide */
     const body *A = &c->w->body[g->spheres.a];
     const double *middle = c->body_middle[g->spheres.a];
     if (!g->moving) return sphere_apart(c, middle, A->sphere, g->spheres.b, n);
