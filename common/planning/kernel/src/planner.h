@@ -80,7 +80,7 @@ static int nearest(const tree *t, const double *q, double *square) {
 
 static int line_free(scratch *c, const double *a, const double *b) {
     curve e;
-    line_curve(c->w->dof, a, b, &e);
+    line_curve(c->w, a, b, &e);
     return curve_free(c, &e);
 }
 
@@ -147,6 +147,9 @@ static int search(run *r, tree trees[2], int meet[2], rng *random, plan_report *
         memcpy(q, one->q + (size_t)dof * node, sizeof(double) * dof);
         int at = nearest(other, q, &square);
         for (;;) {
+            stop = stopped(r);
+            if (stop) return stop;
+            if (trees[0].count + trees[1].count >= r->o->nodes) return NO_PATH;
             int next = extend(r, other, at, q, square, &reached);
             if (next < 0) {
                 if (isinf(other->radius[at])) other->radius[at] = r->o->domain;
@@ -242,10 +245,10 @@ static int plan(run *r, const double *start, int goals, const double *goal, int 
     tree trees[2] = {{.dof = dof}, {.dof = dof}};
     rng random;
     seed_random(&random, r->o->seed);
-    if (add_node(&trees[0], start, -1) < 0) return NO_MEMORY;
-    for (int g = 0; g < goals; g++)
-        if (add_node(&trees[1], goal + (size_t)dof * g, -1) < 0) return NO_MEMORY;
-    int error = search(r, trees, meet, &random, report);
+    int error = goals < 1 ? NO_PATH : add_node(&trees[0], start, -1) < 0 ? NO_MEMORY : 0;
+    for (int g = 0; g < goals && !error; g++)
+        if (add_node(&trees[1], goal + (size_t)dof * g, -1) < 0) error = NO_MEMORY;
+    if (!error) error = search(r, trees, meet, &random, report);
     report->nodes = trees[0].count + trees[1].count;
     report->search_seconds = now() - began;
     if (!error) {
