@@ -76,11 +76,11 @@ def find_path(
     report = _Report()
     path = np.empty((_MOST_WAYPOINTS, world.dof))
     first, last = np.ascontiguousarray(start, dtype=float), np.ascontiguousarray(goals, dtype=float)
-    if first.shape != (world.dof,) or last.ndim != 2 or last.shape[1] != world.dof:
+    if first.shape != (world.dof,) or last.ndim != 2 or last.shape[1] != world.dof or not len(last):
         raise ValueError(f"start has shape {first.shape}, goals {last.shape}")
-    count = world.library.zk_plan(
-        world.scratch, address(first), len(last), address(last), byref(options),
-        None if cancel is None else byref(cancel), len(path), address(path), byref(report),
+    count = world.plan(
+        address(first), len(last), address(last), byref(options), None if cancel is None else byref(cancel), len(path),
+        address(path), byref(report),
     )
     return Found(
         path[:count].copy() if count > 0 else None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from ctypes import byref, c_double, c_int
 from dataclasses import dataclass
@@ -19,6 +20,11 @@ Array = NDArray[np.float64]
 
 EXCUSED = -1e9  # [m] the margin of a pair that may touch
 _SPHERE, _BOX, _CYLINDER, _CAPSULE, _HULL = range(5)
+_LARGEST = 1e7  # [m] beyond which rounding would count
+_JOINTS = (
+    *(f"JointModel{kind}{axis}" for kind in "RP" for axis in "XYZ"),
+    *(f"JointModel{kind}Unaligned" for kind in ("Revolute", "Prismatic")),
+)
 
 
 class NoKernel(ZencellError):
@@ -41,6 +47,15 @@ class Shape:
         Raises:
             NoKernel: it is none that the kernel knows.
         """
+        if isinstance(shape, coal.ShapeBase) and shape.getSweptSphereRadius() > 0:
+            raise NoKernel(f"the planning kernel takes no {type(shape).__name__} with a swept sphere")
+        found = cls._known(shape)
+        if not (np.abs(found.size) < _LARGEST).all() or not (np.abs(found.points) < _LARGEST).all():
+            raise NoKernel(f"the planning kernel takes no {type(shape).__name__} of more than {_LARGEST:g} m")
+        return found
+
+    @classmethod
+    def _known(cls, shape: coal.CollisionGeometry) -> Shape:
         none, nothing = np.zeros((0, 3)), np.zeros(4)
         if isinstance(shape, coal.Sphere):
             return cls(_SPHERE, np.array([shape.radius, 0, 0]), none, nothing)
@@ -56,7 +71,7 @@ class Shape:
 
 
 class KernelWorld:
-    """Answers of the compiled kernel for one robot among obstacles. Not for several threads at once.
+    """Answers of the compiled kernel for one robot among obstacles. Of several threads one is answered at a time.
 
     Pairs are those of the geometry model, in its order.
     """
@@ -71,13 +86,15 @@ class KernelWorld:
         Raises:
             NoKernel: there is no library, or something in the models is not known to it.
         """
-        self._world = self.scratch = None
+        self._world = self._scratch = None
+        self._lock = threading.Lock()  # other threads run while the kernel works
         found = library()
         if found is None:
             raise NoKernel("the planning kernel is not built")
         self.library = found
         self.dof: int = model.nq
         self.pair_count = len(geometry.collisionPairs)
+        self._shape_count = geometry.ngeoms
         kinds, axes = _joints(model)
         parents = np.array(list(model.parents)[1:], dtype=np.int32)
         placements = np.array([placement.homogeneous[:3] for placement in list(model.jointPlacements)[1:]])
@@ -93,15 +110,14 @@ class KernelWorld:
         first, second = pairs[:, 0].copy(), pairs[:, 1].copy()
         if not found.zk_pairs(self._world, self.pair_count, address(first), address(second)):
             raise MemoryError
-        self.scratch = found.zk_scratch(self._world)
-        if not self.scratch:
+        self._scratch = found.zk_scratch(self._world)
+        if not self._scratch:
             raise MemoryError
-        found.zk_refresh(self.scratch)
-        self._where = c_double()
+        found.zk_refresh(self._scratch)
 
     def __del__(self) -> None:
-        if self.scratch:
-            self.library.zk_scratch_free(self.scratch)
+        if self._scratch:
+            self.library.zk_scratch_free(self._scratch)
         if self._world:
             self.library.zk_free(self._world)
 
@@ -116,11 +132,16 @@ class KernelWorld:
 
     def place(self, index: int, pose: Array) -> None:
         """Put a shape at a (4, 4) pose in the frame of its joint; call `placed` after the last."""
-        self.library.zk_place(self._world, index, address(np.ascontiguousarray(pose[:3], dtype=float)))
+        if not 0 <= index < self._shape_count:
+            raise IndexError(f"there are {self._shape_count} shapes, none is number {index}")
+        given = np.ascontiguousarray(pose[:3], dtype=float)
+        with self._lock:
+            self.library.zk_place(self._world, index, address(given))
 
     def placed(self) -> None:
         """Take over where obstacles stand now."""
-        self.library.zk_refresh(self.scratch)
+        with self._lock:
+            self.library.zk_refresh(self._scratch)
 
     def set_rules(
         self,
@@ -142,37 +163,41 @@ class KernelWorld:
         other = None if near is None else np.ascontiguousarray(near, dtype=float)
         if len(arrays[0]) != self.pair_count or (other is not None and len(other) != self.pair_count):
             raise ValueError(f"{len(arrays[0])} margins for {self.pair_count} pairs")
-        self.library.zk_rules(
-            self._world, address(arrays[0]), None if other is None else address(other), tool, address(arrays[1]),
-            address(arrays[2]), leash,
-        )
+        with self._lock:
+            self.library.zk_rules(
+                self._world, address(arrays[0]), None if other is None else address(other), tool, address(arrays[1]),
+                address(arrays[2]), leash,
+            )
 
     def colliding(self, q: Array) -> int:
         """Index of a pair that is too close at q (dof,) [rad], -1 when the robot is free."""
         given = self._q(q)
-        return int(self.library.zk_state(self.scratch, address(given)))
+        with self._lock:
+            return int(self.library.zk_state(self._scratch, address(given)))
 
     def edge_collision(self, a: Array, b: Array) -> tuple[int, float]:
         """A pair that is too close on the straight line in joint space from a to b, and where: 0 to 1.
 
         -1 when the whole line is proved free.
         """
-        first, last = self._q(a), self._q(b)
-        hit = int(self.library.zk_edge(self.scratch, address(first), address(last), byref(self._where)))
-        return hit, self._where.value
+        first, last, where = self._q(a), self._q(b), c_double()
+        with self._lock:
+            hit = int(self.library.zk_edge(self._scratch, address(first), address(last), byref(where)))
+        return hit, where.value
 
     def edge_free(self, a: Array, b: Array) -> bool:
         """Whether the straight line in joint space from a to b (dof,) [rad] is proved free."""
-        first, last = self._q(a), self._q(b)
-        return bool(self.library.zk_edge(self.scratch, address(first), address(last), byref(self._where)) < 0)
+        return self.edge_collision(a, b)[0] < 0
 
     def cubics_collision(self, coefficients: Array) -> tuple[int, float]:
         """The same for cubics (N, 4, dof), c0 + c1 t + c2 t^2 + c3 t^3 with t from 0 to 1: pair, piece + t."""
         given = np.ascontiguousarray(coefficients, dtype=float)
         if given.ndim != 3 or given.shape[1:] != (4, self.dof):
             raise ValueError(f"coefficients have shape {given.shape}")
-        hit = int(self.library.zk_cubics(self.scratch, len(given), address(given), byref(self._where)))
-        return hit, self._where.value
+        where = c_double()
+        with self._lock:
+            hit = int(self.library.zk_cubics(self._scratch, len(given), address(given), byref(where)))
+        return hit, where.value
 
     def first_collision(self, path: Array) -> tuple[int, int]:
         """The first of positions (N, dof) [rad] that is not free, and a pair that is too close there; -1 for none."""
@@ -180,7 +205,9 @@ class KernelWorld:
         if given.ndim != 2 or given.shape[1] != self.dof:
             raise ValueError(f"positions have shape {given.shape}")
         pair = c_int()
-        return int(self.library.zk_first(self.scratch, len(given), address(given), byref(pair))), pair.value
+        with self._lock:
+            index = int(self.library.zk_first(self._scratch, len(given), address(given), byref(pair)))
+        return index, pair.value
 
     def distances(self, q: Array) -> tuple[Array, Array]:
         """(pairs,) [m] how far apart points of each pair are at q, and how far a plane holds them apart.
@@ -189,20 +216,28 @@ class KernelWorld:
         """
         given = self._q(q)
         above, below = np.empty(self.pair_count), np.empty(self.pair_count)
-        self.library.zk_distances(self.scratch, address(given), address(above), address(below))
+        with self._lock:
+            self.library.zk_distances(self._scratch, address(given), address(above), address(below))
         return above, below
 
     def joint_poses(self, q: Array) -> Array:
         """(joints, 3, 4) poses of the joints' frames, world."""
         given, out = self._q(q), np.empty((self.dof, 3, 4))
-        self.library.zk_forward(self.scratch, address(given), address(out))
+        with self._lock:
+            self.library.zk_forward(self._scratch, address(given), address(out))
         return out
 
     def counters(self) -> dict[str, int]:
         """How much was done so far."""
         out = np.zeros(5, dtype=np.int64)
-        self.library.zk_counters(self.scratch, address(out))
+        with self._lock:
+            self.library.zk_counters(self._scratch, address(out))
         return dict(zip(("states", "looks", "searches", "iterations", "edges"), out.tolist(), strict=True))
+
+    def plan(self, *arguments: object) -> int:
+        """See zk_plan in kernel.c; `planner.find_path` asks it."""
+        with self._lock:
+            return int(self.library.zk_plan(self._scratch, *arguments))
 
     def _q(self, q: ArrayLike) -> Array:
         given = np.ascontiguousarray(q, dtype=float)
@@ -224,6 +259,8 @@ def _joints(model: pin.Model) -> tuple[NDArray[np.int32], Array]:
     jacobian = np.array(pin.computeJointJacobians(model, data, pin.neutral(model))).reshape(6, -1)
     kinds, axes = np.zeros(model.nq, dtype=np.int32), np.zeros((model.nq, 3))
     for joint in range(1, model.njoints):
+        if model.joints[joint].shortname() not in _JOINTS:
+            raise NoKernel(f"the planning kernel takes no {model.joints[joint].shortname()}")
         column = jacobian[:, model.joints[joint].idx_v]
         turns = np.linalg.norm(column[3:]) > 0.5
         axis = np.array(data.oMi[joint].rotation).T @ (column[3:] if turns else column[:3])

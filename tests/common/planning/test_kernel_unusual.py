@@ -1,0 +1,148 @@
+"""The compiled kernel where questions are unusual: no numbers, joints out of limits, shapes that it has to refuse."""
+
+import threading
+from itertools import pairwise
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from common.messages import PlanningScene
+from common.planning.collision import CollisionWorld
+from common.planning.kernel import library
+from common.planning.kernel.planner import find_path
+from common.planning.kernel.world import KernelWorld, NoKernel
+from tests.common.planning.planning_scenes import HOME, ROBOT, SPREAD, WORLD, cache, scene, solid
+from tests.common.planning.test_kernel import robot_with
+
+pytestmark = pytest.mark.skipif(library.library() is None, reason="the planning kernel is not built here")
+
+ONE = np.ones(1)
+
+
+def far_from_everything() -> KernelWorld:
+    return KernelWorld(*robot_with((coal.Sphere(0.1), (0, 0, 0)), (coal.Box(0.2, 0.2, 0.2), (5, 0, 0))))
+
+
+def reaching_arm(limit: float) -> KernelWorld:
+    """A joint that turns and one that slides along x within a limit [m], and a sphere 2 m away in direction 1 rad."""
+    model, geometry = pin.Model(), pin.GeometryModel()
+    turn = model.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), "turn", ONE, ONE, -3 * ONE, 3 * ONE)
+    slide = model.addJoint(turn, pin.JointModelPX(), pin.SE3.Identity(), "slide", ONE, ONE, -limit * ONE, limit * ONE)
+    geometry.addGeometryObject(pin.GeometryObject("tip", slide, 0, pin.SE3.Identity(), coal.Sphere(0.05)))
+    place = pin.SE3(np.eye(3), 2 * np.array([np.cos(1), np.sin(1), 0]))
+    geometry.addGeometryObject(pin.GeometryObject("post", 0, 0, place, coal.Sphere(0.05)))
+    geometry.addCollisionPair(pin.CollisionPair(0, 1))
+    return KernelWorld(model, geometry)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_what_is_no_number_is_not_free(number):
+    free, none = np.zeros(1), np.array([number])
+    for kernel in (far_from_everything(), CollisionWorld(ROBOT, scene(), start=HOME, cache=cache()).kernel):
+        if kernel.dof > 1:
+            free = HOME
+            none = HOME.copy()
+            none[0] = number
+        assert kernel.colliding(none) >= 0
+        assert not kernel.edge_free(free, none) and not kernel.edge_free(none, free)
+        assert kernel.first_collision(np.array([free, none, free, free]))[0] == 1
+        curve = np.zeros((1, 4, kernel.dof))
+        curve[0, 0], curve[0, 2] = free, none
+        assert kernel.cubics_collision(curve)[0] >= 0
+
+
+def test_edge_of_absurd_length_is_not_free_and_that_is_said_at_once():
+    far = HOME.copy()
+    far[0] = 1e7
+    assert not CollisionWorld(ROBOT, scene(), start=HOME, cache=cache()).edge_free(HOME, far)
+
+
+@pytest.mark.parametrize("limit", [0.1, 3.0, 1e308, np.inf])
+def test_edge_out_of_the_limits_of_a_sliding_joint_is_judged_by_where_it_leads(limit):
+    kernel, rng = reaching_arm(limit), np.random.default_rng(0)
+    for _ in range(50):
+        a, b = np.array([1 - rng.uniform(0.2, 1), 2.0]), np.array([1 + rng.uniform(0.2, 1), 2.0])
+        assert not kernel.edge_free(a, b)
+        cubic = np.array([a, b - a, [0.0, 0.0], [0.0, 0.0]])
+        assert kernel.cubics_collision(cubic[None])[0] == 0
+        assert kernel.edge_free(a - (0, 0.2), b - (0, 0.2))
+    along = np.stack([np.linspace(0, 2, 401), np.full(401, 2.0)], axis=1)
+    assert kernel.first_collision(along)[0] == 190
+    assert not kernel.edge_free(np.array([1.0, 0.0]), np.array([1.0, 3.0]))
+
+
+@pytest.mark.parametrize("kind", ["HX", "Composite"])
+def test_joint_that_neither_turns_nor_slides_alone_is_refused(kind):
+    model, geometry = pin.Model(), pin.GeometryModel()
+    joint = pin.JointModelHX(0.5) if kind == "HX" else pin.JointModelComposite()
+    if kind == "Composite":
+        joint.addJoint(pin.JointModelRZ(), pin.SE3(np.eye(3), np.array([1.0, 0, 0])))
+    model.addJoint(0, joint, pin.SE3.Identity(), "joint", ONE, ONE, -ONE, ONE)
+    with pytest.raises(NoKernel, match=kind):
+        KernelWorld(model, geometry)
+
+
+@pytest.mark.parametrize("size", [1e8, 1e155, 1e308])
+def test_shape_so_large_that_rounding_counts_is_refused(size):
+    with pytest.raises(NoKernel, match="more than"):
+        KernelWorld(*robot_with((coal.Box(0.2, 0.2, 0.2), (0, 0, 0)), (coal.Sphere(size), (0.05 + size, 0, 0))))
+
+
+def test_scene_with_such_a_shape_is_left_to_coal():
+    ground = solid("ground", "fixture", "box", [1e8, 1e8, 1.0], (0, 0, -0.6))
+    huge = CollisionWorld(ROBOT, PlanningScene(header=WORLD, objects=[ground]), start=HOME, cache=cache())
+    assert huge.kernel is None and not huge.collides(HOME)
+
+
+def test_shape_with_a_swept_sphere_is_refused():
+    wall = coal.Box(0.2, 0.2, 0.2)
+    wall.setSweptSphereRadius(0.1)
+    with pytest.raises(NoKernel, match="swept"):
+        KernelWorld(*robot_with((coal.Sphere(0.1), (0, 0, 0)), (wall, (0.25, 0, 0))))
+
+
+def test_pair_of_which_nothing_moves_is_judged_where_it_stands():
+    ball = coal.Sphere(0.1)
+    for gap, free in ((0.3, True), (0.1, False)):
+        model, geometry = robot_with((ball, (0, 0, 0)), (ball, (3, 0, 0)), (ball, (3 + gap, 0, 0)))
+        geometry.removeAllCollisionPairs()
+        geometry.addCollisionPair(pin.CollisionPair(1, 2))
+        kernel = KernelWorld(model, geometry)
+        assert (kernel.colliding(np.zeros(1)) < 0) == free
+        assert kernel.edge_free(np.zeros(1), ONE) == free
+
+
+def test_search_without_goals_is_refused_and_one_in_tiny_steps_ends_when_it_should():
+    kernel, ends = far_from_everything(), (np.array([-0.9]), np.array([[0.9]]))
+    with pytest.raises(ValueError, match="goals"):
+        find_path(kernel, ends[0], np.zeros((0, 1)))
+    found = find_path(kernel, *ends, reach=1e-5, nodes=1000)
+    assert found.error == "no_path" and found.nodes <= 1000
+    found = find_path(kernel, *ends, reach=1e-8, nodes=10**9, seconds=0.05)
+    assert found.error == "timeout" and found.search_seconds < 1
+
+
+def test_shape_that_is_not_there_can_not_be_placed():
+    with pytest.raises(IndexError):
+        far_from_everything().place(2, np.eye(4))
+
+
+def test_threads_that_ask_the_same_world_get_the_same_answers():
+    world = CollisionWorld(ROBOT, scene(SPREAD), start=HOME, cache=cache())
+    states = np.random.default_rng(0).uniform(ROBOT.lower, ROBOT.upper, (100, ROBOT.dof))
+    edges = [*pairwise(states)]
+    expected = [world.edge_free(a, b) for a, b in edges]
+    wrong: list[int] = []
+
+    def ask() -> None:
+        for _ in range(30):
+            wrong.extend(i for i, (a, b) in enumerate(edges) if world.edge_free(a, b) != expected[i])
+
+    threads = [threading.Thread(target=ask) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
