@@ -20,7 +20,6 @@ _REASONS = {-1: "no_path", -2: "timeout", -3: "cancelled", -4: "no_path"}
 class _Options(ctypes.Structure):
     _fields_ = [
         ("range", ctypes.c_double),
-        ("domain", ctypes.c_double),
         ("seconds", ctypes.c_double),
         ("nodes", ctypes.c_longlong),
         ("shortcuts", ctypes.c_longlong),
@@ -57,7 +56,6 @@ def find_path(
     seed: int = 0,
     seconds: float = 10.0,
     reach: float = 1.0,
-    domain: float = 100.0,
     nodes: int = 1_000_000,
     shortcuts: int = 300,
     patience: int = 60,
@@ -67,12 +65,12 @@ def find_path(
 
     Args:
         seconds: wall time for all of it.
-        reach: longest edge of the trees; domain: how far from a node, once its extension failed, samples count [rad].
+        reach: longest edge of the trees [rad].
         nodes: of both trees at most.
         shortcuts: tries at most; patience: tries that fail in a row before the shortening ends.
         cancel: ends the search once another thread makes it something else than 0.
     """
-    options = _Options(reach, domain, seconds, nodes, shortcuts, patience, seed)
+    options = _Options(reach, seconds, nodes, shortcuts, patience, seed)
     report = _Report()
     path = np.empty((_MOST_WAYPOINTS, world.dof))
     first, last = np.ascontiguousarray(start, dtype=float), np.ascontiguousarray(goals, dtype=float)

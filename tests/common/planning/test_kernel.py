@@ -258,7 +258,7 @@ def test_nothing_is_built_without_a_compiler_and_a_library_of_another_version_is
 def test_options_have_the_layout_of_the_source():
     from common.planning.kernel import planner
 
-    assert ctypes.sizeof(planner._Options) == 7 * 8
+    assert ctypes.sizeof(planner._Options) == 6 * 8
     assert ctypes.sizeof(planner._Report) == 6 * 8
 
 

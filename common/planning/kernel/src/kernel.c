@@ -9,7 +9,7 @@
 #define API __attribute__((visibility("default")))
 #endif
 
-#define VERSION 6
+#define VERSION 7
 
 API int zk_version(void) { return VERSION; }
 

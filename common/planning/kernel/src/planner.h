@@ -1,5 +1,5 @@
-/* A path among obstacles: RRT-Connect (Kuffner, LaValle 2000) with dynamic domains (Yershova, Jaillet, Simeon, LaValle
-   2005), then shortcuts. All edges are proved free. The seed decides the path. */
+/* A path among obstacles: RRT-Connect (Kuffner, LaValle 2000), then shortcuts. All edges are proved free. The seed decides
+   the path. */
 #ifndef ZK_PLANNER_H
 #define ZK_PLANNER_H
 
@@ -38,7 +38,7 @@ static double now(void) {
 
 typedef struct {
     int count, room, dof;
-    double *q, *radius;
+    double *q;
     int *parent;
 } tree;
 
@@ -47,19 +47,17 @@ static int add_node(tree *t, const double *q, int parent) {
         int room = t->room ? 2 * t->room : 256;
         double *more = realloc(t->q, sizeof(double) * t->dof * room);
         if (more) t->q = more;
-        double *radii = realloc(t->radius, sizeof(double) * room);
-        if (radii) t->radius = radii;
         int *parents = realloc(t->parent, sizeof(int) * room);
         if (parents) t->parent = parents;
-        if (!more || !radii || !parents) return -1;
+        if (!more || !parents) return -1;
         t->room = room;
     }
     memcpy(t->q + (size_t)t->dof * t->count, q, sizeof(double) * t->dof);
-    t->parent[t->count] = parent, t->radius[t->count] = INFINITY;
+    t->parent[t->count] = parent;
     return t->count++;
 }
 
-static void free_tree(tree *t) { free(t->q), free(t->radius), free(t->parent); }
+static void free_tree(tree *t) { free(t->q), free(t->parent); }
 
 static double distance2(int dof, const double *a, const double *b) {
     double sum = 0;
@@ -86,7 +84,6 @@ static int line_free(scratch *c, const double *a, const double *b) {
 
 typedef struct {
     double range;        /* [rad] longest edge of the trees */
-    double domain;       /* [rad] radius within which a node is extended once an extension of it failed */
     double seconds;      /* wall time for the search and the shortcuts together */
     long long nodes;     /* most of both trees */
     long long shortcuts; /* tries */
@@ -137,13 +134,8 @@ static int search(run *r, tree trees[2], int meet[2], rng *random, plan_report *
         report->samples++;
         for (int j = 0; j < dof; j++) q[j] = w->lower[j] + uniform(random) * (w->upper[j] - w->lower[j]);
         int from = nearest(one, q, &square);
-        if (square > one->radius[from] * one->radius[from]) continue;
         int reached, node = extend(r, one, from, q, square, &reached);
-        if (node < 0) {
-            one->radius[from] = isinf(one->radius[from]) ? r->o->domain : fmax(one->radius[from] * 0.9, 0.2 * r->o->domain);
-            continue;
-        }
-        if (!isinf(one->radius[from])) one->radius[from] *= 1.1;
+        if (node < 0) continue;
         memcpy(q, one->q + (size_t)dof * node, sizeof(double) * dof);
         int at = nearest(other, q, &square);
         for (;;) {
@@ -151,10 +143,7 @@ static int search(run *r, tree trees[2], int meet[2], rng *random, plan_report *
             if (stop) return stop;
             if (trees[0].count + trees[1].count >= r->o->nodes) return NO_PATH;
             int next = extend(r, other, at, q, square, &reached);
-            if (next < 0) {
-                if (isinf(other->radius[at])) other->radius[at] = r->o->domain;
-                break;
-            }
+            if (next < 0) break;
             at = next;
             if (reached) {
                 meet[grows] = node, meet[1 - grows] = at;
