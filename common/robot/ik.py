@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from common.planning.kernel.ik import KernelArm
+from common.planning.kernel.world import NoKernel
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -15,13 +19,29 @@ ROTATION_TOLERANCE = 1e-4  # [rad]
 _LARGEST_STEP = 1.0  # [rad] in one joint and iteration: beyond it the linearisation means nothing
 
 
+_ARMS: WeakKeyDictionary[RobotModel, KernelArm | None] = WeakKeyDictionary()
+
+
+def _arm(robot: RobotModel) -> KernelArm | None:
+    """The robot in the compiled kernel; None where it cannot be used."""
+    if robot not in _ARMS:
+        try:
+            _ARMS[robot] = KernelArm(robot.model, robot.tcp_frame, POSITION_TOLERANCE, ROTATION_TOLERANCE)
+        except NoKernel:
+            _ARMS[robot] = None
+    return _ARMS[robot]
+
+
 def converge(robot: RobotModel, target: pin.SE3, seed: Array, iterations: int) -> Array | None:
     """Joint positions (dof,) [rad] whose TCP is at the target, found from the seed alone; None where it gets stuck.
 
     Levenberg-Marquardt damping after Sugihara (2011): the damping follows the error, so that steps are short far from
     the target and near singularities, and Newton-like at the end. A joint that would leave its limits is taken out
-    of the step instead of being clipped afterwards.
+    of the step instead of being clipped afterwards. The compiled kernel does it where it is there.
     """
+    arm = _arm(robot)
+    if arm is not None:
+        return arm.solve(target.homogeneous, seed, restarts=0, iterations=iterations)
     model, data, frame = robot.model, robot.data, robot.tcp_frame
     lower, upper = robot.lower, robot.upper
     q = np.clip(seed, lower, upper)
@@ -82,6 +102,10 @@ def solve_ik(
         restarts: random starts after the seed failed; 0 keeps to the seed's branch.
         iterations: steps from each start.
     """
+    arm = _arm(robot)
+    if arm is not None:
+        random = int(rng.integers(2**63)) if rng is not None and restarts else 0
+        return arm.solve(T_world_tcp, seed, restarts=restarts, iterations=iterations, random=random)
     target = pin.SE3(np.asarray(T_world_tcp, dtype=float))
     q = converge(robot, target, np.asarray(seed, dtype=float), iterations)
     if q is not None or restarts == 0:

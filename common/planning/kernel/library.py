@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from ctypes import c_double, c_int, c_void_p
+from ctypes import c_double, c_int, c_uint64, c_void_p
 from functools import cache
 from pathlib import Path
 
@@ -31,6 +31,9 @@ _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_forward": (None, [c_void_p] * 3),
     "zk_plan": (c_int, [c_void_p, c_void_p, c_int, c_void_p, c_void_p, c_void_p, c_int, c_void_p, c_void_p]),
     "zk_speeds": (c_int, [c_int, c_int] + [c_void_p] * 7),
+    "zk_ik": (
+        None, [c_void_p, c_int, c_void_p, c_void_p, c_int, c_void_p, c_int, c_int, c_uint64, c_void_p, c_void_p]
+    ),
     "zk_counters": (None, [c_void_p] * 2),
 }
 

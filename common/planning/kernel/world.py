@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from ctypes import byref, c_double, c_int
+from ctypes import CDLL, byref, c_double, c_int
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,32 +88,20 @@ class KernelWorld:
         """
         self._world = self._scratch = None
         self._lock = threading.Lock()  # other threads run while the kernel works
-        found = library()
-        if found is None:
-            raise NoKernel("the planning kernel is not built")
-        self.library = found
+        self.library, self._world = joints_of(model)
         self.dof: int = model.nq
         self.pair_count = len(geometry.collisionPairs)
         self._shape_count = geometry.ngeoms
-        kinds, axes = _joints(model)
-        parents = np.array(list(model.parents)[1:], dtype=np.int32)
-        placements = np.array([placement.homogeneous[:3] for placement in list(model.jointPlacements)[1:]])
-        lower, upper = (np.array(limit, dtype=float) for limit in (model.lowerPositionLimit, model.upperPositionLimit))
-        self._world = found.zk_world(
-            self.dof, *(address(a) for a in (parents, kinds, placements, axes, lower, upper))
-        )
-        if not self._world:
-            raise NoKernel(f"the planning kernel takes 31 joints at most, not {self.dof}")
         for i, item in enumerate(geometry.geometryObjects):
             self._add(item, known[i] if i < len(known) else Shape.of(item.geometry))
         pairs = np.array([(pair.first, pair.second) for pair in geometry.collisionPairs], dtype=np.int32).reshape(-1, 2)
         first, second = pairs[:, 0].copy(), pairs[:, 1].copy()
-        if not found.zk_pairs(self._world, self.pair_count, address(first), address(second)):
+        if not self.library.zk_pairs(self._world, self.pair_count, address(first), address(second)):
             raise MemoryError
-        self._scratch = found.zk_scratch(self._world)
+        self._scratch = self.library.zk_scratch(self._world)
         if not self._scratch:
             raise MemoryError
-        found.zk_refresh(self._scratch)
+        self.library.zk_refresh(self._scratch)
 
     def __del__(self) -> None:
         if self._scratch:
@@ -249,6 +237,25 @@ class KernelWorld:
 def address(array: NDArray[Any]) -> int:
     """Where the numbers of an array are; the array has to live as long as they are used."""
     return array.ctypes.data
+
+
+def joints_of(model: pin.Model) -> tuple[CDLL, int]:
+    """The library, and a world in it that has the model's joints and nothing else: to be freed with `zk_free`.
+
+    Raises:
+        NoKernel: there is no library, or a joint is not known to it.
+    """
+    found = library()
+    if found is None:
+        raise NoKernel("the planning kernel is not built")
+    kinds, axes = _joints(model)
+    parents = np.array(list(model.parents)[1:], dtype=np.int32)
+    placements = np.array([placement.homogeneous[:3] for placement in list(model.jointPlacements)[1:]])
+    lower, upper = (np.array(limit, dtype=float) for limit in (model.lowerPositionLimit, model.upperPositionLimit))
+    world = found.zk_world(model.nq, *(address(a) for a in (parents, kinds, placements, axes, lower, upper)))
+    if not world:
+        raise NoKernel(f"the planning kernel takes 31 joints at most, not {model.nq}")
+    return found, int(world)
 
 
 def _joints(model: pin.Model) -> tuple[NDArray[np.int32], Array]:

@@ -1,0 +1,56 @@
+"""Inverse kinematics by the kernel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from common.planning.kernel.world import NoKernel, address, joints_of
+
+Array = NDArray[np.float64]
+
+
+class KernelArm:
+    """The chain of joints that carries a frame. Not for several threads at once."""
+
+    def __init__(self, model: pin.Model, frame: int, position_tolerance: float, rotation_tolerance: float) -> None:
+        """Copy joints and limits.
+
+        Args:
+            model: joints; frame: index of the frame that is to be put somewhere.
+            position_tolerance: [m]; rotation_tolerance: [rad].
+
+        Raises:
+            NoKernel: there is no library, or a joint is not known to it.
+        """
+        self._world = None
+        self._library, self._world = joints_of(model)
+        self._joint: int = model.frames[frame].parentJoint
+        if not self._joint:
+            raise NoKernel("no joint moves the frame")
+        self._tip = np.array(model.frames[frame].placement.homogeneous[:3])
+        self._tolerance = np.array([position_tolerance, rotation_tolerance])
+        self._target, self._q, self._starts = np.empty((3, 4)), np.empty(model.nq), np.empty(1, dtype=np.int32)
+        self._fixed = (self._world, self._joint, address(self._tip), address(self._tolerance), 1, address(self._target))
+        self._found = (address(self._q), address(self._starts))
+
+    def __del__(self) -> None:
+        if self._world:
+            self._library.zk_free(self._world)
+
+    def solve(
+        self, T_world_frame: ArrayLike, seed: ArrayLike, *, restarts: int, iterations: int, random: int = 0
+    ) -> Array | None:
+        """Joint positions (dof,) [rad] within the limits that put the frame at a (4, 4) pose; None when none was found.
+
+        Args:
+            seed: (dof,) [rad] where the search starts, clipped to the limits.
+            restarts: random starts after that, which `random` decides; iterations: steps from each start.
+        """
+        pose, first = np.asarray(T_world_frame, dtype=float), np.asarray(seed, dtype=float)
+        if pose.shape != (4, 4) or first.shape != self._q.shape:
+            raise ValueError(f"pose has shape {pose.shape}, seed {first.shape}")
+        self._target[:], self._q[:] = pose[:3], first
+        self._library.zk_ik(*self._fixed, restarts, iterations, random, *self._found)
+        return None if self._starts[0] < 0 else self._q.copy()

@@ -1,0 +1,152 @@
+/* Inverse kinematics: damped least squares within the limits, from a seed and then from random starts. The random number
+   decides the starts. */
+#ifndef ZK_IK_H
+#define ZK_IK_H
+
+#include "planner.h"
+
+#define LARGEST_STEP 1.0 /* [rad], [m] in one joint and iteration: beyond it the linearisation means nothing */
+
+typedef struct {
+    const world *w;
+    int joints;       /* of the chain that carries the tool */
+    const int *chain;
+    pose tip;         /* of the tool in the frame of the chain's last joint */
+    double position, rotation; /* tolerances [m], [rad] */
+} arm;
+
+/* Rotation vector [rad] of a rotation, by its quaternion: exact near 0 and near half a turn. */
+static void rotation_vector(const double *R, double *out) {
+    double t[4] = {R[0] + R[4] + R[8], R[0] - R[4] - R[8], R[4] - R[0] - R[8], R[8] - R[0] - R[4]};
+    double v[3] = {R[7] - R[5], R[2] - R[6], R[3] - R[1]}, w = 1 + t[0];
+    int most = 0;
+    for (int k = 1; k < 4; k++)
+        if (t[k] > t[most]) most = k;
+    if (most) {
+        int i = most - 1, j = most % 3, k = (most + 1) % 3;
+        w = v[i];
+        v[i] = 1 + t[most], v[j] = R[3 * i + j] + R[3 * j + i], v[k] = R[3 * i + k] + R[3 * k + i];
+    }
+    if (w < 0) w = -w, v[0] = -v[0], v[1] = -v[1], v[2] = -v[2];
+    double sine = norm3(v), scale = sine > 1e-12 * w ? 2 * atan2(sine, w) / sine : 2 / w;
+    for (int k = 0; k < 3; k++) out[k] = scale * v[k];
+}
+
+/* The twist (6,), linear at the tool's point first, world, that leads from q to the target, and what one unit of each
+   joint of the chain adds to it. Returns whether q is within the tolerances. */
+static int tool_error(const arm *a, const double *q, const pose *target, double *error, double (*J)[6]) {
+    pose T = {{1, 0, 0, 0, 1, 0, 0, 0, 1}, {0, 0, 0}};
+    double at[MOST_JOINTS][3];
+    for (int i = 0; i < a->joints; i++) {
+        const joint *joint = &a->w->joint[a->chain[i]];
+        double value = q[a->chain[i] - 1];
+        compose(&T, &joint->place, &T);
+        double axis[3] = {T.R[2], T.R[5], T.R[8]};
+        if (joint->kind == REVOLUTE) {
+            double s = sin(value), k = cos(value);
+            for (int r = 0; r < 9; r += 3) {
+                double x = T.R[r], y = T.R[r + 1];
+                T.R[r] = k * x + s * y, T.R[r + 1] = k * y - s * x;
+            }
+            memcpy(J[i] + 3, axis, sizeof axis);
+            memcpy(at[i], T.p, sizeof T.p);
+        } else {
+            for (int r = 0; r < 3; r++) T.p[r] += axis[r] * value;
+            memcpy(J[i], axis, sizeof axis);
+            J[i][3] = J[i][4] = J[i][5] = 0;
+        }
+    }
+    compose(&T, &a->tip, &T);
+    for (int i = 0; i < a->joints; i++)
+        if (a->w->joint[a->chain[i]].kind == REVOLUTE) {
+            double arm_[3];
+            sub3(T.p, at[i], arm_);
+            cross3(J[i] + 3, arm_, J[i]);
+        }
+    pose left;
+    relative(&T, target, &left);
+    rotation_vector(left.R, error + 3);
+    rotate(T.R, error + 3, error + 3);
+    sub3(target->p, T.p, error);
+    return dot3(error, error) < a->position * a->position && dot3(error + 3, error + 3) < a->rotation * a->rotation;
+}
+
+/* step = J' (J J' + damping)^-1 error of the joints that are free, by Cholesky's factors; shortened to LARGEST_STEP. */
+static void damped_step(const arm *a, double (*J)[6], const double *free, const double *error, double damping,
+                        double *step) {
+    double A[6][6], x[6], most = 0;
+    for (int r = 0; r < 6; r++)
+        for (int c = 0; c <= r; c++) A[r][c] = r == c ? damping : 0;
+    for (int i = 0; i < a->joints; i++)
+        if (free[i] > 0)
+            for (int r = 0; r < 6; r++)
+                for (int c = 0; c <= r; c++) A[r][c] += J[i][r] * J[i][c];
+    for (int r = 0; r < 6; r++) {
+        x[r] = error[r];
+        for (int c = 0; c < r; c++) {
+            for (int k = 0; k < c; k++) A[r][c] -= A[r][k] * A[c][k];
+            A[r][c] *= A[c][c];
+            A[r][r] -= A[r][c] * A[r][c];
+            x[r] -= A[r][c] * x[c];
+        }
+        A[r][r] = 1 / sqrt(fmax(A[r][r], 1e-12)); /* its inverse is kept */
+        x[r] *= A[r][r];
+    }
+    for (int r = 5; r >= 0; r--) {
+        for (int k = r + 1; k < 6; k++) x[r] -= A[k][r] * x[k];
+        x[r] *= A[r][r];
+    }
+    for (int i = 0; i < a->joints; i++) {
+        step[i] = 0;
+        if (free[i] > 0)
+            for (int r = 0; r < 6; r++) step[i] += J[i][r] * x[r];
+        most = fmax(most, fabs(step[i]));
+    }
+    if (most > LARGEST_STEP)
+        for (int i = 0; i < a->joints; i++) step[i] *= LARGEST_STEP / most;
+}
+
+/* Moves q, within the limits, to where the tool is at the target; 0 where it gets stuck. The damping follows the error
+   (Sugihara 2011). A joint that stands at a limit and would go on is left out of the step. */
+static int converge(const arm *a, const pose *target, int iterations, double *q) {
+    double J[MOST_JOINTS][6], error[6], step[MOST_JOINTS];
+    for (int n = 0; n < iterations; n++) {
+        if (tool_error(a, q, target, error, J)) return 1;
+        double damping = 0.05 * fmin(1.0, dot3(error, error) + dot3(error + 3, error + 3)) + 1e-7;
+        double free[MOST_JOINTS];
+        for (int i = 0; i < a->joints; i++) free[i] = 1;
+        for (int tries = 0; tries < 3; tries++) {
+            int blocked = 0;
+            damped_step(a, J, free, error, damping, step);
+            for (int i = 0; i < a->joints; i++) {
+                int j = a->chain[i] - 1;
+                if ((q[j] + step[i] < a->w->lower[j] && q[j] <= a->w->lower[j]) ||
+                    (q[j] + step[i] > a->w->upper[j] && q[j] >= a->w->upper[j]))
+                    blocked += free[i] > 0, free[i] = 0;
+            }
+            if (!blocked) break;
+        }
+        for (int i = 0; i < a->joints; i++) {
+            int j = a->chain[i] - 1;
+            q[j] = fmin(fmax(q[j] + step[i] * free[i], a->w->lower[j]), a->w->upper[j]);
+        }
+    }
+    return 0;
+}
+
+/* Joint positions that put the tool at the target, in q: from the seed that is in it, then from random starts. Returns how
+   many of those it took, -1 when none served. */
+static int reach(const arm *a, const pose *target, int restarts, int iterations, rng *random, double *q) {
+    for (int n = 0; n < a->w->dof; n++) q[n] = fmin(fmax(q[n], a->w->lower[n]), a->w->upper[n]);
+    for (int n = 0; n <= restarts; n++) {
+        if (n)
+            for (int i = 0; i < a->joints; i++) {
+                int j = a->chain[i] - 1;
+                q[j] = a->w->lower[j] + uniform(random) * (a->w->upper[j] - a->w->lower[j]);
+            }
+        if (converge(a, target, iterations, q)) return n;
+    }
+    return -1;
+}
+
+#endif
