@@ -18,7 +18,6 @@ POSITION_TOLERANCE = 1e-5  # [m]
 ROTATION_TOLERANCE = 1e-4  # [rad]
 _LARGEST_STEP = 1.0  # [rad] in one joint and iteration: beyond it the linearisation means nothing
 
-
 _ARMS: WeakKeyDictionary[RobotModel, KernelArm | None] = WeakKeyDictionary()
 
 
@@ -87,7 +86,7 @@ def solve_ik(
     seed: ArrayLike,
     *,
     rng: np.random.Generator | None = None,
-    restarts: int = 20,
+    restarts: int = 200,
     iterations: int = 15,
 ) -> Array | None:
     """Joint positions (dof,) [rad] within the limits that put the TCP at a pose; None when none was found.
@@ -100,7 +99,7 @@ def solve_ik(
         seed: (dof,) [rad] from which the search starts; clipped to the limits.
         rng: where restarts come from; the same sequence each time when not given.
         restarts: random starts after the seed failed; 0 keeps to the seed's branch.
-        iterations: steps from each start.
+        iterations: steps from the seed.
     """
     arm = _arm(robot)
     if arm is not None:

@@ -46,7 +46,7 @@ class KernelArm:
 
         Args:
             seed: (dof,) [rad] where the search starts, clipped to the limits.
-            restarts: random starts after that, which `random` decides; iterations: steps from each start.
+            restarts: random starts after that, which `random` decides; iterations: steps from the seed.
         """
         pose, first = np.asarray(T_world_frame, dtype=float), np.asarray(seed, dtype=float)
         if pose.shape != (4, 4) or first.shape != self._q.shape:

@@ -1,9 +1,15 @@
+import time
+
 import numpy as np
+import pinocchio as pin
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from common.config import load_cell
+from common.planning.kernel.ik import KernelArm
+from common.planning.kernel.library import library
+from common.robot import ik
 from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
@@ -12,16 +18,88 @@ robot = RobotModel.load(load_cell("panda").robot)
 HOME = robot.named("home")
 
 
-@settings(max_examples=40, deadline=None)
+ROBOTS = {"panda": robot, "ur5": RobotModel.load(load_cell("ur5").robot)}
+kernel = pytest.mark.skipif(library() is None, reason="the planning kernel is not built here")
+
+
+@pytest.fixture
+def no_kernel(monkeypatch):
+    monkeypatch.setattr(ik, "_arm", lambda robot: None)
+
+
+def sliding_arm() -> tuple[pin.Model, int]:
+    """A model whose first and fourth joints slide, axes askew, and a frame at its end; another branch hangs on it."""
+    rng, model, parent = np.random.default_rng(4), pin.Model(), 0
+    for number in range(8):
+        axis = rng.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        kind = pin.JointModelPrismaticUnaligned(axis) if number in (0, 3) else pin.JointModelRevoluteUnaligned(axis)
+        place = pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-0.3, 0.3, 3))
+        low, high, most = np.full(1, -1.0), np.full(1, 1.5), np.full(1, 10.0)
+        joint = model.addJoint(parent, kind, place, f"j{number}", most, most, low, high)
+        parent = parent if number == 4 else joint
+    tip = pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3) * 0.1)
+    return model, model.addFrame(pin.Frame("tip", parent, tip, pin.FrameType.OP_FRAME))
+
+
+def away(model: pin.Model, frame: int, q, T) -> tuple[float, float]:
+    """How far the frame is from a pose by pinocchio: [m], [rad]."""
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    left = data.oMf[frame].actInv(pin.SE3(T))
+    return float(np.linalg.norm(left.translation)), float(np.linalg.norm(pin.log3(left.rotation)))
+
+
+def check(model: pin.Model, frame: int, q, T) -> None:
+    assert q is not None
+    position, rotation = away(model, frame, q, T)
+    assert position < 1.01e-5 and rotation < 1.01e-4
+    assert (q >= model.lowerPositionLimit).all() and (q <= model.upperPositionLimit).all()
+
+
+@kernel
+@pytest.mark.parametrize("name", ROBOTS)
+@settings(max_examples=300, deadline=None)
+@given(seed=st.integers(0, 2**31))
+def test_solution_puts_the_tcp_at_any_pose_that_was_reached(name, seed):
+    model, rng = ROBOTS[name], np.random.default_rng(seed)
+    T = model.fk(rng.uniform(model.lower, model.upper))
+    check(model.model, model.tcp_frame, solve_ik(model, T, rng.uniform(model.lower, model.upper), rng=rng), T)
+
+
+@kernel
+def test_solution_puts_the_tip_of_an_arm_with_sliding_joints_at_any_pose_that_was_reached():
+    model, frame = sliding_arm()
+    arm, data, rng = KernelArm(model, frame, 1e-5, 1e-4), model.createData(), np.random.default_rng(0)
+    for number in range(300):
+        pin.framesForwardKinematics(model, data, rng.uniform(model.lowerPositionLimit, model.upperPositionLimit))
+        T, seed = data.oMf[frame].homogeneous, rng.uniform(-3, 3, model.nq)
+        q = arm.solve(T, seed, restarts=300, iterations=15, random=number)
+        check(model, frame, q, T)
+        assert q[4] == np.clip(seed[4], -1, 1.5)  # the tip does not hang on it
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(0, 2**31))
-def test_solution_puts_the_tcp_at_any_pose_that_was_reached(seed):
+def test_without_the_kernel_solution_puts_the_tcp_at_any_pose_that_was_reached(no_kernel, seed):
     rng = np.random.default_rng(seed)
     T = robot.fk(rng.uniform(robot.lower, robot.upper))
-    q = solve_ik(robot, T, HOME, rng=rng, restarts=100)
-    assert q is not None
-    assert np.allclose(robot.fk(q), T, atol=2e-4)
-    assert np.allclose(robot.fk(q)[:3, 3], T[:3, 3], atol=2e-5)
-    assert robot.within_limits(q)
+    check(robot.model, robot.tcp_frame, solve_ik(robot, T, HOME, rng=rng), T)
+
+
+@kernel
+@pytest.mark.parametrize("name", ROBOTS)
+def test_from_a_seed_nearby_the_kernel_and_pinocchio_find_the_same(name, monkeypatch):
+    model, rng = ROBOTS[name], np.random.default_rng(3)
+    ends = rng.uniform(model.lower, model.upper, (50, model.dof))
+    seeds = ends + rng.uniform(-0.1, 0.1, ends.shape)
+    poses = [model.fk(q) for q in ends]
+    found = [solve_ik(model, T, seed) for T, seed in zip(poses, seeds, strict=True)]
+    monkeypatch.setattr(ik, "_arm", lambda robot: None)
+    for T, seed, q in zip(poses, seeds, found, strict=True):
+        other = solve_ik(model, T, seed, restarts=0)
+        if other is not None:
+            assert np.abs(q - other).max() < 0.02
 
 
 @pytest.mark.parametrize("yaw", [-1.0, 0.0, 1.0])
@@ -33,6 +111,29 @@ def test_grasps_all_over_the_table_are_found_from_home_alone(yaw):
 
 def test_pose_out_of_reach_has_no_solution():
     assert solve_ik(robot, tool_down(1.5, 0, 0.3), HOME, restarts=3) is None
+
+
+@kernel
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("place", [(1.5, 0, 0.3), (0, 0, 0.1), (1e6, 0, 0), (np.nan, 0, 0)])
+def test_pose_out_of_reach_is_said_to_be_in_bounded_time(name, place):
+    began = time.process_time()
+    assert solve_ik(ROBOTS[name], tool_down(*place), ROBOTS[name].named("home")) is None
+    assert time.process_time() - began < 0.1
+
+
+@kernel
+def test_pose_and_seed_of_another_size_are_refused():
+    with pytest.raises(ValueError, match="shape"):
+        solve_ik(robot, np.eye(4)[:3], HOME)
+    with pytest.raises(ValueError, match="shape"):
+        solve_ik(robot, robot.fk(HOME), HOME[:6])
+
+
+def test_seed_beyond_the_limits_is_clipped():
+    model = ROBOTS["ur5"]
+    q = solve_ik(model, model.fk(model.upper), model.upper + 1.0, restarts=0)
+    assert q is not None and np.abs(q - model.upper).max() < 1e-3
 
 
 def test_neighbouring_poses_have_neighbouring_solutions():

@@ -1,11 +1,12 @@
-/* Inverse kinematics: damped least squares within the limits, from a seed and then from random starts. The random number
-   decides the starts. */
+/* Inverse kinematics: damped least squares within the limits, from a seed and then from random starts. */
 #ifndef ZK_IK_H
 #define ZK_IK_H
 
 #include "planner.h"
 
 #define LARGEST_STEP 1.0 /* [rad], [m] in one joint and iteration: beyond it the linearisation means nothing */
+#define FULL_TURN 6.283185307179586 /* [rad] */
+#define MOST_STEPS 50 /* from a random start */
 
 typedef struct {
     const world *w;
@@ -59,9 +60,9 @@ static int tool_error(const arm *a, const double *q, const pose *target, double 
     compose(&T, &a->tip, &T);
     for (int i = 0; i < a->joints; i++)
         if (a->w->joint[a->chain[i]].kind == REVOLUTE) {
-            double arm_[3];
-            sub3(T.p, at[i], arm_);
-            cross3(J[i] + 3, arm_, J[i]);
+            double lever[3];
+            sub3(T.p, at[i], lever);
+            cross3(J[i] + 3, lever, J[i]);
         }
     pose left;
     relative(&T, target, &left);
@@ -71,14 +72,15 @@ static int tool_error(const arm *a, const double *q, const pose *target, double 
     return dot3(error, error) < a->position * a->position && dot3(error + 3, error + 3) < a->rotation * a->rotation;
 }
 
-/* step = J' (J J' + damping)^-1 error of the joints that are free, by Cholesky's factors; shortened to LARGEST_STEP. */
-static void damped_step(const arm *a, double (*J)[6], const double *free, const double *error, double damping,
+/* step = J' (J J' + damping)^-1 error of the joints that are not left out, by Cholesky's factors; none is longer than
+   LARGEST_STEP. */
+static void damped_step(const arm *a, double (*J)[6], const int *left_out, const double *error, double damping,
                         double *step) {
     double A[6][6], x[6], most = 0;
     for (int r = 0; r < 6; r++)
         for (int c = 0; c <= r; c++) A[r][c] = r == c ? damping : 0;
     for (int i = 0; i < a->joints; i++)
-        if (free[i] > 0)
+        if (!left_out[i])
             for (int r = 0; r < 6; r++)
                 for (int c = 0; c <= r; c++) A[r][c] += J[i][r] * J[i][c];
     for (int r = 0; r < 6; r++) {
@@ -98,7 +100,7 @@ static void damped_step(const arm *a, double (*J)[6], const double *free, const 
     }
     for (int i = 0; i < a->joints; i++) {
         step[i] = 0;
-        if (free[i] > 0)
+        if (!left_out[i])
             for (int r = 0; r < 6; r++) step[i] += J[i][r] * x[r];
         most = fmax(most, fabs(step[i]));
     }
@@ -106,45 +108,60 @@ static void damped_step(const arm *a, double (*J)[6], const double *free, const 
         for (int i = 0; i < a->joints; i++) step[i] *= LARGEST_STEP / most;
 }
 
+/* Whether a joint can be turned back by a full turn at either limit. */
+static int turns_round(const world *w, int j) {
+    return w->joint[j].kind == REVOLUTE && w->upper[j - 1] - w->lower[j - 1] >= FULL_TURN;
+}
+
 /* Moves q, within the limits, to where the tool is at the target; 0 where it gets stuck. The damping follows the error
-   (Sugihara 2011). A joint that stands at a limit and would go on is left out of the step. */
-static int converge(const arm *a, const pose *target, int iterations, double *q) {
-    double J[MOST_JOINTS][6], error[6], step[MOST_JOINTS];
-    for (int n = 0; n < iterations; n++) {
+   (Sugihara 2011). A joint that stands at a limit and would go on is left out of the step. With `anywhere` it is turned
+   back by a full turn where it can be, and the search ends where five steps do not halve the square of the error. */
+static int converge(const arm *a, const pose *target, int steps, int anywhere, double *q) {
+    const world *w = a->w;
+    double J[MOST_JOINTS][6], error[6], step[MOST_JOINTS], last = INFINITY;
+    for (int n = 0; n < steps; n++) {
         if (tool_error(a, q, target, error, J)) return 1;
-        double damping = 0.05 * fmin(1.0, dot3(error, error) + dot3(error + 3, error + 3)) + 1e-7;
-        double free[MOST_JOINTS];
-        for (int i = 0; i < a->joints; i++) free[i] = 1;
-        for (int tries = 0; tries < 3; tries++) {
-            int blocked = 0;
-            damped_step(a, J, free, error, damping, step);
+        double size = dot3(error, error) + dot3(error + 3, error + 3);
+        if (anywhere && n % 5 == 0) {
+            if (!(size < 0.5 * last)) return 0;
+            last = size;
+        }
+        int left_out[MOST_JOINTS] = {0};
+        for (int tries = 0, blocked = 1; blocked && tries < 3; tries++) {
+            blocked = 0;
+            damped_step(a, J, left_out, error, 0.05 * fmin(1.0, size) + 1e-7, step);
             for (int i = 0; i < a->joints; i++) {
-                int j = a->chain[i] - 1;
-                if ((q[j] + step[i] < a->w->lower[j] && q[j] <= a->w->lower[j]) ||
-                    (q[j] + step[i] > a->w->upper[j] && q[j] >= a->w->upper[j]))
-                    blocked += free[i] > 0, free[i] = 0;
+                int j = a->chain[i];
+                double at = q[j - 1], low = w->lower[j - 1], high = w->upper[j - 1];
+                if (left_out[i] || (anywhere && turns_round(w, j))) continue;
+                if ((at <= low && at + step[i] < low) || (at >= high && at + step[i] > high)) {
+                    left_out[i] = blocked = 1;
+                    step[i] = 0;
+                }
             }
-            if (!blocked) break;
         }
         for (int i = 0; i < a->joints; i++) {
-            int j = a->chain[i] - 1;
-            q[j] = fmin(fmax(q[j] + step[i] * free[i], a->w->lower[j]), a->w->upper[j]);
+            int j = a->chain[i];
+            double to = q[j - 1] + step[i], low = w->lower[j - 1], high = w->upper[j - 1];
+            if (anywhere && turns_round(w, j)) to += to > high ? -FULL_TURN : to < low ? FULL_TURN : 0;
+            q[j - 1] = fmin(fmax(to, low), high);
         }
     }
     return 0;
 }
 
-/* Joint positions that put the tool at the target, in q: from the seed that is in it, then from random starts. Returns how
-   many of those it took, -1 when none served. */
-static int reach(const arm *a, const pose *target, int restarts, int iterations, rng *random, double *q) {
-    for (int n = 0; n < a->w->dof; n++) q[n] = fmin(fmax(q[n], a->w->lower[n]), a->w->upper[n]);
-    for (int n = 0; n <= restarts; n++) {
-        if (n)
-            for (int i = 0; i < a->joints; i++) {
-                int j = a->chain[i] - 1;
-                q[j] = a->w->lower[j] + uniform(random) * (a->w->upper[j] - a->w->lower[j]);
-            }
-        if (converge(a, target, iterations, q)) return n;
+/* Joint positions that put the tool at the target, in q: from the seed that is in it, then from random starts. Returns
+   how many of those it took, -1 when none served. */
+static int reach(const arm *a, const pose *target, int restarts, int steps, rng *random, double *q) {
+    const world *w = a->w;
+    for (int j = 0; j < w->dof; j++) q[j] = fmin(fmax(q[j], w->lower[j]), w->upper[j]);
+    if (converge(a, target, steps, 0, q)) return 0;
+    for (int n = 1; n <= restarts; n++) {
+        for (int i = 0; i < a->joints; i++) {
+            int j = a->chain[i] - 1;
+            q[j] = w->lower[j] + uniform(random) * (w->upper[j] - w->lower[j]);
+        }
+        if (converge(a, target, MOST_STEPS, 1, q)) return n;
     }
     return -1;
 }
