@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from common.planning.collision import Pair
@@ -38,17 +39,10 @@ class GoalSamples:
 def sample_pose(region: Region, rng: np.random.Generator) -> Array:
     """(4, 4) T_world_tcp, uniform in the region's box, tilt and yaw."""
     axis = rng.uniform(-math.pi, math.pi)
-    tilt = rotation_about((math.cos(axis), math.sin(axis), 0.0), rng.uniform(0, 1) * region.tilt)
-    turn = rotation_about((0.0, 0.0, 1.0), rng.uniform(-1, 1) * region.yaw)
+    tilt = pin.exp3(rng.uniform(0, 1) * region.tilt * np.array([math.cos(axis), math.sin(axis), 0.0]))
+    turn = pin.exp3(rng.uniform(-1, 1) * region.yaw * np.array([0.0, 0.0, 1.0]))
     T = region.T_world_tcp
     return transform(T[:3, :3] @ tilt @ turn, T[:3, 3] + rng.uniform(-1, 1, 3) * region.half_sides)
-
-
-def rotation_about(axis: tuple[float, float, float], angle: float) -> Array:
-    """(3, 3) rotation by an angle [rad] about a unit axis: Rodrigues' formula."""
-    x, y, z = axis
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.array(np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K)
 
 
 def in_region(region: Region, T_world_tcp: Array, slack: float = 1e-3) -> bool:

@@ -31,9 +31,9 @@ class KernelArm:
             raise NoKernel("no joint moves the frame")
         self._tip = np.array(model.frames[frame].placement.homogeneous[:3])
         self._tolerance = np.array([position_tolerance, rotation_tolerance])
-        self._target, self._q, self._starts = np.empty((3, 4)), np.empty(model.nq), np.empty(1, dtype=np.int32)
-        self._fixed = (self._world, self._joint, address(self._tip), address(self._tolerance), 1, address(self._target))
-        self._found = (address(self._q), address(self._starts))
+        self._target, self._q = np.empty((3, 4)), np.empty(model.nq)
+        self._given = tuple(address(array) for array in (self._tip, self._tolerance, self._target))
+        self._into = address(self._q)
 
     def __del__(self) -> None:
         if self._world:
@@ -52,5 +52,5 @@ class KernelArm:
         if pose.shape != (4, 4) or first.shape != self._q.shape:
             raise ValueError(f"pose has shape {pose.shape}, seed {first.shape}")
         self._target[:], self._q[:] = pose[:3], first
-        self._library.zk_ik(*self._fixed, restarts, iterations, random, *self._found)
-        return None if self._starts[0] < 0 else self._q.copy()
+        starts = self._library.zk_ik(self._world, self._joint, *self._given, restarts, iterations, random, self._into)
+        return None if starts < 0 else self._q.copy()

@@ -31,9 +31,7 @@ _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_forward": (None, [c_void_p] * 3),
     "zk_plan": (c_int, [c_void_p, c_void_p, c_int, c_void_p, c_void_p, c_void_p, c_int, c_void_p, c_void_p]),
     "zk_speeds": (c_int, [c_int, c_int] + [c_void_p] * 7),
-    "zk_ik": (
-        None, [c_void_p, c_int, c_void_p, c_void_p, c_int, c_void_p, c_int, c_int, c_uint64, c_void_p, c_void_p]
-    ),
+    "zk_ik": (c_int, [c_void_p, c_int, c_void_p, c_void_p, c_void_p, c_int, c_int, c_uint64, c_void_p]),
     "zk_counters": (None, [c_void_p] * 2),
 }
 

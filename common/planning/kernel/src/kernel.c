@@ -396,21 +396,18 @@ API int zk_speeds(int count, int rows, const double *lengths, const double *up, 
     return speeds(count, rows, lengths, up, down, slope, highest, x, u);
 }
 
-/* Joint positions that put a tool, at `tip` (3, 4) in the frame of joint `tool`, at targets (count, 3, 4): q (count, dof)
-   holds seeds and then what was found. starts (count,): how many random starts it took, -1 where nothing was found.
-   tolerance: [m], [rad]. Of a world it reads joints and limits alone. */
-API void zk_ik(const world *w, int tool, const double *tip, const double *tolerance, int count, const double *targets,
-               int restarts, int iterations, uint64_t seed, double *q, int *starts) {
+/* Joint positions that put a tool, at `tip` (3, 4) in the frame of joint `tool`, at a target (3, 4): q (dof,) holds the
+   seed and then what was found. Returns how many random starts it took, -1 where nothing was found. tolerance: [m],
+   [rad]. Of a world it reads joints and limits alone. */
+API int zk_ik(const world *w, int tool, const double *tip, const double *tolerance, const double *target, int restarts,
+              int steps, uint64_t seed, double *q) {
     arm a = {w, w->joint[tool].depth, w->joint[tool].chain, {{0}, {0}}, tolerance[0], tolerance[1]};
-    pose given, back = {{0}, {0}}, target;
-    matrix_pose(tip, &given);
-    for (int r = 0; r < 3; r++)
-        for (int k = 0; k < 3; k++) back.R[3 * r + k] = w->joint[tool].turned[3 * k + r];
-    compose(&back, &given, &a.tip);
+    pose turned = {{0}, {0}}, given, to;
     rng random;
+    memcpy(turned.R, w->joint[tool].turned, sizeof turned.R);
+    matrix_pose(tip, &given);
+    relative(&turned, &given, &a.tip);
+    matrix_pose(target, &to);
     seed_random(&random, seed);
-    for (int i = 0; i < count; i++) {
-        matrix_pose(targets + 12 * (size_t)i, &target);
-        starts[i] = reach(&a, &target, restarts, iterations, &random, q + (size_t)w->dof * i);
-    }
+    return reach(&a, &to, restarts, steps, &random, q);
 }
