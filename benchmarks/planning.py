@@ -27,9 +27,9 @@ from common.messages import (
     PoseGoal,
     Vector3,
 )
+from common.planning.ik import solve_ik
 from common.planning.pipeline import PlanningPipeline
 from common.planning.validation import fine_samples, timed_path
-from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, tool_down
 

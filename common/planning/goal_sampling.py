@@ -10,8 +10,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from common.planning.collision import Pair
+from common.planning.ik import solve_ik
 from common.planning.problem import Cancel, Problem, Region, Result
-from common.robot.ik import solve_ik
 from common.robot.transforms import invert, transform
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from common.config import Grasp, Parameters, Tunable, check
-from common.robot.ik import solve_ik
+from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 

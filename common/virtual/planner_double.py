@@ -11,10 +11,10 @@ from common import messages as m
 from common import topics
 from common.config import Motion, Parameters, RobotConfig
 from common.errors import Refused
+from common.planning.ik import solve_ik
 from common.planning.pipeline import trajectory_message
 from common.planning.planners.joint_move import straight_profile
 from common.planning.retiming import TimedPath, join
-from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
 from common.transport.bus import Bus

@@ -30,9 +30,9 @@ from common.messages import (
     Vector3,
     WorldEdit,
 )
+from common.planning.ik import solve_ik
 from common.process.in_process import running_service
 from common.process.wiring import wiring
-from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.scene.workspace import reach_reason

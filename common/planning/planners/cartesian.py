@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common.config import Parameters
+from common.planning.ik import converge
 from common.planning.path import smoothed
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result, ToolPath, ToolWay, too_fine
-from common.robot.ik import converge
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]

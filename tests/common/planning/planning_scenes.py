@@ -16,9 +16,9 @@ from common.messages import (
     PoseGoal,
     Vector3,
 )
+from common.planning.ik import solve_ik
 from common.planning.obstacles import ObstacleCache
 from common.planning.robot_geometry import RobotGeometry
-from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, tool_down
 

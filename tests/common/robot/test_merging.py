@@ -6,7 +6,7 @@ import pytest
 
 from common.config import RobotConfig, check, find_file, load_cell, read_robot
 from common.errors import ConfigError
-from common.robot.ik import solve_ik
+from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, tool_down, transform
 

@@ -9,7 +9,7 @@ from common.applications.pick_place.resting import Resting
 from common.config import Grasp, Surroundings, check, load_cell
 from common.errors import ConfigError
 from common.perception.pinhole import Pinhole
-from common.robot.ik import solve_ik
+from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.scene import workspace

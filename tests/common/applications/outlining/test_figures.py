@@ -16,9 +16,9 @@ from common.applications.outlining.figures import Figures, Traced, distances
 from common.applications.outlining.messages import OutlinePoints, OutlineStatus
 from common.applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
 from common.config import load_cell
+from common.planning.ik import solve_ik
 from common.reporting.fold import Fold
 from common.reporting.summary import describe
-from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
 from common.supervision.collector import Collector

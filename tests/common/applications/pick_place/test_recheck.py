@@ -12,8 +12,8 @@ from common.application import Application
 from common.applications.pick_place.recheck import Recheck, Recording
 from common.config import load_cell
 from common.messages import GripperState, Header, JointState, Pose, PoseArray, Vector3
+from common.planning.ik import solve_ik
 from common.reporting.fold import Fold
-from common.robot.ik import solve_ik
 from common.robot.transforms import tool_down
 
 Array = NDArray[np.float64]

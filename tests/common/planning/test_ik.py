@@ -7,10 +7,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from common.config import load_cell
+from common.planning import ik
+from common.planning.ik import solve_ik
 from common.planning.kernel.ik import KernelArm
 from common.planning.kernel.library import library
-from common.robot import ik
-from common.robot.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 
@@ -53,7 +53,7 @@ def away(model: pin.Model, frame: int, q, T) -> tuple[float, float]:
 def check(model: pin.Model, frame: int, q, T) -> None:
     assert q is not None
     position, rotation = away(model, frame, q, T)
-    assert position < 1.01e-5 and rotation < 1.01e-4
+    assert position < 1.001e-5 and rotation < 1.001e-4
     assert (q >= model.lowerPositionLimit).all() and (q <= model.upperPositionLimit).all()
 
 
