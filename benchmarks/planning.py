@@ -85,7 +85,7 @@ def collides_again(
 
 
 def ik_figures(robot: RobotModel) -> None:
-    """IK over the table from home, and of random poses from random seeds."""
+    """IK over the table from home; `benchmarks.ik` has that of random poses."""
     rng = np.random.default_rng(0)
     seconds, found = [], 0
     for _ in range(300):
@@ -95,14 +95,6 @@ def ik_figures(robot: RobotModel) -> None:
         found += solve_ik(robot, T, robot.named("home")) is not None
         seconds.append(time.perf_counter() - began)
     report("IK, tool down over the table, from home", seconds, f"{found} of 300 found")
-    seconds, found = [], 0
-    for _ in range(300):
-        T = robot.fk(rng.uniform(robot.lower, robot.upper))
-        seed = rng.uniform(robot.lower, robot.upper)
-        began = time.perf_counter()
-        found += solve_ik(robot, T, seed, rng=rng) is not None
-        seconds.append(time.perf_counter() - began)
-    report("IK, random poses from random seeds", seconds, f"{found} of 300 found")
 
 
 def line_figures(pipeline: PlanningPipeline, robot: RobotModel, scene: PlanningScene) -> None:

@@ -149,3 +149,5 @@ def test_same_call_gives_the_same_solution():
     T = tool_down(0.4, -0.4, 0.05, 0.7)
     far = np.clip(-HOME, robot.lower, robot.upper)
     assert np.array_equal(solve_ik(robot, T, far), solve_ik(robot, T, far))
+    found = [solve_ik(robot, T, far, rng=np.random.default_rng(seed)) for seed in (1, 1)]
+    assert np.array_equal(found[0], found[1])
