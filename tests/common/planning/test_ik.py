@@ -96,10 +96,9 @@ def test_from_a_seed_nearby_the_kernel_and_pinocchio_find_the_same(name, monkeyp
     poses = [model.fk(q) for q in ends]
     found = [solve_ik(model, T, seed) for T, seed in zip(poses, seeds, strict=True)]
     monkeypatch.setattr(ik, "_arm", lambda robot: None)
-    for T, seed, q in zip(poses, seeds, found, strict=True):
-        other = solve_ik(model, T, seed, restarts=0)
-        if other is not None:
-            assert np.abs(q - other).max() < 0.02
+    others = [solve_ik(model, T, seed, restarts=0) for T, seed in zip(poses, seeds, strict=True)]
+    apart = [np.abs(q - other).max() for q, other in zip(found, others, strict=True) if other is not None]
+    assert len(apart) >= 45 and max(apart) < 0.02
 
 
 @pytest.mark.parametrize("yaw", [-1.0, 0.0, 1.0])

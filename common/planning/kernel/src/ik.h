@@ -108,9 +108,9 @@ static void damped_step(const arm *a, double (*J)[6], const int *left_out, const
         for (int i = 0; i < a->joints; i++) step[i] *= LARGEST_STEP / most;
 }
 
-/* Whether a joint can be turned back by a full turn at either limit. */
+/* Whether a joint can be turned back by a full turn at either limit, which descriptions give in few digits. */
 static int turns_round(const world *w, int j) {
-    return w->joint[j].kind == REVOLUTE && w->upper[j - 1] - w->lower[j - 1] >= FULL_TURN;
+    return w->joint[j].kind == REVOLUTE && w->upper[j - 1] - w->lower[j - 1] >= FULL_TURN - 1e-3;
 }
 
 /* Moves q, within the limits, to where the tool is at the target; 0 where it gets stuck. The damping follows the error
