@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 class KernelArm:
-    """The chain of joints that carries a frame. Not for several threads at once."""
+    """The chain of joints that carries a frame. Several threads may ask at once."""
 
     def __init__(self, model: pin.Model, frame: int, position_tolerance: float, rotation_tolerance: float) -> None:
         """Copy joints and limits.
@@ -31,9 +31,8 @@ class KernelArm:
             raise NoKernel("no joint moves the frame")
         self._tip = np.array(model.frames[frame].placement.homogeneous[:3])
         self._tolerance = np.array([position_tolerance, rotation_tolerance])
-        self._target, self._q = np.empty((3, 4)), np.empty(model.nq)
-        self._given = tuple(address(array) for array in (self._tip, self._tolerance, self._target))
-        self._into = address(self._q)
+        self._fixed = (self._world, self._joint, address(self._tip), address(self._tolerance))
+        self._shape = (model.nq,)
 
     def __del__(self) -> None:
         if self._world:
@@ -48,9 +47,9 @@ class KernelArm:
             seed: (dof,) [rad] where the search starts, clipped to the limits.
             restarts: random starts after that, which `random` decides; iterations: steps from the seed.
         """
-        pose, first = np.asarray(T_world_frame, dtype=float), np.asarray(seed, dtype=float)
-        if pose.shape != (4, 4) or first.shape != self._q.shape:
-            raise ValueError(f"pose has shape {pose.shape}, seed {first.shape}")
-        self._target[:], self._q[:] = pose[:3], first
-        starts = self._library.zk_ik(self._world, self._joint, *self._given, restarts, iterations, random, self._into)
-        return None if starts < 0 else self._q.copy()
+        pose, q = np.asarray(T_world_frame, dtype=float), np.array(seed, dtype=float, order="C")
+        if pose.shape != (4, 4) or q.shape != self._shape:
+            raise ValueError(f"pose has shape {pose.shape}, seed {q.shape}")
+        target = np.ascontiguousarray(pose[:3])
+        starts = self._library.zk_ik(*self._fixed, address(target), restarts, iterations, random, address(q))
+        return None if starts < 0 else q

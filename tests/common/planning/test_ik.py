@@ -1,4 +1,5 @@
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pinocchio as pin
@@ -150,3 +151,16 @@ def test_same_call_gives_the_same_solution():
     assert np.array_equal(solve_ik(robot, T, far), solve_ik(robot, T, far))
     found = [solve_ik(robot, T, far, rng=np.random.default_rng(seed)) for seed in (1, 1)]
     assert np.array_equal(found[0], found[1])
+
+
+@kernel
+def test_threads_get_the_answers_that_they_asked_for():
+    rng = np.random.default_rng(5)
+    poses = [robot.fk(q) for q in rng.uniform(robot.lower, robot.upper, (200, robot.dof))]
+
+    def ask(T):
+        return solve_ik(robot, T, HOME)
+
+    alone = [ask(T) for T in poses]
+    with ThreadPoolExecutor(4) as threads:
+        assert np.array_equal(alone, list(threads.map(ask, poses)))
