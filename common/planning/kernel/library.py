@@ -9,7 +9,7 @@ from pathlib import Path
 
 from common.planning.kernel.build import FOLDER, NAME
 
-VERSION = 7
+VERSION = 8
 
 _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_version": (c_int, []),

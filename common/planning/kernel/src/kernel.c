@@ -9,7 +9,7 @@
 #define API __attribute__((visibility("default")))
 #endif
 
-#define VERSION 7
+#define VERSION 8
 
 API int zk_version(void) { return VERSION; }
 
