@@ -76,6 +76,12 @@ def test_modules_of_the_old_page_can_be_imported(folder: Path, name: str) -> Non
     assert told == wanted.get(name, [])
 
 
+def test_inverse_kinematics_can_be_imported_from_where_it_was() -> None:
+    old = importlib.import_module("common.robot.ik")
+    with pytest.warns(DeprecationWarning, match=r"common\.robot\.ik\.solve_ik is common\.planning\.ik\.solve_ik now"):
+        assert old.solve_ik is importlib.import_module("common.planning.ik").solve_ik
+
+
 @pytest.mark.parametrize("name", ["evening_camera", "nearest_target"])
 async def test_services_of_the_old_page_read_and_write_what_they_did(folder: Path, name: str) -> None:
     module, _ = imported(f"my_pkg.{name}")

@@ -70,7 +70,7 @@ from cli.doctor.software import kernel
 from common.config import load_cell
 from common.messages import CollisionObject, Header, JointGoal, PlanningScene, PlanRequest, Pose, Vector3
 from common.planning.pipeline import PlanningPipeline
-from common.robot.ik import solve_ik
+from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 

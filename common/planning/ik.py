@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 POSITION_TOLERANCE = 1e-5  # [m]
 ROTATION_TOLERANCE = 1e-4  # [rad]
+_PATIENCE = 20  # random starts without the kernel: each takes a millisecond
 _LARGEST_STEP = 1.0  # [rad] in one joint and iteration: beyond it the linearisation means nothing
 
 _ARMS: WeakKeyDictionary[RobotModel, KernelArm | None] = WeakKeyDictionary()
@@ -98,7 +99,7 @@ def solve_ik(
         T_world_tcp: (4, 4) pose of the TCP in the base frame.
         seed: (dof,) [rad] from which the search starts; clipped to the limits.
         rng: where restarts come from; the same sequence each time when not given.
-        restarts: random starts after the seed failed; 0 keeps to the seed's branch.
+        restarts: random starts after the seed failed, fewer without the kernel; 0 keeps to the seed's branch.
         iterations: steps from the seed.
     """
     arm = _arm(robot)
@@ -110,7 +111,7 @@ def solve_ik(
     if q is not None or restarts == 0:
         return q
     generator = rng if rng is not None else np.random.default_rng(0)
-    for _ in range(restarts):
+    for _ in range(min(restarts, _PATIENCE)):
         q = converge(robot, target, generator.uniform(robot.lower, robot.upper), iterations)
         if q is not None:
             return q
