@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup run up test test-all containers check audit bench chaos fuzz soak docs deploy clean
+.PHONY: setup run up test test-all containers check audit bench bench-check chaos fuzz soak docs deploy clean
 
 setup: $(STAMP)
 
@@ -45,6 +45,9 @@ audit: setup  ## known vulnerabilities in the dependencies, where the database c
 bench: setup  ## every published figure, one module each
 	@for script in $$(grep -l __main__ benchmarks/*.py); do module=benchmarks.$$(basename $$script .py); \
 	  echo "== $$module"; $(BIN)/python -m $$module || exit 1; done
+
+bench-check: setup  ## whether planning lost more than a fifth of its lead; ratios, so that the machine is of no account
+	$(BIN)/python -m benchmarks.ratios
 
 chaos: setup  ## fifty runs, each under a plan of faults of its own: all of them have to end well
 	$(BIN)/python -m benchmarks.chaos
