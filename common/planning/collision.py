@@ -26,6 +26,7 @@ Pair = tuple[str, str]
 
 _PERCEIVED = ("target", "contained", "attached")
 _CONTACT_SLACK = 1  # margin level [1 mm] within which an attached object counts as touching at the start
+_DEEPER = 2e-4  # [m] than at the start: by rounding, and by how far a followed line may be off
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,8 @@ class CollisionWorld:
             attach: the only object that moves with the TCP: as in the scene's attached ones, or from where it lies.
             attach_pose: of that object in the TCP frame, when not held yet; else as it lies relative to the start.
             release: nothing is attached.
-            contact_distance: travel of the TCP [m] until which contact at the start is excused.
+            contact_distance: travel of the TCP [m] until which contact at the start is excused: of what is held to the
+                depth that it has there, of the robot with padding alone.
             cache: built geometry to use again; the world made before with it must not be used any more.
 
         Raises:
@@ -102,6 +104,7 @@ class CollisionWorld:
         self._kernel = self._bank.kernel()
         if self._kernel is not None:
             self._kernel.set_rules(_least(self._far))
+        self._sunk: Rules | None = None  # what the kernel does not measure: how deep things that touch at the start are
         self._near = self._rules_at_start(disabled, margins)
         self._hand_over_rules()
         self._lever = self._bank.lever
@@ -164,13 +167,16 @@ class CollisionWorld:
         if not close:
             return self._far
         first, second = self._bank.first, self._bank.second
-        touching = frozenset(i for i in close if max(first[i], second[i]) >= self._held_from)
+        touching = [i for i in close if max(first[i], second[i]) >= self._held_from]
         near_margins = margins.copy()
-        for i in self._close_at_start(0):
-            near_margins[i] = 0.0
-        if not touching and np.array_equal(near_margins, margins):
+        near_margins[self._close_at_start(0)] = 0.0
+        near_margins[touching] = np.minimum(0.0, self._bank.distances(self.start, touching)) - _DEEPER
+        if np.array_equal(near_margins, margins):
             return self._far
-        self._bank.near.set(disabled | touching, near_margins)
+        self._bank.near.set(disabled, near_margins)
+        if touching and self._kernel is not None:
+            self._sunk = self._bank.sunk
+            self._sunk.set(frozenset(range(self._bank.pair_count)).difference(touching), near_margins)
         return self._bank.near
 
     def _pairs_named(self, excused: Iterable[Pair]) -> frozenset[int]:
@@ -213,22 +219,26 @@ class CollisionWorld:
 
     def collides(self, q: Array) -> bool:
         """Whether the robot at q (dof,) [rad] touches itself or anything that it may not."""
-        if self._kernel is not None:
-            return self._kernel.colliding(q) >= 0
-        if self._near is self._far:
-            return self._far.hit(q)
-        return (self._near if self._travel(q) < self.contact_distance else self._far).hit(q)
+        if self._kernel is not None and self._kernel.colliding(q) >= 0:
+            return True
+        asked = self._asked_at(q)
+        return asked is not None and asked.hit(q)
+
+    def _asked_at(self, q: Array) -> Rules | None:
+        """The rules that coal is asked about at q: all where there is no kernel, else those that it does not know."""
+        if self._kernel is None:
+            return self.rules_at(q)
+        return self._sunk if self._sunk is not None and self._travel(q) < self.contact_distance else None
 
     def colliding_pair(self, q: Array) -> Pair | None:
         """Names of a link or attached object and of what it touches at q; None when nothing touches."""
         if self._kernel is not None:
             hit = self._kernel.colliding(q)
-            if hit < 0:
-                return None
-            close = self._kernel.distances(q)[0] <= _least(self.rules_at(q))
-            return self.pair(int(close.argmax()) if close.any() else hit)
-        rules = self.rules_at(q)
-        if not rules.hit(q):
+            if hit >= 0:
+                close = self._kernel.distances(q)[0] <= _least(self.rules_at(q))
+                return self.pair(int(close.argmax()) if close.any() else hit)
+        rules = self._asked_at(q)
+        if rules is None or not rules.hit(q):
             return None
         found = rules.pairs(q)
         return self.pair(found[0]) if found else None
@@ -238,14 +248,15 @@ class CollisionWorld:
         level = next((i for i, margin in enumerate(MARGINS) if margin >= moves), None)
         if level is None:
             return False
-        if self._near is self._far:
+        near, far = (self._near, self._far) if self._kernel is None else (self._sunk, None)
+        if near is far:
             return not self._far.hit(q, level)
-        travel = self._travel(q)
-        if travel - tcp_moves >= self.contact_distance:
-            return not self._far.hit(q, level)
-        if travel + tcp_moves < self.contact_distance:
-            return not self._near.hit(q, level)
-        return not (self._far.hit(q, level) or self._near.hit(q, level))
+        travel, rules = self._travel(q), []
+        if travel + tcp_moves >= self.contact_distance:
+            rules.append(far)
+        if travel - tcp_moves < self.contact_distance:
+            rules.append(near)
+        return not any(rule.hit(q, level) for rule in rules if rule is not None)
 
     def edge_free(self, a: Array, b: Array) -> bool:
         """Whether the straight line in joint space from a to b (dof,) [rad] is free.
@@ -254,7 +265,9 @@ class CollisionWorld:
         piece. Where nothing can be proved the pieces end at ways of 1 mm, and their middles decide.
         """
         if self._kernel is not None:
-            return self._kernel.edge_free(a, b)
+            proved = self._kernel.edge_free(a, b)
+            if not proved or self._sunk is None:
+                return proved
         span = b - a
         whole = float(np.abs(span) @ self._lever)
         tcp_whole = float(np.abs(span) @ self._tcp_lever)
@@ -277,12 +290,15 @@ class CollisionWorld:
 
     def first_collision(self, path: Array) -> Hit | None:
         """The first of the positions (N, dof) [rad] that collides; pieces between that are proved free are skipped."""
+        found = None
         if self._kernel is not None:
             index, hit = self._kernel.first_collision(path)
-            if index < 0:
-                return None
-            q = path[index].copy()
-            return Hit(index, q, self.colliding_pair(q) or self.pair(hit))
+            if index >= 0:
+                q = path[index].copy()
+                found = Hit(index, q, self.colliding_pair(q) or self.pair(hit))
+                path = path[:index]
+            if self._sunk is None or not len(path):
+                return found
         stack = [(0, len(path) - 1)]
         while stack:
             i, j = stack.pop()
@@ -299,7 +315,7 @@ class CollisionWorld:
                 continue
             if self.collides(q):
                 return Hit(m, q.copy(), self.colliding_pair(q) or ("unknown", "unknown"))
-        return None
+        return found
 
     def bends_free(self, path: SmoothPath, step: float) -> bool:
         """Whether the parabolas of a path are free whose straight lines are; looked for in steps [rad], or proved."""
@@ -309,7 +325,9 @@ class CollisionWorld:
         lengths = path.lengths[bent, None]
         d0, d1 = path.d0[bent] * lengths, path.d1[bent] * lengths
         cubics = np.stack([path.starts[bent], d0, 0.5 * (d1 - d0), np.zeros_like(d0)], axis=1)
-        return self._kernel.cubics_collision(cubics)[0] < 0
+        if self._kernel.cubics_collision(cubics)[0] >= 0:
+            return False
+        return self._sunk is None or self.first_collision(path.positions(step)) is None
 
     def edge_collision(self, a: Array, b: Array, step: float = 0.005) -> Hit | None:
         """The first collision on the straight line from a to b (dof,) [rad], looked for in steps [rad]."""
@@ -317,8 +335,8 @@ class CollisionWorld:
 
 
 def _least(rules: Rules) -> Array:
-    """(pairs,) [m] how far apart pairs must be, EXCUSED for those that may touch."""
-    least = rules.margins.copy()
+    """(pairs,) [m] how far apart pairs must be, EXCUSED for those that may touch or be in each other."""
+    least = np.where(rules.margins < 0, EXCUSED, rules.margins)
     least[list(rules.disabled)] = EXCUSED
     return least
 

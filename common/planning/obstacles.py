@@ -8,6 +8,7 @@ changing the margin of all pairs for each check would cost more than the check.
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -130,7 +131,7 @@ class ObstacleBank:
 
     Attributes:
         first, second: geometry indices of each pair; robot geometries come first, then the solids in their order.
-        near, far: two sets of rules over the same geometry.
+        near, far, sunk: sets of rules over the same geometry.
         lever: (dof,) [m] the farthest that a radian of each joint moves any point of the robot or of what is attached.
         shares: (pairs,) how much closer two things can come, as a share of the way of the point that moves most.
     """
@@ -168,6 +169,7 @@ class ObstacleBank:
         self._kernel_tried = self._kernel_placed = False
         self.near = Rules(self)
         self.far = Rules(self)
+        self.sunk = Rules(self)
         self.lever = np.zeros(self.model.nq)
         self.shares = np.zeros(self.pair_count)
         self._measure()
@@ -205,6 +207,12 @@ class ObstacleBank:
         self._kernel_placed = True
         return self._kernel
 
+    def distances(self, q: Array, pairs: Sequence[int]) -> Array:
+        """(len(pairs),) [m] at q (dof,), negative by how deep two things are in each other."""
+        data = pin.GeometryData(self.geometry)
+        pin.updateGeometryPlacements(self.model, self.data, self.geometry, data, q)
+        return np.array([pin.computeDistance(self.geometry, data, i).min_distance for i in pairs], dtype=float)
+
     def _measure(self) -> None:
         """Levers, and each pair's share: joints between two links alone move them towards each other."""
         items = self.geometry.geometryObjects
@@ -216,8 +224,8 @@ class ObstacleBank:
         shares = np.max(way / np.maximum(self.lever, 1e-9), axis=1, initial=0.0)
         if not np.array_equal(shares, self.shares):
             self.shares = shares
-            self.near.margins_changed()
-            self.far.margins_changed()
+            for rules in (self.near, self.far, self.sunk):
+                rules.margins_changed()
 
 
 class ObstacleCache:

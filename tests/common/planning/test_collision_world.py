@@ -6,9 +6,11 @@ from hypothesis import strategies as st
 from common.errors import UnknownName
 from common.messages import PlanningScene
 from common.planning.collision import CollisionWorld, interpolate
+from common.planning.kernel.library import library
 from common.planning.obstacles import ObstacleCache
 from tests.common.planning.planning_scenes import (
     BLOCK,
+    FINGERS,
     GEOMETRY,
     HOME,
     ROBOT,
@@ -138,6 +140,48 @@ def test_contact_at_the_start_ends_after_the_contact_distance():
     assert not lifted.collides(above(0.50, -0.10, 0.06))
     dragged = above(0.50, -0.075, 0.03)
     assert lifted.colliding_pair(dragged) == ("ball_0", "table")
+
+
+@pytest.fixture(params=["kernel", "coal"])
+def _either(request, monkeypatch):
+    if request.param == "coal":
+        monkeypatch.setattr("common.planning.obstacles.ObstacleBank.kernel", lambda _: None)
+    elif library() is None:
+        pytest.skip("the planning kernel is not built")
+
+
+def blocked(world, *ends):
+    """What each way of asking says of a straight edge; they agree."""
+    path = interpolate(ends, 0.005)
+    hit = world.first_collision(path)
+    assert (hit is None) is world.edge_free(*ends) is all(not world.collides(q) for q in path)
+    return None if hit is None else hit.pair
+
+
+@pytest.mark.usefixtures("_either")
+@pytest.mark.parametrize("overlap", [0.002, 0.0, -0.0005])
+def test_what_is_held_goes_no_deeper_into_what_it_touches_at_the_start(overlap):
+    grasp = above(0.50, -0.10, 0.03)
+    held = world(scene([(0.50, -0.10), (0.56 - overlap, -0.10)]), start=grasp, attach="ball_0", padding=0.003)
+    assert not held.collides(grasp)
+    assert blocked(held, grasp, above(0.50, -0.10, 0.045)) is None
+    assert blocked(held, grasp, above(0.50, -0.11, 0.035)) is None
+    assert blocked(held, grasp, above(0.504, -0.10, 0.0301)) == ("ball_0", "ball_1")
+    assert blocked(held, grasp, above(0.515, -0.10, 0.031)) == ("ball_0", "ball_1")
+    assert held.colliding_pair(above(0.50, -0.10, 0.029)) == ("ball_0", "table")
+
+
+@pytest.mark.usefixtures("_either")
+def test_turning_what_is_held_is_motion_too():
+    grasp = above(0.50, 0.0, 0.2)
+    things = scene(box=False)
+    things.objects += [
+        solid("bar", "target", "box", [0.2, 0.02, 0.02], (0.5, 0.0, 0.19)),
+        solid("post", "fixture", "box", [0.04, 0.04, 0.04], (0.58, 0.03, 0.19)),
+    ]
+    held = world(things, start=grasp, attach="bar", allowed=[(link, "bar") for link in FINGERS])
+    assert not held.collides(grasp)
+    assert {blocked(held, grasp, above(0.50, 0.0, 0.2, yaw)) for yaw in (-0.3, 0.3)} == {None, ("bar", "post")}
 
 
 def test_contact_that_begins_on_the_way_is_a_collision_near_the_start_too():
