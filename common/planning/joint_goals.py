@@ -31,14 +31,7 @@ def joint_goals(problem: Problem, cancel: Cancel, *, wanted: int, tries: int = 4
     samples = sample_goals(problem, problem.goal, cancel, wanted=wanted, tries=tries)
     if samples.goals:
         return samples.goals
-    stop = cancel.reason(problem)
-    if stop:
-        return Result(error=stop, message="planning was ended while goals were sampled")
-    if samples.colliding:
-        one, other = samples.colliding
-        message = f"all {samples.reached} poses found in the goal region collide; {one} collides with {other}"
-        return Result(error="goal_in_collision", message=message, colliding=samples.colliding)
-    return Result(error="no_ik", message="no pose of the goal region can be reached")
+    return samples.failure(cancel.reason(problem))
 
 
 def first_success(goals: list[Array], attempt: Callable[[Array], Result], cancel: Cancel, problem: Problem) -> Result:
