@@ -81,6 +81,7 @@ def test_zenoh_cli_decodes_the_topics_with_the_line_that_is_printed(up: RunningC
     assert len(seen["panda/camera/image_raw"]) < 400
 
 
+@pytest.mark.slow
 def test_the_camera_sends_no_more_than_about_ten_pictures_each_second(up: RunningCell) -> None:
     answer = up.tell("topic", "hz", "camera/image_raw", "--count", "3", "--json")
     assert answer.returncode == 0, answer.stderr

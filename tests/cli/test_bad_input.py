@@ -117,7 +117,10 @@ def test_what_only_a_service_can_tell_is_one_line_too(
     assert not command.children()
 
 
-@pytest.mark.parametrize("verb", [["node", "list"], ["topic", "echo", "tf"], ["task", "start"], ["topic", "hz", "tf"]])
+@pytest.mark.parametrize("verb", [
+    ["node", "list"], ["task", "start"],
+    *(pytest.param(verb, marks=pytest.mark.slow) for verb in (["topic", "echo", "tf"], ["topic", "hz", "tf"])),
+])
 def test_where_no_cell_is_up_the_hint_says_how_to_start_one(verb: list[str], tmp_path: Path, domain: int) -> None:
     done = ask(tmp_path, *verb, "--domain", str(domain))
     assert done.returncode == 1

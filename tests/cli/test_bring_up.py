@@ -53,6 +53,7 @@ def test_wrong_configuration_of_one_service_ends_everything_with_one_line(zencel
     assert not command.children()
 
 
+@pytest.mark.slow
 def test_what_turns_out_wrong_only_in_use_ends_everything_too(zencell: Start) -> None:
     command = zencell("up", "tiny.yaml", "--set", "services.last.behave=wrong", "--log-json")
     assert command.end() == 2
@@ -108,6 +109,7 @@ def test_run_ends_with_the_task_and_writes_the_summary(zencell: Start, folder: P
     assert "tiny: DONE, 2 of 2 placed" in command.lines
 
 
+@pytest.mark.slow
 def test_run_of_a_task_that_ends_in_error_exits_1(zencell: Start, folder: Path) -> None:
     command = zencell("run", "tiny.yaml", "--set", "services.last.behave=error", "--summary", "out.json")
     assert command.end() == 1

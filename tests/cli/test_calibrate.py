@@ -90,6 +90,7 @@ def test_a_video_serves_as_well_as_pictures(pictures, tmp_path):
     assert yaml.safe_load(output.read_text())["fx"] == pytest.approx(LENS.fx, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_board_is_written_with_its_true_size(tmp_path, capsys):
     png, pdf = tmp_path / "board.png", tmp_path / "board.pdf"
     for path in (png, pdf):

@@ -289,6 +289,7 @@ def test_other_programs_are_none_of_our_business() -> None:
     assert list(leftovers.judge(others)) == [Finding("ok", "no process is left over from an earlier run")]
 
 
+@pytest.mark.slow
 def test_stopped_service_of_a_cell_is_found_until_the_cell_is_gone(zencell: Callable[..., Zencell]) -> None:
     command = zencell("up", "tiny.yaml")
     command.until("zenoh --mode client")

@@ -60,7 +60,7 @@ UR5 = Old(
 )
 
 
-@pytest.fixture(params=[PANDA, UR5], ids=lambda old: old.cell)
+@pytest.fixture(params=[PANDA, pytest.param(UR5, marks=pytest.mark.slow)], ids=lambda old: old.cell)
 def old(request: pytest.FixtureRequest) -> Old:
     return request.param  # type: ignore[no-any-return]
 

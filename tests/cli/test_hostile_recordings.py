@@ -84,6 +84,7 @@ BOMBS: dict[str, Callable[[], bytes]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOMBS)
 def test_a_bomb_is_refused_at_once(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -246,6 +247,7 @@ def test_numbers_that_no_run_has_are_one_line_at_most(tmp_path: Path, capsys: py
         assert (code, len(lines)) in ((0, 0), (2, 1)), (number, lines)
 
 
+@pytest.mark.slow
 def test_a_damaged_byte_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     whole = told(tmp_path / "whole.mcap").read_bytes()
     path = tmp_path / "damaged.mcap"

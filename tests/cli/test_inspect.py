@@ -59,6 +59,7 @@ def test_echo_shows_a_state_that_was_said_long_ago(place: Place) -> None:
     assert {service["state"] for service in status["services"]} == {"ready"}
 
 
+@pytest.mark.slow
 def test_hz_and_bw_measure(place: Place) -> None:
     *_, last = place.say("topic", "hz", "camera/image_raw", "--count", "2", "--json")
     assert json.loads(last)["hz"] > 0

@@ -138,6 +138,7 @@ def test_top_shows_processes_and_topics(place: Place) -> None:
     assert view["speed"] == float(SPEED)
 
 
+@pytest.mark.slow
 def test_top_goes_on_in_plain_lines_until_interrupted(place: Place) -> None:
     watching = place.start("top")
     for _ in range(2):

@@ -140,6 +140,7 @@ def test_killed_recorder_leaves_what_recover_makes_whole(place: Recorded) -> Non
         assert recording.finished and pictures(10)(recording)
 
 
+@pytest.mark.slow
 def test_full_disk_stops_the_recording_with_one_line(place: Recorded) -> None:
     def little_room() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))
@@ -203,6 +204,7 @@ def test_play_needs_neither_cell_nor_router_and_loops_until_ctrl_c(tmp_path: Pat
     assert command.lines[-2].startswith("played ") or command.lines[-1].startswith("played ")
 
 
+@pytest.mark.slow
 def test_keys_pause_step_and_quit_and_the_terminal_is_given_back(tmp_path: Path) -> None:
     samples = [joints(n, key="panda/a") for n in range(1, 2000)]
     write(tmp_path / "a.mcap", samples, every=100)
@@ -288,6 +290,7 @@ def test_run_records_from_before_its_services_are_ready_to_after_their_end(zence
     assert b"stopped: SIGTERM" in lines
 
 
+@pytest.mark.slow
 def test_run_goes_on_when_its_recorder_dies(zencell: Start, folder: Path) -> None:
     command = zencell("up", "tiny.yaml", "--record", "run.mcap")
     command.until("zenoh --mode client")

@@ -31,6 +31,7 @@ def test_campaign_with_faults_tells_what_was_made_and_checked(capfd):
         assert what in told
 
 
+@pytest.mark.slow
 def test_campaign_that_does_not_end_names_each_seed_and_fails(capfd):
     code = app.execute(["simulate", *SMALL, "--seeds", "4-5", "--limit", "3"])
     told = capfd.readouterr().out

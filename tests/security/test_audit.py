@@ -101,6 +101,7 @@ def audit(database: Database, tmp_path: Path) -> Callable[[], subprocess.Complet
 Audit = Callable[[], subprocess.CompletedProcess[str]]
 
 
+@pytest.mark.slow
 def test_every_version_that_is_tested_is_looked_up(database: Database, audit: Audit) -> None:
     done = audit()
     assert done.returncode == 0, done.stderr
@@ -108,6 +109,7 @@ def test_every_version_that_is_tested_is_looked_up(database: Database, audit: Au
     assert {plain(name): version for name, version in PINNED.items()}.items() <= database.asked.items()
 
 
+@pytest.mark.slow
 def test_a_finding_fails_and_is_named(database: Database, audit: Audit) -> None:
     database.vulnerable = "cryptography"
     done = audit()

@@ -138,6 +138,7 @@ def is_let_in(endpoint: str, credentials: Credentials) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_an_authority_is_replaced_with_overlap_and_then_trusted_no_more(
     folder: Path, endpoint: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -99,7 +99,7 @@ async def test_whoever_reads_after_a_writer_has_begun_hears_it_whatever_expressi
     writer.close()
 
 
-@pytest.mark.parametrize("flooded", ["near", "front"])
+@pytest.mark.parametrize("flooded", [pytest.param("near", marks=pytest.mark.slow), "front"])
 async def test_silent_connections_at_one_door_keep_nobody_out_at_the_other(door: Door, flooded: str) -> None:
     listening = [each for each in door.near if _listens(each)]
     assert len(listening) == 1
@@ -122,6 +122,7 @@ def _listens(endpoint: str) -> bool:
     return True
 
 
+@pytest.mark.slow
 async def test_one_without_a_certificate_or_of_another_authority_is_not_let_in_near_either(
     door: Door, tmp_path: Path
 ) -> None:

@@ -347,6 +347,7 @@ async def test_stop_that_cannot_be_kept_says_so_everywhere_until_it_is(monkeypat
         assert {one.by for one in found.inhibits} == {"anna", "bert"}
 
 
+@pytest.mark.slow
 async def test_speed_scaling_that_is_set_while_it_moves_slows_the_arm_down(robot: RobotModel) -> None:
     home = robot.named("home")
     net, clock, given = LocalNetwork(), Clock(SPEED), config()

@@ -26,7 +26,7 @@ def outcome_of(name: str, seed: int) -> Outcome:
 
 @pytest.mark.parametrize(("cell", "seed"), [
     ("panda", 1),
-    ("panda", 2),  # the answer to who is there comes late, to a second instance
+    pytest.param("panda", 2, marks=pytest.mark.slow),  # the answer to who is there comes late, to a second instance
     pytest.param("ur5", 2, marks=pytest.mark.slow),
     pytest.param("ur5", 22, marks=pytest.mark.slow),  # stopped where it cannot go up any further
 ])
@@ -50,6 +50,7 @@ def test_run_of_a_campaign_is_repeated_by_its_seed():
         alone.messages, alone.seconds, alone.requests, alone.faults)
 
 
+@pytest.mark.slow
 def test_campaign_goes_on_after_a_process_has_had_its_seeds(monkeypatch):
     monkeypatch.setattr("common.virtual.campaign.SEEDS_A_PROCESS", 1)
     outcomes = [*run_seeds(PANDA, [1, 2, 3], False, 1, 1.0)]  # none ends within that time

@@ -47,6 +47,7 @@ def test_the_object_that_was_chosen_is_outlined() -> None:
     assert outline["object"] == chosen[0] and outline["length_m"] == pytest.approx(2 * math.pi * 0.03, abs=0.005)
 
 
+@pytest.mark.slow
 def test_coordinates_edited_by_hand_are_traced(tmp_path: Path) -> None:
     smaller = [[0.5 + dx, dy, 1.105] for dx, dy in ((-0.03, -0.03), (0.03, -0.03), (0.03, 0.03), (-0.03, 0.03))]
     stage_files.write_points(tmp_path / stage_files.CLEARED, smaller)

@@ -75,6 +75,7 @@ def test_panda_paused_on_its_way_goes_on_and_puts_every_ball_in_the_box() -> Non
     assert summary["seconds"]["moving"] < summary["seconds"]["task"]
 
 
+@pytest.mark.slow
 def test_ur5_paused_in_mid_trace_goes_on_with_the_same_trace() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         status = await pause_in_motion(cell, bus, "trace")

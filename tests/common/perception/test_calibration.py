@@ -57,6 +57,7 @@ def test_a_lens_is_found_within_a_thousandth_and_knows_how_certain_that_is(views
     assert found.corners == sum(len(view.points) for view in views)
 
 
+@pytest.mark.slow
 def test_wide_and_rational_lenses_are_found_with_more_coefficients():
     lens = Lens(fx=380, fy=381, cx=321, cy=238, d=(-0.32, 0.12, 0.0005, -0.0004, -0.02))
     views = collect(many_poses(BOARD, 10, z=(0.3, 0.5)), lens).views

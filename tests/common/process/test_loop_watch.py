@@ -56,6 +56,7 @@ async def test_a_stuck_service_ends_itself_and_says_where_it_hangs(toy, processe
     assert line.startswith("CRITICAL toy: the event loop has not turned for")
 
 
+@pytest.mark.slow
 async def test_what_blocks_a_thread_beside_the_loop_does_no_harm(toy, processes) -> None:
     process = toy("native")
     await processes.said(process, "woke up")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import pytest
+
 from common.transport.endpoint import port_of
 from tests.common.process.test_processes import CELL
 from tests.common.transport.conftest import Processes, until
 from tests.harness import free_domain
 
 
+@pytest.mark.slow
 async def test_of_two_hosts_that_are_linked_later_the_first_keeps_the_service(processes: Processes) -> None:
     domains = free_domain(), free_domain()
     routers = [processes.start("services.router", "--domain", str(domain)) for domain in domains]
