@@ -24,6 +24,7 @@ from common.messages.execution import (
 from common.messages.geometry import Color, Pose, PoseArray, Quaternion, TFMessage, TransformStamped, Vector3
 from common.messages.planning import (
     ArcGoal,
+    GoalSet,
     JointGoal,
     PathGoal,
     PlanAttempt,

@@ -94,6 +94,13 @@ class SequenceGoal(Message):
         return self
 
 
+class GoalSet(Message):
+    """Several goals of which any will do, such as all grasps of an object: the one that takes least time is chosen."""
+
+    kind: Literal["any"] = "any"
+    goals: list[Annotated[JointGoal | PoseGoal, Field(discriminator="kind")]] = Field(min_length=1, max_length=100)
+
+
 class PlanRequest(Message):
     """Ask for a trajectory. Poses are in the robot's base frame, `world`.
 
@@ -109,7 +116,7 @@ class PlanRequest(Message):
     id: Name
     stage: Label = Field("", description="what the motion is for: appears in every error")
     start: Joints = Field([], description="joint positions [rad]; empty: where the robot is now")
-    goal: Annotated[JointGoal | PoseGoal | PathGoal | ArcGoal | SequenceGoal, Field(discriminator="kind")]
+    goal: Annotated[JointGoal | PoseGoal | PathGoal | ArcGoal | SequenceGoal | GoalSet, Field(discriminator="kind")]
     straight: bool = Field(False, description="only a straight line of the tool will do")
     allowed_collisions: Pairs = Field([], description="in addition to the planning scene's")
     attach: Label = ""
@@ -147,6 +154,7 @@ class PlanResponse(Message):
     ok: bool
     trajectory: JointTrajectory | None = None
     planner: Label = ""
+    goal_index: Count = Field(0, description="which goal of a set is reached, from 0")
     seconds: Finite = Field(0.0, description="wall time [s] of the whole request")
     fraction: Finite = 0.0
     error: Label = Field("", description="code: start_in_collision, no_ik, collision, incomplete, timeout, ...")

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import UnknownName, ZencellError
-from common.messages import ArcGoal, JointGoal, PathGoal, PlanningScene, PlanRequest, Pose, PoseGoal, SequenceGoal
+from common.messages import (
+    ArcGoal,
+    GoalSet,
+    JointGoal,
+    PathGoal,
+    PlanningScene,
+    PlanRequest,
+    Pose,
+    PoseGoal,
+    SequenceGoal,
+)
 from common.planning.collision import CollisionWorld, Pair
-from common.planning.problem import Arc, Goal, GoalSequence, Part, Region, ToolPath
+from common.planning.problem import Arc, Goal, GoalChoice, GoalSequence, Part, Region, ToolPath
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, pose_to_matrix
 
@@ -66,18 +77,33 @@ def check_request(
     if isinstance(goal, SequenceGoal):
         parts = [Part(_single_goal(robot, item.goal), item.straight, item.blend_radius) for item in goal.items]
         return CheckedRequest(start, GoalSequence(tuple(parts)))
+    if isinstance(goal, GoalSet):
+        return CheckedRequest(start, GoalChoice(tuple(_goals_of(robot, goal))))
     return CheckedRequest(start, _single_goal(robot, goal))
+
+
+def _goals_of(robot: RobotModel, choice: GoalSet) -> Iterator[Array | Region]:
+    for number, goal in enumerate(choice.goals, 1):
+        try:
+            yield _joint_goal(robot, goal) if isinstance(goal, JointGoal) else _region(robot, goal)
+        except BadRequest as error:
+            raise BadRequest(error.code, f"goal {number} of {len(choice.goals)}: {error}") from None
 
 
 def _single_goal(robot: RobotModel, goal: JointGoal | PoseGoal | ArcGoal) -> Array | Region | Arc:
     if isinstance(goal, JointGoal):
         return _joint_goal(robot, goal)
-    _require_near(robot, goal.pose, "goal")
     if isinstance(goal, ArcGoal):
+        _require_near(robot, goal.pose, "goal")
         if goal.via is not None:
             _require_near(robot, Pose(position=goal.via), "point on the way")
         via, center = (None if p is None else np.array([p.x, p.y, p.z]) for p in (goal.via, goal.center))
         return Arc(pose_to_matrix(goal.pose), via, center)
+    return _region(robot, goal)
+
+
+def _region(robot: RobotModel, goal: PoseGoal) -> Region:
+    _require_near(robot, goal.pose, "goal")
     tolerance = goal.position_tolerance
     sides = np.array([tolerance.x, tolerance.y, tolerance.z])
     if (sides < 0).any():

@@ -45,20 +45,36 @@ def sample_pose(region: Region, rng: np.random.Generator) -> Array:
     return transform(T[:3, :3] @ tilt @ turn, T[:3, 3] + rng.uniform(-1, 1, 3) * region.half_sides)
 
 
-def in_region(region: Region, T_world_tcp: Array, slack: float = 1e-3) -> bool:
-    """Whether a (4, 4) pose lies in the region, give or take the slack [m], [rad]."""
+def missed_by(region: Region, T_world_tcp: Array) -> float:
+    """How far a (4, 4) pose lies outside of the region, in its worst direction [m], [rad]; 0 and less for inside."""
     T = invert(region.T_world_tcp) @ T_world_tcp
     tilt = math.acos(float(np.clip(T[2, 2], -1, 1)))
     # The turn that is left once the tool axis was brought back by the shortest way.
     yaw = math.atan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1])
-    away = np.abs(T_world_tcp[:3, 3] - region.T_world_tcp[:3, 3])
-    within = (away <= region.half_sides + slack).all()
-    return bool(within and tilt <= region.tilt + slack and abs(yaw) <= region.yaw + slack)
+    away = np.abs(T_world_tcp[:3, 3] - region.T_world_tcp[:3, 3]) - region.half_sides
+    return max(float(away.max()), tilt - region.tilt, abs(yaw) - region.yaw)
 
 
-def sample_goals(problem: Problem, region: Region, cancel: Cancel, *, wanted: int, tries: int) -> GoalSamples:
-    """Up to `wanted` free goal positions: the region's own pose first, then others drawn from the region."""
+def sample_goals(problem: Problem, goal: Array | Region, cancel: Cancel, *, wanted: int, tries: int) -> GoalSamples:
+    """Up to `wanted` free goal positions: a region's own pose first, then others drawn from the region."""
     samples = GoalSamples()
+    if isinstance(goal, Region):
+        _draw(problem, goal, cancel, samples, wanted, tries)
+    else:
+        _look_at(problem, goal, samples)
+    samples.goals.sort(key=lambda goal: least_time(problem.start, goal, problem.velocity))
+    return samples
+
+
+def _look_at(problem: Problem, q: Array, samples: GoalSamples) -> None:
+    samples.reached += 1
+    if problem.world.collides(q):
+        samples.colliding = samples.colliding or problem.world.colliding_pair(q)
+    else:
+        samples.goals.append(q)
+
+
+def _draw(problem: Problem, region: Region, cancel: Cancel, samples: GoalSamples, wanted: int, tries: int) -> None:
     robot, rng = problem.robot, problem.rng
     point = not region.half_sides.any() and region.tilt == 0 and region.yaw == 0
     for attempt in range(tries):
@@ -67,15 +83,8 @@ def sample_goals(problem: Problem, region: Region, cancel: Cancel, *, wanted: in
         T = region.T_world_tcp if attempt == 0 or point else sample_pose(region, rng)
         seed = problem.start if attempt == 0 or (attempt % 2 and not point) else rng.uniform(robot.lower, robot.upper)
         q = solve_ik(robot, T, seed, rng=rng, restarts=5 if attempt == 0 else 1)
-        if q is None:
-            continue
-        samples.reached += 1
-        if problem.world.collides(q):
-            samples.colliding = samples.colliding or problem.world.colliding_pair(q)
-        else:
-            samples.goals.append(q)
-    samples.goals.sort(key=lambda goal: least_time(problem.start, goal, problem.velocity))
-    return samples
+        if q is not None:
+            _look_at(problem, q, samples)
 
 
 def least_time(a: Array, b: Array, velocity: Array) -> float:

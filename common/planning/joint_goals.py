@@ -2,36 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from common.planning.goal_sampling import sample_goals
-from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result
+from common.messages import PlanAttempt
+from common.planning.goal_sampling import least_time, sample_goals
+from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result
+from common.sources import monotonic
 
 Array = NDArray[np.float64]
+
+_LEAST_TRIES = 4  # to find one of the solutions of each of many poses
+_TOLD = 4  # goals of a set of which a message says why they fail
 
 
 def joint_goals(problem: Problem, cancel: Cancel, *, wanted: int, tries: int = 40) -> list[Array] | Result:
     """Free goal positions (dof,) [rad], nearest to the start first; or why there is none.
 
     Args:
-        problem: with a joint goal or a region; other goals, and straight lines of the tool, do not apply.
+        problem: with a joint goal, a region, or several of these to choose from; other goals, and straight lines of the
+            tool, do not apply.
         cancel: ends the search for IK solutions.
-        wanted: how many solutions of a pose to look for.
+        wanted: how many solutions of a pose to look for; of several poses together, but at least one of each.
         tries: seeds and poses tried to find them.
     """
     if problem.straight:
         return Result(error=NOT_APPLICABLE, message="a path through joint space is no straight line of the tool")
     if isinstance(problem.goal, np.ndarray):
-        return [problem.goal]
-    if not isinstance(problem.goal, Region):
+        return [problem.goal]  # the request's checks found it free
+    if not isinstance(problem.goal, Region | GoalChoice):
         return Result(error=NOT_APPLICABLE, message="a path through joint space needs a joint goal or a pose goal")
-    samples = sample_goals(problem, problem.goal, cancel, wanted=wanted, tries=tries)
-    if samples.goals:
-        return samples.goals
-    return samples.failure(cancel.reason(problem))
+    choices = problem.goal.goals if isinstance(problem.goal, GoalChoice) else (problem.goal,)
+    wanted, tries = math.ceil(wanted / len(choices)), max(_LEAST_TRIES, tries // len(choices))
+    found: list[Array] = []
+    failures: dict[int, Result] = {}
+    for number, goal in enumerate(choices, 1):
+        samples = sample_goals(problem, goal, cancel, wanted=wanted, tries=tries)
+        found += samples.goals
+        if not samples.goals:
+            failures[number] = samples.failure(cancel.reason(problem))
+    if found:
+        return sorted(found, key=lambda goal: least_time(problem.start, goal, problem.velocity))
+    return failures[1] if isinstance(problem.goal, Region) else none_of(failures)
+
+
+def none_of(failures: Mapping[int, Result]) -> Result:
+    """Why none of several goals can be reached, by their numbers: the failure that got furthest, and what each is."""
+    best = max(failures.values(), key=lambda failure: (failure.fraction, failure.colliding is not None))
+    told = [f"goal {number}: {failures[number].message}" for number in sorted(failures)[:_TOLD]]
+    if len(failures) > _TOLD:
+        told.append(f"and {len(failures) - _TOLD} more")
+    return replace(best, message=f"none of {len(failures)} goals; {'; '.join(told)}")
+
+
+def straight_edge(problem: Problem, goals: list[Array], planner: str) -> Result | None:
+    """The straight edge to the first goal to which it is free: so it is for most pairs, and nothing is shorter."""
+    began = monotonic()
+    for goal in goals:
+        if problem.world.edge_free(problem.start, goal):
+            attempt = PlanAttempt(
+                planner=planner, seconds=monotonic() - began, fraction=1.0, message="straight edge in joint space"
+            )
+            return Result(waypoints=np.array([problem.start, goal]), fraction=1.0, attempts=[attempt])
+    return None
 
 
 def first_success(goals: list[Array], attempt: Callable[[Array], Result], cancel: Cancel, problem: Problem) -> Result:

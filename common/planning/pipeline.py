@@ -13,9 +13,10 @@ from common.errors import UnknownName
 from common.messages import JointTrajectory, JointTrajectoryPoint, PlanAttempt, PlanningScene, PlanRequest, PlanResponse
 from common.planning.checks import BadRequest, CheckedRequest, check_collisions, check_request
 from common.planning.collision import CollisionWorld, Pair
+from common.planning.goal_sampling import missed_by
 from common.planning.obstacles import BadShape, ObstacleCache
 from common.planning.planners import Plan, load_planner, planner_names
-from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result, ToolPath
+from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result, ToolPath
 from common.planning.retiming import RetimingFailed, TimedPath, TooLong, require_tellable, stretch
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.timing import BLENDS, retime
@@ -98,6 +99,7 @@ class PlanningPipeline:
                     trajectory=message,
                     planner=name,
                     seconds=monotonic() - began,
+                    goal_index=_reached(problem, trajectory.positions[-1]),
                     fraction=result.fraction,
                     attempts=attempts,
                 )
@@ -221,6 +223,18 @@ class PlanningPipeline:
             acceleration=problem.acceleration,
             step=self._pipeline.validation_step,
         )
+
+
+def _reached(problem: Problem, q: Array) -> int:
+    """Which of several goals to choose from q (dof,) [rad] is at."""
+    if not isinstance(problem.goal, GoalChoice):
+        return 0
+    T_world_tcp = problem.robot.fk(q)
+    missed = [
+        missed_by(goal, T_world_tcp) if isinstance(goal, Region) else float(np.abs(goal - q).max())
+        for goal in problem.goal.goals
+    ]
+    return int(np.argmin(missed))
 
 
 def _further(one: Result, other: Result) -> bool:

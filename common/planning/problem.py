@@ -69,7 +69,14 @@ class GoalSequence:
     parts: tuple[Part, ...]
 
 
-Goal = Array | Region | ToolPath | Arc | GoalSequence
+@dataclass(frozen=True)
+class GoalChoice:
+    """Goals of which any will do."""
+
+    goals: tuple[Array | Region, ...]
+
+
+Goal = Array | Region | ToolPath | Arc | GoalSequence | GoalChoice
 
 
 @dataclass(frozen=True)
@@ -78,7 +85,8 @@ class Problem:
 
     Attributes:
         start: (dof,) [rad].
-        goal: (dof,) [rad] for a joint goal, else a region for the TCP, a path that it follows, or several goals.
+        goal: (dof,) [rad] for a joint goal, else a region for the TCP, a path that it follows, several goals one after
+            the other, or several of which any will do.
         straight: only a straight line of the TCP will do.
         velocity, acceleration, jerk: scaled limits (dof,).
         attempts: how many tries a sampling planner has.

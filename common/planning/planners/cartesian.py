@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -13,8 +14,19 @@ from pydantic import Field
 
 from common.config import Parameters
 from common.planning.ik import converge
+from common.planning.joint_goals import none_of
 from common.planning.path import smoothed
-from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result, ToolPath, ToolWay, too_fine
+from common.planning.problem import (
+    NOT_APPLICABLE,
+    Cancel,
+    GoalChoice,
+    Problem,
+    Region,
+    Result,
+    ToolPath,
+    ToolWay,
+    too_fine,
+)
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -60,7 +72,29 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
         return _line(problem, goal, options, cancel)
     if isinstance(goal, ToolPath):
         return _path(problem, goal, options, cancel)
+    if isinstance(goal, GoalChoice) and problem.straight:
+        return shortest_line(problem, goal, lambda region: _line(problem, region, options, cancel))
     return Result(error=NOT_APPLICABLE, message="a straight line needs a pose goal")
+
+
+def shortest_line(problem: Problem, choice: GoalChoice, follow: Callable[[Region], Result]) -> Result:
+    """The shortest of the lines to several goals that can be followed to its end; or why none can."""
+    T_start = pin.SE3(problem.robot.fk(problem.start))
+
+    def way(region: Region) -> float:
+        distance, angle = _distance(T_start, pin.SE3(region.T_world_tcp))
+        return distance + _REACH_OF_TURN * angle
+
+    regions = {number: goal for number, goal in enumerate(choice.goals, 1) if isinstance(goal, Region)}
+    if not regions:
+        return Result(error=NOT_APPLICABLE, message="a straight line needs a pose goal")
+    failures: dict[int, Result] = {}
+    for number in sorted(regions, key=lambda number: way(regions[number])):
+        result = follow(regions[number])
+        if not result.error or result.error in ("cancelled", "timeout"):
+            return result
+        failures[number] = result
+    return none_of(failures)
 
 
 def _line(problem: Problem, goal: Region, options: Options, cancel: Cancel) -> Result:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common.planning.planners import cartesian
-from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result
+from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result
 from common.planning.timing import ToolLimits, ToolWaypoints, follow_in_time
 
 Array = NDArray[np.float64]
@@ -27,12 +27,18 @@ class Options(ToolLimits):
 
 def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
     """A trajectory along the whole line to a pose goal, or what ends the line."""
-    if not isinstance(problem.goal, Region):
-        return Result(error=NOT_APPLICABLE, message="a straight line of the tool needs a pose goal")
-    found = line_waypoints(problem, problem.goal, options, cancel)
-    if isinstance(found, Result):
-        return found
-    return Result(trajectory=follow_in_time(problem, found, options), fraction=1.0)
+
+    def timed(region: Region) -> Result:
+        found = line_waypoints(problem, region, options, cancel)
+        if isinstance(found, Result):
+            return found
+        return Result(trajectory=follow_in_time(problem, found, options), fraction=1.0)
+
+    if isinstance(problem.goal, Region):
+        return timed(problem.goal)
+    if isinstance(problem.goal, GoalChoice) and problem.straight:
+        return cartesian.shortest_line(problem, problem.goal, timed)
+    return Result(error=NOT_APPLICABLE, message="a straight line of the tool needs a pose goal")
 
 
 def line_waypoints(problem: Problem, goal: Region, options: Options, cancel: Cancel) -> ToolWaypoints | Result:

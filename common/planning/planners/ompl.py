@@ -16,8 +16,9 @@ from pydantic import Field
 from common.config import Parameters
 from common.messages import PlanAttempt
 from common.planning.collision import CollisionWorld
-from common.planning.goal_sampling import least_time, sample_goals
-from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result
+from common.planning.goal_sampling import least_time
+from common.planning.joint_goals import joint_goals, straight_edge
+from common.planning.problem import Cancel, Problem, Result
 from common.robot.model import RobotModel
 from common.sources import monotonic
 
@@ -45,27 +46,12 @@ class Options(Parameters):
 
 
 def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
-    """The best path of several attempts to a joint goal or into the region of a pose goal.
-
-    A straight edge to one of the goals is taken when there is one: it is free for most pairs and nothing is shorter.
-    """
-    if problem.straight or not isinstance(problem.goal, Region | np.ndarray):
-        return Result(error=NOT_APPLICABLE, message="a sampled path is no straight line of the tool")
-    if isinstance(problem.goal, Region):
-        samples = sample_goals(problem, problem.goal, cancel, wanted=options.goals, tries=options.goal_tries)
-        goals = samples.goals
-        if not goals:
-            return samples.failure(cancel.reason(problem))
-    else:
-        goals = [problem.goal]
-    began = monotonic()
-    for goal in goals:
-        if problem.world.edge_free(problem.start, goal):
-            attempt = PlanAttempt(
-                planner="ompl", seconds=monotonic() - began, fraction=1.0, message="straight edge in joint space"
-            )
-            return Result(waypoints=np.array([problem.start, goal]), fraction=1.0, attempts=[attempt])
-    return _best(problem, options, cancel, goals)
+    """The straight edge where it is free, else the best of several attempts: to a joint or pose goal."""
+    goals = joint_goals(problem, cancel, wanted=options.goals, tries=options.goal_tries)
+    if isinstance(goals, Result):
+        return goals
+    straight = straight_edge(problem, goals, "ompl")
+    return straight or _best(problem, options, cancel, goals)
 
 
 def _best(problem: Problem, options: Options, cancel: Cancel, goals: Sequence[Array]) -> Result:

@@ -10,10 +10,11 @@ from pydantic import Field
 
 from common.config import Parameters
 from common.messages import PlanAttempt
-from common.planning.goal_sampling import least_time, sample_goals
+from common.planning.goal_sampling import least_time
+from common.planning.joint_goals import joint_goals, straight_edge
 from common.planning.kernel.planner import find_path
 from common.planning.kernel.world import KernelWorld
-from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Region, Result
+from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result
 from common.sources import monotonic
 
 Array = NDArray[np.float64]
@@ -33,28 +34,14 @@ class Options(Parameters):
 
 
 def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
-    """The best path of several attempts to a joint goal or into the region of a pose goal.
-
-    A straight edge to one of the goals is taken when there is one: it is free for most pairs and nothing is shorter.
-    """
-    if problem.straight or not isinstance(problem.goal, Region | np.ndarray):
-        return Result(error=NOT_APPLICABLE, message="a sampled path is no straight line of the tool")
+    """The straight edge where it is free, else the best of several attempts: to a joint or pose goal."""
     if problem.world.kernel is None:
         return Result(error=NOT_APPLICABLE, message="the planning kernel is not built")
-    goals = [problem.goal] if isinstance(problem.goal, np.ndarray) else []
-    if isinstance(problem.goal, Region):
-        samples = sample_goals(problem, problem.goal, cancel, wanted=options.goals, tries=options.goal_tries)
-        goals = samples.goals
-        if not goals:
-            return samples.failure(cancel.reason(problem))
-    began = monotonic()
-    for goal in goals:
-        if problem.world.edge_free(problem.start, goal):
-            straight = PlanAttempt(
-                planner="rrt_connect", seconds=monotonic() - began, fraction=1.0, message="straight edge in joint space"
-            )
-            return Result(waypoints=np.array([problem.start, goal]), fraction=1.0, attempts=[straight])
-    return _best(problem, options, cancel, problem.world.kernel, np.array(goals))
+    goals = joint_goals(problem, cancel, wanted=options.goals, tries=options.goal_tries)
+    if isinstance(goals, Result):
+        return goals
+    straight = straight_edge(problem, goals, "rrt_connect")
+    return straight or _best(problem, options, cancel, problem.world.kernel, np.array(goals))
 
 
 def _best(problem: Problem, options: Options, cancel: Cancel, kernel: KernelWorld, goals: Array) -> Result:

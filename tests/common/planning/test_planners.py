@@ -13,7 +13,7 @@ from common.errors import ConfigError, UnknownName
 from common.messages import PlanningScene, PlanRequest, PlanResponse, Vector3
 from common.planning import retiming
 from common.planning.collision import CollisionWorld
-from common.planning.goal_sampling import in_region
+from common.planning.goal_sampling import missed_by
 from common.planning.kernel.library import library
 from common.planning.kernel.world import NoKernel
 from common.planning.pipeline import PlanningPipeline
@@ -160,15 +160,15 @@ def test_sampled_path_ends_in_the_region_of_the_goal():
     )
     response = PIPELINE.plan(request, wall())
     assert_sound(request, wall(), response)
-    assert in_region(Region(T, np.full(3, 0.02), 0.25, 3.14), ROBOT.fk(last(response)))
+    assert missed_by(Region(T, np.full(3, 0.02), 0.25, 3.14), ROBOT.fk(last(response))) < 1e-3
 
 
 def test_region_knows_its_bounds():
     T = tool_down(0.5, 0.0, 0.2, 0.0)
     region = Region(T, np.full(3, 0.02), 0.2, 0.5)
-    assert in_region(region, tool_down(0.515, 0.0, 0.2, 0.4))
-    assert not in_region(region, tool_down(0.53, 0.0, 0.2, 0.0))
-    assert not in_region(region, tool_down(0.5, 0.0, 0.2, 0.6))
+    assert missed_by(region, tool_down(0.515, 0.0, 0.2, 0.4)) < 0
+    assert missed_by(region, tool_down(0.53, 0.0, 0.2, 0.0)) == pytest.approx(0.01)
+    assert missed_by(region, tool_down(0.5, 0.0, 0.2, 0.6)) == pytest.approx(0.1)
 
 
 def test_straight_line_keeps_the_tool_on_it_and_turns_it_evenly():

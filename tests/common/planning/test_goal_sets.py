@@ -1,0 +1,110 @@
+"""Several goals of which any will do: one that can be reached is found, and the one that takes least time."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from common.messages import GoalSet, JointGoal, PlanningScene, PlanRequest, PoseGoal
+from common.planning.pipeline import PlanningPipeline
+from common.robot.transforms import matrix_to_pose, tool_down
+from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, SPREAD, above, last, scene, solid
+
+PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
+TABLE = scene(SPREAD)
+SAMPLING = ["rrt_connect", "ompl", "ptp", "lerp", "chomp", "trajopt"]
+LINES = ["cartesian", "lin"]
+
+
+def pose(x: float, y: float, z: float, yaw: float = 0.0) -> PoseGoal:
+    return PoseGoal(pose=matrix_to_pose(tool_down(x, y, z, yaw)))
+
+
+def to_any(goals: list[JointGoal | PoseGoal], **options) -> PlanRequest:
+    return PlanRequest(id="any", start=HOME.tolist(), goal=GoalSet(goals=goals), seed=1, **options)
+
+
+NEAR, FAR = pose(0.45, 0.05, 0.45), pose(0.3, -0.5, 0.3)
+BURIED, UNREACHABLE = pose(0.5, 0.0, -0.1), pose(1.2, 0.0, 0.6)
+
+
+@pytest.mark.parametrize("planner", [*SAMPLING, ""])
+def test_goal_that_takes_least_time_is_chosen(planner):
+    times = []
+    for goals in ([NEAR], [FAR], [FAR, NEAR]):
+        response = PIPELINE.plan(to_any(goals, planner=planner), TABLE)
+        assert response.ok, response.message
+        times.append(response.trajectory.points[-1].time_from_start)
+    assert response.goal_index == 1
+    assert times[0] < times[1] and times[2] == pytest.approx(times[0], rel=0.05)
+    np.testing.assert_allclose(ROBOT.fk(last(response))[:3, 3], (0.45, 0.05, 0.45), atol=1e-3)
+
+
+@pytest.mark.parametrize("planner", [*SAMPLING, *LINES, ""])
+def test_goals_that_cannot_be_reached_are_passed_over(planner):
+    request = to_any([UNREACHABLE, BURIED, NEAR], planner=planner, straight=planner in LINES)
+    response = PIPELINE.plan(request, TABLE)
+    assert response.ok, response.message
+    assert response.goal_index == 2
+
+
+def test_joint_goals_that_collide_are_passed_over():
+    below = above(0.5, 0.0, -0.05)
+    assert PIPELINE.world(to_any([NEAR]), TABLE, HOME).collides(below)
+    goals = [JointGoal(positions=below.tolist()), JointGoal(positions=above(0.5, 0.3, 0.2).tolist()), BURIED]
+    response = PIPELINE.plan(to_any(goals), TABLE)
+    assert response.ok, response.message
+    assert response.goal_index == 1
+
+
+@pytest.mark.parametrize("planner", ["rrt_connect", "ompl", "lerp"])
+def test_each_goal_says_why_it_cannot_be_reached(planner):
+    response = PIPELINE.plan(to_any([UNREACHABLE, BURIED], planner=planner), TABLE)
+    assert not response.ok and response.error == "goal_in_collision"
+    assert response.colliding is not None
+    why = "none of 2 goals; goal 1: no pose of the goal region can be reached; goal 2: all "
+    assert f"{planner}: {why}" in response.message
+    assert "collides with" in response.message
+
+
+def test_lines_say_why_each_of_them_ends():
+    response = PIPELINE.plan(to_any([UNREACHABLE, BURIED], straight=True), TABLE)
+    assert not response.ok
+    assert "none of 2 goals; goal 1: waypoint" in response.message and "; goal 2: waypoint" in response.message
+
+
+def test_of_many_goals_a_few_say_why():
+    response = PIPELINE.plan(to_any([UNREACHABLE] * 30, planner="rrt_connect"), TABLE)
+    assert response.error == "no_ik"
+    assert response.message.endswith("; and 26 more") and len(response.message) < 500
+
+
+def around(scene_: PlanningScene) -> PlanningScene:
+    wall = solid("wall", "fixture", "box", [0.5, 0.02, 0.4], (0.55, 0.0, 0.2))
+    return scene_.model_copy(update={"objects": [*scene(box=False).objects, wall]})
+
+
+@pytest.mark.parametrize("planner", ["rrt_connect", "ompl"])
+def test_way_around_an_obstacle_leads_to_one_of_all(planner):
+    goals = [pose(0.5, y, 0.2, yaw) for y in (-0.3, -0.25) for yaw in np.linspace(-1.5, 1.5, 10)]
+    request = PlanRequest(id="any", start=above(0.5, 0.3, 0.2).tolist(), goal=GoalSet(goals=goals), planner=planner)
+    response = PIPELINE.plan(request, around(TABLE))
+    assert response.ok, response.message
+    reached = goals[response.goal_index].pose.position
+    np.testing.assert_allclose(ROBOT.fk(last(response))[:3, 3], (reached.x, reached.y, reached.z), atol=1e-3)
+
+
+@pytest.mark.parametrize(("goals", "error", "message"), [
+    ([NEAR, pose(40.0, 0, 0)], "out_of_reach", "goal 2 of 2: goal at (40, 0, 0) is 40 m away"),
+    ([NEAR, NEAR, JointGoal(positions=[9.0] * 7)], "goal_out_of_limits", "goal 3 of 3: goal puts"),
+    ([JointGoal(named="hoem"), NEAR], "unknown_pose", "goal 1 of 2: "),
+])
+def test_goal_that_makes_no_sense_is_named_by_its_number(goals, error, message):
+    response = PIPELINE.plan(to_any(goals), TABLE)
+    assert (response.ok, response.error) == (False, error)
+    assert message in response.message
+
+
+@pytest.mark.parametrize("goals", [[], [NEAR] * 101, [{"kind": "sequence", "items": []}]])
+def test_set_has_between_one_and_a_hundred_single_goals(goals):
+    with pytest.raises(ValidationError):
+        GoalSet(goals=goals)
