@@ -24,8 +24,10 @@ from common.messages.execution import (
 from common.messages.geometry import Color, Pose, PoseArray, Quaternion, TFMessage, TransformStamped, Vector3
 from common.messages.planning import (
     ArcGoal,
+    Box,
     GoalSet,
     JointGoal,
+    PathConstraints,
     PathGoal,
     PlanAttempt,
     PlanRequest,

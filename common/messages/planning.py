@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from common.messages.basics import SMALL, Count, Finite, Fraction, Header, Label, Message, Name, Text
 from common.messages.geometry import Pose, Vector3
 from common.messages.robot import TRAJECTORY_BYTES, Joints, JointTrajectory
 from common.messages.scene import Pairs
+
+_THINNEST = 1e-3  # [m]
 
 
 class JointGoal(Message):
@@ -101,6 +103,43 @@ class GoalSet(Message):
     goals: list[Annotated[JointGoal | PoseGoal, Field(discriminator="kind")]] = Field(min_length=1, max_length=100)
 
 
+class Box(Message):
+    """A box: the pose of its middle, and its full sides [m]."""
+
+    pose: Pose
+    size: Vector3
+
+    @model_validator(mode="after")
+    def _has_sides(self) -> Box:
+        if (least := min(self.size.x, self.size.y, self.size.z)) < _THINNEST:
+            raise ValueError(f"a box has a side of {least:g} m, {_THINNEST:g} m is the least")
+        return self
+
+
+class PathConstraints(Message):
+    """What is kept to all along the way, the start and the goal included.
+
+    `tilt`: the direction `tool_axis` of the tool's frame leans by at most this angle from `axis` in world: the tool's z
+    axis from straight down, unless told. With `upright_at_start` the tool stands upright at the start, whatever of it
+    lies along `axis` there: a glass held from the side. `region`: the tool centre point stays inside. `tool_speed`:
+    it never moves faster.
+    """
+
+    tilt: Annotated[float, Field(ge=0.005, le=math.pi)] | None = Field(None, description="[rad]")
+    axis: Vector3 = Field(Vector3(z=-1.0), description="of any length")
+    tool_axis: Vector3 = Field(Vector3(z=1.0), description="of any length")
+    upright_at_start: bool = False
+    region: Box | None = None
+    tool_speed: Annotated[float, Field(ge=1e-5, le=5)] | None = Field(None, description="[m/s]")
+
+    @model_validator(mode="after")
+    def _tells_directions(self) -> PathConstraints:
+        for name, axis in (("axis", self.axis), ("tool_axis", self.tool_axis)):
+            if not 1e-6 < (length := math.hypot(axis.x, axis.y, axis.z)) < 1e6:
+                raise ValueError(f"{name} has length {length:g}, and so no direction")
+        return self
+
+
 class PlanRequest(Message):
     """Ask for a trajectory. Poses are in the robot's base frame, `world`.
 
@@ -123,12 +162,21 @@ class PlanRequest(Message):
     attach_pose: Pose | None = Field(None, description="of the attached object in the tool frame, when not held yet")
     release: bool = False
     contact_distance: Annotated[float, Field(ge=0, le=0.2)] = 0.02
+    constraints: PathConstraints | None = Field(None, description="of the way, whoever plans it")
     velocity_scaling: Annotated[float, Field(ge=1e-4, le=1)] | None = None
     acceleration_scaling: Annotated[float, Field(ge=1e-4, le=1)] | None = None
     planning_time: Annotated[float, Field(gt=0, le=600)] | None = Field(None, description="wall time [s]")
     planning_attempts: Annotated[int, Field(ge=1, le=100)] | None = None
     planner: Label = Field("", description="use only this one, of the pipeline or of the project")
     seed: int | None = None
+
+    @model_serializer(mode="wrap")
+    def _written(self, write: SerializerFunctionWrapHandler) -> Any:
+        """The fields; constraints only where there are some, so that who knows none of them can read the rest."""
+        fields: dict[str, Any] = write(self)
+        if self.constraints is None:
+            fields.pop("constraints", None)
+        return fields
 
 
 class PlanAttempt(Message):

@@ -22,6 +22,7 @@ from common.messages import (
     SequenceGoal,
 )
 from common.planning.collision import CollisionWorld, Pair
+from common.planning.constraints import ToolConstraints
 from common.planning.problem import Arc, Goal, GoalChoice, GoalSequence, Part, Region, ToolPath
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, pose_to_matrix
@@ -109,6 +110,39 @@ def _region(robot: RobotModel, goal: PoseGoal) -> Region:
     if (sides < 0).any():
         raise BadRequest("bad_goal", f"goal has a negative position tolerance {float(sides.min()):g} m")
     return Region(pose_to_matrix(goal.pose), sides / 2, goal.tilt_tolerance, goal.yaw_tolerance)
+
+
+def check_constraints(robot: RobotModel, request: PlanRequest, checked: CheckedRequest) -> ToolConstraints | None:
+    """The constraints of a request whose start keeps to them, and its goal as far as it is known.
+
+    Raises:
+        BadRequest: start_violates_constraint, goal_violates_constraint, with the value and the limit.
+    """
+    if request.constraints is None:
+        return None
+    constraints = ToolConstraints(robot, request.constraints, checked.start)
+    for what, code, T, turn, way in _known_poses(robot, checked):
+        if wrong := constraints.wrong_with(T, turn, way):
+            raise BadRequest(f"{code}_violates_constraint", f"{what}: {wrong}")
+    return constraints
+
+
+def _known_poses(robot: RobotModel, checked: CheckedRequest) -> Iterator[tuple[str, str, Array, float, float]]:
+    """Name, whether start or goal, pose (4, 4), and by how much turn [rad] and way [m] it may be missed."""
+    yield "start", "start", robot.fk(checked.start), 0.0, 0.0
+    goal = checked.goal
+    goals: list[tuple[str, object]] = [("goal", goal)]
+    if isinstance(goal, ToolPath):
+        goals = [(f"point {number} of {len(goal.poses)}", T) for number, T in enumerate(goal.poses, 1)]
+    elif isinstance(goal, GoalSequence):
+        goals = [(f"item {number} of {len(goal.parts)}", part.goal) for number, part in enumerate(goal.parts, 1)]
+    for what, each in goals:
+        if isinstance(each, Region):
+            yield what, "goal", each.T_world_tcp, each.tilt + each.yaw, float(np.linalg.norm(each.half_sides))
+        elif isinstance(each, Arc):
+            yield what, "goal", each.T_world_tcp, 0.0, 0.0
+        elif isinstance(each, np.ndarray):
+            yield what, "goal", robot.fk(each) if each.ndim == 1 else each, 0.0, 0.0
 
 
 def check_collisions(world: CollisionWorld, checked: CheckedRequest) -> None:

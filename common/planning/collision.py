@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.errors import UnknownName
 from common.messages import CollisionObject, PlanningScene, Pose
+from common.planning.constraints import ToolConstraints
 from common.planning.kernel.world import EXCUSED, KernelWorld
 from common.planning.obstacles import MARGINS, ObstacleBank, ObstacleCache, Rules, Solid
 from common.planning.path import SmoothPath
@@ -38,6 +39,15 @@ class Hit:
     pair: Pair
 
 
+@dataclass(frozen=True)
+class Obstruction:
+    """What is in the way: a code for programs, a message for people, and the pair where two things touch."""
+
+    error: str
+    message: str
+    colliding: Pair | None
+
+
 class CollisionWorld:
     """Answers whether joint positions, edges and paths are free of collision, for one request on one scene.
 
@@ -46,7 +56,8 @@ class CollisionWorld:
     - an attached object with the gripper's links, always;
     - what an attached object touches at the start, and perceived objects into whose padding (not into themselves) a
       link reaches at the start: until the TCP is `contact_distance` away from where it was at the start.
-    Planners and validation ask the same world, so they hold the same rule.
+    Planners and validation ask the same world, so they hold the same rule. With constraints of the tool, what breaks
+    them is not free either (`collides`, `edge_free`, `bends_free`); what touches is told apart from it.
     """
 
     def __init__(
@@ -62,6 +73,7 @@ class CollisionWorld:
         release: bool = False,
         contact_distance: float = 0.02,
         cache: ObstacleCache | None = None,
+        constraints: ToolConstraints | None = None,
     ) -> None:
         """Set up the scene for a motion that begins at `start` (dof,) [rad].
 
@@ -77,11 +89,13 @@ class CollisionWorld:
             contact_distance: travel of the TCP [m] until which contact at the start is excused: of what is held to the
                 depth that it has there, of the robot with padding alone.
             cache: built geometry to use again; the world made before with it must not be used any more.
+            constraints: what the tool keeps to.
 
         Raises:
             UnknownName: `attach` is not in the scene.
         """
         self.robot = robot
+        self.constraints = constraints
         self.start: Array = np.array(start, dtype=float)
         self.cache = cache or ObstacleCache(RobotGeometry(robot))
         self._T_world_tcp_start = robot.fk(self.start)
@@ -218,7 +232,9 @@ class CollisionWorld:
         return math.dist(data.oMi[frame.parentJoint].act(frame.placement.translation), self._origin)
 
     def collides(self, q: Array) -> bool:
-        """Whether the robot at q (dof,) [rad] touches itself or anything that it may not."""
+        """Whether the robot at q (dof,) [rad] touches itself or anything that it may not, or breaks a constraint."""
+        if self.constraints is not None and not self.constraints.holds(q):
+            return True
         if self._kernel is not None and self._kernel.colliding(q) >= 0:
             return True
         asked = self._asked_at(q)
@@ -264,6 +280,8 @@ class CollisionWorld:
         Bisects: the middle being free with a margin of at least the way of any point to the ends proves the whole
         piece. Where nothing can be proved the pieces end at ways of 1 mm, and their middles decide.
         """
+        if self.constraints is not None and not self.constraints.line_holds(a, b):
+            return False
         if self._kernel is not None:
             proved = self._kernel.edge_free(a, b)
             if not proved or self._sunk is None:
@@ -320,11 +338,13 @@ class CollisionWorld:
     def bends_free(self, path: SmoothPath, step: float) -> bool:
         """Whether the parabolas of a path are free whose straight lines are; looked for in steps [rad], or proved."""
         bent = (path.d0 != path.d1).any(axis=1)
-        if self._kernel is None:
-            return self.first_collision(path.positions(step)) is None
         lengths = path.lengths[bent, None]
         d0, d1 = path.d0[bent] * lengths, path.d1[bent] * lengths
         cubics = np.stack([path.starts[bent], d0, 0.5 * (d1 - d0), np.zeros_like(d0)], axis=1)
+        if self.constraints is not None and self.constraints.first_break(cubics) is not None:
+            return False
+        if self._kernel is None:
+            return self.first_collision(path.positions(step)) is None
         if self._kernel.cubics_collision(cubics)[0] >= 0:
             return False
         return self._sunk is None or self.first_collision(path.positions(step)) is None
@@ -332,6 +352,16 @@ class CollisionWorld:
     def edge_collision(self, a: Array, b: Array, step: float = 0.005) -> Hit | None:
         """The first collision on the straight line from a to b (dof,) [rad], looked for in steps [rad]."""
         return self.first_collision(interpolate([a, b], step))
+
+    def obstruction(self, a: Array, b: Array, step: float) -> Obstruction:
+        """Why the straight line from a to b (dof,) [rad] is not free; a collision is looked for in steps [rad]."""
+        hit = self.edge_collision(a, b, step)
+        if hit is None and self.constraints is not None:
+            wrong = self.constraints.wrong_on_line(a, b)
+            if wrong:
+                return Obstruction("constraint", wrong, None)
+        pair = hit.pair if hit else ("robot", "scene")
+        return Obstruction("collision", f"{pair[0]} collides with {pair[1]}", pair)
 
 
 def _least(rules: Rules) -> Array:

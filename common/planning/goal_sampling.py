@@ -23,15 +23,20 @@ class GoalSamples:
 
     goals: list[Array] = field(default_factory=list)
     reached: int = 0
+    left: str = ""  # what the first of those violated that break a constraint of the tool
     colliding: Pair | None = None
 
     def failure(self, stop: str) -> Result:
         """Why there is no goal; `stop`: cancelled or timeout where that ended the search."""
         if stop:
             return Result(error=stop, message="planning was ended while goals were sampled")
+        if self.left and not self.colliding:
+            message = f"none of {self.reached} poses found in the goal region will do; {self.left}"
+            return Result(error="goal_violates_constraint", message=message)
         if self.colliding:
             one, other = self.colliding
-            message = f"all {self.reached} poses found in the goal region collide; {one} collides with {other}"
+            what = f"collide, or else {self.left}" if self.left else "collide"
+            message = f"all {self.reached} poses found in the goal region {what}; {one} collides with {other}"
             return Result(error="goal_in_collision", message=message, colliding=self.colliding)
         return Result(error="no_ik", message="no pose of the goal region can be reached")
 
@@ -68,7 +73,10 @@ def sample_goals(problem: Problem, goal: Array | Region, cancel: Cancel, *, want
 
 def _look_at(problem: Problem, q: Array, samples: GoalSamples) -> None:
     samples.reached += 1
-    if problem.world.collides(q):
+    left = problem.world.constraints.wrong_at(q) if problem.world.constraints else ""
+    if left:
+        samples.left = samples.left or left
+    elif problem.world.collides(q):
         samples.colliding = samples.colliding or problem.world.colliding_pair(q)
     else:
         samples.goals.append(q)

@@ -93,11 +93,10 @@ def blocked(problem: Problem, waypoints: Array) -> Result | None:
     for i in range(1, count + 1):
         if problem.world.edge_free(waypoints[i - 1], waypoints[i]):
             continue
-        hit = problem.world.edge_collision(waypoints[i - 1], waypoints[i], 0.002)
-        pair = hit.pair if hit else ("robot", "scene")
-        message = f"waypoint {i} of {count}: {pair[0]} collides with {pair[1]}"
+        found = problem.world.obstruction(waypoints[i - 1], waypoints[i], 0.002)
+        message = f"waypoint {i} of {count}: {found.message}"
         return Result(
-            error="collision", message=message, waypoint=i, colliding=pair, fraction=(i - 1) / count
+            error=found.error, message=message, waypoint=i, colliding=found.colliding, fraction=(i - 1) / count
         )
     return None
 

@@ -11,13 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from common.config import Motion, Parameters, Pipeline
 from common.errors import UnknownName
 from common.messages import JointTrajectory, JointTrajectoryPoint, PlanAttempt, PlanningScene, PlanRequest, PlanResponse
-from common.planning.checks import BadRequest, CheckedRequest, check_collisions, check_request
+from common.planning.checks import BadRequest, CheckedRequest, check_collisions, check_constraints, check_request
 from common.planning.collision import CollisionWorld, Pair
+from common.planning.constraints import CHECKED, ToolConstraints
 from common.planning.goal_sampling import missed_by
 from common.planning.obstacles import BadShape, ObstacleCache
 from common.planning.planners import Plan, load_planner, planner_names
 from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result, ToolPath
-from common.planning.retiming import RetimingFailed, TimedPath, TooLong, require_tellable, stretch
+from common.planning.retiming import RetimingFailed, TimedPath, TooLong, cubics, require_tellable, stretch
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.timing import BLENDS, retime
 from common.planning.validation import Fault, validate
@@ -76,7 +77,8 @@ class PlanningPipeline:
             planners = self._chosen(request)
             state = None if current is None else np.asarray(current, dtype=float)
             checked = check_request(self.robot, request, scene, state)
-            world = self._world(request, scene, checked)
+            constraints = check_constraints(self.robot, request, checked)
+            world = self._world(request, scene, checked, constraints)
             check_collisions(world, checked)
         except BadRequest as error:
             failure = Result(error=error.code, message=str(error), colliding=error.colliding)
@@ -129,16 +131,19 @@ class PlanningPipeline:
             self._others[name] = load_planner(name, {})
         return {name: self._others[name]}
 
-    def _world(self, request: PlanRequest, scene: PlanningScene, checked: CheckedRequest) -> CollisionWorld:
+    def _world(
+        self, request: PlanRequest, scene: PlanningScene, checked: CheckedRequest, constraints: ToolConstraints | None
+    ) -> CollisionWorld:
         try:
-            return self._make_world(request, scene, checked.start, self._cache)
+            return self._make_world(request, scene, checked.start, self._cache, constraints)
         except UnknownName as error:
             raise BadRequest(f"unknown_{error.what}", str(error)) from None
         except BadShape as error:
             raise BadRequest("bad_scene", str(error)) from None
 
     def _make_world(
-        self, request: PlanRequest, scene: PlanningScene, start: Array, cache: ObstacleCache
+        self, request: PlanRequest, scene: PlanningScene, start: Array, cache: ObstacleCache,
+        constraints: ToolConstraints | None = None,
     ) -> CollisionWorld:
         return CollisionWorld(
             self.robot,
@@ -151,6 +156,7 @@ class PlanningPipeline:
             release=request.release,
             contact_distance=request.contact_distance,
             cache=cache,
+            constraints=constraints,
         )
 
     def _problem(
@@ -214,7 +220,7 @@ class PlanningPipeline:
             yield stretch(trajectory, self._motion.cartesian_speed_scale) if result.tool_line else trajectory
 
     def _fault(self, problem: Problem, trajectory: TimedPath) -> Fault | None:
-        return validate(
+        fault = validate(
             trajectory,
             problem.robot,
             problem.world,
@@ -223,6 +229,16 @@ class PlanningPipeline:
             acceleration=problem.acceleration,
             step=self._pipeline.validation_step,
         )
+        constraints = problem.world.constraints
+        if fault is not None or constraints is None:
+            return fault
+        pieces = cubics(trajectory)
+        broken = constraints.first_break(pieces, CHECKED)
+        if broken is None:
+            return None
+        waypoint, t = broken
+        wrong = constraints.told_at(np.array([1, t, t**2, t**3]) @ pieces[waypoint])
+        return Fault("constraint", f"waypoint {waypoint} of {len(trajectory.times)}: {wrong}", waypoint)
 
 
 def _reached(problem: Problem, q: Array) -> int:

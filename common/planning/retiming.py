@@ -259,3 +259,11 @@ def sample(trajectory: TimedPath, times: ArrayLike) -> Array:
     return np.array(
         q0 + r * v0 + r**2 * (3 * (q1 - q0) - 2 * v0 - v1) + r**3 * (2 * (q0 - q1) + v0 + v1)
     )
+
+
+def cubics(trajectory: TimedPath) -> Array:
+    """(N - 1, 4, dof) coefficients c0 + c1 r + c2 r^2 + c3 r^3 between states, r from 0 to 1: what `sample` follows."""
+    span = np.diff(trajectory.times)[:, None]
+    q0, q1 = trajectory.positions[:-1], trajectory.positions[1:]
+    v0, v1 = trajectory.velocities[:-1] * span, trajectory.velocities[1:] * span
+    return np.stack([q0, v0, 3 * (q1 - q0) - 2 * v0 - v1, 2 * (q0 - q1) + v0 + v1], axis=1)

@@ -235,9 +235,8 @@ def _step(
         joint = int(np.argmax(jump))
         return Result(error="joint_jump", message=f"{robot.joint_names[joint]} jumps {jump[joint]:.2f} rad", waypoint=i)
     if not problem.world.edge_free(q, following):
-        hit = problem.world.edge_collision(q, following, 0.002)
-        pair = hit.pair if hit else ("robot", "scene")
-        return Result(error="collision", message=f"{pair[0]} collides with {pair[1]}", waypoint=i, colliding=pair)
+        found = problem.world.obstruction(q, following, 0.002)
+        return Result(error=found.error, message=found.message, waypoint=i, colliding=found.colliding)
     return following
 
 

@@ -28,11 +28,9 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
     """
     if not isinstance(problem.goal, np.ndarray) or problem.straight:
         return Result(error=NOT_APPLICABLE, message="joint moves need a joint goal and no straight line of the tool")
-    hit = None
     if not problem.world.edge_free(problem.start, problem.goal):
-        hit = problem.world.edge_collision(problem.start, problem.goal)
-        pair = hit.pair if hit else ("robot", "scene")
-        return Result(error="collision", message=f"{pair[0]} collides with {pair[1]}", colliding=pair)
+        found = problem.world.obstruction(problem.start, problem.goal, 0.005)
+        return Result(error=found.error, message=found.message, colliding=found.colliding)
     trajectory = straight_profile(problem.start, problem.goal, problem.velocity, problem.acceleration, problem.jerk)
     return Result(trajectory=trajectory, fraction=1.0)
 

@@ -1,0 +1,208 @@
+"""What the tool keeps to on its way: upright within an angle, inside a box. Proved along curves, not sampled.
+
+Each is a number n x - least, of a tool direction or of the tool centre point x, that must not be negative. Along a
+curve it is at least s0 + v (t - t0) - K (t - t0)^2 / 2 and s0 - M |t - t0|, with s0 and v at t0 and bounds K, M on the
+second and the first derivative along the whole curve, as in the proof that an edge is free (docs/planning.md).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from common.messages import PathConstraints
+from common.robot.model import RobotModel
+from common.robot.transforms import pose_to_matrix
+
+Array = NDArray[np.float64]
+
+TILT_TOLERANCE = 1e-3  # [rad] by which a trajectory may miss the angle, and
+PLACE_TOLERANCE = 1e-4  # [m] the box, anywhere on it
+# Shares of the tolerances that planners, and then the last check, use up: at states, and between them.
+PLANNED = (0.25, 0.5)
+CHECKED = (0.5, 1.0)
+_MOST_LOOKS = 20_000  # at one curve; what is not proved then is taken for a violation
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Numbers n x - least that must not be negative, of tool directions or of the tool centre point.
+
+    Attributes:
+        directions: (B,) whether x is a direction fixed to the tool, else the tool centre point.
+        at: (B, 3) that direction in the tool's frame; n: (B, 3) unit, world; least, slack: (B,), slack is what n x may
+            be less by at the tolerance.
+    """
+
+    directions: NDArray[np.bool_]
+    at: Array
+    n: Array
+    least: Array
+    slack: Array
+
+
+class ToolConstraints:
+    """Tilt and region of one request on one robot; tool speed is a matter of timing."""
+
+    def __init__(self, robot: RobotModel, wanted: PathConstraints, start: Array) -> None:
+        """Take over a message; `start` (dof,) [rad] says what is upright where the message says "as at the start"."""
+        self.robot = robot
+        self.tilt = wanted.tilt
+        self.tool_speed = wanted.tool_speed
+        rows: list[tuple[bool, Array, Array, float, float]] = []
+        if wanted.tilt is not None:
+            up = _unit(wanted.axis)
+            own = robot.fk(start)[:3, :3].T @ up if wanted.upright_at_start else _unit(wanted.tool_axis)
+            self._up, self._own = up, own
+            slack = math.cos(wanted.tilt) - math.cos(min(wanted.tilt + TILT_TOLERANCE, math.pi))
+            if slack > 0:
+                rows.append((True, own, up, math.cos(wanted.tilt), slack))
+        if wanted.region is not None:
+            T, size = pose_to_matrix(wanted.region.pose), wanted.region.size
+            for axis, side in enumerate((size.x, size.y, size.z)):
+                for n in (T[:3, axis], -T[:3, axis]):
+                    rows.append((False, np.zeros(3), n, float(n @ T[:3, 3]) - side / 2, PLACE_TOLERANCE))
+        self.bounds = Bounds(
+            np.array([row[0] for row in rows], dtype=bool),
+            np.array([row[1] for row in rows]).reshape(-1, 3),
+            np.array([row[2] for row in rows]).reshape(-1, 3),
+            np.array([row[3] for row in rows], dtype=float),
+            np.array([row[4] for row in rows], dtype=float),
+        )
+        self._turns = np.array([not joint.shortname().startswith("JointModelP") for joint in robot.model.joints[1:]])
+        self._levers = _levers(robot)
+
+    def holds(self, q: ArrayLike, share: float = PLANNED[0]) -> bool:
+        """Whether the robot at q (dof,) [rad] keeps to everything, but for a share of the tolerances."""
+        bounds = self.bounds
+        return not len(bounds.n) or bool((self._values(self.robot.fk(q)) >= -share * bounds.slack).all())
+
+    def wrong_with(self, T_world_tcp: Array, turn: float = 0.0, way: float = 0.0, share: float = PLANNED[0]) -> str:
+        """What a pose (4, 4) violates by more than this turn [rad] and way [m] could make good; "" for nothing."""
+        if self.tilt is not None:
+            tilt = math.acos(float(np.clip(self._up @ T_world_tcp[:3, :3] @ self._own, -1, 1)))
+            if tilt - turn > self.tilt + share * TILT_TOLERANCE:
+                return f"the tool is tilted by {tilt:.4g} rad, {self.tilt:.4g} allowed"
+        values = self._values(T_world_tcp)[~self.bounds.directions]
+        beyond = -float(values.min(initial=0.0))
+        if beyond - way > share * PLACE_TOLERANCE:
+            return f"the tool centre point is {1e3 * beyond:.4g} mm outside its region"
+        return ""
+
+    def wrong_at(self, q: ArrayLike, share: float = PLANNED[0]) -> str:
+        """What the robot violates at q (dof,) [rad]; "" for nothing."""
+        return self.wrong_with(self.robot.fk(q), share=share)
+
+    def line_holds(self, a: Array, b: Array) -> bool:
+        """Whether all is kept to on the straight line in joint space from a to b (dof,) [rad]."""
+        return self.first_break(line(a, b)) is None
+
+    def wrong_on_line(self, a: Array, b: Array) -> str:
+        """What is violated first on the straight line from a to b (dof,) [rad]; "" for nothing."""
+        broken = self.first_break(line(a, b))
+        return self.told_at(a + broken[1] * (b - a)) if broken else ""
+
+    def told_at(self, q: Array) -> str:
+        """What is violated at q (dof,) [rad], where a bound was found broken."""
+        return self.wrong_at(q, 0.0) or "the constraints of the tool are left"
+
+    def first_break(self, cubics: Array, shares: tuple[float, float] = PLANNED) -> tuple[int, float] | None:
+        """The first piece, and t, at which cubics break a bound; None where they keep to all.
+
+        Args:
+            cubics: (N, 4, dof) [rad] c0 + c1 t + c2 t^2 + c3 t^3, t from 0 to 1.
+            shares: of the tolerances: what states may use, and what is proved between them.
+        """
+        if not len(self.bounds.n):
+            return None
+        for number, c in enumerate(cubics):
+            t = self._breaks_at(c, *shares)
+            if t is not None:
+                return number, t
+        return None
+
+    def _breaks_at(self, c: Array, accepted: float, proved: float) -> float | None:
+        M, K = self._rates(c)
+        slack = self.bounds.slack
+        t = 0.0
+        for _ in range(_MOST_LOOKS):
+            q = c[0] + t * (c[1] + t * (c[2] + t * c[3]))
+            dq = c[1] + t * (2 * c[2] + t * 3 * c[3])
+            values, change = self._moving(q, dq)
+            if not (values >= -accepted * slack).all():
+                return t
+            t += float(_lasts(values + proved * slack, -change, K, M).min())
+            if t >= 1:
+                return None
+        return t
+
+    def _values(self, T: Array) -> Array:
+        """(B,) how far each bound is kept at a pose (4, 4) of the tool."""
+        b = self.bounds
+        x = np.where(b.directions[:, None], b.at @ T[:3, :3].T, T[:3, 3])
+        return np.asarray((b.n * x).sum(axis=1) - b.least)
+
+    def _moving(self, q: Array, dq: Array) -> tuple[Array, Array]:
+        """(B,) how far each bound is kept, and how that changes at velocities dq."""
+        robot, b = self.robot, self.bounds
+        J = pin.computeFrameJacobian(
+            robot.model, robot.data, q, robot.tcp_frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        T = np.array(pin.updateFramePlacement(robot.model, robot.data, robot.tcp_frame).homogeneous)
+        twist = J @ dq
+        turned = np.cross(twist[3:], b.at @ T[:3, :3].T)
+        dx = np.where(b.directions[:, None], turned, twist[:3])
+        return self._values(T), np.asarray((b.n * dx).sum(axis=1))
+
+    def _rates(self, c: Array) -> tuple[Array, Array]:
+        """(B,) M and K of each bound on one cubic (4, dof)."""
+        ends = np.abs([c[1], c[1] + 2 * c[2] + 3 * c[3]])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            turn = np.where(c[3] != 0, -c[2] / (3 * c[3]), -1.0)
+        inside = (turn > 0) & (turn < 1)
+        middle = np.where(inside, np.abs(c[1] + turn * (2 * c[2] + 3 * c[3] * turn)), 0.0)
+        speed = np.maximum(ends.max(axis=0), middle)
+        bend = np.maximum(np.abs(2 * c[2]), np.abs(2 * c[2] + 6 * c[3]))
+        turning = np.where(self._turns, speed, 0.0)
+        before = np.cumsum(turning) - turning
+        second = speed * (speed + 2 * before) + bend
+        levers = np.where(self.bounds.directions[:, None], self._turns.astype(float), self._levers)
+        return levers @ speed, levers @ second
+
+
+def line(a: Array, b: Array) -> Array:
+    """(1, 4, dof) the straight line from a to b."""
+    rest = np.zeros_like(a)
+    return np.stack([a, b - a, rest, rest])[None]
+
+
+def _unit(v: object) -> Array:
+    along = np.array([v.x, v.y, v.z])  # type: ignore[attr-defined]
+    return np.asarray(along / np.linalg.norm(along))
+
+
+def _lasts(s0: Array, v: Array, K: Array, M: Array) -> Array:
+    """How long s0 - v t - K t^2 / 2 or s0 - M t stays positive: the longer of both."""
+    root = np.sqrt(v * v + 2 * K * s0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        curved = np.where(v > 0, 2 * s0 / (v + root), np.where(K > 1e-300, (root - v) / K, np.inf))
+        plain = np.where(M > 1e-300, s0 / M, np.inf)
+    return np.maximum(np.maximum(curved, plain), 0.0)
+
+
+def _levers(robot: RobotModel) -> Array:
+    """(dof,) how far from each joint's axis the tool centre point can ever be [m]; 1 for joints that slide."""
+    model, frame = robot.model, robot.model.frames[robot.tcp_frame]
+    levers = np.zeros(robot.dof)
+    beyond, joint = float(np.linalg.norm(frame.placement.translation)), frame.parentJoint
+    while joint:
+        slides = model.joints[joint].shortname().startswith("JointModelP")
+        i = model.joints[joint].idx_q
+        levers[i] = 1.0 if slides else beyond
+        beyond += float(np.linalg.norm(model.jointPlacements[joint].translation))
+        beyond += max(abs(robot.lower[i]), abs(robot.upper[i])) if slides else 0.0
+        joint = model.parents[joint]
+    return levers

@@ -1,0 +1,204 @@
+import sys
+from types import ModuleType
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from common.config import Parameters, Pipeline
+from common.messages import (
+    ArcGoal,
+    Box,
+    GoalSet,
+    PathConstraints,
+    PathGoal,
+    PlanRequest,
+    Pose,
+    PoseGoal,
+    SequenceGoal,
+    SequenceItem,
+    Vector3,
+)
+from common.planning.constraints import CHECKED, PLANNED, ToolConstraints, line
+from common.planning.joint_goals import line as steps_to
+from common.planning.pipeline import PlanningPipeline
+from common.planning.problem import Result
+from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down, transform
+from common.transport.codec import decode, encode
+from tests.common.planning import ur5_scene
+from tests.common.planning.constraint_checks import driven
+from tests.common.planning.planner_checks import LEFT, RIGHT, with_planner
+from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, scene, to_joints, to_pose
+
+PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
+EMPTY = scene(box=False)
+CORRIDOR = Box(pose=Pose(position=Vector3(x=0.5, z=0.25)), size=Vector3(x=0.2, y=0.7, z=0.2))
+LEANING = transform(rpy_to_matrix(np.pi - 0.5, 0.0, 0.0), (0.5, 0.3, 0.3))
+
+
+def upright(tilt: float, **more) -> PathConstraints:
+    return PathConstraints(tilt=tilt, **more)
+
+
+def pose_goal(T, **more) -> PoseGoal:
+    return PoseGoal(pose=matrix_to_pose(T), **more)
+
+
+@pytest.mark.parametrize(
+    ("constraints", "text"),
+    [
+        ({"tilt": 0.0}, "0.005"),
+        ({"tilt": float("nan")}, "finite"),
+        ({"tilt": 4.0}, "3.14"),
+        ({"tilt": 0.1, "axis": {"x": 0.0, "y": 0.0, "z": 0.0}}, "axis has length 0, and so no direction"),
+        ({"tilt": 0.1, "tool_axis": {"x": 1e7, "y": 0.0, "z": 0.0}}, "no direction"),
+        ({"region": {"pose": {}, "size": {"x": 1.0, "y": -1.0, "z": 1.0}}}, "a box has a side of -1 m"),
+        ({"region": {"pose": {}}}, "size"),
+        ({"tool_speed": 0.0}, "0.00001"),
+        ({"tool_speed": "fast"}, "number"),
+        ({"speed": 1.0}, "Extra"),
+    ],
+)
+def test_constraint_that_makes_no_sense_is_refused_by_the_message(constraints, text):
+    with pytest.raises(ValidationError, match=text):
+        PathConstraints.model_validate(constraints)
+
+
+def test_request_without_constraints_looks_on_the_wire_as_it_did():
+    plain = to_joints(LEFT, RIGHT)
+    assert b"constraints" not in encode(plain) and "constraints" not in plain.model_dump_json()
+    kept = to_joints(LEFT, RIGHT, constraints=PathConstraints(tilt=0.1, region=CORRIDOR, tool_speed=0.2))
+    for request in (plain, kept):
+        assert decode(PlanRequest, encode(request)) == request
+
+
+@pytest.mark.parametrize(
+    ("goal", "start", "code", "text"),
+    [
+        (pose_goal(LEANING), RIGHT, "goal", "goal: the tool is tilted by 0.5 rad, 0.3 allowed"),
+        (pose_goal(tool_down(0.5, 0.2, 0.2)), HOME + 0.5 * np.eye(7)[5], "start", "tilted by 0.5"),
+        (pose_goal(tool_down(0.5, 0.2, 0.5)), RIGHT, "goal", "goal: the tool centre point is 150 mm outside its"),
+        (pose_goal(LEANING, tilt_tolerance=0.1), RIGHT, "goal", "tilted by 0.5 rad, 0.3 allowed"),
+        (ArcGoal(pose=matrix_to_pose(LEANING), via=Vector3(x=0.6, z=0.25)), RIGHT, "goal", "tilted by 0.5"),
+        (PathGoal(waypoints=[matrix_to_pose(ROBOT.fk(RIGHT)), matrix_to_pose(tool_down(0.5, 0.0, 0.6))]), RIGHT, "goal",
+         "point 2 of 2: the tool centre point is 250 mm outside"),
+        (SequenceGoal(items=[SequenceItem(goal=pose_goal(tool_down(0.5, 0.2, 0.2))), SequenceItem(
+            goal=pose_goal(LEANING))]), RIGHT, "goal", "item 2 of 2: the tool is tilted by 0.5 rad"),
+    ],
+)
+def test_start_and_goal_that_break_a_constraint_are_named_with_value_and_limit(goal, start, code, text):
+    request = PlanRequest(id="1", start=list(start), goal=goal, constraints=upright(0.3, region=CORRIDOR))
+    response = PIPELINE.plan(request, EMPTY)
+    assert response.error == f"{code}_violates_constraint"
+    assert text in response.message
+    assert "\n" not in response.message
+    assert response.attempts == []
+
+
+def test_goal_region_is_entered_where_the_tool_stands_upright():
+    goal = transform(rpy_to_matrix(np.pi - 0.35, 0.0, 0.0), (0.5, 0.3, 0.25))
+    for planner in ("rrt_connect", "ompl", "ptp"):
+        request = to_pose(goal, RIGHT, tilt_tolerance=0.3, constraints=upright(0.2), planner=planner)
+        response = PIPELINE.plan(request, EMPTY)
+        if response.ok:
+            assert driven(ROBOT, response).tilt() < 0.201
+        else:
+            assert response.error in ("goal_violates_constraint", "constraint"), response.message
+    assert PIPELINE.plan(request.model_copy(update={"planner": "rrt_connect"}), EMPTY).ok
+
+
+@pytest.mark.parametrize("planner", ["joint_move", "lerp", "ptp", "rrt_connect", "ompl", "chomp", "trajopt", "lin"])
+def test_no_planner_returns_a_trajectory_that_breaks_a_constraint(planner):
+    kept = refused = 0
+    pipeline = with_planner(planner)
+    for tilt, size in ((0.5, 0.62), (0.25, 0.2), (0.03, 0.02)):
+        box = Box(pose=Pose(position=Vector3(x=0.5, z=0.2)), size=Vector3(x=size, y=0.7, z=size))
+        wanted = upright(tilt, region=box)
+        request = to_pose(ROBOT.fk(LEFT), RIGHT, constraints=wanted) if planner == "lin" else to_joints(
+            LEFT, RIGHT, constraints=wanted)
+        request.planning_time = 1.0
+        response = pipeline.plan(request, EMPTY)
+        if response.ok:
+            kept += 1
+            way = driven(ROBOT, response)
+            assert way.tilt() < tilt + 1e-3
+            assert way.outside((0.5, 0.0, 0.2), (size, 0.7, size)) < 1e-4
+        else:
+            refused += 1
+            assert response.error in ("constraint", "timeout", "no_path"), response.message
+    assert kept
+    assert planner in ("lin", "rrt_connect") or refused
+
+
+def test_trajectory_of_a_users_planner_that_breaks_a_constraint_is_refused(monkeypatch):
+    def plan(problem, options, cancel):
+        return Result(waypoints=steps_to(problem.start, problem.goal, 40), dense=True, fraction=1.0)
+
+    module = ModuleType("my_planners.careless")
+    module.plan, module.Options = plan, type("Options", (Parameters,), {"__doc__": "None."})
+    monkeypatch.setitem(sys.modules, "my_planners", ModuleType("my_planners"))
+    monkeypatch.setitem(sys.modules, "my_planners.careless", module)
+    pipeline = PlanningPipeline(ROBOT, CELL.motion, Pipeline.model_validate(
+        {"planners": [{"name": "my_planners.careless"}, {"name": "rrt_connect"}]}))
+    request = to_joints(LEFT, RIGHT, constraints=upright(0.03), planner="careless")
+    response = pipeline.plan(request, EMPTY)
+    assert response.error == "constraint"
+    assert "waypoint" in response.message and "rad, 0.03 allowed" in response.message
+    assert response.attempts[0].waypoint
+    assert pipeline.plan(request.model_copy(update={"constraints": None}), EMPTY).planner == "careless"
+
+
+def arms():
+    return [(ROBOT, PIPELINE), (ur5_scene.ROBOT, ur5_scene.PIPELINE)]
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_what_is_proved_along_a_curve_holds_at_every_place_of_it(number):
+    robot, _ = arms()[number]
+    rng = np.random.default_rng(number)
+    held = broken = 0
+    for _ in range(40):
+        q = rng.uniform(robot.lower, robot.upper)
+        T = robot.fk(q)
+        wanted = PathConstraints(
+            tilt=float(rng.uniform(0.02, 0.5)),
+            axis=Vector3(**dict(zip("xyz", (T[:3, 2] + rng.normal(0, 0.02, 3)).tolist(), strict=True))),
+            region=Box(pose=matrix_to_pose(transform(T[:3, :3], T[:3, 3])), size=Vector3(x=0.3, y=0.2, z=0.1)),
+        )
+        constraints = ToolConstraints(robot, wanted, q)
+        cubic = np.stack([q, *rng.normal(0, rng.choice([0.01, 0.1, 0.3]), (3, robot.dof))])
+        for pieces in (line(q, cubic.sum(axis=0)), cubic[None]):
+            c = pieces[0]
+            wrong = [constraints.wrong_at(np.array([1, t, t**2, t**3]) @ c, 1.0) for t in np.linspace(0, 1, 200)]
+            for shares in (PLANNED, CHECKED):
+                found = constraints.first_break(pieces, shares)
+                if found is None:
+                    held += 1
+                    assert not any(wrong)
+                else:
+                    broken += 1
+                    t = found[1]
+                    assert constraints.wrong_at(np.array([1, t, t**2, t**3]) @ c, 0.0)
+    assert held > 25 and broken > 25
+
+
+def test_upright_may_be_how_the_tool_stands_at_the_start():
+    on_its_side = transform(rpy_to_matrix(np.pi / 2, 0.0, 0.0), (0.5, -0.1, 0.4))
+    constraints = ToolConstraints(ROBOT, upright(0.1, upright_at_start=True), HOME)
+    assert constraints.wrong_at(HOME) == ""
+    assert constraints.wrong_with(on_its_side)
+    leaning = ToolConstraints(ROBOT, upright(0.1, tool_axis=Vector3(y=-2.0), axis=Vector3(z=-5.0)), HOME)
+    assert leaning.wrong_with(on_its_side) == ""
+    assert "tilted by 1.57" in leaning.wrong_at(HOME)
+
+
+def test_of_several_goals_one_that_keeps_the_tool_upright_is_taken_else_each_is_told():
+    leaning, good = pose_goal(LEANING), pose_goal(tool_down(0.5, 0.2, 0.25))
+    request = PlanRequest(id="1", start=list(RIGHT), goal=GoalSet(goals=[leaning, good]), constraints=upright(0.2))
+    response = PIPELINE.plan(request, EMPTY)
+    assert response.goal_index == 1
+    assert driven(ROBOT, response).tilt() < 0.201
+    request.goal = GoalSet(goals=[leaning, pose_goal(tool_down(2.0, 0.0, 0.2))])
+    response = PIPELINE.plan(request, EMPTY)
+    assert "goal 1: " in response.message and "tilted by 0.5 rad, 0.2 allowed" in response.message
+    assert "goal 2: no pose of the goal region can be reached" in response.message
