@@ -26,6 +26,9 @@ class Motion(Section):
     object_padding: Tunable[float] = Field(
         0.003, ge=0, le=0.05, description="perceived objects are planned around with this much more radius [m]"
     )
+    start_tolerance: Tunable[float] = Field(
+        0.05, ge=0, le=0.5, description="where a joint stands this far beyond its limit a plan begins inwards [rad]"
+    )
 
 
 class Grasp(Section):

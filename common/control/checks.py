@@ -49,13 +49,13 @@ def checked_trajectory(
     trajectory = from_message(message, limits.names)
     _check_numbers(trajectory, limits, tolerances)
     _check_start(trajectory, limits, measured, tolerances)
-    _check_limits(trajectory, limits, tolerances)
+    _check_limits(trajectory, limits, measured, tolerances)
     _check_consistency(trajectory, limits, tolerances)
     best = with_best_interpolation(trajectory, limits, 1 + tolerances.slack)
     for fraction in (0.25, 0.5, 0.75):
         q, dq, _ = best.between(fraction)
-        slack, fastest = tolerances.position_slack, limits.velocity * (1 + tolerances.slack)
-        _within("position after", q, limits.lower - slack, limits.upper + slack, limits.names)
+        fastest = limits.velocity * (1 + tolerances.slack)
+        _within("position after", q, *_inwards(best.positions[:-1], limits, tolerances), limits.names)
         _within("velocity after", dq, -fastest, fastest, limits.names)
     return best
 
@@ -107,13 +107,22 @@ def _within(what: str, values: Vector, lower: Vector, upper: Vector, names: tupl
     outside = (values < lower) | (values > upper)
     if outside.any():
         point, j = np.argwhere(outside)[0]
+        low, high = (float(np.broadcast_to(limit, values.shape)[point, j]) for limit in (lower, upper))
         raise Refused("limit", f"{what} point {point} exceeds the limit of {names[j]}: "
-                               f"{values[point, j]:.4f} is not within {lower[j]:.4f} to {upper[j]:.4f}")
+                               f"{values[point, j]:.4f} is not within {low:.4f} to {high:.4f}")
 
 
-def _check_limits(trajectory: Trajectory, limits: Limits, tolerances: Tolerances) -> None:
+def _inwards(before: Vector, limits: Limits, tolerances: Tolerances) -> tuple[Vector, Vector]:
+    """Lowest and highest positions (N, dof) [rad] after those before: a joint beyond its limit gets no farther out."""
     slack = tolerances.position_slack
-    _within("position of", trajectory.positions, limits.lower - slack, limits.upper + slack, limits.names)
+    return np.minimum(limits.lower - slack, before), np.maximum(limits.upper + slack, before)
+
+
+def _check_limits(trajectory: Trajectory, limits: Limits, measured: Vector, tolerances: Tolerances) -> None:
+    lower, upper = _inwards(np.concatenate([[measured], trajectory.positions[:-1]]), limits, tolerances)
+    lower[0] -= tolerances.position_slack  # what is measured has noise
+    upper[0] += tolerances.position_slack
+    _within("position of", trajectory.positions, lower, upper, limits.names)
     for what, values, most in (
         ("velocity of", trajectory.velocities, limits.velocity),
         ("acceleration of", trajectory.accelerations, limits.acceleration),

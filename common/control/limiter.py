@@ -81,6 +81,10 @@ class Limiter:
         self.position, self._way, self._change, self._step = target, way, change, seconds
         return target, velocity
 
+    def _room(self) -> tuple[Vector, Vector]:
+        """Lowest and highest positions (dof,) [rad]: a joint that stands beyond its limit may stay there or come in."""
+        return np.minimum(self._lower, self.position), np.maximum(self._upper, self.position)
+
     def _passes(
         self, target: Vector, velocity: Vector, way: Vector, change: Vector, seconds: float, between: float,
         share: float, most: Vector,
@@ -90,7 +94,8 @@ class Limiter:
         jump = np.abs(change - self._change)
         goes_on = 1.0 if self._kept is None else 0.5  # what is caught up with is left no faster than it was reached
         # With the velocity that it has it must be possible to stop before the end of the joint.
-        free = np.where(way > 0, self._upper - target, target - self._lower)
+        lower, upper = self._room()
+        free = np.where(way > 0, upper - target, target - lower)
         speed = np.abs(way)
         return bool(
             np.all(speed <= self._velocity * (share * (1 + SLACK)) + ROUNDING)
@@ -108,8 +113,9 @@ class Limiter:
             self._kept = self._way + self._change * (self._step / 2), self._change
         v0, a0 = self._kept
         fastest, hardest = share * self._velocity, self._acceleration
-        target = np.clip(np.where(np.isfinite(target), target, self.position), self._lower, self._upper)
-        free = np.minimum(self._upper - target, target - self._lower)  # to come to that velocity, and to rest again
+        lower, upper = self._room()
+        target = np.clip(np.where(np.isfinite(target), target, self.position), lower, upper)
+        free = np.minimum(upper - target, target - lower)  # to come to that velocity, and to rest again
         ending = np.minimum(fastest, np.sqrt(hardest * free))
         velocity = np.clip(np.where(np.isfinite(velocity), velocity, 0.0), -ending, ending)
         given = ruckig.InputParameter(len(v0))

@@ -23,6 +23,7 @@ from common.messages.execution import (
 )
 from common.messages.geometry import Color, Pose, PoseArray, Quaternion, TFMessage, TransformStamped, Vector3
 from common.messages.planning import (
+    AnyGoal,
     ArcGoal,
     Box,
     GoalSet,

@@ -103,6 +103,9 @@ class GoalSet(Message):
     goals: list[Annotated[JointGoal | PoseGoal, Field(discriminator="kind")]] = Field(min_length=1, max_length=100)
 
 
+AnyGoal = JointGoal | PoseGoal | PathGoal | ArcGoal | SequenceGoal | GoalSet
+
+
 class Box(Message):
     """A box: the pose of its middle, and its full sides [m]."""
 
@@ -155,7 +158,7 @@ class PlanRequest(Message):
     id: Name
     stage: Label = Field("", description="what the motion is for: appears in every error")
     start: Joints = Field([], description="joint positions [rad]; empty: where the robot is now")
-    goal: Annotated[JointGoal | PoseGoal | PathGoal | ArcGoal | SequenceGoal | GoalSet, Field(discriminator="kind")]
+    goal: Annotated[AnyGoal, Field(discriminator="kind")]
     straight: bool = Field(False, description="only a straight line of the tool will do")
     allowed_collisions: Pairs = Field([], description="in addition to the planning scene's")
     attach: Label = ""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from common.errors import UnknownName, ZencellError
 from common.messages import (
+    AnyGoal,
     ArcGoal,
     GoalSet,
     JointGoal,
@@ -21,7 +22,7 @@ from common.messages import (
     PoseGoal,
     SequenceGoal,
 )
-from common.planning.collision import CollisionWorld, Pair
+from common.planning.collision import CollisionWorld, Pair, interpolate
 from common.planning.constraints import ToolConstraints
 from common.planning.problem import Arc, Goal, GoalChoice, GoalSequence, Part, Region, ToolPath
 from common.robot.model import RobotModel
@@ -31,6 +32,7 @@ Array = NDArray[np.float64]
 
 
 _MEASURED = 1e-4  # [rad] a measured state may stand this far beyond its limit
+_INWARDS = 2e-3  # [rad] steps in which the way back to a limit is checked
 _FAR = 2.0  # times the reach; of what is nearer the planners tell how far they come
 _AT_FIRST = (0.002, 0.02)  # [m], [rad] a path begins this close to where the robot is
 
@@ -46,16 +48,20 @@ class BadRequest(ZencellError):
 
 @dataclass(frozen=True)
 class CheckedRequest:
-    """Start (dof,) [rad] and goal, such as joint positions or a region, of a request whose numbers fit the robot."""
+    """Start (dof,) [rad] and goal, such as joint positions or a region, of a request whose numbers fit the robot.
+
+    `beyond` is where the robot stands, (dof,) [rad], when that is beyond a limit and `start` is within.
+    """
 
     start: Array
     goal: Goal
+    beyond: Array | None = None
 
 
 def check_request(
-    robot: RobotModel, request: PlanRequest, scene: PlanningScene, current: Array | None
+    robot: RobotModel, request: PlanRequest, scene: PlanningScene, current: Array | None, tolerance: float = _MEASURED
 ) -> CheckedRequest:
-    """Start and goal of a request.
+    """Start and goal of a request; the start may be beyond a limit by the tolerance [rad].
 
     Raises:
         BadRequest: start or goal do not fit the robot, names that are not known, a scene in another frame.
@@ -71,16 +77,20 @@ def check_request(
         raise BadRequest("no_state", "no start is given and the robot's joint states are not known yet")
     else:
         start = _positions(robot, list(current), "current state", "bad_start")
-    start = _within_limits(robot, start, "start", "start_out_of_limits")
-    goal = request.goal
+    stands, start = start, _within_limits(robot, start, "start", "start_out_of_limits", max(tolerance, _MEASURED))
+    beyond = stands if np.abs(stands - start).max() > _MEASURED else None
+    return CheckedRequest(start, _goal(robot, request.goal, start), beyond)
+
+
+def _goal(robot: RobotModel, goal: AnyGoal, start: Array) -> Goal:
     if isinstance(goal, PathGoal):
-        return CheckedRequest(start, _tool_path(robot, start, goal))
+        return _tool_path(robot, start, goal)
     if isinstance(goal, SequenceGoal):
         parts = [Part(_single_goal(robot, item.goal), item.straight, item.blend_radius) for item in goal.items]
-        return CheckedRequest(start, GoalSequence(tuple(parts)))
+        return GoalSequence(tuple(parts))
     if isinstance(goal, GoalSet):
-        return CheckedRequest(start, GoalChoice(tuple(_goals_of(robot, goal))))
-    return CheckedRequest(start, _single_goal(robot, goal))
+        return GoalChoice(tuple(_goals_of(robot, goal)))
+    return _single_goal(robot, goal)
 
 
 def _goals_of(robot: RobotModel, choice: GoalSet) -> Iterator[Array | Region]:
@@ -152,6 +162,8 @@ def check_collisions(world: CollisionWorld, checked: CheckedRequest) -> None:
         BadRequest: start_in_collision or goal_in_collision with the pair.
     """
     ends = [("start", checked.start)]
+    if checked.beyond is not None:
+        ends += [("start", q) for q in interpolate([checked.beyond, checked.start], _INWARDS)]
     if isinstance(checked.goal, np.ndarray):
         ends.append(("goal", checked.goal))
     for what, q in ends:
@@ -207,11 +219,11 @@ def _positions(robot: RobotModel, values: list[float], what: str, code: str) -> 
     return np.array(values, dtype=float)
 
 
-def _within_limits(robot: RobotModel, q: Array, what: str, code: str) -> Array:
-    """q, clipped to limits that it may miss by what a measured state does."""
+def _within_limits(robot: RobotModel, q: Array, what: str, code: str, tolerance: float = _MEASURED) -> Array:
+    """q, clipped to limits that it may miss by the tolerance [rad]."""
     excess = np.maximum(robot.lower - q, q - robot.upper)
     joint = int(np.argmax(excess))
-    if excess[joint] > _MEASURED:
+    if excess[joint] > tolerance:
         raise BadRequest(
             code,
             f"{what} puts {robot.joint_names[joint]} at {q[joint]:.4f} rad, "

@@ -17,8 +17,9 @@ from common.planning.constraints import CHECKED, ToolConstraints
 from common.planning.goal_sampling import missed_by
 from common.planning.obstacles import BadShape, ObstacleCache
 from common.planning.planners import Plan, load_planner, planner_names
+from common.planning.planners.joint_move import straight_profile
 from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result, ToolPath
-from common.planning.retiming import RetimingFailed, TimedPath, TooLong, cubics, require_tellable, stretch
+from common.planning.retiming import RetimingFailed, TimedPath, TooLong, cubics, join, require_tellable, stretch
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.timing import BLENDS, retime
 from common.planning.validation import Fault, validate
@@ -76,7 +77,7 @@ class PlanningPipeline:
         try:
             planners = self._chosen(request)
             state = None if current is None else np.asarray(current, dtype=float)
-            checked = check_request(self.robot, request, scene, state)
+            checked = check_request(self.robot, request, scene, state, self._motion.start_tolerance)
             constraints = check_constraints(self.robot, request, checked)
             world = self._world(request, scene, checked, constraints)
             check_collisions(world, checked)
@@ -178,6 +179,7 @@ class PlanningPipeline:
             deadline=began + budget,
             latest=began + (1 + FINISHING) * budget,
             rng=np.random.default_rng(self._seed if request.seed is None else abs(request.seed)),
+            beyond=checked.beyond,
         )
 
     def _ask(self, plan: Plan, problem: Problem, options: Parameters, flag: Cancel) -> Result:
@@ -193,7 +195,8 @@ class PlanningPipeline:
         """The timed and validated trajectory and the result, or None and the result with what is wrong."""
         wrong = result
         try:
-            for trajectory in self._timings(problem, result):
+            for timed in self._timings(problem, result):
+                trajectory = timed if problem.beyond is None else _from_beyond(problem, problem.beyond, timed)
                 if flag.is_set:
                     return None, replace(result, error="cancelled", message="planning was ended while a path was timed")
                 require_tellable(trajectory)
@@ -224,7 +227,7 @@ class PlanningPipeline:
             trajectory,
             problem.robot,
             problem.world,
-            start=problem.start,
+            start=problem.start if problem.beyond is None else problem.beyond,
             velocity=problem.velocity,
             acceleration=problem.acceleration,
             step=self._pipeline.validation_step,
@@ -239,6 +242,12 @@ class PlanningPipeline:
         waypoint, t = broken
         wrong = constraints.told_at(np.array([1, t, t**2, t**3]) @ pieces[waypoint])
         return Fault("constraint", f"waypoint {waypoint} of {len(trajectory.times)}: {wrong}", waypoint)
+
+
+def _from_beyond(problem: Problem, beyond: Array, trajectory: TimedPath) -> TimedPath:
+    """The trajectory, after a straight move to its start from where the robot stands beyond a limit."""
+    inwards = straight_profile(beyond, problem.start, problem.velocity, problem.acceleration, problem.jerk)
+    return join([inwards, trajectory])
 
 
 def _reached(problem: Problem, q: Array) -> int:

@@ -87,6 +87,7 @@ class Problem:
         start: (dof,) [rad].
         goal: (dof,) [rad] for a joint goal, else a region for the TCP, a path that it follows, several goals one after
             the other, or several of which any will do.
+        beyond: (dof,) [rad] where the robot stands, beyond a limit; it moves straight to the start first.
         straight: only a straight line of the TCP will do.
         velocity, acceleration, jerk: scaled limits (dof,).
         attempts: how many tries a sampling planner has.
@@ -106,6 +107,7 @@ class Problem:
     deadline: float
     latest: float
     rng: np.random.Generator
+    beyond: Array | None = None
 
     @property
     def seconds_left(self) -> float:

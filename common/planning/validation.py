@@ -76,6 +76,13 @@ def fine_samples(trajectory: TimedPath, step: float) -> tuple[Array, NDArray[np.
     return path, np.append(owners, len(counts))
 
 
+def _outwards(q: Array, lower: Array, upper: Array) -> Array:
+    """(N, dof) [rad] how far positions are beyond a limit and farther out than the ones before; 0 or less for none."""
+    before = np.concatenate([q[:1], q[:-1]])
+    excess: Array = np.maximum(np.minimum(lower - 1e-6, before) - q, q - np.maximum(upper + 1e-6, before))
+    return excess
+
+
 def check_numbers(
     trajectory: TimedPath, robot: RobotModel, *, start: ArrayLike, velocity: ArrayLike, acceleration: ArrayLike
 ) -> Fault | None:
@@ -100,7 +107,7 @@ def check_numbers(
     peak = 1.5 * ahead - 0.25 * (dq[:-1] + dq[1:])  # velocity in the middle of the cubic
     begin, finish = end_accelerations(trajectory)
     checks: list[tuple[str, Array, Callable[[int], str]]] = [
-        ("position_limit", np.maximum(robot.lower - 1e-6 - q, q - robot.upper - 1e-6), lambda j: "its position limit"),
+        ("position_limit", _outwards(q, robot.lower, robot.upper), lambda j: "its position limit"),
         ("velocity_limit", np.abs(dq) - (1 + TOLERANCE) * limit_v, lambda j: f"{limit_v[j]:.3f} rad/s"),
         ("velocity_limit", np.abs(peak) - (1 + TOLERANCE) * limit_v, lambda j: f"{limit_v[j]:.3f} rad/s"),
         ("acceleration_limit", np.abs(ddq) - (1 + TOLERANCE) * limit_a, lambda j: f"{limit_a[j]:.3f} rad/s^2"),

@@ -33,7 +33,7 @@ AT_REST = ("IDLE", "DONE", "ERROR")  # states in which a task does not move the 
 
 A = TypeVar("A", bound=m.Message)
 
-Goal = m.JointGoal | m.PoseGoal | m.PathGoal | m.ArcGoal | m.SequenceGoal | m.GoalSet
+Goal = m.AnyGoal
 
 
 class MotionFailed(ZencellError):

@@ -8,7 +8,7 @@ from typing import Literal
 from common import messages as m
 
 Place = tuple[float, float, float]
-Goal = m.JointGoal | m.PoseGoal | m.PathGoal | m.ArcGoal | m.SequenceGoal | m.GoalSet
+Goal = m.AnyGoal
 Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | m.HoldRequest
 Report = m.MotionStatus | m.GripperState
 

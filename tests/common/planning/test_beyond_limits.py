@@ -1,0 +1,105 @@
+"""A robot that stands beyond the limit of a joint, as one pushed by hand does: plans lead in, and nothing leads out."""
+
+import numpy as np
+import pytest
+
+from common.control.checks import Tolerances, checked_trajectory
+from common.control.limiter import Limiter
+from common.errors import Refused
+from common.hardware.interface import Limits
+from common.planning.pipeline import PlanningPipeline
+from common.planning.planners import planner_names
+from common.planning.validation import timed_path, validate
+from common.robot.transforms import tool_down
+from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, SPREAD, above, scene, to_joints, to_pose
+
+PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
+TABLE = scene(SPREAD)
+ELBOW, SHOULDER = 3, 1
+LIMITS = Limits(ROBOT.joint_names, ROBOT.lower, ROBOT.upper, ROBOT.velocity, ROBOT.acceleration, ROBOT.acceleration,
+                ROBOT.jerk)
+
+
+def beyond(by: float) -> np.ndarray:
+    """The elbow stretched and the shoulder leant back farther than they may."""
+    q = HOME.copy()
+    q[ELBOW], q[SHOULDER] = ROBOT.upper[ELBOW] + by, ROBOT.lower[SHOULDER] - by
+    return q
+
+
+def excess(q: np.ndarray) -> np.ndarray:
+    return np.maximum(np.maximum(ROBOT.lower - q, q - ROBOT.upper), 0)
+
+
+@pytest.mark.parametrize("planner", [name for name in planner_names() if name not in ("circ", "sequence")])
+@pytest.mark.parametrize("by", [0.0005, 0.04])
+def test_plan_leads_inwards_first_whoever_makes_it(planner, by):
+    lines = planner in ("cartesian", "lin")
+    start = np.array([*HOME[:-1], ROBOT.upper[-1] + by]) if lines else beyond(by)
+    goal = ROBOT.fk(np.clip(start, ROBOT.lower, ROBOT.upper))
+    goal[2, 3] -= 0.05
+    request = to_pose(goal, start, planner=planner) if lines else to_joints(HOME, start, planner=planner)
+    response = PIPELINE.plan(request, TABLE)
+    assert response.ok, response.message
+    trajectory = timed_path(response.trajectory)
+    np.testing.assert_array_equal(trajectory.positions[0], start)
+    out = excess(trajectory.positions)
+    assert (np.diff(out, axis=0) <= 0).all() and not out[-1].any()
+    accepted = checked_trajectory(response.trajectory, LIMITS, start + 1e-4, Tolerances())
+    limiter, t, q = Limiter(LIMITS, start, 0.01), 0.0, [start]
+    while t < trajectory.duration:
+        t += 0.01
+        wanted, velocity = accepted.at(t)
+        q.append(limiter.step(wanted, velocity, 0.01)[0])
+    assert (np.diff(excess(np.array(q)), axis=0) <= 1e-9).all()
+    assert np.abs(q[-1] - trajectory.positions[-1]).max() < 1e-3
+
+
+def test_start_farther_beyond_than_the_tolerance_is_refused():
+    response = PIPELINE.plan(to_joints(HOME, beyond(0.06)), TABLE)
+    assert (response.ok, response.error) == (False, "start_out_of_limits")
+
+
+def test_goal_beyond_a_limit_is_refused_however_little():
+    response = PIPELINE.plan(to_joints(beyond(0.001), HOME), TABLE)
+    assert (response.ok, response.error) == (False, "goal_out_of_limits")
+
+
+def test_what_is_in_the_way_back_in_is_named():
+    start = above(0.5, 0.0, 0.15)
+    start[ROBOT.dof - 1] = ROBOT.upper[-1] + 0.04
+    free = PIPELINE.plan(to_pose(tool_down(0.5, 0, 0.3, 0.0), start), TABLE)
+    assert free.error != "start_in_collision"
+    low = above(0.5, 0.0, -0.05)
+    low[ROBOT.dof - 1] = ROBOT.upper[-1] + 0.04
+    response = PIPELINE.plan(to_pose(tool_down(0.5, 0, 0.3, 0.0), low), TABLE)
+    assert response.error == "start_in_collision" and response.colliding
+
+
+def test_arm_that_stands_beyond_a_limit_is_left_alone_until_somebody_asks():
+    start = beyond(0.03)
+    limiter = Limiter(LIMITS, start, 0.01)
+    for _ in range(50):
+        position, velocity = limiter.step(start, np.zeros(ROBOT.dof), 0.01)
+        assert (position == start).all() and not velocity.any()
+
+
+def test_nothing_goes_farther_out_than_the_arm_stands():
+    start = beyond(0.03)
+    limiter = Limiter(LIMITS, start, 0.01)
+    for _ in range(300):
+        position, _ = limiter.step(beyond(0.1), np.zeros(ROBOT.dof), 0.01)
+        assert (excess(position) <= excess(start) + 1e-9).all()
+    response = PIPELINE.plan(to_joints(HOME, start), TABLE)
+    message = response.trajectory.model_copy(deep=True)
+    message.points.reverse()
+    for point, other in zip(message.points, response.trajectory.points, strict=True):
+        point.time_from_start = other.time_from_start
+        point.velocities = [-v for v in point.velocities]
+    with pytest.raises(Refused, match="exceeds the limit of panda_joint"):
+        checked_trajectory(message, LIMITS, HOME, Tolerances())
+    fault = validate(
+        timed_path(message), ROBOT, PIPELINE.world(to_joints(HOME, HOME), TABLE, HOME), start=HOME,
+        velocity=ROBOT.velocity, acceleration=ROBOT.acceleration, step=0.01,
+    )
+    assert fault is not None and fault.code == "position_limit"
