@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -21,7 +22,7 @@ from common.planning.planners.joint_move import straight_profile
 from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result, ToolPath
 from common.planning.retiming import RetimingFailed, TimedPath, TooLong, cubics, join, require_tellable, stretch
 from common.planning.robot_geometry import RobotGeometry
-from common.planning.timing import BLENDS, retime
+from common.planning.timing import BLENDS, retime, slowed
 from common.planning.validation import Fault, validate
 from common.robot.model import RobotModel
 from common.sources import monotonic
@@ -215,12 +216,15 @@ class PlanningPipeline:
 
     def _timings(self, problem: Problem, result: Result) -> Iterator[TimedPath]:
         """The planner's own trajectory, or its path timed with smaller and smaller blends."""
+        robot, limit = problem.robot, problem.tool_speed
         if result.trajectory is not None:
-            yield result.trajectory
+            yield slowed(robot, result.trajectory, limit) if limit < math.inf else result.trajectory
             return
+        scale = self._motion.cartesian_speed_scale if result.tool_line else 1.0
         for blend in BLENDS[:1] if result.dense or result.way else BLENDS:
-            trajectory = retime(problem, result, blend)
-            yield stretch(trajectory, self._motion.cartesian_speed_scale) if result.tool_line else trajectory
+            trajectory = retime(problem, result, blend, limit / scale)
+            trajectory = stretch(trajectory, scale) if result.tool_line else trajectory
+            yield slowed(robot, trajectory, limit) if limit < math.inf else trajectory
 
     def _fault(self, problem: Problem, trajectory: TimedPath) -> Fault | None:
         fault = validate(

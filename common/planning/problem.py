@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import threading
 from dataclasses import dataclass, field
 
@@ -108,6 +109,12 @@ class Problem:
     latest: float
     rng: np.random.Generator
     beyond: Array | None = None
+
+    @property
+    def tool_speed(self) -> float:
+        """That the TCP may move with [m/s]."""
+        constraints = self.world.constraints
+        return (constraints and constraints.tool_speed) or math.inf
 
     @property
     def seconds_left(self) -> float:

@@ -10,7 +10,7 @@ ends of an interval, hold all along it. Between grid points x = (ds/dt)^2 is lin
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,7 +72,7 @@ def parametrise(
     velocity: ArrayLike,
     acceleration: ArrayLike,
     step: float = 0.02,
-    speed: float = math.inf,
+    speed: float | Callable[[SmoothPath], Array] = math.inf,
     braking: ArrayLike | None = None,
     deadline: float = math.inf,
 ) -> TimedPath:
@@ -82,7 +82,8 @@ def parametrise(
         path: pieces (P, dof).
         velocity, acceleration: limits (dof,) [rad/s], [rad/s^2].
         step: largest joint movement between grid points [rad].
-        speed: highest ds/dt: that of the tool along a path that is measured by the tool's way [m/s].
+        speed: highest ds/dt: that of the tool along a path that is measured by the tool's way [m/s]. Or how it follows
+            from the path: (P + 1,) where its pieces meet.
         braking: limits (dof,) that hold instead of `acceleration` where speed along the path is lost.
         deadline: on the monotonic clock of common.sources [s], after which no finer grid is begun.
 
@@ -108,8 +109,10 @@ def parametrise(
     raise RetimingFailed("the path bends too sharply to be followed by cubics")
 
 
-def _timed(grid: SmoothPath, limit_v: Array, limit_a: Array, limit_b: Array, speed: float) -> TimedPath:
-    x, u = _profile(grid, limit_v, limit_a, limit_b, speed)
+def _timed(
+    grid: SmoothPath, limit_v: Array, limit_a: Array, limit_b: Array, speed: float | Callable[[SmoothPath], Array]
+) -> TimedPath:
+    x, u = _profile(grid, limit_v, limit_a, limit_b, speed if isinstance(speed, float | int) else speed(grid))
     root = np.sqrt(x)
     durations = 2 * grid.lengths / (root[:-1] + root[1:])
     times = np.concatenate([[0.0], np.cumsum(durations)])
@@ -139,7 +142,7 @@ def _overshoot(trajectory: TimedPath, limit_a: Array) -> float:
 
 
 def _profile(
-    grid: SmoothPath, limit_v: Array, limit_a: Array, limit_b: Array, speed: float
+    grid: SmoothPath, limit_v: Array, limit_a: Array, limit_b: Array, speed: float | Array
 ) -> tuple[Array, Array]:
     """x (N + 1,) at the grid points and u (N,) between them."""
     d0, d1, lengths = grid.d0, grid.d1, grid.lengths
@@ -164,7 +167,9 @@ def _profile(
     return _forward(highest, lengths, up, B)
 
 
-def _highest_x(grid: SmoothPath, limit_v: Array, limit_a: Array, bends: Array, speed: float) -> list[float]:
+def _highest_x(
+    grid: SmoothPath, limit_v: Array, limit_a: Array, bends: Array, speed: float | Array
+) -> list[float]:
     """(N + 1,) x at which speed and velocities are within limits, and accelerations at constant speed.
 
     A path may be followed somewhat faster into a bend if the speed changes just right in it; leaving that out makes
@@ -267,3 +272,14 @@ def cubics(trajectory: TimedPath) -> Array:
     q0, q1 = trajectory.positions[:-1], trajectory.positions[1:]
     v0, v1 = trajectory.velocities[:-1] * span, trajectory.velocities[1:] * span
     return np.stack([q0, v0, 3 * (q1 - q0) - 2 * v0 - v1, 2 * (q0 - q1) + v0 + v1], axis=1)
+
+
+def moving_samples(trajectory: TimedPath, step: float) -> tuple[Array, Array]:
+    """(N, dof) positions [rad] and velocities [rad/s] along a trajectory, its joints moving by `step` [rad] between."""
+    pieces = cubics(trajectory)
+    spans = np.diff(trajectory.times)
+    counts = np.maximum(2, np.ceil(np.abs(pieces[:, 1:]).sum(axis=1).max(axis=1) / step).astype(int))
+    owners = np.repeat(np.arange(len(counts)), counts)
+    r = ((np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[owners])[:, None]
+    c0, c1, c2, c3 = pieces[owners].transpose(1, 0, 2)
+    return c0 + r * (c1 + r * (c2 + r * c3)), (c1 + r * (2 * c2 + 3 * r * c3)) / spans[owners, None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,8 @@ from common.config import Parameters
 from common.planning.collision import CollisionWorld
 from common.planning.path import SmoothPath, blended_path, dense_path, distinct
 from common.planning.problem import Problem, Result
-from common.planning.retiming import RetimingFailed, TimedPath, join, parametrise
+from common.planning.retiming import RetimingFailed, TimedPath, join, moving_samples, parametrise, stretch
+from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
 
@@ -21,16 +23,19 @@ LIMIT_SHARE = 0.98  # of the limits: between two states the controller's cubic m
 # [rad] taken from both edges at a corner, where that is free. A blend that passes within a hair of something may be
 # found free here and not by validation, which looks at other positions: then smaller ones are tried, in the end none.
 BLENDS = (0.25, 0.06, 0.0)
+_PEAK_STEP = 0.005  # [rad] between places at which the speed of the tool is looked at; it peaks between them, so
+_BELOW = 0.999  # of the speed at them is allowed
 _SMALLEST_BLEND = 0.02  # [rad] below it the robot stops at the corner
 
 
-def retime(problem: Problem, result: Result, blend: float = BLENDS[0]) -> TimedPath:
+def retime(problem: Problem, result: Result, blend: float = BLENDS[0], tool_speed: float = math.inf) -> TimedPath:
     """The time-optimal trajectory of a planner's path, at rest at both ends.
 
     Args:
         problem: limits and the collision world.
         result: a planner's waypoints.
         blend: length [rad] taken at most from both edges at a corner of a path that is not dense.
+        tool_speed: that the TCP moves with at most [m/s], between states but for a little.
 
     Raises:
         RetimingFailed: the path cannot be followed.
@@ -46,10 +51,24 @@ def retime(problem: Problem, result: Result, blend: float = BLENDS[0]) -> TimedP
         if not np.abs(np.diff(result.waypoints, axis=0)).max(axis=1).all():
             raise RetimingFailed("two waypoints are one: the steps are finer than joint positions are solved")
         paths = blended_path(result.waypoints, result.way.cuts, result.way.lengths)
-        speed = result.way.speed or math.inf
+        speed = min(result.way.speed or math.inf, tool_speed)
         return join([parametrise(path, velocity, acceleration, speed=speed, deadline=deadline) for path in paths])
     paths = [dense_path(waypoints)] if result.dense else free_blends(waypoints, problem.world, blend)
-    return join([parametrise(path, velocity, acceleration, deadline=deadline) for path in paths])
+    most = math.inf if math.isinf(tool_speed) else partial(_rates_at, problem.robot, tool_speed)
+    return join([parametrise(path, velocity, acceleration, speed=most, deadline=deadline) for path in paths])
+
+
+def _rates_at(robot: RobotModel, tool_speed: float, path: SmoothPath) -> Array:
+    """(P + 1,) ds/dt at which the TCP moves with a speed [m/s] where the pieces of a path meet."""
+    slopes = np.concatenate([path.d0, path.d1[-1:]])
+    places = np.concatenate([path.starts, path.end[None, :]])
+    return tool_speed / np.maximum([robot.tool_speed(q, dq) for q, dq in zip(places, slopes, strict=True)], 1e-9)
+
+
+def slowed(robot: RobotModel, trajectory: TimedPath, tool_speed: float) -> TimedPath:
+    """The trajectory, stretched in time so that the TCP never moves faster than a speed [m/s]."""
+    peak = max(robot.tool_speed(q, dq) for q, dq in zip(*moving_samples(trajectory, _PEAK_STEP), strict=True))
+    return trajectory if peak <= tool_speed else stretch(trajectory, _BELOW * tool_speed / peak)
 
 
 def free_blends(waypoints: Array, world: CollisionWorld, blend: float, step: float = 0.003) -> list[SmoothPath]:
@@ -109,6 +128,8 @@ def follow_in_time(problem: Problem, path: ToolWaypoints, limits: ToolLimits) ->
     scale_a = float((problem.acceleration / robot.acceleration).max())
     turning = limits.rotation_speed / limits.speed
     tool_v = scale_v * np.array([limits.speed, limits.rotation_speed])
+    if problem.tool_speed < tool_v[0]:
+        tool_v *= problem.tool_speed / tool_v[0]
     tool_a = scale_a * limits.acceleration * np.array([1.0, turning])
     tool_b = scale_a * limits.deceleration * np.array([1.0, turning])
     velocity, acceleration = LIMIT_SHARE * problem.velocity, LIMIT_SHARE * problem.acceleration

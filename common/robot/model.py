@@ -141,6 +141,12 @@ class RobotModel:
         pin.forwardKinematics(self.model, self.data, self._checked(q))
         return np.array(pin.updateFramePlacement(self.model, self.data, self.tcp_frame).homogeneous)
 
+    def tool_speed(self, q: ArrayLike, dq: ArrayLike) -> float:
+        """[m/s] of the TCP at q (dof,) [rad] and dq (dof,) [rad/s]."""
+        pin.forwardKinematics(self.model, self.data, self._checked(q), self._checked(dq))
+        twist = pin.getFrameVelocity(self.model, self.data, self.tcp_frame, pin.ReferenceFrame.LOCAL)
+        return float(np.linalg.norm(twist.linear))
+
     def link_poses(self, q: ArrayLike, others: Mapping[str, float] | None = None) -> dict[str, Array]:
         """(4, 4) T_world_link of every link at q (dof,) [rad].
 

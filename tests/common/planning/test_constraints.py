@@ -27,7 +27,7 @@ from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down, tr
 from common.transport.codec import decode, encode
 from tests.common.planning import ur5_scene
 from tests.common.planning.constraint_checks import driven
-from tests.common.planning.planner_checks import LEFT, RIGHT, with_planner
+from tests.common.planning.planner_checks import LEFT, RIGHT, assert_sound, with_planner
 from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, scene, to_joints, to_pose
 
 PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
@@ -202,3 +202,33 @@ def test_of_several_goals_one_that_keeps_the_tool_upright_is_taken_else_each_is_
     response = PIPELINE.plan(request, EMPTY)
     assert "goal 1: " in response.message and "tilted by 0.5 rad, 0.2 allowed" in response.message
     assert "goal 2: no pose of the goal region can be reached" in response.message
+
+
+TRACE = PathGoal(waypoints=[matrix_to_pose(tool_down(x, y, 0.2)) for x, y in ((0.5, -0.3), (0.4, -0.1), (0.5, 0.1))])
+WEAVE = SequenceGoal(items=[
+    SequenceItem(goal=pose_goal(tool_down(0.4, 0.0, 0.3)), blend_radius=0.05, straight=True),
+    SequenceItem(goal=pose_goal(tool_down(0.5, 0.3, 0.2))),
+])
+
+
+@pytest.mark.parametrize("speed", [0.4, 0.05])
+@pytest.mark.parametrize(
+    ("planner", "goal"),
+    [("joint_move", None), ("rrt_connect", None), ("ptp", None), ("lerp", None), ("cartesian", TRACE),
+     ("lin", pose_goal(tool_down(0.5, 0.3, 0.2))), ("cartesian", pose_goal(tool_down(0.5, 0.3, 0.2))),
+     ("sequence", WEAVE)],
+)
+def test_tool_is_never_faster_than_asked_and_as_fast_where_it_may(planner, goal, speed):
+    wanted = PathConstraints(tool_speed=speed)
+    joints = to_joints(LEFT, RIGHT, constraints=wanted, planner=planner)
+    request = joints.model_copy(update={"goal": goal, "straight": planner in ("lin", "cartesian")}) if goal else joints
+    response = PIPELINE.plan(request, EMPTY)
+    assert_sound(PIPELINE, request, EMPTY, response)
+    way = driven(ROBOT, response)
+    assert way.speeds.max() < 1.01 * speed
+    free = driven(ROBOT, PIPELINE.plan(request.model_copy(update={"constraints": None}), EMPTY))
+    if free.speeds.max() > speed:
+        assert way.speeds.max() > 0.9 * speed
+    if planner in ("rrt_connect", "lerp", "lin") and speed < 0.1:  # slowed only where it is too fast
+        length = np.linalg.norm(np.diff(way.places, axis=0), axis=1).sum()
+        assert len(way.speeds) * 1e-3 < 1.1 * length / speed + 0.5
