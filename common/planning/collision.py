@@ -18,6 +18,7 @@ from common.planning.constraints import ToolConstraints
 from common.planning.kernel.world import EXCUSED, KernelWorld
 from common.planning.obstacles import MARGINS, ObstacleBank, ObstacleCache, Rules, Solid
 from common.planning.path import SmoothPath
+from common.planning.points import PointObstacle
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, pose_to_matrix
@@ -55,7 +56,8 @@ class CollisionWorld:
     - pairs in the scene's and the request's allowed collisions, always;
     - an attached object with the gripper's links, always;
     - what an attached object touches at the start, and perceived objects into whose padding (not into themselves) a
-      link reaches at the start: until the TCP is `contact_distance` away from where it was at the start.
+      link reaches at the start: until the TCP is `contact_distance` away from where it was at the start. Of points,
+      their padding alone, for attached objects, too.
     Planners and validation ask the same world, so they hold the same rule. With constraints of the tool, what breaks
     them is not free either (`collides`, `edge_free`, `bends_free`); what touches is told apart from it.
     """
@@ -74,6 +76,7 @@ class CollisionWorld:
         contact_distance: float = 0.02,
         cache: ObstacleCache | None = None,
         constraints: ToolConstraints | None = None,
+        points: Sequence[PointObstacle] = (),
     ) -> None:
         """Set up the scene for a motion that begins at `start` (dof,) [rad].
 
@@ -90,6 +93,7 @@ class CollisionWorld:
                 depth that it has there, of the robot with padding alone.
             cache: built geometry to use again; the world made before with it must not be used any more.
             constraints: what the tool keeps to.
+            points: what cameras saw and the scene does not have; kept away from as perceived objects are.
 
         Raises:
             UnknownName: `attach` is not in the scene.
@@ -105,12 +109,18 @@ class CollisionWorld:
         objects = [*environment, *(item for item, _, _ in held)]
         solids = [Solid.of(o) for o in environment]
         solids += [Solid.of(o, robot.model.frames[frame].parentJoint, frame) for o, frame, _ in held]
-        self._bank = self.cache.bank(tuple(solids))
+        self._bank = self.cache.bank(tuple(solids), len(points))
+        self._bank.set_points([seen.spheres for seen in points])
         self._bank.place([pose_to_matrix(o.pose) for o in environment] + [pose for _, _, pose in held])
-        self._names = [*self.cache.robot.links, *(o.id for o in objects)]
+        self._names = [*self.cache.robot.links, *(o.id for o in objects), *(seen.name for seen in points)]
         self._held_from = self._bank.robot_count + len(environment)
+        self._points_from = self._held_from + len(held)
         self.attached: list[str] = [o.id for o, _, _ in held]
-        padded = np.array([0.0] * self._bank.robot_count + [padding if o.role in _PERCEIVED else 0.0 for o in objects])
+        padded = np.array(
+            [0.0] * self._bank.robot_count
+            + [padding if o.role in _PERCEIVED else 0.0 for o in objects]
+            + [padding] * len(points)
+        )
         margins = padded[self._bank.first] + padded[self._bank.second]
         disabled = self._pairs_named((*scene.allowed_collisions, *allowed))
         self._far = self._bank.far
@@ -181,7 +191,8 @@ class CollisionWorld:
         if not close:
             return self._far
         first, second = self._bank.first, self._bank.second
-        touching = [i for i in close if max(first[i], second[i]) >= self._held_from]
+        last = np.maximum(first, second)
+        touching = [i for i in close if self._held_from <= last[i] < self._points_from]
         near_margins = margins.copy()
         near_margins[self._close_at_start(0)] = 0.0
         near_margins[touching] = np.minimum(0.0, self._bank.distances(self.start, touching)) - _DEEPER

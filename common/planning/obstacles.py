@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from common.errors import ZencellError
 from common.messages import CollisionObject
-from common.planning.kernel.world import KernelWorld, NoKernel
+from common.planning.kernel.world import EXCUSED, KernelWorld, NoKernel
 from common.planning.prism import is_line, prism
 from common.planning.robot_geometry import RobotGeometry, largest
 
@@ -64,6 +64,21 @@ class Solid:
         return coal.Cylinder(*self.dimensions)
 
 
+def cubes(spheres: Array) -> coal.BVHModelOBBRSS:
+    """A mesh of the cubes about spheres (N, 4), middle and radius [m]."""
+    signs = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    sides = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]])
+    sides = np.concatenate([sides, [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]])
+    vertices = (spheres[:, None, :3] + spheres[:, None, 3:] * signs).reshape(-1, 3)
+    triangles = (sides + 8 * np.arange(len(spheres))[:, None, None]).reshape(-1, 3)
+    mesh = coal.BVHModelOBBRSS()
+    mesh.beginModel(len(triangles), len(vertices))
+    mesh.addVertices(vertices)
+    mesh.addTriangles(triangles.astype(np.int32))
+    mesh.endModel()
+    return mesh
+
+
 class _Level:
     """Pinocchio's working data for one margin, and what was last set in them."""
 
@@ -104,9 +119,16 @@ class Rules:
         """Have the levels set their margins again before they are used."""
         self._current = [False] * len(MARGINS)
 
+    def shapes_changed(self) -> None:
+        """Have the levels made anew."""
+        self._levels = [None] * len(MARGINS)
+        self.margins_changed()
+
     def _level(self, index: int) -> _Level:
         level = self._levels[index]
         if level is None:
+            if self is not self._bank.sunk:  # which has no pairs with points
+                self._bank.mesh_points()
             level = self._levels[index] = _Level(self._bank.model, self._bank.geometry)
         if not self._current[index]:
             level.apply(self.disabled, self.margins + MARGINS[index] * self._bank.shares)
@@ -127,16 +149,17 @@ class Rules:
 
 
 class ObstacleBank:
-    """The robot among solids of given shapes.
+    """The robot among solids of given shapes, and sets of points.
 
     Attributes:
-        first, second: geometry indices of each pair; robot geometries come first, then the solids in their order.
+        first, second: geometry indices of each pair; robot geometries come first, then the solids in their order, then
+            the sets of points.
         near, far, sunk: sets of rules over the same geometry.
         lever: (dof,) [m] the farthest that a radian of each joint moves any point of the robot or of what is attached.
         shares: (pairs,) how much closer two things can come, as a share of the way of the point that moves most.
     """
 
-    def __init__(self, robot: RobotGeometry, solids: tuple[Solid, ...]) -> None:
+    def __init__(self, robot: RobotGeometry, solids: tuple[Solid, ...], point_sets: int = 0) -> None:
         self.model = robot.robot.model
         self.data = self.model.createData()
         self.geometry = robot.geometry.copy()
@@ -149,7 +172,15 @@ class ObstacleBank:
                 f"solid_{number}", solid.joint, solid.frame, pin.SE3.Identity(), solid.geometry()
             )
             indices.append(self.geometry.addGeometryObject(item))
+        self._points_from = self.robot_count + len(solids)
+        for number in range(point_sets):  # the kernel takes the points; coal gets them in `mesh_points`
+            nothing = coal.Sphere(1e-6)
+            item = pin.GeometryObject(f"points_{number}", 0, 0, pin.SE3(np.eye(3), np.array([0, 0, -1e3])), nothing)
+            self.geometry.addGeometryObject(item)
+        self._spheres: list[Array] = [np.zeros((0, 4))] * point_sets
+        self._meshed = self._points_placed = True
         environment = [i for i, solid in zip(indices, solids, strict=True) if solid.joint == 0]
+        environment += range(self._points_from, self._points_from + point_sets)
         held = [(i, solid.joint) for i, solid in zip(indices, solids, strict=True) if solid.joint != 0]
         for link in range(self.robot_count):
             if robot.joints[link] != 0:  # the base cannot move: what stands beside it is no collision
@@ -191,18 +222,72 @@ class ObstacleBank:
         if moved:
             self._measure()
 
+    def set_points(self, sets: Sequence[Array]) -> None:
+        """Put spheres (N, 4), middle and radius [m] in the world, into each set of points, without a copy."""
+        if len(sets) != len(self._spheres):
+            raise ValueError(f"{len(sets)} sets of points for {len(self._spheres)}")
+        if all(new is old for new, old in zip(sets, self._spheres, strict=True)):
+            return
+        self._spheres = list(sets)
+        self._meshed = self._points_placed = self._kernel_placed = False
+        for rules in (self.near, self.far):
+            rules.shapes_changed()
+
+    def mesh_points(self) -> None:
+        """Show coal each sphere as the cube about it. That takes 30 us each, so only when coal is asked."""
+        if self._meshed:
+            return
+        self._meshed = True
+        items = self.geometry.geometryObjects
+        for number, spheres in enumerate(self._spheres):
+            items[self._points_from + number].geometry = cubes(spheres) if len(spheres) else coal.Sphere(1e-6)
+            at = (0, 0, 0) if len(spheres) else (0, 0, -1e3)
+            items[self._points_from + number].placement = pin.SE3(np.eye(3), np.array(at, dtype=float))
+
+    def near_shapes(self, q: Array, margins: Array, points: Array) -> NDArray[np.bool_]:
+        """(N,) which of points (N, 3), world, are no farther than a margin [m] from robot or solids at q.
+
+        Args:
+            margins: (robot and solids,) [m] of each.
+        """
+        kernel = self.kernel()
+        if kernel is not None:
+            own = np.full(len(self.geometry.geometryObjects), EXCUSED)
+            own[: len(margins)] = margins
+            return kernel.near(q, own, points)
+        data = pin.GeometryData(self.geometry)
+        pin.updateGeometryPlacements(self.model, self.data, self.geometry, data, q)
+        found = np.zeros(len(points), dtype=bool)
+        dot, identity = coal.Sphere(1e-9), np.eye(3)
+        for i, margin in enumerate(margins.tolist()):
+            shape = self.geometry.geometryObjects[i].geometry
+            shape.computeLocalAABB()
+            placement = data.oMg[i]
+            away = np.linalg.norm(points - placement.act(np.array(shape.aabb_center)), axis=1)
+            at = coal.Transform3s(placement.rotation, placement.translation)
+            for k in np.flatnonzero(~found & (away <= shape.aabb_radius + margin)).tolist():
+                where = coal.Transform3s(identity, points[k])
+                request, result = coal.DistanceRequest(), coal.DistanceResult()
+                found[k] = coal.distance(shape, at, dot, where, request, result) <= margin
+        return found
+
     def kernel(self) -> KernelWorld | None:
         """The same geometry, where solids stand now, in the compiled kernel; None where it cannot be used."""
         if not self._kernel_tried:
             self._kernel_tried = True
             try:
-                self._kernel = KernelWorld(self.model, self.geometry, self._robot.kernel_shapes)
+                points = range(self._points_from, self._points_from + len(self._spheres))
+                self._kernel = KernelWorld(self.model, self.geometry, self._robot.kernel_shapes, points)
             except NoKernel:
                 return None
-        elif self._kernel is not None and not self._kernel_placed:
+        if self._kernel is not None and not self._kernel_placed:
             items = self.geometry.geometryObjects
-            for index in range(self.robot_count, len(items)):
+            for index in range(self.robot_count, self._points_from):
                 self._kernel.place(index, items[index].placement.homogeneous)
+            if not self._points_placed:
+                for number, spheres in enumerate(self._spheres):
+                    self._kernel.set_points(self._points_from + number, spheres)
+                self._points_placed = True
             self._kernel.placed()
         self._kernel_placed = True
         return self._kernel
@@ -234,14 +319,15 @@ class ObstacleCache:
     def __init__(self, robot: RobotGeometry, size: int = 8) -> None:
         self.robot = robot
         self._size = size
-        self._banks: OrderedDict[tuple[Solid, ...], ObstacleBank] = OrderedDict()
+        self._banks: OrderedDict[tuple[tuple[Solid, ...], int], ObstacleBank] = OrderedDict()
 
-    def bank(self, solids: tuple[Solid, ...]) -> ObstacleBank:
-        """The bank for these shapes, built when there is none."""
-        found = self._banks.get(solids)
+    def bank(self, solids: tuple[Solid, ...], point_sets: int = 0) -> ObstacleBank:
+        """The bank for these shapes and that many sets of points, built when there is none."""
+        key = (solids, point_sets)
+        found = self._banks.get(key)
         if found is None:
-            found = self._banks[solids] = ObstacleBank(self.robot, solids)
+            found = self._banks[key] = ObstacleBank(self.robot, solids, point_sets)
             if len(self._banks) > self._size:
                 self._banks.popitem(last=False)
-        self._banks.move_to_end(solids)
+        self._banks.move_to_end(key)
         return found

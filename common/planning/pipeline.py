@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from common.planning.goal_sampling import missed_by
 from common.planning.obstacles import BadShape, ObstacleCache
 from common.planning.planners import Plan, load_planner, planner_names
 from common.planning.planners.joint_move import straight_profile
+from common.planning.points import PointObstacle
 from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result, ToolPath
 from common.planning.retiming import RetimingFailed, TimedPath, TooLong, cubics, join, require_tellable, stretch
 from common.planning.robot_geometry import RobotGeometry
@@ -63,6 +64,7 @@ class PlanningPipeline:
         scene: PlanningScene,
         current: ArrayLike | None = None,
         cancel: Cancel | None = None,
+        points: Sequence[PointObstacle] = (),
     ) -> PlanResponse:
         """A validated trajectory, or the error of the planner that got furthest; never raises for a bad request.
 
@@ -71,6 +73,7 @@ class PlanningPipeline:
             scene: what is to be avoided.
             current: (dof,) [rad] where the robot is, used when the request has no start.
             cancel: set from another thread to end planning early.
+            points: what cameras saw and the scene does not have.
         """
         began = monotonic()
         flag = cancel or Cancel()
@@ -80,7 +83,7 @@ class PlanningPipeline:
             state = None if current is None else np.asarray(current, dtype=float)
             checked = check_request(self.robot, request, scene, state, self._motion.start_tolerance)
             constraints = check_constraints(self.robot, request, checked)
-            world = self._world(request, scene, checked, constraints)
+            world = self._world(request, scene, checked, constraints, points)
             check_collisions(world, checked)
         except BadRequest as error:
             failure = Result(error=error.code, message=str(error), colliding=error.colliding)
@@ -134,18 +137,28 @@ class PlanningPipeline:
         return {name: self._others[name]}
 
     def _world(
-        self, request: PlanRequest, scene: PlanningScene, checked: CheckedRequest, constraints: ToolConstraints | None
+        self,
+        request: PlanRequest,
+        scene: PlanningScene,
+        checked: CheckedRequest,
+        constraints: ToolConstraints | None,
+        points: Sequence[PointObstacle],
     ) -> CollisionWorld:
         try:
-            return self._make_world(request, scene, checked.start, self._cache, constraints)
+            return self._make_world(request, scene, checked.start, self._cache, constraints, points)
         except UnknownName as error:
             raise BadRequest(f"unknown_{error.what}", str(error)) from None
         except BadShape as error:
             raise BadRequest("bad_scene", str(error)) from None
 
     def _make_world(
-        self, request: PlanRequest, scene: PlanningScene, start: Array, cache: ObstacleCache,
+        self,
+        request: PlanRequest,
+        scene: PlanningScene,
+        start: Array,
+        cache: ObstacleCache,
         constraints: ToolConstraints | None = None,
+        points: Sequence[PointObstacle] = (),
     ) -> CollisionWorld:
         return CollisionWorld(
             self.robot,
@@ -159,6 +172,7 @@ class PlanningPipeline:
             contact_distance=request.contact_distance,
             cache=cache,
             constraints=constraints,
+            points=points,
         )
 
     def _problem(

@@ -58,6 +58,7 @@ class Proximity:
         """
         self._world = world
         self._bank = world.bank
+        self._bank.mesh_points()
         own = self._bank.second < self._bank.robot_count
         self._reach = np.where(own, reach if own_reach is None else own_reach, reach)
         self._longest = float(self._reach.max(initial=0.0))

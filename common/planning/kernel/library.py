@@ -9,13 +9,16 @@ from pathlib import Path
 
 from common.planning.kernel.build import FOLDER, NAME
 
-VERSION = 8
+VERSION = 9
 
 _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_version": (c_int, []),
     "zk_has_avx2": (c_int, []),
     "zk_world": (c_void_p, [c_int] + [c_void_p] * 6),
     "zk_add": (c_int, [c_void_p, c_int, c_int, c_void_p, c_void_p, c_int, c_void_p, c_void_p]),
+    "zk_points": (c_int, [c_void_p, c_int, c_int, c_void_p]),
+    "zk_thin": (c_int, [c_int, c_void_p, c_void_p, c_double, c_void_p]),
+    "zk_near": (None, [c_void_p, c_void_p, c_void_p, c_int, c_void_p, c_void_p]),
     "zk_place": (None, [c_void_p, c_int, c_void_p]),
     "zk_pairs": (c_int, [c_void_p, c_int, c_void_p, c_void_p]),
     "zk_rules": (None, [c_void_p, c_void_p, c_void_p, c_int, c_void_p, c_void_p, c_double]),

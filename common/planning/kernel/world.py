@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from ctypes import CDLL, byref, c_double, c_int
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +19,7 @@ from common.planning.kernel.library import library
 Array = NDArray[np.float64]
 
 EXCUSED = -1e9  # [m] the margin of a pair that may touch
-_SPHERE, _BOX, _CYLINDER, _CAPSULE, _HULL = range(5)
+_SPHERE, _BOX, _CYLINDER, _CAPSULE, _HULL, _POINTS = range(6)
 _LARGEST = 1e7  # [m] beyond which rounding would count
 _JOINTS = (
     *(f"JointModel{kind}{axis}" for kind in "RP" for axis in "XYZ"),
@@ -76,12 +76,20 @@ class KernelWorld:
     Pairs are those of the geometry model, in its order.
     """
 
-    def __init__(self, model: pin.Model, geometry: pin.GeometryModel, known: Sequence[Shape] = ()) -> None:
+    def __init__(
+        self,
+        model: pin.Model,
+        geometry: pin.GeometryModel,
+        known: Sequence[Shape] = (),
+        points: Collection[int] = (),
+    ) -> None:
         """Copy joints, shapes, placements and pairs.
 
         Args:
             model: joints; geometry: shapes and pairs.
             known: the first of the shapes, where they were read before: reading a hull takes a millisecond.
+            points: shapes of the environment that stand for sets of points, empty until `set_points`; they are paired
+                with what moves alone.
 
         Raises:
             NoKernel: there is no library, or something in the models is not known to it.
@@ -93,7 +101,12 @@ class KernelWorld:
         self.pair_count = len(geometry.collisionPairs)
         self._shape_count = geometry.ngeoms
         for i, item in enumerate(geometry.geometryObjects):
-            self._add(item, known[i] if i < len(known) else Shape.of(item.geometry))
+            if i in points:
+                shape = Shape(_POINTS, np.zeros(3), np.zeros((0, 3)), np.zeros(4))
+            else:
+                shape = known[i] if i < len(known) else Shape.of(item.geometry)
+            self._add(item, shape)
+        self._points = frozenset(points)
         pairs = np.array([(pair.first, pair.second) for pair in geometry.collisionPairs], dtype=np.int32).reshape(-1, 2)
         first, second = pairs[:, 0].copy(), pairs[:, 1].copy()
         if not self.library.zk_pairs(self._world, self.pair_count, address(first), address(second)):
@@ -125,6 +138,36 @@ class KernelWorld:
         given = np.ascontiguousarray(pose[:3], dtype=float)
         with self._lock:
             self.library.zk_place(self._world, index, address(given))
+
+    def set_points(self, index: int, spheres: Array) -> None:
+        """Put spheres (N, 4), middle and radius [m] in the world, into a set of points; call `placed` after the last.
+
+        Raises:
+            ValueError: they are no spheres.
+        """
+        given = np.ascontiguousarray(spheres, dtype=float)
+        if index not in self._points:
+            raise IndexError(f"shape {index} is no set of points")
+        if given.ndim != 2 or given.shape[1] != 4 or not (np.abs(given) < _LARGEST).all() or (given[:, 3] < 0).any():
+            raise ValueError(f"spheres of shape {given.shape} have to be (N, 4), finite and of radius 0 or more")
+        with self._lock:
+            if not self.library.zk_points(self._world, index, len(given), address(given)):
+                raise MemoryError
+
+    def near(self, q: Array, margins: Array, points: Array) -> NDArray[np.bool_]:
+        """(N,) which of points (N, 3), world, are no farther than a margin [m] from any shape with the robot at q.
+
+        Args:
+            margins: (shapes,) of each shape, EXCUSED for those that do not count.
+        """
+        given, least = self._q(q), np.ascontiguousarray(margins, dtype=float)
+        at = np.ascontiguousarray(points, dtype=float)
+        if at.ndim != 2 or at.shape[1] != 3 or least.shape != (self._shape_count,):
+            raise ValueError(f"points have shape {at.shape}, margins {least.shape} for {self._shape_count} shapes")
+        out = np.zeros(len(at), dtype=np.uint8)
+        with self._lock:
+            self.library.zk_near(self._scratch, address(given), address(least), len(at), address(at), address(out))
+        return out.view(np.bool_)
 
     def placed(self) -> None:
         """Take over where obstacles stand now."""

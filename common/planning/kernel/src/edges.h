@@ -23,6 +23,7 @@
 #define KEEP 0.05      /* a group's sphere that proves less of a span than this share gives way to its pairs */
 #define KEEP_PAIR 0.3  /* and a pair's sphere to its shapes */
 #define SHARE 0.7      /* of the distance that a plane shows; GJK need not look for a better one */
+#define ACCEPT 0.7     /* of what the nearest spheres leave of a span: a node that proves as much is not looked into */
 #define PROBES 7       /* places of an edge at which the collisions that were found last are looked for first */
 
 /* q(t) = c[0] + c[1] t + c[2] t^2 + c[3] t^3, 0 <= t <= 1 */
@@ -118,17 +119,83 @@ static inline void relative_twist(const scratch *c, int tip, int above, double *
     sub3(c->slide[tip], c->slide[above], slide);
 }
 
+/* What moves towards a set of points: a sphere, and the shape within it where that is asked, too. */
+typedef struct {
+    int shape; /* -1: the sphere alone */
+    const double *middle, *spin, *slide, *bound; /* M and K of the sphere's middle, then of the shape */
+    double sphere;
+} mover;
+
+/* The interval about t0, within `from` to `to`, in which all spheres of a set stay farther than `need` from a mover; 0
+   where one does not at t0. Each node's sphere is a convex shape, so its plane holds apart all that is within. */
+static int points_proved(scratch *c, const struct points *set, const mover *m, double *axis, double need, double t0,
+                         double from, double to, double *since, double *until, int *hit) {
+    const shape *A = m->shape < 0 ? NULL : &c->w->shape[m->shape];
+    const pose *T = A ? shape_pose(c, m->shape) : NULL;
+    double lo = from, hi = to, least_lo = from, least_hi = to; /* what spheres themselves leave, and nodes for all below */
+    visit stack[DEEPEST] = {{0, {axis[0], axis[1], axis[2]}}};
+    int top = set && set->count ? 1 : 0;
+    while (top) {
+        visit v = stack[--top];
+        const globe *b = &set->node[v.node];
+        double n[3], a = t0, z = t0, s0 = spheres_apart(m->middle, m->sphere, b->c, b->r, n) - need;
+        if (s0 > 0) {
+            double speed = speed_at(m->spin, m->slide, m->middle, n);
+            z = t0 + lasts(s0, speed, m->bound[1], m->bound[0]);
+            a = t0 - lasts(s0, -speed, m->bound[1], m->bound[0]);
+            if (a <= lo && z >= hi) continue;
+        }
+        if (A && (!b->right || b->r < A->sphere)) {
+            double M = m->bound[2], K = m->bound[3], ahead = hi - t0, back = t0 - lo;
+            double speed = speed_at(m->spin, m->slide, m->middle, v.n);
+            double wanted = fmax(ahead * (speed + 0.5 * K * ahead), back * (0.5 * K * back - speed));
+            wanted = fmax(fmin(wanted, fmax(ahead, back) * M), 0.0);
+            gjk_answer found;
+            globe_distance(A, T, b, v.n, need + 1.01 * wanted, need, SHARE, &found);
+            c->searches++, c->iterations += found.iterations;
+            if (found.below > -1e9) memcpy(v.n, found.n, sizeof v.n), memcpy(axis, found.n, sizeof v.n);
+            s0 = found.below - need;
+            if (s0 > 0) {
+                z = fmax(z, t0 + lasts(s0, shape_speed(c, m->shape, m->spin, m->slide, v.n, 1.0), K, M));
+                a = fmin(a, t0 - lasts(s0, shape_speed(c, m->shape, m->spin, m->slide, v.n, -1.0), K, M));
+                if (a <= lo && z >= hi) continue;
+            }
+        }
+        int leaf = !b->right;
+        if (leaf && !(z > t0)) {
+            *hit = v.node;
+            return 0;
+        }
+        if (leaf) least_lo = fmax(least_lo, a), least_hi = fmin(least_hi, z);
+        if (leaf || (z - t0 >= ACCEPT * (least_hi - t0) && t0 - a >= ACCEPT * (t0 - least_lo) && z > t0)) {
+            lo = fmax(lo, a), hi = fmin(hi, z);
+            continue;
+        }
+        top = push_children(set->node, &v, m->middle, m->sphere, INFINITY, stack, top);
+    }
+    *since = lo, *until = hi;
+    return 1;
+}
+
 /* The interval about t0 in which a group's spheres keep its margin; 0 where they do not at t0. After forward, twists,
    middles. */
-static int group_proved(scratch *c, const curve *e, const group *g, double margin, double t0, double *since,
-                        double *until) {
+static int group_proved(scratch *c, const curve *e, const group *g, double margin, double t0, double from, double to,
+                        double *since, double *until) {
     const world *w = c->w;
     const pair *p = &g->spheres;
-    double n[3], s0 = group_apart(c, g, n) - margin - TOUCHING;
+    double n[3], spin[3], slide[3], M, K, Mb = 0, Kb = 0;
     c->checks++;
     *since = *until = t0;
+    if (!g->moving && w->shape[p->b].kind == POINTS) {
+        double bound[2], axis[3] = {0, 0, 1};
+        int hit;
+        relative_twist(c, p->a, 0, spin, slide);
+        bounds(w, e, p->a, 0, w->body[p->a].reach, &bound[0], &bound[1]);
+        mover m = {-1, c->body_middle[p->a], spin, slide, bound, w->body[p->a].sphere};
+        return points_proved(c, w->shape[p->b].set, &m, axis, margin + TOUCHING, t0, from, to, since, until, &hit);
+    }
+    double s0 = group_apart(c, g, n) - margin - TOUCHING;
     if (!(s0 > 0)) return 0;
-    double spin[3], slide[3], M, K, Mb = 0, Kb = 0;
     relative_twist(c, p->a, p->common, spin, slide);
     double v = speed_at(spin, slide, c->body_middle[p->a], n);
     bounds(w, e, p->a, p->common, w->body[p->a].reach, &M, &K);
@@ -167,6 +234,11 @@ static int proved(scratch *c, int i, double margin, double t0, double from, doub
     double spin[3], slide[3], spin_b[3] = {0}, slide_b[3] = {0}, n[3], need = margin + TOUCHING;
     c->checks++;
     relative_twist(c, A->joint, p->common, spin, slide);
+    if (B->kind == POINTS) {
+        mover m = {p->a, c->middle[p->a], spin, slide, bound, A->sphere};
+        *since = *until = t0;
+        return points_proved(c, B->set, &m, c->axis[i], need, t0, from, to, since, until, &c->touched[i]);
+    }
     if (!p->fixed) relative_twist(c, B->joint, p->common, spin_b, slide_b);
     double s0 = pair_apart(c, p, n) - need;
     *since = *until = t0;
@@ -321,7 +393,7 @@ static int curve_free(scratch *c, const curve *e) {
             const int *members = &first;
             if (entry < 0) {
                 const group *g = &w->group[-1 - entry];
-                if (group_proved(c, e, g, fmax(g->far, g->near), t0, &since, &until)) {
+                if (group_proved(c, e, g, fmax(g->far, g->near), t0, s.from, s.to, &since, &until)) {
                     if (since <= s.from && until >= s.to) continue;
                     int small = (s.to - s.from) * most < 100 * SHORTEST_MOTION;
                     if (!small && fmin(until, s.to) - fmax(since, s.from) > KEEP * (s.to - s.from)) {
@@ -389,15 +461,19 @@ static int around_free(scratch *c, const double *q, const double *away) {
         if (G->moving && !G->spheres.fixed)
             bounds(w, &e, G->spheres.b, G->spheres.common, w->body[G->spheres.b].reach, &Mb, &Kb);
         c->checks++;
-        if (group_apart(c, G, n) > most + TOUCHING + M + Mb) continue;
+        if (group_clear(c, G, most + TOUCHING + M + Mb)) continue;
         for (int k = 0; k < G->count; k++) {
             int i = w->member[G->first + k];
             double margin = inside > 0 ? w->near[i] : inside < 0 ? w->far[i] : fmax(w->near[i], w->far[i]);
             if (margin <= EXCUSED) continue;
             pair_bounds(c, &e, i);
             c->checks++;
-            if (pair_apart(c, &w->pair[i], n) > margin + TOUCHING + c->bound[i][0]) continue;
-            double need = margin + TOUCHING + c->bound[i][2];
+            double far = margin + TOUCHING + c->bound[i][0], need = margin + TOUCHING + c->bound[i][2];
+            if (w->shape[w->pair[i].b].kind == POINTS) {
+                if (pair_clear(c, i, far, need)) continue;
+                return 0;
+            }
+            if (pair_apart(c, &w->pair[i], n) > far) continue;
             gjk_answer found;
             pair_distance(c, i, need, need, 1.0, &found);
             if (!(found.below > need)) return 0;

@@ -9,7 +9,7 @@
 #define API __attribute__((visibility("default")))
 #endif
 
-#define VERSION 8
+#define VERSION 9
 
 API int zk_version(void) { return VERSION; }
 
@@ -113,7 +113,8 @@ static void place(world *w, int i, const double *placement) {
    radius. points (count, 3) of a hull. sphere: middle (3) and radius of a sphere about a hull. Returns its index or -1. */
 API int zk_add(world *w, int kind, int jointed, const double *size, const double *points, int count, const double *sphere,
                const double *placement) {
-    if (jointed < 0 || jointed >= w->joints || kind < SPHERE || kind > HULL || (kind == HULL && count < 1)) return -1;
+    if (jointed < 0 || jointed >= w->joints || kind < SPHERE || kind > POINTS) return -1;
+    if ((kind == HULL && count < 1) || (kind == POINTS && jointed)) return -1;
     if (w->shapes == w->room) {
         int room = w->room ? 2 * w->room : 64;
         shape *more = realloc(w->shape, sizeof(shape) * room);
@@ -144,6 +145,8 @@ API int zk_add(world *w, int kind, int jointed, const double *size, const double
     case CAPSULE:
         s->size[0] = s->radius = size[0], s->size[1] = 0.5 * size[1];
         s->sphere = s->size[0] + s->size[1];
+        break;
+    case POINTS: /* none as yet: see zk_points */
         break;
     default:
         s->blocks = (count + 3) / 4;
@@ -273,7 +276,7 @@ API void zk_rules(world *w, const double *far, const double *near, int tool, con
 
 API void zk_free(world *w) {
     if (!w) return;
-    for (int i = 0; i < w->shapes; i++) aligned_free(w->shape[i].x);
+    for (int i = 0; i < w->shapes; i++) aligned_free(w->shape[i].x), points_free(w->shape[i].set);
     free(w->shape), free(w->lever), free(w->reach), free(w->pair), free(w->far), free(w->near);
     free(w->group), free(w->member), free(w);
 }
@@ -281,7 +284,7 @@ API void zk_free(world *w) {
 API void zk_scratch_free(scratch *c) {
     if (!c) return;
     free(c->middle), free(c->T_shape), free(c->stamp), free(c->axis), free(c->list), free(c->span);
-    free(c->body_middle), free(c->bound), free(c);
+    free(c->body_middle), free(c->bound), free(c->touched), free(c);
 }
 
 /* Working memory for one thread; to be made anew when shapes or pairs were added. */
@@ -295,12 +298,13 @@ API scratch *zk_scratch(const world *w) {
     c->axis = calloc(w->pairs + 1, sizeof *c->axis);
     c->body_middle = calloc(w->joints, sizeof *c->body_middle);
     c->bound = calloc(w->pairs + 1, sizeof *c->bound);
-    if (!c->middle || !c->T_shape || !c->stamp || !c->axis || !c->body_middle || !c->bound) {
+    c->touched = calloc(w->pairs + 1, sizeof *c->touched);
+    if (!c->middle || !c->T_shape || !c->stamp || !c->axis || !c->body_middle || !c->bound || !c->touched) {
         zk_scratch_free(c);
         return NULL;
     }
     for (int k = 0; k < 3; k++) c->T[0].R[4 * k] = 1.0;
-    for (int i = 0; i < w->pairs; i++) c->axis[i][2] = 1.0;
+    for (int i = 0; i < w->pairs; i++) c->axis[i][2] = 1.0, c->touched[i] = -1;
     for (int k = 0; k < HOT; k++) c->hot[k] = -1;
     return c;
 }
@@ -314,6 +318,68 @@ API void zk_refresh(scratch *c) {
             act(&c->T_shape[i], w->shape[i].middle, c->middle[i]);
         }
     c->now++;
+}
+
+/* Spheres (count, 4), middle and radius [m] in the world, in place of those that were in a shape of kind POINTS; then
+   zk_refresh. Returns 0 when there is no memory. */
+API int zk_points(world *w, int i, int count, const double *spheres) {
+    shape *s = &w->shape[i];
+    struct points *set = points_of(count, spheres);
+    if (!set) return 0;
+    points_free(s->set);
+    s->set = set;
+    memset(s->middle, 0, sizeof s->middle);
+    if (count) memcpy(s->middle, set->node[0].c, sizeof s->middle);
+    s->sphere = count ? set->node[0].r : 0.0;
+    return 1;
+}
+
+/* See thin_points. */
+API int zk_thin(int count, const double *points, const uint8_t *skip, double side, double *out) {
+    return thin_points(count, points, skip, side, (double(*)[4])out);
+}
+
+/* Sets a 1 in `out` (count,) for each of points (count, 3), world, that is no farther than a margin [m] from any shape
+   where the robot is at q. margins: of each shape, EXCUSED for those that do not count. */
+API void zk_near(scratch *c, const double *q, const double *margins, int count, const double *points, uint8_t *out) {
+    const world *w = c->w;
+    double reach[MOST_JOINTS], axis[3] = {0, 0, 1}; /* squares of how far from their middles bodies count */
+    forward(c, q);
+    middles(c);
+    for (int j = 0; j < w->joints; j++) reach[j] = -1;
+    for (int i = 0; i < w->shapes; i++) {
+        int j = w->shape[i].joint;
+        double far = w->body[j].sphere + margins[i];
+        if (j && margins[i] > EXCUSED) reach[j] = fmax(reach[j], far * far);
+    }
+    for (int k = 0; k < count; k++) {
+        const double *at = points + 3 * (size_t)k;
+        double d[3], n[3];
+        unsigned near = 1; /* joints whose bodies are; obstacles are looked at one by one */
+        for (int j = 1; j < w->joints; j++) {
+            sub3(at, c->body_middle[j], d);
+            if (dot3(d, d) <= reach[j]) near |= 1u << j;
+        }
+        for (int i = 0; i < w->shapes && !out[k]; i++) {
+            const shape *B = &w->shape[i];
+            double margin = margins[i], far = B->sphere + margin;
+            if (margin <= EXCUSED || B->kind == POINTS || !(near >> B->joint & 1)) continue;
+            sub3(at, c->middle[i], d);
+            if (dot3(d, d) > far * far) continue;
+            const pose *T = shape_pose(c, i);
+            if (B->kind == HULL) {
+                globe point = {{at[0], at[1], at[2]}, 0.0, 0};
+                gjk_answer found;
+                globe_distance(B, T, &point, axis, margin, margin, 1.0, &found);
+                if (found.below > -1e9) memcpy(axis, found.n, sizeof axis);
+                out[k] = !(found.below > margin);
+            } else {
+                sub3(at, T->p, d);
+                unrotate(T->R, d, d);
+                out[k] = point_distance(B, d, n) <= margin;
+            }
+        }
+    }
 }
 
 /* -1 when the robot is free at q, else a pair that is too close. */
@@ -354,6 +420,12 @@ API void zk_distances(scratch *c, const double *q, double *above, double *below)
     middles(c);
     for (int i = 0; i < c->w->pairs; i++) {
         gjk_answer found;
+        const pair *p = &c->w->pair[i];
+        if (c->w->shape[p->b].kind == POINTS) {
+            const shape *A = &c->w->shape[p->a];
+            points_distance(c->w->shape[p->b].set, A, shape_pose(c, p->a), c->middle[p->a], c->axis[i], above + i, below + i);
+            continue;
+        }
         pair_distance(c, i, INFINITY, -INFINITY, 1.0, &found);
         above[i] = found.above, below[i] = found.below;
     }

@@ -10,7 +10,7 @@
 
 #include "linear.h"
 
-enum { SPHERE, BOX, CYLINDER, CAPSULE, HULL };
+enum { SPHERE, BOX, CYLINDER, CAPSULE, HULL, POINTS };
 
 typedef double v4 __attribute__((vector_size(32)));
 typedef long long i4 __attribute__((vector_size(32)));
@@ -24,6 +24,7 @@ typedef struct {
     pose placed;      /* in the frame of the joint */
     double middle[3]; /* of a sphere about the shape, in its own frame */
     double sphere;      /* radius of that sphere, rounding included */
+    struct points *set; /* of POINTS, in the world; see points.h */
 } shape;
 
 #define select4(mask, yes, no) ((v4)(((mask) & (i4)(yes)) | (~(mask) & (i4)(no))))

@@ -2,7 +2,7 @@
 #ifndef ZK_WORLD_H
 #define ZK_WORLD_H
 
-#include "gjk.h"
+#include "points.h"
 
 #define MOST_JOINTS 32 /* the first stands for the world */
 #define EXCUSED (-1e9) /* [m] a margin that every distance keeps */
@@ -67,6 +67,7 @@ typedef struct {
     pose *T_shape;
     unsigned *stamp, now;
     double (*axis)[3]; /* direction that held a pair apart the last time, frame of b */
+    int *touched;      /* sphere of a set of points that a pair touched last */
     int hot[HOT];      /* pairs that touched last, the last one first */
     double (*body_middle)[3];
     double (*bound)[4]; /* of each pair on a curve: M and K of the sphere, M and K of the shape */
@@ -249,10 +250,38 @@ static inline double tool_travel(scratch *c) {
     return norm3(at);
 }
 
+/* Whether the sphere about the first shape of a pair keeps `far` [m] from all points of the second, or the shape `need`. */
+static inline int pair_clear(scratch *c, int i, double far, double need) {
+    const pair *p = &c->w->pair[i];
+    const shape *A = &c->w->shape[p->a];
+    const struct points *set = c->w->shape[p->b].set;
+    const pose *T = shape_pose(c, p->a);
+    if (set && c->touched[i] >= 0 && c->touched[i] < set->nodes) { /* likely still so */
+        const globe *b = &set->node[c->touched[i]];
+        gjk_answer found;
+        if (globe_apart(c->middle[p->a], A->sphere, b) <= far) {
+            globe_distance(A, T, b, c->axis[i], need, need, 1.0, &found);
+            if (!(found.below > need)) return 0;
+        }
+    }
+    c->touched[i] = points_touch(set, A, T, c->middle[p->a], A->sphere, far, need, c->axis[i], &c->searches);
+    return c->touched[i] < 0;
+}
+
+/* Whether the sphere about a body keeps a distance from an obstacle. */
+static inline int group_clear(scratch *c, const group *g, double need) {
+    double n[3] = {0, 0, 1};
+    const body *A = &c->w->body[g->spheres.a];
+    if (g->moving || c->w->shape[g->spheres.b].kind != POINTS) return group_apart(c, g, n) > need;
+    const double *middle = c->body_middle[g->spheres.a];
+    return points_touch(c->w->shape[g->spheres.b].set, NULL, NULL, middle, A->sphere, need, need, n, &c->searches) < 0;
+}
+
 /* Whether a pair keeps its margin where the robot is now. */
 static inline int pair_free(scratch *c, int i, double margin) {
     double n[3], need = margin + TOUCHING;
     c->checks++;
+    if (c->w->shape[c->w->pair[i].b].kind == POINTS) return pair_clear(c, i, need, need);
     if (pair_apart(c, &c->w->pair[i], n) > need) return 1;
     gjk_answer found;
     pair_distance(c, i, need, margin, 1.0, &found);
@@ -279,10 +308,10 @@ static int state_free(scratch *c, const double *q) {
     if (!hot_free(c, margin)) return 0;
     for (int g = 0; g < w->groups; g++) {
         const group *G = &w->group[g];
-        double most = starting ? G->near : G->far, n[3];
+        double most = starting ? G->near : G->far;
         if (most <= EXCUSED) continue;
         c->checks++;
-        if (group_apart(c, G, n) > most + TOUCHING) continue;
+        if (group_clear(c, G, most + TOUCHING)) continue;
         for (int k = 0; k < G->count; k++) {
             int i = w->member[G->first + k];
             if (margin[i] <= EXCUSED || pair_free(c, i, margin[i])) continue;

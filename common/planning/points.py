@@ -1,0 +1,170 @@
+"""Obstacles as they are seen: points of cameras, without the robot and known objects, as spheres for the planner."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.messages import PlanningScene
+from common.perception.depth import Depth, is_valid
+from common.perception.pinhole import Pinhole
+from common.planning.kernel.library import library
+from common.planning.kernel.world import address
+from common.planning.obstacles import ObstacleBank, ObstacleCache, Solid
+from common.planning.robot_geometry import RobotGeometry
+from common.robot.transforms import pose_to_matrix
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_FARTHEST = 1e4  # [m] beyond which a point is taken for none
+_CELLS = 1 << 20  # of the grid on each side of the origin
+
+
+@dataclass(frozen=True, eq=False)
+class PointObstacle:
+    """Spheres (N, 4), middle and radius [m] in the world, about all that one camera saw; `name` is told in errors."""
+
+    name: str
+    spheres: Array
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What one camera saw at one moment.
+
+    Attributes:
+        name: of the obstacle that comes of it.
+        points: (N, 3) [m] in the world; what is no number is no point.
+        q: (dof,) [rad] where the robot was.
+    """
+
+    name: str
+    points: Array
+    q: Array
+
+
+def thinned(points: Array, side: float, skip: Mask | None = None) -> Array:
+    """Spheres (M, 4), middle and radius [m]: one for each cube of a grid in which there are any of points (N, 3).
+
+    A sphere is about the mean of its points and holds all of them, so nothing that was seen is lost. It is no smaller
+    than half a side, because a point stands for a piece of a surface.
+
+    Args:
+        side: of the cubes [m].
+        skip: (N,) points that are left out.
+    """
+    given = np.ascontiguousarray(points, dtype=float)
+    if given.ndim != 2 or given.shape[1] != 3 or not side > 0:
+        raise ValueError(f"points have shape {given.shape}, cubes a side of {side} m")
+    found = library()
+    if found is None:
+        return _thinned(given, side, skip)
+    without = None if skip is None else np.ascontiguousarray(skip, dtype=np.uint8)
+    out = np.empty((len(given), 4))
+    count = found.zk_thin(
+        len(given), address(given), None if without is None else address(without), side, address(out)
+    )
+    if count < 0:
+        raise MemoryError
+    return out[:count].copy()
+
+
+def _thinned(points: Array, side: float, skip: Mask | None) -> Array:
+    kept = (np.abs(points) < _FARTHEST).all(axis=1)
+    if skip is not None:
+        kept &= ~skip
+    points = points[kept]
+    cells = np.clip(np.floor(points / side), -_CELLS, _CELLS - 1).astype(np.int64) + _CELLS
+    keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
+    _, owner, members = np.unique(keys, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(owner, points[:, k], len(members)) for k in range(3)], axis=1)
+    middles = sums / members[:, None]
+    radii = np.full(len(members), 0.5 * side)
+    np.maximum.at(radii, owner, np.linalg.norm(points - middles[owner], axis=1) * (1 + 1e-12) + 1e-12)
+    return np.column_stack([middles, radii])
+
+
+def depth_points(depth: Depth, camera: Pinhole) -> Array:
+    """(N, 3) points [m] in the world of all pixels of a depth picture (height, width) that measured any depth."""
+    rows, columns = np.nonzero(is_valid(depth))
+    far = depth[rows, columns].astype(float)
+    seen = np.stack([far * (columns - camera.cx) / camera.fx, far * (rows - camera.cy) / camera.fy, far], axis=1)
+    T = camera.T_world_optical
+    return np.asarray(seen @ T[:3, :3].T + T[:3, 3])
+
+
+def unseen(pictures: Sequence[tuple[Depth, Pinhole]], low: Array, high: Array, side: float) -> Array:
+    """Spheres (N, 4), middle and radius [m], about the cubes of a box in the world that no camera saw through.
+
+    A camera sees through a cube whose middle is nearer than what it measured there. What is behind that, where it
+    measured nothing and out of its picture is not known to be free.
+
+    Args:
+        pictures: depth (height, width) [m] and the camera that took it, of one or several.
+        low, high: (3,) corners of the box; side: of its cubes [m].
+    """
+    counts = np.maximum(np.ceil((np.asarray(high) - np.asarray(low)) / side - 1e-9), 1).astype(int)
+    axes = [float(low[k]) + side * (np.arange(counts[k]) + 0.5) for k in range(3)]
+    middles = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    for depth, camera in pictures:
+        T = camera.T_world_optical
+        x, y, z = ((middles - T[:3, 3]) @ T[:3, :3]).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = np.rint(camera.fx * x / z + camera.cx), np.rint(camera.fy * y / z + camera.cy)
+            inside = (z > 0) & (u >= 0) & (u < depth.shape[1]) & (v >= 0) & (v < depth.shape[0])
+            there = np.flatnonzero(inside)
+            through = depth[v[there].astype(int), u[there].astype(int)] > z[there]  # NaN is not
+        keep = np.ones(len(middles), dtype=bool)
+        keep[there[through]] = False
+        middles = middles[keep]
+    return np.column_stack([middles, np.full(len(middles), 0.5 * math.sqrt(3) * side)])
+
+
+class KnownShapes:
+    """Tells which points belong to the robot or to objects of the planning scene. Not for several threads at once."""
+
+    def __init__(self, robot: RobotGeometry) -> None:
+        self._cache = ObstacleCache(robot)  # apart from the planner's, whose banks belong to its worlds
+
+    def mask(self, scene: PlanningScene, q: Array, points: Array, *, margin: float, object_margin: float) -> Mask:
+        """(N,) which of points (N, 3), world, are within a margin [m] of the robot at q, or of what it holds or avoids.
+
+        Args:
+            scene: objects where they are, and what is attached; both by `object_margin`.
+            q: (dof,) [rad]; margin: of the robot's own links.
+        """
+        bank = self._bank(scene)
+        count = len(scene.objects) + len(scene.attached)
+        margins = np.array([margin] * bank.robot_count + [object_margin] * count)
+        return bank.near_shapes(q, margins, points)
+
+    def _bank(self, scene: PlanningScene) -> ObstacleBank:
+        model = self._cache.robot.robot.model
+        solids, poses = [Solid.of(o) for o in scene.objects], [pose_to_matrix(o.pose) for o in scene.objects]
+        for item in scene.attached:
+            frame = model.getFrameId(item.link)
+            solids.append(Solid.of(item.object, model.frames[frame].parentJoint, frame))
+            poses.append(model.frames[frame].placement.homogeneous @ pose_to_matrix(item.object.pose))
+        bank = self._cache.bank(tuple(solids))
+        bank.place(poses)
+        return bank
+
+    def obstacle(
+        self, view: View, scene: PlanningScene, *, side: float = 0.01, margin: float = 0.03, object_margin: float = 0.02
+    ) -> PointObstacle:
+        """The obstacle that a view shows: its points without those that are known, thinned to cubes of a side [m]."""
+        known = self.mask(scene, view.q, view.points, margin=margin, object_margin=object_margin)
+        return PointObstacle(view.name, thinned(view.points, side, known))
+
+    def unknown(
+        self, name: str, spheres: Array, scene: PlanningScene, q: Array, *, margin: float, object_margin: float
+    ) -> PointObstacle:
+        """The obstacle of space that was not seen: spheres (N, 4) without those that reach into what is known."""
+        reach = float(spheres[:, 3].max(initial=0.0))
+        known = self.mask(scene, q, spheres[:, :3], margin=margin + reach, object_margin=object_margin + reach)
+        return PointObstacle(name, spheres[~known])
