@@ -128,6 +128,7 @@ class CollisionWorld:
         self._kernel = self._bank.kernel()
         if self._kernel is not None:
             self._kernel.set_rules(_least(self._far))
+            (constraints or ToolConstraints.none(robot)).hand_to(self._kernel)
         self._sunk: Rules | None = None  # what the kernel does not measure: how deep things that touch at the start are
         self._near = self._rules_at_start(disabled, margins)
         self._hand_over_rules()

@@ -15,6 +15,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from common.messages import PathConstraints
+from common.planning.kernel.world import KernelWorld
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
 
@@ -25,6 +26,8 @@ PLACE_TOLERANCE = 1e-4  # [m] the box, anywhere on it
 # Shares of the tolerances that planners, and then the last check, use up: at states, and between them.
 PLANNED = (0.25, 0.5)
 CHECKED = (0.5, 1.0)
+_BROUGHT_BACK = 0.8  # of the angle, and
+_INSIDE = 0.01  # [m] from the sides of the box: to where states that break a constraint are brought back
 _MOST_LOOKS = 20_000  # at one curve; what is not proved then is taken for a violation
 
 
@@ -36,6 +39,7 @@ class Bounds:
         directions: (B,) whether x is a direction fixed to the tool, else the tool centre point.
         at: (B, 3) that direction in the tool's frame; n: (B, 3) unit, world; least, slack: (B,), slack is what n x may
             be less by at the tolerance.
+        inside: (B,) to where states are brought back: an angle [rad] between both, or n x - least [m].
     """
 
     directions: NDArray[np.bool_]
@@ -43,6 +47,7 @@ class Bounds:
     n: Array
     least: Array
     slack: Array
+    inside: Array
 
 
 class ToolConstraints:
@@ -53,28 +58,46 @@ class ToolConstraints:
         self.robot = robot
         self.tilt = wanted.tilt
         self.tool_speed = wanted.tool_speed
-        rows: list[tuple[bool, Array, Array, float, float]] = []
+        self._kernel: KernelWorld | None = None
+        rows: list[tuple[bool, Array, Array, float, float, float]] = []
         if wanted.tilt is not None:
             up = _unit(wanted.axis)
             own = robot.fk(start)[:3, :3].T @ up if wanted.upright_at_start else _unit(wanted.tool_axis)
             self._up, self._own = up, own
             slack = math.cos(wanted.tilt) - math.cos(min(wanted.tilt + TILT_TOLERANCE, math.pi))
             if slack > 0:
-                rows.append((True, own, up, math.cos(wanted.tilt), slack))
+                rows.append((True, own, up, math.cos(wanted.tilt), slack, _BROUGHT_BACK * wanted.tilt))
         if wanted.region is not None:
             T, size = pose_to_matrix(wanted.region.pose), wanted.region.size
             for axis, side in enumerate((size.x, size.y, size.z)):
                 for n in (T[:3, axis], -T[:3, axis]):
-                    rows.append((False, np.zeros(3), n, float(n @ T[:3, 3]) - side / 2, PLACE_TOLERANCE))
+                    inside = min(_INSIDE, side / 8)
+                    rows.append((False, np.zeros(3), n, float(n @ T[:3, 3]) - side / 2, PLACE_TOLERANCE, inside))
         self.bounds = Bounds(
             np.array([row[0] for row in rows], dtype=bool),
             np.array([row[1] for row in rows]).reshape(-1, 3),
             np.array([row[2] for row in rows]).reshape(-1, 3),
             np.array([row[3] for row in rows], dtype=float),
             np.array([row[4] for row in rows], dtype=float),
+            np.array([row[5] for row in rows], dtype=float),
         )
         self._turns = np.array([not joint.shortname().startswith("JointModelP") for joint in robot.model.joints[1:]])
         self._levers = _levers(robot)
+
+    @classmethod
+    def none(cls, robot: RobotModel) -> ToolConstraints:
+        """What keeps to nothing."""
+        return cls(robot, PathConstraints(), np.zeros(robot.dof))
+
+    def hand_to(self, kernel: KernelWorld) -> None:
+        """Let the compiled kernel keep to this, and answer for it."""
+        frame = self.robot.model.frames[self.robot.tcp_frame]
+        b, placement = self.bounds, frame.placement
+        kernel.keep_to(
+            frame.parentJoint, np.array(placement.translation), b.directions, b.at @ np.array(placement.rotation).T,
+            b.n, b.least, b.slack, b.inside,
+        )
+        self._kernel = kernel
 
     def holds(self, q: ArrayLike, share: float = PLANNED[0]) -> bool:
         """Whether the robot at q (dof,) [rad] keeps to everything, but for a share of the tolerances."""
@@ -119,6 +142,8 @@ class ToolConstraints:
         """
         if not len(self.bounds.n):
             return None
+        if self._kernel is not None:
+            return self._kernel.first_break(cubics, *shares)
         for number, c in enumerate(cubics):
             t = self._breaks_at(c, *shares)
             if t is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from common.planning.kernel.build import FOLDER, NAME
 
-VERSION = 9
+VERSION = 10
 
 _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_version": (c_int, []),
@@ -22,6 +22,8 @@ _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_place": (None, [c_void_p, c_int, c_void_p]),
     "zk_pairs": (c_int, [c_void_p, c_int, c_void_p, c_void_p]),
     "zk_rules": (None, [c_void_p, c_void_p, c_void_p, c_int, c_void_p, c_void_p, c_double]),
+    "zk_keep": (c_int, [c_void_p, c_int, c_int, *[c_void_p] * 7]),
+    "zk_kept": (c_int, [c_void_p, c_int, c_void_p, c_double, c_double, c_void_p]),
     "zk_free": (None, [c_void_p]),
     "zk_scratch": (c_void_p, [c_void_p]),
     "zk_scratch_free": (None, [c_void_p]),

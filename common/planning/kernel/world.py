@@ -200,6 +200,38 @@ class KernelWorld:
                 address(arrays[2]), leash,
             )
 
+    def keep_to(
+        self, tool: int, tip: ArrayLike, directions: ArrayLike, at: Array, n: Array, least: Array, slack: Array,
+        inside: Array,
+    ) -> None:
+        """Set numbers n x - least (K,) that edges and paths keep from being negative, but for their slack (K,).
+
+        Args:
+            tool: joint that carries the tool; tip: (3,) the tool point in that joint's frame.
+            directions: (K,) whether x is the direction `at` (K, 3), in that joint's frame, else the tool point.
+            n: (K, 3) world.
+            inside: (K,) where states are projected to: an angle [rad] between `at` and n, or n x - least [m].
+        """
+        arrays = [np.ascontiguousarray(a, dtype=float) for a in (at, n, least, slack, inside)]
+        place, kinds = np.ascontiguousarray(tip, dtype=float), np.ascontiguousarray(directions, dtype=np.int32)
+        with self._lock:
+            if not self.library.zk_keep(
+                self._world, len(kinds), tool, address(place), address(kinds), *(address(a) for a in arrays)
+            ):
+                raise ValueError(f"the planning kernel keeps to no {len(kinds)} numbers")
+
+    def first_break(self, coefficients: Array, accepted: float, proved: float) -> tuple[int, float] | None:
+        """The first of cubics (N, 4, dof), as below, at which what is kept to is broken, and t on it; None for none.
+
+        Args:
+            accepted: share of the slack that states may use; proved: what is proved between them.
+        """
+        given, where = self._cubics(coefficients), c_double()
+        with self._lock:
+            piece = int(
+                self.library.zk_kept(self._scratch, len(given), address(given), accepted, proved, byref(where)))
+        return None if piece < 0 else (piece, where.value)
+
     def colliding(self, q: Array) -> int:
         """Index of a pair that is too close at q (dof,) [rad], -1 when the robot is free."""
         given = self._q(q)
@@ -222,10 +254,7 @@ class KernelWorld:
 
     def cubics_collision(self, coefficients: Array) -> tuple[int, float]:
         """The same for cubics (N, 4, dof), c0 + c1 t + c2 t^2 + c3 t^3 with t from 0 to 1: pair, piece + t."""
-        given = np.ascontiguousarray(coefficients, dtype=float)
-        if given.ndim != 3 or given.shape[1:] != (4, self.dof):
-            raise ValueError(f"coefficients have shape {given.shape}")
-        where = c_double()
+        given, where = self._cubics(coefficients), c_double()
         with self._lock:
             hit = int(self.library.zk_cubics(self._scratch, len(given), address(given), byref(where)))
         return hit, where.value
@@ -269,6 +298,12 @@ class KernelWorld:
         """See zk_plan in kernel.c; `planner.find_path` asks it."""
         with self._lock:
             return int(self.library.zk_plan(self._scratch, *arguments))
+
+    def _cubics(self, coefficients: Array) -> Array:
+        given = np.ascontiguousarray(coefficients, dtype=float)
+        if given.ndim != 3 or given.shape[1:] != (4, self.dof):
+            raise ValueError(f"coefficients have shape {given.shape}")
+        return given
 
     def _q(self, q: ArrayLike) -> Array:
         given = np.ascontiguousarray(q, dtype=float)

@@ -1,4 +1,8 @@
-"""Constraints judged apart from the code that keeps to them: pinocchio's kinematics at every millisecond."""
+"""Problems whose ways keep to constraints, and what judges these apart from the code that keeps to them.
+
+Both ends of a problem have a solution near to the home pose: from one posture of the arm to another there may be no way
+that keeps the tool upright. Judged is by pinocchio's kinematics at every millisecond.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +11,27 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from common.messages import PlanResponse
+from common.messages import (
+    Box,
+    CollisionObject,
+    Header,
+    PathConstraints,
+    PlanningScene,
+    PlanResponse,
+    Pose,
+    Vector3,
+)
+from common.planning.collision import CollisionWorld
+from common.planning.ik import solve_ik
 from common.planning.retiming import sample
 from common.planning.validation import timed_path
 from common.robot.model import RobotModel
+from common.robot.transforms import tool_down, transform
+
+FLOOR = {"panda": 0.0, "ur5": 1.0}  # [m] on which the wall stands
+_WALL = 0.25  # [m] high
+_POSTURE = 2.0  # [rad] at most from the home pose
+_CORRIDOR = (0.3, 0.9, 0.35)  # [m] sides
 
 
 @dataclass(frozen=True)
@@ -25,9 +46,11 @@ class Way:
         """The most [rad] by which the tool's z axis leans from an axis."""
         return float(np.arccos(np.clip(self.axes @ np.array(axis), -1, 1)).max())
 
-    def outside(self, middle, size) -> float:
+    def outside(self, box: Box) -> float:
         """The most [m] by which the tool is outside a box that stands straight."""
-        return float((np.abs(self.places - middle) - np.array(size) / 2).max())
+        middle, size = box.pose.position, box.size
+        away = np.abs(self.places - (middle.x, middle.y, middle.z))
+        return float((away - np.array([size.x, size.y, size.z]) / 2).max())
 
 
 def driven(robot: RobotModel, response: PlanResponse) -> Way:
@@ -44,3 +67,63 @@ def driven(robot: RobotModel, response: PlanResponse) -> Way:
     poses = np.array(poses)
     speeds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / np.diff(times)
     return Way(poses[:, :3, 3], poses[:, :3, 2], speeds)
+
+
+@dataclass(frozen=True)
+class Carry:
+    """From a start (dof,) [rad] to a pose (4, 4) of the tool."""
+
+    start: np.ndarray
+    T_world_goal: np.ndarray
+
+
+def walled(robot: str) -> PlanningScene:
+    """A wall between the two sides."""
+    floor = FLOOR[robot]
+    objects = [
+        _box("floor", [0.6, 1.0, 0.05], floor - 0.025),
+        _box("wall", [0.5, 0.02, _WALL], floor + _WALL / 2),
+    ]
+    return PlanningScene(header=Header(frame_id="world"), objects=objects)
+
+
+def _box(name: str, sides: list[float], z: float) -> CollisionObject:
+    pose = Pose(position=Vector3(x=0.55, z=z))
+    return CollisionObject(id=name, role="fixture", shape="box", dimensions=sides, pose=pose)
+
+
+def constraints_of(name: str, robot: str) -> PathConstraints:
+    """What is kept to."""
+    tilt = float(name.split()[1].rstrip(",")) if name.startswith("tilt") else None
+    if "corridor" not in name:
+        return PathConstraints(tilt=tilt)
+    x, y, z = _CORRIDOR
+    middle = Vector3(x=0.475, z=FLOOR[robot] + 0.05 + z / 2)
+    return PathConstraints(tilt=tilt, region=Box(pose=Pose(position=middle), size=Vector3(x=x, y=y, z=z)))
+
+
+def carries(robot: RobotModel, name: str, count: int, lean: float) -> list[Carry]:
+    """Problems with free ends; the same ones each time."""
+    rng = np.random.default_rng(0)
+    world = CollisionWorld(robot, walled(name), start=robot.named("home"))
+    found: list[Carry] = []
+    while len(found) < count:
+        side = rng.choice([-1.0, 1.0])
+        ends = [_stand(robot, world, rng, name, y, lean) for y in (side, -side)]
+        if ends[0] is not None and ends[1] is not None:
+            found.append(Carry(ends[0], robot.fk(ends[1])))
+    return found
+
+
+def _stand(
+    robot: RobotModel, world: CollisionWorld, rng: np.random.Generator, name: str, side: float, lean: float
+) -> np.ndarray | None:
+    """(dof,) [rad] free, the tool near to upright on one side of the wall; None where what is drawn is out of reach."""
+    z = FLOOR[name] + rng.uniform(0.1, 0.3)
+    T = tool_down(rng.uniform(0.38, 0.58), side * rng.uniform(0.15, 0.35), z, rng.uniform(-1.5, 1.5))
+    about = rng.uniform(-np.pi, np.pi)
+    turn = pin.exp3(rng.uniform(0, lean) * np.array([np.cos(about), np.sin(about), 0.0]))
+    q = solve_ik(robot, transform(T[:3, :3] @ turn, T[:3, 3]), robot.named("home"), rng=rng)
+    if q is None or world.collides(q) or np.abs(q - robot.named("home")).max() > _POSTURE:
+        return None
+    return q

@@ -22,12 +22,13 @@ from common.messages import (
 from common.planning.constraints import CHECKED, PLANNED, ToolConstraints, line
 from common.planning.joint_goals import line as steps_to
 from common.planning.pipeline import PlanningPipeline
-from common.planning.problem import Result
+from common.planning.problem import Cancel, Result
+from common.planning.validation import fine_samples, timed_path
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down, transform
 from common.transport.codec import decode, encode
 from tests.common.planning import ur5_scene
-from tests.common.planning.constraint_checks import driven
-from tests.common.planning.planner_checks import LEFT, RIGHT, assert_sound, with_planner
+from tests.common.planning.constraint_checks import carries, constraints_of, driven, walled
+from tests.common.planning.planner_checks import LEFT, RIGHT, assert_sound, wall, with_planner
 from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, scene, to_joints, to_pose
 
 PIPELINE = PlanningPipeline(ROBOT, CELL.motion, CELL.pipeline)
@@ -122,7 +123,7 @@ def test_no_planner_returns_a_trajectory_that_breaks_a_constraint(planner):
             kept += 1
             way = driven(ROBOT, response)
             assert way.tilt() < tilt + 1e-3
-            assert way.outside((0.5, 0.0, 0.2), (size, 0.7, size)) < 1e-4
+            assert way.outside(box) < 1e-4
         else:
             refused += 1
             assert response.error in ("constraint", "timeout", "no_path"), response.message
@@ -152,9 +153,11 @@ def arms():
     return [(ROBOT, PIPELINE), (ur5_scene.ROBOT, ur5_scene.PIPELINE)]
 
 
+@pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("number", [0, 1])
-def test_what_is_proved_along_a_curve_holds_at_every_place_of_it(number):
-    robot, _ = arms()[number]
+def test_what_is_proved_along_a_curve_holds_at_every_place_of_it(number, compiled):
+    robot, pipeline = arms()[number]
+    kernel = pipeline.world(to_joints(robot.named("home"), robot.named("home")), EMPTY, robot.named("home")).kernel
     rng = np.random.default_rng(number)
     held = broken = 0
     for _ in range(40):
@@ -166,6 +169,8 @@ def test_what_is_proved_along_a_curve_holds_at_every_place_of_it(number):
             region=Box(pose=matrix_to_pose(transform(T[:3, :3], T[:3, 3])), size=Vector3(x=0.3, y=0.2, z=0.1)),
         )
         constraints = ToolConstraints(robot, wanted, q)
+        if compiled:
+            constraints.hand_to(kernel)
         cubic = np.stack([q, *rng.normal(0, rng.choice([0.01, 0.1, 0.3]), (3, robot.dof))])
         for pieces in (line(q, cubic.sum(axis=0)), cubic[None]):
             c = pieces[0]
@@ -232,3 +237,50 @@ def test_tool_is_never_faster_than_asked_and_as_fast_where_it_may(planner, goal,
     if planner in ("rrt_connect", "lerp", "lin") and speed < 0.1:  # slowed only where it is too fast
         length = np.linalg.norm(np.diff(way.places, axis=0), axis=1).sum()
         assert len(way.speeds) * 1e-3 < 1.1 * length / speed + 0.5
+
+
+@pytest.mark.parametrize("what", ["tilt 0.3", "tilt 0.1", "tilt 0.1, corridor"])
+@pytest.mark.parametrize("name", ["panda", "ur5"])
+def test_glass_is_carried_upright_over_a_wall_each_time(name, what):
+    robot, pipeline = arms()[name == "ur5"]
+    wanted, around = constraints_of(what, name), walled(name)
+    for number, carry in enumerate(carries(robot, name, 20, 0.5 * wanted.tilt)):
+        request = to_pose(carry.T_world_goal, carry.start, constraints=wanted, planning_time=20.0, seed=number)
+        response = pipeline.plan(request, around)
+        assert response.ok, (number, response.message)
+        way = driven(robot, response)
+        assert way.tilt() < wanted.tilt + 1e-3
+        if wanted.region is not None:
+            assert way.outside(wanted.region) < 1e-4
+        world = pipeline.world(request, around, carry.start)
+        path, _ = fine_samples(timed_path(response.trajectory), 0.02)
+        assert not any(world.collides(q) for q in path)
+
+
+def test_seed_decides_the_way_that_keeps_the_tool_upright():
+    carry = carries(ROBOT, "panda", 1, 0.05)[0]
+    request = to_pose(carry.T_world_goal, carry.start, constraints=upright(0.1), planner="rrt_connect", seed=3)
+    one, other = (PIPELINE.plan(request, walled("panda")) for _ in range(2))
+    assert one.trajectory == other.trajectory
+    assert one.trajectory != PIPELINE.plan(request.model_copy(update={"seed": 4}), walled("panda")).trajectory
+
+
+def test_way_that_is_not_there_is_looked_for_no_longer_than_asked():
+    over = wall(height=0.6, depth=0.5)
+    wanted = upright(0.3, region=CORRIDOR)
+    request = to_joints(LEFT, RIGHT, constraints=wanted, planning_time=0.3, planner="rrt_connect")
+    response = PIPELINE.plan(request, over)
+    assert response.error in ("timeout", "no_path")
+    assert response.seconds < 0.6
+    cancel = Cancel()
+    cancel.set()
+    assert PIPELINE.plan(request, over, cancel=cancel).error == "cancelled"
+
+
+def test_what_one_request_keeps_to_binds_no_other():
+    request = to_joints(LEFT, RIGHT, constraints=upright(0.03, region=CORRIDOR))
+    plain = request.model_copy(update={"constraints": None})
+    before = PIPELINE.plan(plain, EMPTY)
+    PIPELINE.plan(request, EMPTY)
+    assert PIPELINE.plan(plain, EMPTY).trajectory == before.trajectory
+    assert PIPELINE.world(plain, EMPTY, RIGHT).edge_free(HOME, HOME + 1.0 * np.eye(7)[5])

@@ -9,7 +9,7 @@
 #define API __attribute__((visibility("default")))
 #endif
 
-#define VERSION 9
+#define VERSION 10
 
 API int zk_version(void) { return VERSION; }
 
@@ -274,6 +274,26 @@ API void zk_rules(world *w, const double *far, const double *near, int tool, con
     levers_of(w, tool, w->tip, 0.0, w->tip_lever);
 }
 
+/* What the tool keeps to: `count` numbers n x - least that must not be negative, of directions `at` (count, 3) in the frame
+   of joint `tool` or, where `direction` is 0, of the point `tip` in it. See `kept`. Returns 0 where there are too many. */
+API int zk_keep(world *w, int count, int tool, const double *tip, const int *direction, const double *at, const double *n,
+                const double *least, const double *slack, const double *inside) {
+    w->keeps = 0;
+    if (count < 0 || count > MOST_KEPT || tool < 0 || tool >= w->joints) return 0;
+    w->keep_tool = tool;
+    unrotate(w->joint[tool].turned, tip, w->keep_tip);
+    levers_of(w, tool, w->keep_tip, 0.0, w->keep_lever);
+    for (int j = 0; j < w->joints; j++) w->turn_lever[j] = w->joint[j].kind == REVOLUTE;
+    for (int i = 0; i < count; i++) {
+        kept *k = &w->keep[i];
+        k->direction = direction[i] != 0, k->least = least[i], k->slack = slack[i], k->inside = inside[i];
+        unrotate(w->joint[tool].turned, at + 3 * i, k->at);
+        memcpy(k->n, n + 3 * i, sizeof k->n);
+    }
+    w->keeps = count;
+    return 1;
+}
+
 API void zk_free(world *w) {
     if (!w) return;
     for (int i = 0; i < w->shapes; i++) aligned_free(w->shape[i].x), points_free(w->shape[i].set);
@@ -402,6 +422,20 @@ API int zk_cubics(scratch *c, int count, const double *coefficients, double *at)
         if (!curve_free(c, &e)) {
             *at = i + c->hit_at;
             return c->hit_pair;
+        }
+    }
+    return -1;
+}
+
+/* The first of cubics (count, 4, dof), as in zk_cubics, that breaks what is kept to, -1 when none does, and where on it.
+   States may use a share `accepted` of the slack; `proved` is what is proved between them. */
+API int zk_kept(scratch *c, int count, const double *coefficients, double accepted, double proved, double *at) {
+    curve e;
+    for (int i = 0; i < count; i++) {
+        cubic_curve(c->w, coefficients + 4 * c->w->dof * i, &e);
+        if (!keeps_curve(c, &e, accepted, proved)) {
+            *at = c->hit_at;
+            return i;
         }
     }
     return -1;

@@ -1,12 +1,12 @@
 /* A path among obstacles: RRT-Connect (Kuffner, LaValle 2000), then shortcuts. All edges are proved free. The seed decides
-   the path. */
+   the path. Where the tool keeps to something, new states are projected onto it (Berenson et al. 2009, see keep.h). */
 #ifndef ZK_PLANNER_H
 #define ZK_PLANNER_H
 
 #include <stdint.h>
 #include <time.h>
 
-#include "edges.h"
+#include "keep.h"
 
 typedef struct {
     uint64_t s[4];
@@ -78,6 +78,7 @@ static int nearest(const tree *t, const double *q, double *square) {
 
 static int line_free(scratch *c, const double *a, const double *b) {
     curve e;
+    if (!keeps_line(c, a, b)) return 0;
     line_curve(c->w, a, b, &e);
     return curve_free(c, &e);
 }
@@ -110,11 +111,33 @@ static int stopped(const run *r) {
     return now() >= r->end ? NO_TIME : 0;
 }
 
+#define SHORTEST_STEP 0.02 /* [rad] of the trees, where the tool keeps to something */
+#define LEAST_PROGRESS 0.1 /* share of a step by which it has to come nearer */
+
+/* A state `to` towards q, kept to and with a free line from a; 0 when there is none. Steps are as long as they may be. */
+static int step_towards(run *r, const double *a, const double *q, double far, double *to, int *reached) {
+    scratch *c = r->c;
+    int dof = c->w->dof;
+    for (double step = fmin(r->o->range, far); step >= fmin(SHORTEST_STEP, far) && step > 0; step *= 0.5) {
+        *reached = step >= far;
+        for (int j = 0; j < dof; j++) to[j] = *reached ? q[j] : a[j] + step / far * (q[j] - a[j]);
+        if (!keeps_state(c, to)) {
+            *reached = 0;
+            if (!project(c, to)) continue;
+        }
+        if (!*reached && sqrt(distance2(dof, to, q)) > far - LEAST_PROGRESS * step) continue;
+        if (!keeps_line(c, a, to)) continue;
+        return state_free(c, to) && line_free(c, a, to);
+    }
+    return 0;
+}
+
 /* A new node towards q, from the nearest one: its index, or -1. */
 static int extend(run *r, tree *t, int from, const double *q, double square, int *reached) {
     int dof = t->dof;
     double far = sqrt(square), to[MOST_JOINTS];
     const double *a = t->q + (size_t)dof * from;
+    if (r->c->w->keeps) return step_towards(r, a, q, far, to, reached) ? add_node(t, to, from) : -1;
     *reached = far <= r->o->range;
     double share = *reached ? 1.0 : r->o->range / far;
     for (int j = 0; j < dof; j++) to[j] = *reached ? q[j] : a[j] + share * (q[j] - a[j]);
@@ -133,6 +156,7 @@ static int search(run *r, tree trees[2], int meet[2], rng *random, plan_report *
         tree *one = &trees[grows], *other = &trees[1 - grows];
         report->samples++;
         for (int j = 0; j < dof; j++) q[j] = w->lower[j] + uniform(random) * (w->upper[j] - w->lower[j]);
+        if (w->keeps) project(r->c, q);
         int from = nearest(one, q, &square);
         int reached, node = extend(r, one, from, q, square, &reached);
         if (node < 0) continue;
@@ -176,8 +200,25 @@ static int skip_waypoints(run *r, int count, double *path) {
     return count;
 }
 
-/* Replaces pieces between two points of the path by straight lines where these are free. The path has room for two
-   waypoints more. */
+#define MOST_FOLLOWED 64
+
+/* Waypoints from a to b, both included: a straight line, or steps that keep to what is kept to. 0 when it is not free. */
+static int follow(run *r, const double *a, const double *b, double *out) {
+    int dof = r->c->w->dof, count = 1, reached = 0;
+    memcpy(out, a, sizeof(double) * dof);
+    if (line_free(r->c, a, b)) {
+        memcpy(out + dof, b, sizeof(double) * dof);
+        return 2;
+    }
+    if (!r->c->w->keeps) return 0;
+    for (; count < MOST_FOLLOWED && !reached; count++) {
+        double *at = out + (size_t)dof * (count - 1), far = sqrt(distance2(dof, at, b));
+        if (stopped(r) || !step_towards(r, at, b, far, at + dof, &reached)) return 0;
+    }
+    return reached ? count : 0;
+}
+
+/* Replaces pieces between two points of the path by straight lines, or what comes near to them, where these are free. */
 static int shorten(run *r, int count, int room, double *path, rng *random, plan_report *report) {
     int dof = r->c->w->dof;
     long long failed = 0;
@@ -208,21 +249,17 @@ static int shorten(run *r, int count, int room, double *path, rng *random, plan_
         double before = 0, *first = path + (size_t)dof * (piece[0] + 1);
         before += sqrt(distance2(dof, ends[0], first)) + sqrt(distance2(dof, ends[1], path + (size_t)dof * piece[1]));
         before += path_length(dof, dropped, first);
-        double after = sqrt(distance2(dof, ends[0], ends[1]));
-        if (after > before - 1e-3 * total || count - dropped + 2 > room) {
-            failed++;
-            continue;
-        }
-        if (!line_free(r->c, ends[0], ends[1])) {
+        double after = sqrt(distance2(dof, ends[0], ends[1])), new[MOST_FOLLOWED * MOST_JOINTS];
+        int added = after > before - 1e-3 * total ? 0 : follow(r, ends[0], ends[1], new);
+        if (!added || count - dropped + added > room || path_length(dof, added, new) > before - 1e-3 * total) {
             failed++;
             continue;
         }
         failed = 0;
         report->shortened++;
-        memmove(first + 2 * (size_t)dof, first + (size_t)dof * dropped, sizeof(double) * dof * (count - piece[1] - 1));
-        memcpy(first, ends[0], sizeof(double) * dof);
-        memcpy(first + dof, ends[1], sizeof(double) * dof);
-        count += 2 - dropped;
+        memmove(first + added * (size_t)dof, first + (size_t)dof * dropped, sizeof(double) * dof * (count - piece[1] - 1));
+        memcpy(first, new, sizeof(double) * dof * added);
+        count += added - dropped;
     }
     return count;
 }

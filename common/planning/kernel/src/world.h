@@ -39,6 +39,16 @@ typedef struct {
     double reach[MOST_JOINTS];     /* levers of the middle */
 } body;
 
+#define MOST_KEPT 8
+
+/* A number n x - least that must not be negative: of a direction of the tool, or of the tool point. */
+typedef struct {
+    int direction;
+    double at[3];  /* the direction, in the frame of the joint that carries the tool */
+    double n[3], least, slack; /* slack: of n x, at the tolerance */
+    double inside; /* where states are projected to: an angle [rad], or a distance from the bound [m] */
+} kept;
+
 typedef struct {
     int dof, joints, shapes, pairs, room;
     joint joint[MOST_JOINTS]; /* joint i > 0 is moved by q[i - 1] */
@@ -56,6 +66,9 @@ typedef struct {
     int tool;           /* joint that carries the tool point */
     double tip[3], origin[3], leash;
     double tip_lever[MOST_JOINTS];
+    int keeps, keep_tool; /* what the tool keeps to, and the joint that carries it */
+    kept keep[MOST_KEPT];
+    double keep_tip[3], keep_lever[MOST_JOINTS], turn_lever[MOST_JOINTS];
 } world;
 
 /* What one thread needs to answer questions. */
