@@ -28,7 +28,6 @@ from tests.common.planning.constraint_checks import FLOOR, carries, constraints_
 CONSTRAINTS = ("tilt 0.3", "tilt 0.1", "tilt 0.03", "corridor", "tilt 0.1, corridor")
 
 
-
 def broken(robot: RobotModel, response: PlanResponse, wanted: PathConstraints) -> bool:
     """Whether a trajectory breaks a constraint at any millisecond."""
     way = driven(robot, response)

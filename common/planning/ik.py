@@ -81,6 +81,49 @@ def _step_within(q: Array, jacobian: Array, error: Array, damping: Array, lower:
     return np.asarray(np.clip(q + step * free, lower, upper))
 
 
+_TURN = 2 * np.pi
+_STEPS_BEYOND = 40
+_SEEDS_BEYOND = 4
+
+
+def why_no_ik(robot: RobotModel, T_world_tcp: Array, seed: Array) -> str:
+    """Why no joint positions put the TCP at a pose (4, 4) for which none were found: too far away, or which limit.
+
+    Looks for positions beyond the limits, from the seed (dof,) [rad] and a few others, and tells the nearest.
+    """
+    away = float(np.linalg.norm(T_world_tcp[:3, 3] - robot.foot))
+    if away > robot.reach:
+        return f"it is {away:.2f} m from the first joint, {robot.reach:.2f} m is the most"
+    rng = np.random.default_rng(0)
+    nearest: tuple[float, str] | None = None
+    for number in range(_SEEDS_BEYOND):
+        q = _beyond_limits(robot, pin.SE3(T_world_tcp), seed if number == 0 else rng.uniform(robot.lower, robot.upper))
+        if q is None:
+            continue
+        excess = np.maximum(robot.lower - q, q - robot.upper)
+        joint = int(np.argmax(excess))
+        if nearest is None or excess[joint] < nearest[0]:
+            limits = f"{robot.lower[joint]:.2f} to {robot.upper[joint]:.2f} rad"
+            nearest = float(excess[joint]), f"{robot.joint_names[joint]} would be at {q[joint]:.2f}, not in {limits}"
+    return nearest[1] if nearest is not None and nearest[0] > 0 else "the arm does not get there"
+
+
+def _beyond_limits(robot: RobotModel, target: pin.SE3, seed: Array) -> Array | None:
+    """Joint positions with the TCP at the target, whatever the limits, but turned back by full turns towards them."""
+    model, data, frame = robot.model, robot.data, robot.tcp_frame
+    turns = np.array([not joint.shortname().startswith("JointModelP") for joint in model.joints[1:]])
+    middle = (robot.lower + robot.upper) / 2
+    q = seed
+    for _ in range(_STEPS_BEYOND):
+        pin.computeJointJacobians(model, data, q)
+        error = pin.log6(pin.updateFramePlacement(model, data, frame).actInv(target)).vector
+        if np.abs(error).max() < ROTATION_TOLERANCE:
+            return np.asarray(np.where(turns, middle + (q - middle + np.pi) % _TURN - np.pi, q))
+        jacobian = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL)
+        q = q + _step(jacobian, error, (0.05 * min(1.0, float(error @ error)) + 1e-7) * _EYE)
+    return None
+
+
 def solve_ik(
     robot: RobotModel,
     T_world_tcp: ArrayLike,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from common.messages import PlanAttempt
 from common.planning.goal_sampling import least_time, sample_goals
+from common.planning.ik import why_no_ik
 from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result
 from common.sources import monotonic
 
@@ -47,7 +48,16 @@ def joint_goals(problem: Problem, cancel: Cancel, *, wanted: int, tries: int = 4
             failures[number] = samples.failure(cancel.reason(problem))
     if found:
         return sorted(found, key=lambda goal: least_time(problem.start, goal, problem.velocity))
+    for number in list(failures)[:_TOLD]:
+        failures[number] = _explained(problem, choices[number - 1], failures[number])
     return failures[1] if isinstance(problem.goal, Region) else none_of(failures)
+
+
+def _explained(problem: Problem, goal: Array | Region, failure: Result) -> Result:
+    """The failure of a goal, with what keeps the arm from it."""
+    if failure.error != "no_ik" or not isinstance(goal, Region):
+        return failure
+    return replace(failure, message=f"{failure.message}: {why_no_ik(problem.robot, goal.T_world_tcp, problem.start)}")
 
 
 def none_of(failures: Mapping[int, Result]) -> Result:

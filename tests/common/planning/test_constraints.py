@@ -206,7 +206,7 @@ def test_of_several_goals_one_that_keeps_the_tool_upright_is_taken_else_each_is_
     request.goal = GoalSet(goals=[leaning, pose_goal(tool_down(2.0, 0.0, 0.2))])
     response = PIPELINE.plan(request, EMPTY)
     assert "goal 1: " in response.message and "tilted by 0.5 rad, 0.2 allowed" in response.message
-    assert "goal 2: no pose of the goal region can be reached" in response.message
+    assert "goal 2: no pose of the goal region can be reached: it is 2.0" in response.message
 
 
 TRACE = PathGoal(waypoints=[matrix_to_pose(tool_down(x, y, 0.2)) for x, y in ((0.5, -0.3), (0.4, -0.1), (0.5, 0.1))])
@@ -284,3 +284,18 @@ def test_what_one_request_keeps_to_binds_no_other():
     PIPELINE.plan(request, EMPTY)
     assert PIPELINE.plan(plain, EMPTY).trajectory == before.trajectory
     assert PIPELINE.world(plain, EMPTY, RIGHT).edge_free(HOME, HOME + 1.0 * np.eye(7)[5])
+
+
+@pytest.mark.parametrize(
+    ("place", "why"),
+    [
+        ((0.05, 0.0, 0.1), "panda_joint4 would be at -3.45, not in -3.07 to -0.07 rad"),
+        ((0.9, 0.0, 0.1), "can be reached: the arm does not get there"),
+        ((1.4, 0.0, 0.1), "it is 1.42 m from the first joint, 1."),
+    ],
+)
+def test_pose_without_a_solution_is_told_with_what_keeps_the_arm_from_it(place, why):
+    for planner in ("ptp", "rrt_connect"):
+        response = PIPELINE.plan(to_pose(tool_down(*place), RIGHT, planner=planner), EMPTY)
+        assert response.error == "no_ik"
+        assert why in response.message and why in response.attempts[-1].message
