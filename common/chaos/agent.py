@@ -210,12 +210,7 @@ class Chaos:
             payload = nonsense(model, _stateless(fault, rng), rng)
             own = Attachment("chaos", int(rng.integers(2**31)), checksum=checksum_of(key, payload))
             return payload, encode_attachment(own) if rng.random() < 0.5 else b""
-        # The next message of this writer, as it would look had it been damaged on the way.
-        following = Attachment(
-            attachment.writer, attachment.sequence + int(rng.integers(1, 50)), trace=attachment.trace,
-            checksum=checksum_of(real.key, real.payload),
-        )
-        return damaged(real.payload, fault.form, rng), encode_attachment(following)
+        return next_damaged(real, attachment, fault.form, rng)
 
     async def _sample(self, key: str) -> RawSample | None:
         """A real message of a key; None when nothing is said there."""
@@ -250,6 +245,17 @@ async def _until(reader: Reader[Any] | None, condition: Callable[[], bool], seco
 def _signal(pid: int, number: signal.Signals) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, number)
+
+
+def next_damaged(
+    real: RawSample, attachment: Attachment, form: Form, rng: np.random.Generator
+) -> tuple[bytes, bytes]:
+    """The next message of the writer of one that was heard, payload and attachment, had it been damaged on the way.
+
+    It has the number that the next message has: one farther on would have readers take for old what comes after it.
+    """
+    following = attachment._replace(sequence=attachment.sequence + 1, checksum=checksum_of(real.key, real.payload))
+    return damaged(real.payload, form, rng), encode_attachment(following)
 
 
 def damaged(payload: bytes, form: Form, rng: np.random.Generator) -> bytes:

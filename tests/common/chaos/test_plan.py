@@ -11,13 +11,24 @@ import numpy as np
 import pytest
 
 from common.applications.pick_place.messages import PickPlaceStatus
-from common.chaos.agent import damaged, nonsense
+from common.chaos.agent import damaged, next_damaged, nonsense
 from common.chaos.plan import CELL_SECONDS, LABELS, Fault, Form, Kind, faults, plan
 from common.chaos.setting import keys_of
 from common.errors import DecodeError
 from common.messages import Image, StopRequest
-from common.transport.codec import Attachment, checksum_of, decode, encode, require_whole
+from common.transport.codec import (
+    CHECKED_BYTES,
+    Attachment,
+    checksum_of,
+    decode,
+    decode_attachment,
+    encode,
+    encode_attachment,
+    require_whole,
+)
 from common.transport.ownership import Owner
+from common.transport.reader import Newness
+from common.transport.session import RawSample
 
 PROCESSES = ["router", "motion_planner", "trajectory_executor", "smart_pick_place"]
 KEYS = ["camera/image_raw", "gripper/state", "motion/plan"]
@@ -99,6 +110,24 @@ def test_damaged_messages_are_refused(form: Form) -> None:
             decode(PickPlaceStatus, bad)
         if form == "huge":
             break
+
+
+def test_a_picture_that_is_damaged_where_no_checksum_looks_costs_one_picture() -> None:
+    key, payload = "ur5/depth_camera/image_raw", bytes(2 * CHECKED_BYTES)
+    rng = np.random.default_rng(0)
+
+    def heard(number: int) -> Attachment:
+        return Attachment("depth_camera.1", number, checksum=checksum_of(key, payload))
+
+    newness = Newness()
+    assert newness.is_new(heard(7))
+    real = RawSample(key, payload, "", encode_attachment(heard(7)))
+    bad = (next_damaged(real, heard(7), "flipped", rng) for _ in range(100))
+    body, beside = next((body, beside) for body, beside in bad if body[:CHECKED_BYTES] == payload[:CHECKED_BYTES])
+    attachment = decode_attachment(beside)
+    assert attachment is not None and body != payload
+    require_whole(attachment, key, body)
+    assert newness.is_new(attachment) and not newness.is_new(heard(8)) and newness.is_new(heard(9))
 
 
 @pytest.mark.parametrize("form", ["wrong type", "noise"])
