@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
+from dataclasses import replace
+
+from pydantic import Field
 
 from common import topics
 from common.config import Motion, Parameters, Pipeline, RobotConfig, Run
 from common.errors import Refused
-from common.messages import PlanningScene, PlanRequest, PlanResponse
+from common.messages import CameraInfo, Image, PlanningScene, PlanRequest, PlanResponse, PointCloud2
 from common.planning.pipeline import PlanningPipeline
+from common.planning.points import PointObstacle
 from common.planning.problem import Cancel
+from common.planning.seeing import Camera, JointHistory, PointsOptions, Seeing, Seen
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
+from common.transport.reader import Reader
 
 
 class Config(Parameters):
-    """The motion planner has no parameters of its own: see motion and pipeline."""
+    """How it plans is said by motion and pipeline."""
 
     robot: RobotConfig
     motion: Motion
     pipeline: Pipeline
     run: Run
+    points: PointsOptions | None = Field(None, description="cameras whose points are obstacles")
 
 
 async def run(bus: Bus, config: Config) -> None:
@@ -29,6 +37,7 @@ async def run(bus: Bus, config: Config) -> None:
     scenes = bus.reader(topics.PLANNING_SCENE)
     states = bus.reader(topics.JOINT_STATES)
     display = bus.writer(topics.DISPLAY_TRAJECTORY)
+    eyes = None if config.points is None else Eyes(bus, config.points)
     one_at_a_time = asyncio.Lock()
     loaded: list[PlanningPipeline] = []
 
@@ -41,7 +50,8 @@ async def run(bus: Bus, config: Config) -> None:
             current = None if state is None else pipeline.robot.order(state.name, state.position)
             if not request.start and current is None:
                 raise Refused("no_state", f"{request.stage or request.id}: the joint states are not known yet")
-            response = await _plan(pipeline, request, scene, None if current is None else current.tolist())
+            see = None if eyes is None else eyes.look(scene, request.stage or request.id)
+            response = await _plan(pipeline, request, scene, None if current is None else current.tolist(), see)
         response.header = bus.header()
         if response.trajectory is not None:
             response.trajectory.header = bus.header()
@@ -52,20 +62,76 @@ async def run(bus: Bus, config: Config) -> None:
 
     bus.serve(topics.MOTION_PLAN, handle)
     loaded.append(await asyncio.to_thread(_load, config))
+    if eyes is not None:
+        await asyncio.to_thread(eyes.load, loaded[0])
     await bus.ready()
-    await asyncio.Event().wait()
+    await (asyncio.Event().wait() if eyes is None else eyes.follow())
 
 
 def _load(config: Config) -> PlanningPipeline:
     return PlanningPipeline(RobotModel.load(config.robot), config.motion, config.pipeline, seed=config.run.seed)
 
 
+class Eyes:
+    """The newest of what each camera sent, and where the robot was."""
+
+    def __init__(self, bus: Bus, options: PointsOptions) -> None:
+        self._bus, self._options = bus, options
+        self._readers = [_readers(bus, camera) for camera in options.cameras]
+        self._poses, self._states = bus.reader(topics.TF_STATIC), bus.reader(topics.JOINT_STATES)
+        self._loaded: list[tuple[Seeing, JointHistory]] = []
+
+    def load(self, pipeline: PlanningPipeline) -> None:
+        """Take over the robot."""
+        seeing = Seeing(pipeline.robot, pipeline.geometry, self._options)
+        self._loaded.append((seeing, JointHistory(pipeline.robot)))
+
+    async def follow(self) -> None:
+        """Note where the robot is, for as long as the service runs."""
+        async for state in self._states:
+            self._loaded[0][1].note(state)
+
+    def look(self, scene: PlanningScene, stage: str) -> Callable[[], list[PointObstacle]]:
+        """What makes obstacles, in a thread, of what has come until now."""
+        (seeing, joints), now, poses = self._loaded[0], self._bus.clock.now_ns(), self._poses.latest
+        seen = [
+            Seen(camera, pictures.latest, None if infos is None else infos.latest)
+            for camera, (pictures, infos) in zip(self._options.cameras, self._readers, strict=True)
+        ]
+
+        def obstacles() -> list[PointObstacle]:
+            try:
+                return seeing.obstacles(seen, poses, joints, scene, now)
+            except Refused as error:
+                raise Refused(error.code, f"{stage}: {error}") from None
+
+        return obstacles
+
+
+def _readers(
+    bus: Bus, camera: Camera
+) -> tuple[Reader[PointCloud2] | Reader[Image], Reader[CameraInfo] | None]:
+    if camera.points:
+        return bus.reader(replace(topics.DEPTH_CAMERA_POINTS, key=camera.points)), None
+    depths = bus.reader(replace(topics.DEPTH_CAMERA_DEPTH, key=camera.depth))
+    return depths, bus.reader(replace(topics.DEPTH_CAMERA_INFO, key=camera.info))
+
+
 async def _plan(
-    pipeline: PlanningPipeline, request: PlanRequest, scene: PlanningScene, current: list[float] | None
+    pipeline: PlanningPipeline,
+    request: PlanRequest,
+    scene: PlanningScene,
+    current: list[float] | None,
+    see: Callable[[], list[PointObstacle]] | None,
 ) -> PlanResponse:
     """Plan in a thread; when this is cancelled the planner is told and waited for: never two at once."""
     cancel = Cancel()
-    planning = asyncio.create_task(asyncio.to_thread(pipeline.plan, request, scene, current, cancel))
+
+    def plan() -> PlanResponse:
+        points = [] if see is None else see()
+        return pipeline.plan(request, scene, current, cancel, points)
+
+    planning = asyncio.create_task(asyncio.to_thread(plan))
     try:
         return await asyncio.shield(planning)
     except asyncio.CancelledError:

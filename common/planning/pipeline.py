@@ -117,6 +117,11 @@ class PlanningPipeline:
         assert best is not None  # a pipeline has at least one planner
         return _failed(request, began, best[0], best[1], attempts)
 
+    @property
+    def geometry(self) -> RobotGeometry:
+        """The robot's collision geometry."""
+        return self._cache.robot
+
     def world(self, request: PlanRequest, scene: PlanningScene, start: ArrayLike) -> CollisionWorld:
         """The collision world of a request, apart from those that `plan` uses: to check a trajectory again."""
         geometry = ObstacleCache(self._cache.robot)

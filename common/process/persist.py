@@ -13,7 +13,7 @@ from common.transport.requests import Client
 A = TypeVar("A", bound=Message)
 Q = TypeVar("Q", bound=Message)
 
-NOT_YET = ("no_scene", "no_state")  # the planner has not heard enough to answer
+NOT_YET = ("no_scene", "no_state", "no_points")  # the planner has not heard enough to answer
 AGAIN_AFTER = 0.1  # [s] wall
 
 

@@ -1,0 +1,258 @@
+"""The planner of a cell with a depth camera avoids what nobody told it of, or says why it cannot."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from common import topics
+from common.clock import Clock
+from common.config import (
+    ObjectConfig,
+    Run,
+    Surroundings,
+    World,
+    check,
+    config_root,
+    load_cell,
+    read_yaml,
+    service_config,
+)
+from common.errors import RemoteError
+from common.messages import (
+    CollisionObject,
+    Header,
+    JointGoal,
+    JointState,
+    PlanRequest,
+    PointCloud2,
+    Pose,
+    TFMessage,
+    Vector3,
+    WorldObjects,
+)
+from common.perception.intake import Unusable
+from common.planning.collision import CollisionWorld, interpolate
+from common.planning.ik import solve_ik
+from common.planning.seeing import JointHistory, PointsOptions, cloud_points, frame_pose
+from common.process.in_process import running_service
+from common.process.wiring import wiring
+from common.robot.transforms import rpy_to_matrix, transform
+from common.sim.objects import world_object
+from common.transport.local import LocalNetwork
+from services import depth_camera, motion_planner
+from services.robot_state_publisher import stamped
+from tests.common.planning.ur5_scene import HOME, ROBOT, SCENE, tip_at
+
+W2 = check(World, read_yaml(config_root() / "worlds" / "w2.yaml"))
+AROUND = Surroundings.model_validate({f: getattr(W2, f) for f in Surroundings.model_fields})
+CAMERA = depth_camera.Config(world=AROUND, robot=load_cell("ur5").robot, run=Run(cell="test"), rate=10, max_rate=10)
+PLANNER = service_config(load_cell("ur5"), "motion_planner", motion_planner.Config)
+DEPTH = {"depth": topics.DEPTH_CAMERA_DEPTH.key, "info": topics.DEPTH_CAMERA_INFO.key}
+UNKNOWN = {"unknown": "occupied", "box": {"low": [0.42, -0.1, 1.02], "high": [0.58, 0.1, 1.3]}}
+POST = ObjectConfig(id="post", shape="box", x=0.5, y=0.0, z=1.0, size=(0.08, 0.08), height=0.25)
+
+
+def sees(**options) -> motion_planner.Config:
+    return PLANNER.model_copy(update={"points": PointsOptions(stride=4, max_age=60.0, **options)})
+
+
+class Cell:
+    """What a tester says to a planner and a depth camera."""
+
+    def __init__(self) -> None:
+        self.net = LocalNetwork()
+        self.bus = self.net.bus("tester", cell="test", clock=Clock())
+        self.plan = self.bus.client(topics.MOTION_PLAN)
+        self.scenes, self.joints = self.bus.writer(topics.PLANNING_SCENE), self.bus.writer(topics.JOINT_STATES)
+        self.truth, self.static = self.bus.writer(topics.SCENE_OBJECTS), self.bus.writer(topics.TF_STATIC)
+        self.depths = self.bus.reader(topics.DEPTH_CAMERA_DEPTH)
+        self.clouds = self.bus.reader(topics.DEPTH_CAMERA_POINTS)
+
+    def say(self, q: np.ndarray, *things: ObjectConfig, stamp: int | None = None) -> None:
+        camera = AROUND.camera
+        T = transform(rpy_to_matrix(*camera.rpy), camera.position)
+        self.static.put(TFMessage(transforms=[stamped("world", camera.frame, T, 0)]))
+        self.scenes.put(SCENE)
+        self.stand(q, stamp)
+        self.truth.put(WorldObjects(objects=[world_object(thing) for thing in things]))
+
+    def stand(self, q: np.ndarray, stamp: int | None = None) -> None:
+        header = self.bus.header() if stamp is None else Header(stamp=stamp)
+        self.joints.put(JointState(header=header, name=ROBOT.joint_names, position=list(q)))
+
+    async def picture(self, reader) -> None:
+        """One that was taken from now on has come, and where the robot was then is known."""
+        now = self.bus.clock.now_ns()
+        async with asyncio.timeout(60):
+            while (picture := await reader.next()).header.stamp < now:
+                pass
+        self.stand(START, picture.header.stamp)
+
+    async def refusal(self) -> RemoteError:
+        with pytest.raises(RemoteError) as caught:
+            await self.plan.call(ACROSS.model_copy(update={"stage": "reach"}), timeout=60)
+        assert caught.value.message.startswith("reach: ")
+        return caught.value
+
+
+def joints_at(y: float) -> np.ndarray:
+    """Where the tool points down beside the block's middle, close above it."""
+    found = solve_ik(ROBOT, tip_at(0.5, y, 1.15), HOME, rng=np.random.default_rng(1))
+    assert found is not None
+    return found
+
+
+START, GOAL = joints_at(-0.3), joints_at(0.3)
+ACROSS = PlanRequest(id="1", start=START.tolist(), goal=JointGoal(positions=GOAL.tolist()))
+
+
+def real_world() -> CollisionWorld:
+    post = CollisionObject(
+        id="post", role="fixture", shape="box", dimensions=[0.08, 0.08, 0.25],
+        pose=Pose(position=Vector3(x=0.5, y=0.0, z=1.125)),
+    )
+    return CollisionWorld(ROBOT, SCENE.model_copy(update={"objects": [*SCENE.objects, post]}), start=START)
+
+
+def hits(response) -> bool:
+    path = interpolate(np.array([point.positions for point in response.trajectory.points]), 0.005)
+    return real_world().first_collision(path) is not None
+
+
+@pytest.mark.parametrize("camera", [DEPTH, {"points": topics.DEPTH_CAMERA_POINTS.key}], ids=["depth", "cloud"])
+async def test_what_only_the_camera_sees_is_avoided(camera) -> None:
+    cell, kinds = Cell(), [PLANNER, sees(cameras=[camera], **(UNKNOWN if "depth" in camera else {}))]
+    outcomes = []
+    async with AsyncExitStack() as stack:
+        await stack.enter_async_context(running_service(cell.net, depth_camera.run, CAMERA, name="depth_camera"))
+        for config in kinds:
+            async with running_service(cell.net, motion_planner.run, config, name="motion_planner"):
+                await cell.plan.wait_available(20)
+                cell.say(START, POST)
+                await cell.picture(cell.clouds if "points" in camera else cell.depths)
+                response = await cell.plan.call(ACROSS, timeout=60)
+                assert response.ok, response.message
+                outcomes.append(hits(response))
+    assert outcomes[0]  # so it is in the way
+    assert not outcomes[1]
+
+
+@pytest.fixture
+async def planner():
+    cell = Cell()
+    async with running_service(cell.net, motion_planner.run, sees(cameras=[DEPTH]), name="motion_planner"):
+        await cell.plan.wait_available(20)
+        yield cell
+
+
+async def test_without_a_picture_nothing_is_planned(planner) -> None:
+    planner.say(START)
+    refusal = await planner.refusal()
+    assert refusal.code == "no_points" and "depth_camera/depth/image_raw: nothing came yet" in refusal.message
+
+
+async def test_picture_of_a_moment_at_which_the_robot_was_anywhere_is_refused(planner) -> None:
+    async with running_service(planner.net, depth_camera.run, CAMERA, name="depth_camera"):
+        planner.say(START, stamp=1)
+        async with asyncio.timeout(60):
+            await planner.depths.next()
+        refusal = await planner.refusal()
+        assert refusal.code == "no_state" and "where the robot was" in refusal.message
+
+
+async def test_old_picture_is_refused() -> None:
+    cell, config = Cell(), PLANNER.model_copy(update={"points": PointsOptions(cameras=[DEPTH], max_age=1e-6)})
+    async with AsyncExitStack() as stack:
+        await stack.enter_async_context(running_service(cell.net, motion_planner.run, config, name="motion_planner"))
+        await stack.enter_async_context(running_service(cell.net, depth_camera.run, CAMERA, name="depth_camera"))
+        await cell.plan.wait_available(20)
+        cell.say(START)
+        await cell.picture(cell.depths)
+        refusal = await cell.refusal()
+        assert refusal.code == "old_points" and "points.max_age is 1e-06 s" in refusal.message
+
+
+async def test_frame_that_nobody_knows_is_refused(planner) -> None:
+    async with running_service(planner.net, depth_camera.run, CAMERA, name="depth_camera"):
+        planner.say(START)
+        planner.static.put(TFMessage(transforms=[stamped("world", "elsewhere", np.eye(4), 0)]))
+        await planner.picture(planner.depths)
+        refusal = await planner.refusal()
+    assert refusal.code == "bad_points" and "depth_camera_optical_frame" in refusal.message
+
+
+async def test_it_reads_cameras_where_it_is_told_to() -> None:
+    plain = {topic.key for topic in (await wiring(motion_planner.run, PLANNER)).reads}
+    assert plain == {topics.PLANNING_SCENE.key, topics.JOINT_STATES.key}
+    other = {"points": "left/points"}
+    found = {topic.key for topic in (await wiring(motion_planner.run, sees(cameras=[DEPTH, other]))).reads}
+    assert found - plain == {topics.TF_STATIC.key, "left/points", *DEPTH.values()}
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"cameras": [{}]}, "either points, or depth and info"),
+        ({"cameras": [{"depth": "a"}]}, "either points, or depth and info"),
+        ({"cameras": [DEPTH], "unknown": "occupied"}, "needs a box"),
+        ({"cameras": [{"points": "a"}], **UNKNOWN}, "needs depth and info"),
+        ({"cameras": [DEPTH], "unknown": "occupied", "box": {"low": [0, 0, 0], "high": [1, 0, 1]}}, "less than high"),
+        ({"cameras": [DEPTH], "unknown": "occupied", "box": {"low": [0, 0, 0], "high": [9, 9, 9]}}, "million cubes"),
+    ],
+)
+def test_options_that_cannot_be_are_told(options, told) -> None:
+    with pytest.raises(ValidationError, match=told):
+        PointsOptions(**options)
+
+
+def test_camera_on_the_robot_is_where_its_link_was() -> None:
+    on_tool = transform(np.eye(3), (0.0, 0.05, 0.1))
+    link = ROBOT.link_names[-1]
+    poses = TFMessage(transforms=[stamped("mount", "lens", on_tool, 0), stamped(link, "mount", on_tool, 0)])
+    expected = ROBOT.link_poses(START)[link] @ on_tool @ on_tool
+    np.testing.assert_allclose(frame_pose("lens", poses, ROBOT, START), expected, atol=1e-12)
+    with pytest.raises(Unusable, match="'nowhere' is; it has: lens, mount"):
+        frame_pose("nowhere", poses, ROBOT, START)
+    around = TFMessage(transforms=[stamped("a", "b", on_tool, 0), stamped("b", "a", on_tool, 0)])
+    with pytest.raises(Unusable, match="'a' is"):
+        frame_pose("a", around, ROBOT, START)
+
+
+def test_where_the_robot_was_is_between_the_states_about_it() -> None:
+    history = JointHistory(ROBOT)
+    for stamp, q in ((1.0, START), (1.02, START + 0.02), (1.01, START - 1), (3.0, GOAL)):
+        header = Header(stamp=int(stamp * 1e9))
+        history.note(JointState(header=header, name=ROBOT.joint_names, position=list(q)))
+    np.testing.assert_allclose(history.at(int(1.005e9)), START + 0.005, atol=1e-9)
+    np.testing.assert_allclose(history.at(int(1.1e9)), START + 0.02)
+    np.testing.assert_allclose(history.at(int(3.05e9)), GOAL)
+    assert history.at(int(2e9)) is None and history.at(int(0.8e9)) is None
+
+
+def test_clouds_are_read_by_their_fields() -> None:
+    rows = np.zeros((2, 20), np.uint8)  # a row of two points, and four bytes that are nothing
+    values = np.array([[[1, 2], [3, 4]], [[5, 6], [np.nan, 8]]], "<f4")
+    rows[:, :16] = values.reshape(2, 4).view(np.uint8)
+    cloud = PointCloud2(
+        header=Header(), height=2, width=2, fields=["y", "x"], point_step=8, row_step=20, data=rows.tobytes()
+    )
+    with pytest.raises(Unusable, match="the cloud has no z; its fields are y, x"):
+        cloud_points(cloud)
+    flat = cloud.model_copy(update={"fields": ["z", "x"]})
+    with pytest.raises(Unusable, match="no y"):
+        cloud_points(flat)
+    three = values.repeat(2, axis=2)[..., :3].copy()  # x, x, y
+    three = np.ascontiguousarray(three)
+    whole = PointCloud2(
+        header=Header(), height=2, width=2, fields=["z", "x", "y"], point_step=12, row_step=24, data=three.tobytes()
+    )
+    np.testing.assert_allclose(cloud_points(whole), [[1, 2, 1], [3, 4, 3], [5, 6, 5]])
+    with pytest.raises(Unusable, match="too few for 2x2"):
+        cloud_points(whole.model_copy(update={"data": b"0" * 47}))
+    with pytest.raises(Unusable, match="do not fit"):
+        cloud_points(whole.model_copy(update={"row_step": 20}))
