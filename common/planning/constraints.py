@@ -89,6 +89,11 @@ class ToolConstraints:
         """What keeps to nothing."""
         return cls(robot, PathConstraints(), np.zeros(robot.dof))
 
+    @property
+    def limit_ways(self) -> bool:
+        """Whether anything is kept to on the way, but for the speed."""
+        return len(self.bounds.n) > 0
+
     def hand_to(self, kernel: KernelWorld) -> None:
         """Let the compiled kernel keep to this, and answer for it."""
         frame = self.robot.model.frames[self.robot.tcp_frame]
@@ -102,7 +107,7 @@ class ToolConstraints:
     def holds(self, q: ArrayLike, share: float = PLANNED[0]) -> bool:
         """Whether the robot at q (dof,) [rad] keeps to everything, but for a share of the tolerances."""
         bounds = self.bounds
-        return not len(bounds.n) or bool((self._values(self.robot.fk(q)) >= -share * bounds.slack).all())
+        return not self.limit_ways or bool((self._values(self.robot.fk(q)) >= -share * bounds.slack).all())
 
     def wrong_with(self, T_world_tcp: Array, turn: float = 0.0, way: float = 0.0, share: float = PLANNED[0]) -> str:
         """What a pose (4, 4) violates by more than this turn [rad] and way [m] could make good; "" for nothing."""
@@ -140,7 +145,7 @@ class ToolConstraints:
             cubics: (N, 4, dof) [rad] c0 + c1 t + c2 t^2 + c3 t^3, t from 0 to 1.
             shares: of the tolerances: what states may use, and what is proved between them.
         """
-        if not len(self.bounds.n):
+        if not self.limit_ways:
             return None
         if self._kernel is not None:
             return self._kernel.first_break(cubics, *shares)

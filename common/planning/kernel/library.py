@@ -9,7 +9,7 @@ from pathlib import Path
 
 from common.planning.kernel.build import FOLDER, NAME
 
-VERSION = 10
+VERSION = 11
 
 _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "zk_version": (c_int, []),

@@ -30,19 +30,23 @@ class _Options(ctypes.Structure):
 
 class _Report(ctypes.Structure):
     _fields_ = [
-        *((name, ctypes.c_longlong) for name in ("samples", "nodes", "shortcuts", "shortened")),
+        *((name, ctypes.c_longlong) for name in ("samples", "nodes", "from_start", "shortcuts", "shortened")),
         *((name, ctypes.c_double) for name in ("search_seconds", "shorten_seconds")),
     ]
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a search came to: waypoints (N, dof) [rad], or the reason for none."""
+    """What a search came to: waypoints (N, dof) [rad], or the reason for none.
+
+    `from_start` of the `nodes` can be reached from the start, the others lead to the goals.
+    """
 
     waypoints: Array | None
     error: str
     samples: int
     nodes: int
+    from_start: int
     shortcuts: int
     search_seconds: float
     shorten_seconds: float
@@ -85,6 +89,7 @@ def find_path(
         _REASONS.get(count, ""),
         report.samples,
         report.nodes,
+        report.from_start,
         report.shortcuts,
         report.search_seconds,
         report.shorten_seconds,

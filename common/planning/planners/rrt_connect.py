@@ -12,12 +12,15 @@ from common.config import Parameters
 from common.messages import PlanAttempt
 from common.planning.goal_sampling import least_time
 from common.planning.joint_goals import joint_goals, straight_edge
-from common.planning.kernel.planner import find_path
+from common.planning.kernel.planner import Found, find_path
 from common.planning.kernel.world import KernelWorld
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result
 from common.sources import monotonic
 
 Array = NDArray[np.float64]
+
+
+_MANY = 200  # samples after which a tree that has not grown tells something
 
 
 class Options(Parameters):
@@ -60,7 +63,8 @@ def _best(problem: Problem, options: Options, cancel: Cancel, kernel: KernelWorl
         path = found.waypoints
         if path is None:
             error = cancel.reason(problem) or found.error
-            attempts.append(PlanAttempt(planner="rrt_connect", seconds=seconds, error=error, message="found no path"))
+            failure = "found no path" if cancel.is_set else _no_path(problem, goals, found)
+            attempts.append(PlanAttempt(planner="rrt_connect", seconds=seconds, error=error, message=failure))
         else:
             time = sum(least_time(a, b, problem.velocity) for a, b in pairwise(path))
             message = f"{len(path)} waypoints, {time:.2f} s at least, {found.nodes} nodes"
@@ -71,5 +75,17 @@ def _best(problem: Problem, options: Options, cancel: Cancel, kernel: KernelWorl
             break
     if best is None or cancel.is_set:
         error = "cancelled" if cancel.is_set else attempts[-1].error or "no_path"
-        return Result(error=error, message="RRT-Connect found no path", attempts=attempts)
+        told = [attempt.message for attempt in attempts if attempt.error]
+        return Result(error=error, message=f"RRT-Connect {told[-1] if told else 'was ended'}", attempts=attempts)
     return Result(waypoints=best, fraction=1.0, attempts=attempts)
+
+
+def _no_path(problem: Problem, goals: Array, found: Found) -> str:
+    """What a search without success tells: where it got stuck, and what is on the straight edge to the nearest goal."""
+    constraints = problem.world.constraints
+    message = "found no path" + (" that keeps to the constraints" if constraints and constraints.limit_ways else "")
+    if found.samples >= _MANY and found.from_start == 1:
+        message += " nor any other way from the start"
+    elif found.samples >= _MANY and found.nodes - found.from_start == len(goals):
+        message += " nor any other way to the goal"
+    return f"{message}; on the straight edge, {problem.world.obstruction(problem.start, goals[0], 0.01).message}"

@@ -19,8 +19,10 @@ from common.messages import (
     SequenceItem,
     Vector3,
 )
+from common.planning.collision import CollisionWorld
 from common.planning.constraints import CHECKED, PLANNED, ToolConstraints, line
 from common.planning.joint_goals import line as steps_to
+from common.planning.kernel.planner import find_path
 from common.planning.pipeline import PlanningPipeline
 from common.planning.problem import Cancel, Result
 from common.planning.validation import fine_samples, timed_path
@@ -272,6 +274,9 @@ def test_way_that_is_not_there_is_looked_for_no_longer_than_asked():
     response = PIPELINE.plan(request, over)
     assert response.error in ("timeout", "no_path")
     assert response.seconds < 0.6
+    why = "found no path that keeps to the constraints; on the straight edge, panda_link5 collides with wall"
+    assert response.message == f"rrt_connect: RRT-Connect {why}"
+    assert response.attempts[-1].message == why
     cancel = Cancel()
     cancel.set()
     assert PIPELINE.plan(request, over, cancel=cancel).error == "cancelled"
@@ -299,3 +304,16 @@ def test_pose_without_a_solution_is_told_with_what_keeps_the_arm_from_it(place, 
         response = PIPELINE.plan(to_pose(tool_down(*place), RIGHT, planner=planner), EMPTY)
         assert response.error == "no_ik"
         assert why in response.message and why in response.attempts[-1].message
+
+
+def test_tool_that_is_held_in_place_turns_about_its_axis_and_goes_nowhere_else():
+    start = ROBOT.fk(RIGHT)[:3, 3].tolist()
+    held = PathConstraints(tilt=0.005, region=Box(
+        pose=Pose(position=Vector3(**dict(zip("xyz", start, strict=True)))), size=Vector3(x=0.001, y=0.001, z=0.001)))
+    goal = RIGHT + np.array([0, 0, 0, 0, 0, 0, 0.5])
+    constraints = ToolConstraints(ROBOT, held, RIGHT)
+    world = CollisionWorld(ROBOT, EMPTY, start=RIGHT, constraints=constraints)
+    assert world.edge_free(RIGHT, goal)  # it turns about the tool axis
+    found = find_path(world.kernel, RIGHT, np.array([LEFT]), seconds=0.1)
+    assert found.waypoints is None
+    assert 1 <= found.from_start <= found.nodes - 1

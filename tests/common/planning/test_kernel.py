@@ -259,7 +259,7 @@ def test_options_have_the_layout_of_the_source():
     from common.planning.kernel import planner
 
     assert ctypes.sizeof(planner._Options) == 6 * 8
-    assert ctypes.sizeof(planner._Report) == 6 * 8
+    assert ctypes.sizeof(planner._Report) == 7 * 8
 
 
 def test_paths_are_timed_the_same_with_and_without_the_kernel(monkeypatch):

@@ -9,7 +9,7 @@
 #define API __attribute__((visibility("default")))
 #endif
 
-#define VERSION 10
+#define VERSION 11
 
 API int zk_version(void) { return VERSION; }
 

@@ -93,7 +93,7 @@ typedef struct {
 } plan_options;
 
 typedef struct {
-    long long samples, nodes, shortcuts, shortened;
+    long long samples, nodes, from_start, shortcuts, shortened; /* from_start: nodes of the tree that begins there */
     double search_seconds, shorten_seconds;
 } plan_report;
 
@@ -275,7 +275,7 @@ static int plan(run *r, const double *start, int goals, const double *goal, int 
     for (int g = 0; g < goals && !error; g++)
         if (add_node(&trees[1], goal + (size_t)dof * g, -1) < 0) error = NO_MEMORY;
     if (!error) error = search(r, trees, meet, &random, report);
-    report->nodes = trees[0].count + trees[1].count;
+    report->nodes = trees[0].count + trees[1].count, report->from_start = trees[0].count;
     report->search_seconds = now() - began;
     if (!error) {
         int steps = 0;
