@@ -162,7 +162,7 @@ def test_what_is_proved_along_a_curve_holds_at_every_place_of_it(number, compile
     kernel = pipeline.world(to_joints(robot.named("home"), robot.named("home")), EMPTY, robot.named("home")).kernel
     rng = np.random.default_rng(number)
     held = broken = 0
-    for _ in range(40):
+    for _ in range(25):
         q = rng.uniform(robot.lower, robot.upper)
         T = robot.fk(q)
         wanted = PathConstraints(
@@ -186,7 +186,7 @@ def test_what_is_proved_along_a_curve_holds_at_every_place_of_it(number, compile
                     broken += 1
                     t = found[1]
                     assert constraints.wrong_at(np.array([1, t, t**2, t**3]) @ c, 0.0)
-    assert held > 25 and broken > 25
+    assert held > 15 and broken > 15
 
 
 def test_upright_may_be_how_the_tool_stands_at_the_start():
@@ -241,7 +241,8 @@ def test_tool_is_never_faster_than_asked_and_as_fast_where_it_may(planner, goal,
         assert len(way.speeds) * 1e-3 < 1.1 * length / speed + 0.5
 
 
-@pytest.mark.parametrize("what", ["tilt 0.3", "tilt 0.1", "tilt 0.1, corridor"])
+@pytest.mark.parametrize(
+    "what", ["tilt 0.3", "tilt 0.1", pytest.param("tilt 0.1, corridor", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["panda", "ur5"])
 def test_glass_is_carried_upright_over_a_wall_each_time(name, what):
     robot, pipeline = arms()[name == "ur5"]
