@@ -361,6 +361,18 @@ class CollisionWorld:
             return False
         return self._sunk is None or self.first_collision(path.positions(step)) is None
 
+    def curves_judged(self, pieces: Array) -> tuple[bool, Hit | None]:
+        """Whether cubics (N, 4, dof) in r from 0 to 1 are proved free; the collision that was found instead, if any."""
+        if self._kernel is None:
+            return False, None
+        index, where = self._kernel.cubics_collision(pieces)
+        if index < 0:
+            return self._sunk is None, None
+        piece = min(int(where), len(pieces) - 1)
+        q = (where - piece) ** np.arange(4) @ pieces[piece]
+        pair = self.colliding_pair(q)
+        return False, None if pair is None else Hit(piece, q, pair)
+
     def edge_collision(self, a: Array, b: Array, step: float = 0.005) -> Hit | None:
         """The first collision on the straight line from a to b (dof,) [rad], looked for in steps [rad]."""
         return self.first_collision(interpolate([a, b], step))

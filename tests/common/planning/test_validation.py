@@ -5,6 +5,7 @@ import pytest
 
 from common.messages import PlanningScene
 from common.planning.collision import CollisionWorld
+from common.planning.kernel.library import library
 from common.planning.path import blended_path
 from common.planning.retiming import TimedPath, parametrise
 from common.planning.validation import check_numbers, fine_samples, validate
@@ -80,3 +81,16 @@ def test_samples_are_no_farther_apart_than_the_step():
     assert np.abs(np.diff(path, axis=0)).max() <= 0.01 + 1e-9
     assert np.array_equal(path[[0, -1]], GOOD.positions[[0, -1]])
     assert (np.diff(owners) >= 0).all()
+
+
+@pytest.mark.skipif(library() is None, reason="the planning kernel is not built")
+def test_collision_between_the_states_that_are_looked_at_is_found():
+    turned = 1.6 * np.eye(7)[0]
+    positions, still = np.stack([HOME, HOME + turned]), np.zeros((2, 7))
+    swing = TimedPath(np.array([0.0, 10.0]), positions, still, 0.06 * np.stack([turned, -turned]))
+    x, y, z = ROBOT.fk(HOME + 0.5 * turned)[:3, 3]
+    palm = PlanningScene(header=WORLD, objects=[ball(0, x, y, z + 0.06)])
+    world = CollisionWorld(ROBOT, palm, start=HOME, cache=cache())
+    assert not any(world.collides(q) for q in positions) and world.collides(HOME + 0.5 * turned)
+    fault = validate(swing, ROBOT, world, start=HOME, velocity=V, acceleration=A, step=100.0)
+    assert fault is not None and (fault.code, fault.waypoint) == ("collision", 0) and "ball_0" in fault.colliding
