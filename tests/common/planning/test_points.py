@@ -20,7 +20,7 @@ from common.planning.pipeline import PlanningPipeline
 from common.planning.points import KnownShapes, PointObstacle, View, depth_points, thinned, unseen
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.transforms import transform
-from tests.common.planning.planning_scenes import CELL, GEOMETRY, HOME, ROBOT, SPREAD, ball, cache, scene
+from tests.common.planning.planning_scenes import CELL, GEOMETRY, HOME, ROBOT, SPREAD, ball, cache, held_scene, scene
 from tests.common.planning.ur5_scene import ROBOT as UR5
 
 needs_kernel = pytest.mark.skipif(library.library() is None, reason="the planning kernel is not built here")
@@ -182,6 +182,19 @@ def test_world_keeps_padding_from_points_and_names_them(either):
     assert not gap.collides(HOME)
     elsewhere = HOME + np.array([0.6, 0, 0, 0, 0, 0, 0])
     assert CollisionWorld(ROBOT, scene(), start=elsewhere, padding=0.05, cache=shared, points=[near]).collides(HOME)
+
+
+def test_what_is_held_keeps_padding_from_points_but_where_it_starts(either):
+    base, tip = held_scene(scene(SPREAD[:2]), "ball_0"), ROBOT.fk(HOME)[:3, 3]
+    middle = np.array([[*tip, 0.01]]) - (0, 0, 0.055, 0)  # 15 mm below a ball of 30 mm
+    near, deep = (PointObstacle("points of camera", middle - (0, 0, down, 0)) for down in (0.0, -0.02))
+
+    def world(start, points):
+        return CollisionWorld(ROBOT, base, start=start, padding=0.03, cache=cache(), points=[points])
+
+    assert not world(HOME, near).collides(HOME)
+    assert world(HOME + 0.6 * np.eye(7)[0], near).colliding_pair(HOME) == ("ball_0", "points of camera")
+    assert world(HOME, deep).colliding_pair(HOME) == ("ball_0", "points of camera")
 
 
 def test_robot_and_known_objects_are_taken_out(either):
