@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import coal
 import numpy as np
@@ -32,6 +32,11 @@ class Near:
     distance: Array
     reach: Array
     gradient: Array
+
+
+def joined(one: Near, other: Near) -> Near:
+    """What is near in both."""
+    return Near(*(np.concatenate([getattr(one, f.name), getattr(other, f.name)]) for f in fields(Near)))
 
 
 @dataclass

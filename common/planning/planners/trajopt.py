@@ -2,8 +2,10 @@
 
 Schulman, Duan, Ho, Lee, Awwal, Bradlow, Pan, Patil, Goldberg, Abbeel: "Motion planning with sequential convex
 optimization and convex collision checking" (IJRR 2014), algorithm 1: distances are linearised, violations of the
-clearance are penalised, and a quadratic program is solved within a trust region about the last path. The programs are
-dense and small, and daqp, an active-set solver, solves them in milliseconds.
+clearance are penalised, and a quadratic program is solved within a trust region about the last path. Distances are
+those at the waypoints and the middles of the edges; once these are free and an edge still is not, also those of the
+hulls of links at both ends of an edge, as in the paper: they take several times as long. The programs are dense and
+small, and daqp, an active-set solver, solves them in milliseconds.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from common.config import Parameters
 from common.planning.joint_goals import first_success, joint_goals, line
 from common.planning.optimised_path import check_path, evenly_spaced, with_restarts
 from common.planning.problem import Cancel, Problem, Result
-from common.planning.proximity import Near, Proximity
+from common.planning.proximity import Near, Proximity, joined
+from common.planning.swept import SweptPieces
 
 Array = NDArray[np.float64]
 
@@ -79,24 +82,36 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
     if isinstance(goals, Result):
         return goals
     proximity = Proximity(problem.world, options.clearance + _BEYOND, own_reach=_OWN_CLEARANCE + _BEYOND, nearest=True)
+    swept = SweptPieces(problem.world, options.clearance)
 
     def attempt(goal: Array) -> Result:
         path = line(problem.start, goal, options.steps)
         if problem.world.edge_free(problem.start, goal):  # nothing is shorter
             return Result(waypoints=evenly_spaced(path), dense=True, fraction=1.0)
-        from_guess = partial(_optimise, problem, options, proximity, cancel)
+        from_guess = partial(_optimise, problem, options, proximity, swept, cancel)
         return with_restarts(problem, path, options.restarts, from_guess)
 
     return first_success(goals, attempt, cancel, problem)
 
 
-def _optimise(problem: Problem, options: Options, proximity: Proximity, cancel: Cancel, path: Array) -> Result:
+def _optimise(
+    problem: Problem, options: Options, proximity: Proximity, swept: SweptPieces, cancel: Cancel, path: Array
+) -> Result:
     """The path that the optimisation makes of a first guess (steps + 1, dof) [rad], or what is wrong with it."""
     chain = _chain(path[0], path[-1], options.steps)
     waypoints = path[1:-1]
     trust, merit = options.trust_region, options.merit
     proximity.forget()
-    near = proximity.measure(chain.positions(waypoints))
+
+    def measured(waypoints: Array, sweeping: bool) -> Near:
+        positions = chain.positions(waypoints)
+        states = proximity.measure(positions)
+        return joined(states, swept.measure(positions[::2])) if sweeping else states
+
+    near = measured(waypoints, False)
+    sweeping = bool((near.distance > 0).all())
+    if sweeping:
+        near = measured(waypoints, True)
     for iteration in range(options.iterations):
         stop = cancel.reason(problem)
         if stop:
@@ -108,16 +123,18 @@ def _optimise(problem: Problem, options: Options, proximity: Proximity, cancel: 
                 break
             merit, trust = merit * _STRICTER, options.trust_region
             continue
-        measured = proximity.measure(chain.positions(following))
-        then = chain.cost(following) + merit * _violation(measured, options.clearance)
+        near_then = measured(following, sweeping)
+        then = chain.cost(following) + merit * _violation(near_then, options.clearance)
         if now - then < _ACCEPTED * (now - expected):
             trust *= _SHRINK
             continue
-        waypoints, near, trust = following, measured, trust * _GROW
+        waypoints, near, trust = following, near_then, trust * _GROW
         if (near.distance > 0).all():
             even = evenly_spaced(np.concatenate([path[:1], waypoints, path[-1:]]))
             if check_path(problem, even) is None:
                 return Result(waypoints=even, dense=True, fraction=1.0)
+            if not sweeping:
+                near, sweeping, trust = measured(waypoints, True), True, options.trust_region
     even = evenly_spaced(np.concatenate([path[:1], waypoints, path[-1:]]))
     failure = check_path(problem, even)
     if failure is None:
