@@ -91,11 +91,16 @@ def _thinned(points: Array, side: float, skip: Mask | None) -> Array:
 
 def depth_points(depth: Depth, camera: Pinhole) -> Array:
     """(N, 3) points [m] in the world of all pixels of a depth picture (height, width) that measured any depth."""
-    rows, columns = np.nonzero(is_valid(depth))
-    far = depth[rows, columns].astype(float)
-    seen = np.stack([far * (columns - camera.cx) / camera.fx, far * (rows - camera.cy) / camera.fy, far], axis=1)
+    valid = is_valid(depth)
+    height, width = depth.shape
+    far = depth.astype(float)
+    seen = np.empty((3, int(np.count_nonzero(valid))))
+    with np.errstate(invalid="ignore"):  # of what measured nothing
+        seen[0] = (far * ((np.arange(width) - camera.cx) / camera.fx))[valid]
+        seen[1] = (far * ((np.arange(height) - camera.cy) / camera.fy)[:, None])[valid]
+    seen[2] = far[valid]
     T = camera.T_world_optical
-    return np.asarray(seen @ T[:3, :3].T + T[:3, 3])
+    return np.ascontiguousarray((T[:3, :3] @ seen + T[:3, 3:]).T)
 
 
 def unseen(pictures: Sequence[tuple[Depth, Pinhole]], low: Array, high: Array, side: float) -> Array:

@@ -40,6 +40,7 @@ from common.planning.collision import CollisionWorld, interpolate
 from common.planning.ik import solve_ik
 from common.planning.seeing import JointHistory, PointsOptions, cloud_points, frame_pose
 from common.process.in_process import running_service
+from common.process.persist import persist
 from common.process.wiring import wiring
 from common.robot.transforms import rpy_to_matrix, transform
 from common.sim.objects import world_object
@@ -184,6 +185,19 @@ async def test_frame_that_nobody_knows_is_refused(planner) -> None:
         await planner.picture(planner.depths)
         refusal = await planner.refusal()
     assert refusal.code == "bad_points" and "depth_camera_optical_frame" in refusal.message
+
+
+async def test_who_asks_before_the_first_picture_asks_again() -> None:
+    told: list[str] = []
+
+    class Client:
+        async def call(self, request, timeout):
+            if not told:
+                raise RemoteError("motion/plan", "no_points", "nothing came yet")
+            return "a plan"
+
+    assert await persist(Client(), ACROSS, 1.0, refused=lambda error: error, note=told.append) == "a plan"
+    assert len(told) == 1
 
 
 async def test_it_reads_cameras_where_it_is_told_to() -> None:
