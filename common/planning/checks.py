@@ -139,7 +139,9 @@ def check_constraints(robot: RobotModel, request: PlanRequest, checked: CheckedR
 
 def _known_poses(robot: RobotModel, checked: CheckedRequest) -> Iterator[tuple[str, str, Array, float, float]]:
     """Name, whether start or goal, pose (4, 4), and by how much turn [rad] and way [m] it may be missed."""
-    yield "start", "start", robot.fk(checked.start), 0.0, 0.0
+    for q in (checked.start, checked.beyond):
+        if q is not None:
+            yield "start", "start", robot.fk(q), 0.0, 0.0
     goal = checked.goal
     goals: list[tuple[str, object]] = [("goal", goal)]
     if isinstance(goal, ToolPath):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -237,13 +236,13 @@ class PlanningPipeline:
         """The planner's own trajectory, or its path timed with smaller and smaller blends."""
         robot, limit = problem.robot, problem.tool_speed
         if result.trajectory is not None:
-            yield slowed(robot, result.trajectory, limit) if limit < math.inf else result.trajectory
+            yield slowed(robot, result.trajectory, limit)
             return
         scale = self._motion.cartesian_speed_scale if result.tool_line else 1.0
         for blend in BLENDS[:1] if result.dense or result.way else BLENDS:
             trajectory = retime(problem, result, blend, limit / scale)
             trajectory = stretch(trajectory, scale) if result.tool_line else trajectory
-            yield slowed(robot, trajectory, limit) if limit < math.inf else trajectory
+            yield slowed(robot, trajectory, limit)
 
     def _fault(self, problem: Problem, trajectory: TimedPath) -> Fault | None:
         fault = validate(
@@ -270,7 +269,7 @@ class PlanningPipeline:
 def _from_beyond(problem: Problem, beyond: Array, trajectory: TimedPath) -> TimedPath:
     """The trajectory, after a straight move to its start from where the robot stands beyond a limit."""
     inwards = straight_profile(beyond, problem.start, problem.velocity, problem.acceleration, problem.jerk)
-    return join([inwards, trajectory])
+    return join([slowed(problem.robot, inwards, problem.tool_speed), trajectory])
 
 
 def _reached(problem: Problem, q: Array) -> int:

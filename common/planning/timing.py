@@ -67,6 +67,8 @@ def _rates_at(robot: RobotModel, tool_speed: float, path: SmoothPath) -> Array:
 
 def slowed(robot: RobotModel, trajectory: TimedPath, tool_speed: float) -> TimedPath:
     """The trajectory, stretched in time so that the TCP never moves faster than a speed [m/s]."""
+    if math.isinf(tool_speed):
+        return trajectory
     peak = max(robot.tool_speed(q, dq) for q, dq in zip(*moving_samples(trajectory, _PEAK_STEP), strict=True))
     return trajectory if peak <= tool_speed else stretch(trajectory, _BELOW * tool_speed / peak)
 

@@ -318,3 +318,19 @@ def test_tool_that_is_held_in_place_turns_about_its_axis_and_goes_nowhere_else()
     found = find_path(world.kernel, RIGHT, np.array([LEFT]), seconds=0.1)
     assert found.waypoints is None
     assert 1 <= found.from_start <= found.nodes - 1
+
+
+def test_way_back_within_the_limits_keeps_to_the_constraints_too():
+    inside = LEFT.copy()
+    inside[0] = ROBOT.upper[0]
+    out = inside + 0.03 * np.eye(7)[0]
+    goal = inside - 0.3 * np.eye(7)[0]
+    slow = PIPELINE.plan(to_joints(goal, out, constraints=PathConstraints(tool_speed=0.01)), EMPTY)
+    way = driven(ROBOT, slow)
+    assert np.linalg.norm(way.places[0] - ROBOT.fk(out)[:3, 3]) < 1e-6
+    assert 0.009 < way.speeds.max() < 0.0101
+    x, y, z = ROBOT.fk(inside - 0.15 * np.eye(7)[0])[:3, 3].tolist()
+    side = 2 * float(np.abs(ROBOT.fk(inside)[:3, 3] - (x, y, z)).max()) + 0.002
+    box = Box(pose=Pose(position=Vector3(x=x, y=y, z=z)), size=Vector3(x=side, y=side, z=side))
+    response = PIPELINE.plan(to_joints(inside, out, constraints=PathConstraints(region=box)), EMPTY)
+    assert response.error == "start_violates_constraint"
