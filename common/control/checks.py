@@ -11,6 +11,9 @@ from common.errors import Refused
 from common.hardware.interface import Limits, Vector
 from common.messages import JointTrajectory
 
+_SHARES = 256  # of a segment at which positions are looked at that may be beyond a limit
+_ROUNDING = 1e-9  # [rad]
+
 
 class Tolerances(Parameters):
     """How exact a trajectory must be, and how exactly it must be followed."""
@@ -53,11 +56,24 @@ def checked_trajectory(
     _check_consistency(trajectory, limits, tolerances)
     best = with_best_interpolation(trajectory, limits, 1 + tolerances.slack)
     for fraction in (0.25, 0.5, 0.75):
-        q, dq, _ = best.between(fraction)
+        _, dq, _ = best.between(fraction)
         fastest = limits.velocity * (1 + tolerances.slack)
-        _within("position after", q, *_inwards(best.positions[:-1], limits, tolerances), limits.names)
         _within("velocity after", dq, -fastest, fastest, limits.names)
+    _check_positions_between(best, limits, tolerances)
     return best
+
+
+def _check_positions_between(trajectory: Trajectory, limits: Limits, tolerances: Tolerances) -> None:
+    """Refuse what swings out through a limit between two points, and is back before the second."""
+    lower, upper = _inwards(trajectory.positions[:-1], limits, tolerances)
+    lowest, highest = trajectory.hull()
+    doubtful = (lowest < lower) | (highest > upper)
+    if not doubtful.any():
+        return
+    q = trajectory.positions[:-1].copy()
+    for u in np.arange(1, _SHARES) / _SHARES:
+        q[doubtful] = trajectory.at_share(float(u), doubtful)
+        _within("position after", q, lower - _ROUNDING, upper + _ROUNDING, limits.names)
 
 
 def _check_points(message: JointTrajectory) -> None:

@@ -41,6 +41,8 @@ class Limiter:
         """Go on from rest: where the set-point is, or at a position (dof,) [rad] where the arm was found."""
         if position is not None:
             self.position = position.copy()
+            # A joint that is found beyond its limit may stay there or come in, and then has no more room than that.
+            self._lowest, self._highest = np.minimum(self._lower, position), np.maximum(self._upper, position)
         self._step = self._period  # duration of the newest step [s]
         self._way = 0.0 * self.position  # mean velocity in it
         self._change = 0.0 * self.position  # mean acceleration up to the middle of it
@@ -79,11 +81,9 @@ class Limiter:
             way = (target - self.position) / seconds
             change = (way - self._way) / between
         self.position, self._way, self._change, self._step = target, way, change, seconds
+        self._lowest = np.minimum(self._lower, np.maximum(self._lowest, target))
+        self._highest = np.maximum(self._upper, np.minimum(self._highest, target))
         return target, velocity
-
-    def _room(self) -> tuple[Vector, Vector]:
-        """Lowest and highest positions (dof,) [rad]: a joint that stands beyond its limit may stay there or come in."""
-        return np.minimum(self._lower, self.position), np.maximum(self._upper, self.position)
 
     def _passes(
         self, target: Vector, velocity: Vector, way: Vector, change: Vector, seconds: float, between: float,
@@ -94,15 +94,16 @@ class Limiter:
         jump = np.abs(change - self._change)
         goes_on = 1.0 if self._kept is None else 0.5  # what is caught up with is left no faster than it was reached
         # With the velocity that it has it must be possible to stop before the end of the joint.
-        lower, upper = self._room()
-        free = np.where(way > 0, upper - target, target - lower)
+        free = np.where(way > 0, self._highest - target, target - self._lowest)
+        beyond = np.where(way > 0, self._highest > self._upper, self._lowest < self._lower)
+        free += np.where(beyond, ROUNDING, POSITION_SLACK)
         speed = np.abs(way)
         return bool(
             np.all(speed <= self._velocity * (share * (1 + SLACK)) + ROUNDING)
             and np.all(np.abs(velocity - way) <= hardest * (seconds * goes_on) + ROUNDING)
             and np.all(np.abs(change) <= hardest)
             and np.all(jump <= np.maximum(self._jerk * between, 2 * hardest))
-            and np.all(speed * (seconds + speed / (2 * self._braking)) <= free + POSITION_SLACK)
+            and np.all(speed * (seconds + speed / (2 * self._braking)) <= free)
         )
 
     def _approach(
@@ -113,7 +114,7 @@ class Limiter:
             self._kept = self._way + self._change * (self._step / 2), self._change
         v0, a0 = self._kept
         fastest, hardest = share * self._velocity, self._acceleration
-        lower, upper = self._room()
+        lower, upper = self._lowest, self._highest
         target = np.clip(np.where(np.isfinite(target), target, self.position), lower, upper)
         free = np.minimum(upper - target, target - lower)  # to come to that velocity, and to rest again
         ending = np.minimum(fastest, np.sqrt(hardest * free))

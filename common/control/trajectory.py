@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from common.hardware.interface import Limits, Vector
 from common.messages import JointTrajectory, JointTrajectoryPoint
 
 PIECE = 1000  # points that are made an array of at once: all else waits meanwhile
+_BEZIER = np.array([[math.comb(i, k) / math.comb(5, k) for k in range(6)] for i in range(6)])  # of powers, degree 5
 ACCELERATION_MISMATCH = 0.3  # share of the velocity changes that the given accelerations may leave unexplained
 
 
@@ -57,6 +59,15 @@ class Trajectory:
         u = fraction
         ddq = (2 * a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / h**2
         return *_interpolated(u, h, self._segments), ddq
+
+    def hull(self) -> tuple[Vector, Vector]:
+        """Bounds (N - 1, dof) that each segment's positions keep to: those of its Bezier points."""
+        points = np.tensordot(_BEZIER, self._segments, axes=1)
+        return points.min(axis=0), points.max(axis=0)
+
+    def at_share(self, u: float, chosen: NDArray[np.bool_]) -> Vector:
+        """Positions (M,) at a share u, 0 to 1, of the M chosen among segments and joints (N - 1, dof)."""
+        return _interpolated(u, 1.0, self._segments[:, chosen])[0]
 
     @cached_property
     def _segments(self) -> Vector:

@@ -100,3 +100,37 @@ def test_after_a_rest_it_goes_on_from_rest():
     for k in range(30, 100):
         after.append(limiter.step(STILL + 5 * 0.29 ** 2 / 2 + 1.45 * (k - 29) * PERIOD, STILL + 1.45, PERIOD)[0])
     assert_within(after)
+
+
+@pytest.mark.parametrize("beyond", [0.0, 0.0005, 0.03])
+@pytest.mark.parametrize("speed", [0.001, 0.02])
+def test_no_joint_creeps_out_through_its_limit(beyond, speed):
+    """In steps that are small enough to be within all other limits, as a jog or a forged trajectory has them."""
+    start = LIMITS.upper + beyond
+    limiter, target = Limiter(LIMITS, start, PERIOD), start
+    for _ in range(int(0.02 / (speed * PERIOD))):
+        target = target + speed * PERIOD
+        position, _ = limiter.step(target, np.full(2, speed), PERIOD)
+        assert np.all(position <= np.maximum(start + 1e-8, LIMITS.upper + 2.5 * POSITION_SLACK)), position - start
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    out=st.lists(st.floats(-0.1, 0.1), min_size=2, max_size=2),
+    steps=st.lists(st.tuples(
+        st.integers(1, 40), st.lists(st.floats(-0.04, 0.04) | st.floats(-3, 3), min_size=2, max_size=2),
+        st.booleans(),
+    ), min_size=1, max_size=12),
+)
+def test_arm_beyond_a_limit_gets_no_farther_out(out, steps):
+    """Whatever it follows: speeds, or jumps."""
+    out = np.array(out)
+    start = np.where(out > 0, LIMITS.upper, LIMITS.lower) + out
+    limiter, target, farthest = Limiter(LIMITS, start, PERIOD), start, np.abs(out)
+    for count, speed, jumps in steps:
+        for _ in range(count):
+            asked = np.array(speed)
+            target = start + asked if jumps else limiter.position + asked * PERIOD
+            position, _ = limiter.step(target, STILL if jumps else asked, PERIOD)
+            excess = np.maximum(LIMITS.lower - position, position - LIMITS.upper)
+            assert np.all(excess <= np.maximum(farthest + 1e-8, 4 * POSITION_SLACK))  # the slack, and to brake

@@ -164,3 +164,16 @@ def test_garbage_numbers_are_refused_or_taken_but_never_crash(limits, data):
         check(message, limits)
         raise Refused("taken", "by chance")
 
+
+def test_swing_through_a_limit_between_two_points_is_refused(limits):
+    """At the limit with some speed, back from it at the next point, and within it again after a quarter of the way."""
+    a, speed = 0.9 * limits.acceleration[0], 0.5 * limits.velocity[0]
+    rising, span = np.linspace(0, speed / a, 20), 10 * speed / limits.acceleration[0]
+    top, back = limits.upper[0], 1.02 * speed * span * 0.5625 / 0.625
+    states = [(t, top - speed**2 / a / 2 + a * t**2 / 2, a * t) for t in rising]
+    states.append((rising[-1] + span, top - back, 0.0))
+    message = JointTrajectory(joint_names=list(limits.names), points=[
+        JointTrajectoryPoint(time_from_start=t, positions=[q, 0.0], velocities=[v, 0.0], accelerations=[0.0, 0.0])
+        for t, q, v in states])
+    code, text = code_of(message, limits, np.array([states[0][1], 0.0]))
+    assert code == "limit" and "position after point 19" in text and "shoulder" in text
