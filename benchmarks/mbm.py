@@ -58,6 +58,11 @@ class Problem:
     start: Array
     goal: Array
 
+    def request(self, attempts: int | None, seed: int) -> PlanRequest:
+        """To the goal; with so many attempts, or as many as are configured."""
+        goal = JointGoal(positions=self.goal.tolist())
+        return PlanRequest(id="problem", start=self.start.tolist(), goal=goal, planning_attempts=attempts, seed=seed)
+
 
 @dataclass
 class Figures:
@@ -183,13 +188,7 @@ def run(
         referee = Referee(hulls, problem.scene)
         if referee.collides(problem.start) or referee.collides(problem.goal):
             continue
-        request = PlanRequest(
-            id="problem",
-            start=problem.start.tolist(),
-            goal=JointGoal(positions=problem.goal.tolist()),
-            planning_attempts=given.attempts,
-            seed=given.seed,
-        )
+        request = problem.request(given.attempts, given.seed)
         began = clock()
         response = pipeline.plan(request, problem.scene)
         figures.seconds.append(clock() - began)

@@ -28,7 +28,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from benchmarks.mbm import CHANGES, SETS, Problem, Referee, load_robot, read
-from common.messages import JointGoal, PlanRequest, PlanResponse
+from common.messages import PlanResponse
 from common.planning.collision import interpolate
 from common.planning.pipeline import PlanningPipeline
 from common.planning.robot_geometry import RobotGeometry
@@ -130,12 +130,8 @@ def ways(
     seconds, path = peer.plan(problem, seed)
     yield "roboplan", seconds, None if path is None else interpolate(path, JUDGED)
     for name, attempts in (("one attempt", 1), ("configured", None)):
-        request = PlanRequest(
-            id="problem", start=problem.start.tolist(), goal=JointGoal(positions=problem.goal.tolist()), seed=seed,
-            planning_attempts=attempts,
-        )
         began = perf_counter()
-        response = pipeline.plan(request, problem.scene)
+        response = pipeline.plan(problem.request(attempts, seed), problem.scene)
         seconds = perf_counter() - began
         found = _path(response)
         yield name, seconds, found
