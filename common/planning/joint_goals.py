@@ -48,6 +48,8 @@ def joint_goals(problem: Problem, cancel: Cancel, *, wanted: int, tries: int = 4
             failures[number] = samples.failure(cancel.reason(problem))
     if found:
         return sorted(found, key=lambda goal: least_time(problem.start, goal, problem.velocity))
+    if (stop := cancel.reason(problem)) and len(choices) > 1:  # the others may not be looked at yet
+        return Result(error=stop, message=f"planning was ended while {len(choices)} goals were sampled")
     for number in list(failures)[:_TOLD]:
         failures[number] = _explained(problem, choices[number - 1], failures[number])
     return failures[1] if isinstance(problem.goal, Region) else none_of(failures)

@@ -5,7 +5,9 @@ import pytest
 from pydantic import ValidationError
 
 from common.messages import GoalSet, JointGoal, PlanningScene, PlanRequest, PoseGoal
+from common.planning import joint_goals
 from common.planning.pipeline import PlanningPipeline
+from common.planning.problem import Cancel
 from common.robot.transforms import matrix_to_pose, tool_down
 from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, SPREAD, above, last, scene, solid
 
@@ -108,3 +110,17 @@ def test_goal_that_makes_no_sense_is_named_by_its_number(goals, error, message):
 def test_set_has_between_one_and_a_hundred_single_goals(goals):
     with pytest.raises(ValidationError):
         GoalSet(goals=goals)
+
+
+def test_what_was_not_looked_at_in_time_is_not_said_to_be_out_of_reach(monkeypatch):
+    flag, sample = Cancel(), joint_goals.sample_goals
+
+    def once(*arguments, **options):
+        found = sample(*arguments, **options)
+        monkeypatch.setattr(joint_goals, "sample_goals", lambda *a, **o: flag.set() or sample(*a, **o))
+        return found
+
+    monkeypatch.setattr(joint_goals, "sample_goals", once)
+    response = PIPELINE.plan(to_any([UNREACHABLE, NEAR], planner="rrt_connect"), TABLE, cancel=flag)
+    assert (response.ok, response.error) == (False, "cancelled")
+    assert "planning was ended while 2 goals were sampled" in response.message
