@@ -193,7 +193,9 @@ def _parameters(incomplete: str) -> Iterator[Offer]:
             continue
         config = find_model(path, "Config")
         for field in fields_of(config) if config else ():
-            if field.model is None or not is_section(field.model):
+            if field.empty:
+                yield f"services.{path.stem}.{field.name}", field.description
+            elif field.model is None or not is_section(field.model):
                 yield from _below(field, f"services.{path.stem}")
 
 

@@ -21,11 +21,12 @@ class Model:
 
 @dataclass(frozen=True)
 class ModelField:
-    """A field of a model; `model` is its type where that is a model too."""
+    """A field of a model; `model` is its type where that is a model too; `empty`: there is none unless it is given."""
 
     name: str
     description: str
     model: Model | None
+    empty: bool
 
 
 @cache
@@ -65,7 +66,9 @@ def fields_of(model: Model) -> Iterator[ModelField]:
             if _is_secret(node.value):
                 continue
             kind = _type_name(node.annotation)
-            yield ModelField(node.target.id, _description(node.value), find_model(model.path, kind) if kind else None)
+            found = find_model(model.path, kind) if kind else None
+            empty = found is not None and _default_is_none(node.value)
+            yield ModelField(node.target.id, _description(node.value), found, empty)
 
 
 def is_section(model: Model) -> bool:
@@ -84,6 +87,11 @@ def _type_name(annotation: ast.expr) -> str:
         case ast.Subscript(value=ast.Name(id="Tunable"), slice=inner):
             return _type_name(inner)
     return annotation.id if isinstance(annotation, ast.Name) else ""
+
+
+def _default_is_none(value: ast.expr | None) -> bool:
+    first = value.args[0] if isinstance(value, ast.Call) and value.args else value
+    return isinstance(first, ast.Constant) and first.value is None
 
 
 def _is_secret(value: ast.expr | None) -> bool:
