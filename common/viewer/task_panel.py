@@ -54,9 +54,6 @@ class TaskPanel:
 
         console.doors.need(hotkey._impl.uuid, "stop", "STOP")
         hotkey.on_trigger(pressed)
-        self._state = gui.add_html("")
-        self._progress = gui.add_progress_bar(0.0)
-        self._notice = gui.add_html("")
         console.on_choice(gui.add_button_group("Task", COMMANDS), self._command)
         console.on_choice(gui.add_button_group("Arm", ("Go home",)), lambda _: home())
         if console.doors.guarded:
@@ -64,6 +61,10 @@ class TaskPanel:
             console.on_click(take, lambda: self.tell("You operate", "good"), "take")
         self._speed = gui.add_slider("Speed [%]", SLOWEST, 100, 5, 100, hint="share of the planned speed, at once")
         console.on_change(self._speed, self._set_speed)
+        # Below all that is pressed: lines come and go here, and a button that moves away under the pointer is missed.
+        self._state = gui.add_html("")
+        self._progress = gui.add_progress_bar(0.0)
+        self._notice = gui.add_html("")
 
     def tell(self, line: str, kind: str = "bad") -> None:
         """Show a line about what a person asked for; an empty one takes it away."""

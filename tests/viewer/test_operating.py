@@ -62,13 +62,16 @@ async def test_pause_stops_the_arm_and_resume_starts_it(bring: Bring, watched: W
     async with cell.listen() as bus:
         joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
         status = bus.reader(PICK_PLACE_STATUS)
+        pause = page.get_by_role("button", name="Pause")
+        place = await pause.bounding_box()
         await in_motion(page, joints)
-        await page.get_by_role("button", name="Pause").click()
+        await pause.click()
         await until(motion, lambda told: told.held, PATIENCE)
         await until(joints, lambda state: not is_moving(state), PATIENCE)
         still = (await after(joints, 5)).position
         assert (await after(joints, 100)).position == pytest.approx(still, abs=1e-6)
         await page.locator('[data-part="task"][data-paused="True"]').get_by_text("Paused", exact=True).wait_for()
+        assert await pause.bounding_box() == place, "it moved away under the pointer"
         await page.get_by_role("button", name="Resume").click()
         await until(joints, is_moving, PATIENCE)
         assert not (await until(status, lambda told: not told.paused, PATIENCE)).paused
