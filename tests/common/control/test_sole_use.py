@@ -42,8 +42,18 @@ async def test_second_is_refused_in_one_line_that_names_the_first(
         pass
 
 
-async def test_who_ends_just_now_is_waited_for(record: Path) -> None:
-    entered = asyncio.Event()
+async def test_who_ends_just_now_is_waited_for(record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    entered, looked_again = asyncio.Event(), asyncio.Event()
+    asked, locked = [], module._locked
+
+    def look(descriptor: int, folder: str) -> bool:
+        asked.append(descriptor)
+        if len(asked) == 4:  # the first one's, and three of who waits
+            looked_again.set()
+        return locked(descriptor, folder)
+
+    monkeypatch.setattr(module, "_locked", look)
+    monkeypatch.setattr(module, "PATIENCE", 60.0)
 
     async def second() -> None:
         async with sole_use(record, "second"):
@@ -51,7 +61,8 @@ async def test_who_ends_just_now_is_waited_for(record: Path) -> None:
 
     async with sole_use(record, "first"):
         waiting = asyncio.create_task(second())
-        await asyncio.sleep(3 * module.LOOK_AGAIN)
+        async with asyncio.timeout(20):
+            await looked_again.wait()
         assert not entered.is_set()
     async with asyncio.timeout(20):
         await waiting
