@@ -202,13 +202,27 @@ def run(
     return figures, paths
 
 
-def main() -> None:
-    """Run the sets of one robot."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def arguments(about: str | None, every: int) -> argparse.ArgumentParser:
+    """A parser that knows where the problems are and which of them are taken: every n-th unless told."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", type=Path, help="holds panda.tar.bz2 and ur5.tar.bz2")
     parser.add_argument("--robot", choices=list(CHANGES), default="panda")
     parser.add_argument("--set", action="append", choices=SETS, help="only this one; may be repeated")
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="only every N-th problem")
+    parser.add_argument("--every", type=int, default=every, metavar="N", help="only every N-th problem")
+    return parser
+
+
+def has_problems(given: argparse.Namespace) -> bool:
+    """Whether the folder holds those of the robot; says so where it does not."""
+    if given.folder is not None and (given.folder / f"{given.robot}.tar.bz2").is_file():
+        return True
+    print(f"problems skipped: {given.folder or 'no folder'} holds no {given.robot}.tar.bz2")
+    return False
+
+
+def main() -> None:
+    """Run the sets of one robot."""
+    parser = arguments(__doc__, every=1)
     parser.add_argument("--odd", action="store_true", help="only problems with odd numbers")
     parser.add_argument("--attempts", type=int, help="planning attempts; else as configured")
     parser.add_argument("--seed", type=int, default=0)
@@ -216,8 +230,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--paths", type=Path, help="npz file for the paths")
     given = parser.parse_args()
-    if given.folder is None or not (given.folder / f"{given.robot}.tar.bz2").is_file():
-        print(f"problems skipped: {given.folder or 'no folder'} holds no {given.robot}.tar.bz2")
+    if not has_problems(given):
         return
     cell, robot = load_robot(given.robot)
     pipeline, hulls = PlanningPipeline(robot, cell.motion, cell.pipeline), RobotGeometry(robot)

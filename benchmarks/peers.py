@@ -12,7 +12,6 @@ alone at 0.01 rad.
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import venv
@@ -27,7 +26,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from benchmarks.mbm import CHANGES, SETS, Problem, Referee, load_robot, read
+from benchmarks.mbm import SETS, Problem, Referee, arguments, has_problems, load_robot, read
 from common.messages import PlanResponse
 from common.planning.collision import interpolate
 from common.planning.pipeline import PlanningPipeline
@@ -147,16 +146,11 @@ def _path(response: PlanResponse) -> Array | None:
 
 def main() -> None:
     """Compare on one robot."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", nargs="?", type=Path, help="holds panda.tar.bz2 and ur5.tar.bz2")
-    parser.add_argument("--robot", choices=list(CHANGES), default="panda")
-    parser.add_argument("--set", action="append", choices=SETS, help="only this one; may be repeated")
-    parser.add_argument("--every", type=int, default=5, metavar="N", help="only every N-th problem")
+    parser = arguments(__doc__, every=5)
     parser.add_argument("--step", type=float, default=0.05, help="of roboplan's checks [rad]")
     parser.add_argument("--environment", type=Path, default=Path("build/peers"))
     given = parser.parse_args()
-    if given.folder is None or not (given.folder / f"{given.robot}.tar.bz2").is_file():
-        print(f"problems skipped: {given.folder or 'no folder'} holds no {given.robot}.tar.bz2")
+    if not has_problems(given):
         return
     cell, robot = load_robot(given.robot)
     pipeline, hulls = PlanningPipeline(robot, cell.motion, cell.pipeline), RobotGeometry(robot)

@@ -97,7 +97,11 @@ class SequenceGoal(Message):
 
 
 class GoalSet(Message):
-    """Several goals of which any will do, such as all grasps of an object: the one that takes least time is chosen."""
+    """Several goals of which any will do, such as all grasps of an object.
+
+    With `straight` it is the one at the end of the shortest line that can be followed; else the one that the arm can
+    turn straight to in the least time; where obstacles are in the way of all, the one of the best of the attempts.
+    """
 
     kind: Literal["any"] = "any"
     goals: list[Annotated[JointGoal | PoseGoal, Field(discriminator="kind")]] = Field(min_length=1, max_length=100)

@@ -68,7 +68,7 @@ def none_of(failures: Mapping[int, Result]) -> Result:
     told = [f"goal {number}: {failures[number].message}" for number in sorted(failures)[:_TOLD]]
     if len(failures) > _TOLD:
         told.append(f"and {len(failures) - _TOLD} more")
-    return replace(best, message=f"none of {len(failures)} goals; {'; '.join(told)}")
+    return replace(best, message=f"none of {len(failures)} goals; {'; '.join(told)}", goal=None)
 
 
 def straight_edge(problem: Problem, goals: list[Array], planner: str) -> Result | None:

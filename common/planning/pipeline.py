@@ -19,7 +19,16 @@ from common.planning.obstacles import BadShape, ObstacleCache
 from common.planning.planners import Plan, load_planner, planner_names
 from common.planning.planners.joint_move import straight_profile
 from common.planning.points import PointObstacle
-from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result, ToolPath
+from common.planning.problem import (
+    NOT_APPLICABLE,
+    Cancel,
+    GoalChoice,
+    Problem,
+    Region,
+    Result,
+    ToolPath,
+    not_timed,
+)
 from common.planning.retiming import RetimingFailed, TimedPath, TooLong, cubics, join, require_tellable, stretch
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.timing import BLENDS, retime, slowed
@@ -90,13 +99,18 @@ class PlanningPipeline:
         problem = self._problem(request, checked, world, began)
         best: tuple[str, Result] | None = None
         for name, (plan, options) in planners.items():
-            since = monotonic()
-            result = self._ask(plan, problem, options, flag)
-            trajectory = None
-            if not result.error:
-                trajectory, result = self._finish(problem, result, flag)
-            if result.error != NOT_APPLICABLE:
-                attempts += _recorded(name, result, monotonic() - since)
+            failed: dict[int, Result] = {}  # goals of a set to which a line was found that is not good in the end
+            while True:
+                since = monotonic()
+                result = self._ask(plan, replace(problem, failed=failed), options, flag)
+                trajectory = None
+                if not result.error:
+                    trajectory, result = self._finish(problem, result, flag)
+                if result.error != NOT_APPLICABLE:
+                    attempts += _recorded(name, result, monotonic() - since)
+                if trajectory is not None or result.goal is None or flag.reason(problem):
+                    break
+                failed[result.goal] = result
             if trajectory is not None:
                 message = trajectory_message(self.robot, trajectory)
                 return PlanResponse(
@@ -205,10 +219,8 @@ class PlanningPipeline:
         """The planner's answer; some time their paths themselves, and may fail at that."""
         try:
             return plan(problem, options, flag)
-        except RetimingFailed as error:
-            return Result(error="retiming_failed", message=f"retiming: {error}")
-        except TooLong as error:
-            return Result(error=error.code, message=str(error))
+        except (RetimingFailed, TooLong) as error:
+            return not_timed(error)
 
     def _finish(self, problem: Problem, result: Result, flag: Cancel) -> tuple[TimedPath | None, Result]:
         """The timed and validated trajectory and the result, or None and the result with what is wrong."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from common.messages import PlanAttempt
 from common.planning.collision import CollisionWorld, Pair
-from common.planning.retiming import TimedPath
+from common.planning.retiming import RetimingFailed, TimedPath, TooLong
 from common.robot.model import RobotModel
 from common.sources import monotonic
 
@@ -89,6 +89,7 @@ class Problem:
         goal: (dof,) [rad] for a joint goal, else a region for the TCP, a path that it follows, several goals one after
             the other, or several of which any will do.
         beyond: (dof,) [rad] where the robot stands, beyond a limit; it moves straight to the start first.
+        failed: of several goals those, by their numbers from 1, whose lines were found but not good in the end.
         straight: only a straight line of the TCP will do.
         velocity, acceleration, jerk: scaled limits (dof,).
         attempts: how many tries a sampling planner has.
@@ -109,6 +110,7 @@ class Problem:
     latest: float
     rng: np.random.Generator
     beyond: Array | None = None
+    failed: dict[int, Result] = field(default_factory=dict)
 
     @property
     def tool_speed(self) -> float:
@@ -175,6 +177,7 @@ class Result:
         trajectory: already timed; then there are no waypoints.
         fraction: how much of the way is covered.
         waypoint, colliding: where and between what a failure was found.
+        goal: number from 1 of the one of several goals to which its line leads; another may be tried in its place.
     """
 
     waypoints: Array | None = None
@@ -187,11 +190,19 @@ class Result:
     message: str = ""
     waypoint: int | None = None
     colliding: Pair | None = None
+    goal: int | None = None
     attempts: list[PlanAttempt] = field(default_factory=list)
 
 
 NOT_APPLICABLE = "not_applicable"
 MOST_STEPS = 25_000  # poses of the tool for which joint positions are solved
+
+
+def not_timed(error: RetimingFailed | TooLong) -> Result:
+    """The failure of a planner that times its paths itself."""
+    if isinstance(error, TooLong):
+        return Result(error=error.code, message=str(error))
+    return Result(error="retiming_failed", message=f"retiming: {error}")
 
 
 def too_fine(steps: float) -> Result | None:

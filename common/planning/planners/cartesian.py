@@ -88,10 +88,12 @@ def shortest_line(problem: Problem, choice: GoalChoice, follow: Callable[[Region
     regions = {number: goal for number, goal in enumerate(choice.goals, 1) if isinstance(goal, Region)}
     if not regions:
         return Result(error=NOT_APPLICABLE, message="a straight line needs a pose goal")
-    failures: dict[int, Result] = {}
-    for number in sorted(regions, key=lambda number: way(regions[number])):
+    failures = dict(problem.failed)
+    for number in sorted(regions.keys() - failures.keys(), key=lambda number: (way(regions[number]), number)):
         result = follow(regions[number])
-        if not result.error or result.error in ("cancelled", "timeout"):
+        if not result.error:
+            return replace(result, goal=number)
+        if result.error in ("cancelled", "timeout"):
             return result
         failures[number] = result
     return none_of(failures)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common.planning.planners import cartesian
-from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result
+from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result, not_timed
+from common.planning.retiming import RetimingFailed, TooLong
 from common.planning.timing import ToolLimits, ToolWaypoints, follow_in_time
 
 Array = NDArray[np.float64]
@@ -32,7 +33,10 @@ def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
         found = line_waypoints(problem, region, options, cancel)
         if isinstance(found, Result):
             return found
-        return Result(trajectory=follow_in_time(problem, found, options), fraction=1.0)
+        try:
+            return Result(trajectory=follow_in_time(problem, found, options), fraction=1.0)
+        except (RetimingFailed, TooLong) as error:
+            return not_timed(error)
 
     if isinstance(problem.goal, Region):
         return timed(problem.goal)

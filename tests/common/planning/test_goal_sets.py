@@ -1,13 +1,15 @@
-"""Several goals of which any will do: one that can be reached is found, and the one that takes least time."""
+"""Several goals of which any will do: one that can be reached is found, and where the arm can turn straight to them the
+one that takes least time."""
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from common.messages import GoalSet, JointGoal, PlanningScene, PlanRequest, PoseGoal
-from common.planning import joint_goals
+from common.planning import joint_goals, pipeline
 from common.planning.pipeline import PlanningPipeline
 from common.planning.problem import Cancel
+from common.planning.validation import Fault, validate
 from common.robot.transforms import matrix_to_pose, tool_down
 from tests.common.planning.planning_scenes import CELL, HOME, ROBOT, SPREAD, above, last, scene, solid
 
@@ -72,6 +74,26 @@ def test_lines_say_why_each_of_them_ends():
     response = PIPELINE.plan(to_any([UNREACHABLE, BURIED], straight=True), TABLE)
     assert not response.ok
     assert "none of 2 goals; goal 1: waypoint" in response.message and "; goal 2: waypoint" in response.message
+
+
+@pytest.mark.parametrize("planner", LINES)
+def test_line_that_fails_the_last_check_is_followed_by_the_line_to_the_next_goal(planner, monkeypatch):
+    lower, lowest = pose(0.31, 0.0, 0.42), pose(0.31, 0.0, 0.37)
+    wanted = [to_any([lowest, lower], straight=True, planner=planner), to_any([lower], straight=True, planner=planner)]
+    reached = last(PIPELINE.plan(wanted[0], TABLE))
+    assert ROBOT.fk(reached)[2, 3] == pytest.approx(0.42, abs=0.003)
+
+    def not_to_the_nearest(trajectory, *arguments, **options):
+        bad = np.allclose(trajectory.positions[-1], reached, atol=1e-6)
+        return Fault("collision", "found at last") if bad else validate(trajectory, *arguments, **options)
+
+    monkeypatch.setattr(pipeline, "validate", not_to_the_nearest)
+    response = PIPELINE.plan(wanted[0], TABLE)
+    assert response.ok and response.goal_index == 0, response.message
+    assert [attempt.error for attempt in response.attempts] == ["collision", ""]
+    response = PIPELINE.plan(wanted[1], TABLE)
+    assert not response.ok and response.error == "collision"
+    assert "none of 1 goals; goal 1: validation: found at last" in response.message
 
 
 def test_of_many_goals_a_few_say_why():
