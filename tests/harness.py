@@ -5,6 +5,7 @@ where nothing of a process matters, in this one.
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import importlib
 import io
 import json
@@ -16,6 +17,7 @@ import signal
 import socket
 import subprocess
 import sys
+import termios
 import threading
 import time
 from collections import deque
@@ -95,6 +97,11 @@ def end_in_order() -> None:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
+def _take_terminal() -> None:
+    """Have Ctrl-C on the terminal that stdout is reach this process."""
+    fcntl.ioctl(1, termios.TIOCSCTTY, 0)
+
+
 class RunningCell:
     """A `zencell run` or `zencell up` in a domain of its own; its log and its summary are files in a folder."""
 
@@ -110,7 +117,8 @@ class RunningCell:
             cell: name of the cell.
             arguments: further options, but for domain and summary; without `--viewer-port` there is no page.
             secrets: environment variables that no command line may show.
-            output: descriptor of the file that stdout and stderr go to, instead of the log.
+            output: descriptor of the file that stdout and stderr go to, instead of the log; a terminal is the one
+                whose Ctrl-C it hears.
         """
         end_in_order()
         if "--viewer-port" not in arguments:
@@ -123,6 +131,7 @@ class RunningCell:
             self.process = subprocess.Popen(
                 command, cwd=folder, env={**environment(folder), **(secrets or {})}, stdin=subprocess.DEVNULL,
                 stdout=log if output is None else output, stderr=subprocess.STDOUT, start_new_session=True,
+                preexec_fn=_take_terminal if output is not None and os.isatty(output) else None,  # noqa: PLW1509
             )
 
     def __enter__(self) -> RunningCell:

@@ -12,9 +12,9 @@ from typing import TextIO
 MOST_BYTES = 1_000_000  # that wait; what comes when there are so many is lost
 
 
-def told_lost(lines: int) -> str:
+def told_lost(lines: int, why: str = "nobody read them") -> str:
     """What is said of lines that were lost."""
-    return f"{lines} line{'s were' if lines > 1 else ' was'} lost: nobody read them"
+    return f"{lines} line{'s were' if lines > 1 else ' was'} lost: {why}"
 
 
 class LossyWriter:

@@ -1,19 +1,28 @@
-"""Nobody reads what a cell says, on a pipe that is full or dead: it works, and ends when it is told to."""
+"""Nobody reads what a cell says, on a pipe or a terminal: it works, and ends when it is told to."""
 
 from __future__ import annotations
 
+import asyncio
 import fcntl
 import os
+import pty
+import select
 import signal
+import threading
 from pathlib import Path
 
 import pytest
+import yaml
 
 from common import topics
 from tests.cells.test_watchdogs import halfway, restarted
-from tests.harness import RunningCell, until
+from tests.gaps import Gaps, Side
+from tests.harness import ROOT, RunningCell, until
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow]
+
+SECONDS = 15.0  # for which nobody reads
+CTRL_C, CTRL_Q, CTRL_S = b"\x03", b"\x11", b"\x13"
 
 
 def full_pipe() -> tuple[int, int]:
@@ -51,3 +60,84 @@ async def test_cell_whose_lines_nobody_reads_works_and_can_be_ended(
         assert not cell.processes()
     if kind == "full":
         os.close(read)
+
+
+class Terminal:
+    """A terminal with somebody in front of it, who may look away."""
+
+    def __init__(self) -> None:
+        self._keys, self.device = pty.openpty()
+        self.looks = threading.Event()
+        self.looks.set()
+        self._gone = False
+        self._text = b""
+        self._changed = threading.Condition()
+        self._reading = threading.Thread(target=self._read, daemon=True)
+        self._reading.start()
+
+    def __enter__(self) -> Terminal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._gone = True
+        self.looks.set()
+        self._reading.join()
+        os.close(self._keys)
+
+    def press(self, key: bytes) -> None:
+        with self._changed:
+            self._text = b""
+        os.write(self._keys, key)
+
+    def until(self, text: str, timeout: float = 60.0) -> None:
+        """Return when the text stands there, of all that came since a key was pressed."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: text.encode() in self._text, timeout), self._text[-2000:]
+
+    def _read(self) -> None:
+        while not self._gone:
+            self.looks.wait()
+            if not select.select([self._keys], [], [], 0.1)[0]:
+                continue
+            try:
+                chunk = os.read(self._keys, 65536)
+            except OSError:  # nobody has it open any more
+                return
+            with self._changed:
+                self._text += chunk
+                self._changed.notify_all()
+
+
+@pytest.mark.parametrize(("verb", "how"), [("up", "Ctrl-S"), ("run", "looks away")])
+async def test_terminal_that_takes_nothing_holds_nothing_up(tmp_path: Path, verb: str, how: str) -> None:
+    file = tmp_path / "with_chatty.yaml"
+    cell_file = yaml.safe_load((ROOT / "config" / "cells" / "panda.yaml").read_text())
+    file.write_text(yaml.safe_dump({**cell_file, "services": {**cell_file["services"], "tests.cells.chatty": {}}},
+                                   sort_keys=False))
+    with Terminal() as terminal, RunningCell(
+        tmp_path, verb, str(file), output=terminal.device, secrets={"TERM": "xterm"}
+    ) as cell:
+        os.close(terminal.device)
+        cell.name = "panda"
+        async with cell.listen() as bus:
+            await until(bus.reader(topics.MOTION_STATUS), halfway, 120)
+            executor = cell.processes()["trajectory_executor"].pid
+            sides = read, unread = Side("read"), Side(f"unread, {how}")
+            for side in sides:
+                if side is unread and how == "Ctrl-S":
+                    terminal.press(CTRL_S)
+                elif side is unread:
+                    terminal.looks.clear()
+                gaps = Gaps(bus, cell.name, executor)
+                await asyncio.sleep(SECONDS)
+                gaps.add_to(side)
+            told = "\n".join(map(str, [*sides, *read.own, *unread.own]))
+            assert unread.states > 0.5 * read.states, told
+            assert len(unread.own) + unread.lost <= len(read.own) + read.lost, told
+        if how == "Ctrl-S":
+            terminal.press(CTRL_Q)
+            terminal.until(" lines were lost: nobody read them")
+            terminal.press(CTRL_S)
+        terminal.press(CTRL_C)
+        assert await cell.ended(30) == (0 if verb == "up" else 130)
+        assert not cell.processes()

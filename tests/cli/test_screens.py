@@ -1,11 +1,13 @@
 import io
 import json
 import logging
+import re
+import threading
 
 import pytest
 from rich.console import Console
 
-from cli.live import render
+from cli.live import MOST_LINES, LiveScreen, render
 from cli.screens import Content, JsonScreen, PlainScreen, ScreenHandler, open_screen
 from common.messages import ServiceStatus
 
@@ -23,6 +25,36 @@ def test_table_shows_state_restarts_rates_and_progress() -> None:
     (row,) = [line.split() for line in text.splitlines() if line.startswith("vision")]
     assert row == ["vision", "restarting", "2", "detected_objects", "10.0"]
     assert "3 of 7 placed - GRASPING ball_4" in text
+
+
+def test_many_lines_on_a_terminal_are_drawn_together_and_those_that_are_too_many_are_counted() -> None:
+    text = io.StringIO()
+    screen = LiveScreen(Console(file=text, width=100, force_terminal=True), lambda: CONTENT)
+    screen.note("it is up")
+    for number in range(2000):
+        screen.line("chatty", f"line {number}")
+    screen.close()
+    shown = [int(number) for number in re.findall(r"chatty: line (\d+)", text.getvalue())]
+    lost = sum(int(number) for number in re.findall(r"(\d+) lines were lost: there were too many", text.getvalue()))
+    assert shown == sorted(shown) and shown[:MOST_LINES - 1] == list(range(MOST_LINES - 1))
+    assert len(shown) + lost == 2000
+    assert text.getvalue().count(CONTENT.progress) < 200, "the table is not drawn for each line"
+    assert "it is up" in text.getvalue()
+
+
+def test_table_on_a_terminal_has_its_news_also_while_lines_come() -> None:
+    text, said, told = io.StringIO(), ["the first"], threading.Event()
+
+    def content() -> Content:
+        if said[0] in text.getvalue():
+            told.set()
+        return Content([], {}, said[0])
+
+    screen = LiveScreen(Console(file=text, width=100, force_terminal=True), content)
+    said[0] = "the second"
+    while not told.wait(0.01):
+        screen.line("chatty", "a line")
+    screen.close()
 
 
 def test_lines_elsewhere_have_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
