@@ -55,7 +55,9 @@ class GripperConfig(Section):
     speed: Length = Field(0.2, description="closing speed of the width [m/s]")
     acceleration: Length = Field(2.0, description="of the width [m/s^2]")
     jerk: float = Field(50.0, gt=0, le=1e4, description="of the width [m/s^3]")
-    max_effort: float = Field(70.0, gt=0, le=1e4, description="grip force [N]")
+    max_effort: float = Field(70.0, gt=0, le=1e4, description="grip force that it has [N]")
+    effort: float = Field(5.0, gt=0, le=1e4, description="grip force, where neither object nor command say it [N]")
+    latency: float = Field(0.2, ge=0, le=2, description="from a command until readings must show that fingers move [s]")
     controller: str = Field("gripper_controller", description="name of its controller, the source of its state")
     named_widths: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field({}, description="such as open, closed [m]")
 
@@ -72,6 +74,10 @@ class GripperConfig(Section):
             opens = 2 * bars.length * (math.sin(bars.open_angle) - math.sin(bars.open_angle - bars.closed))
             if not abs(opens - self.max_width) <= 1e-4:
                 raise ValueError(f"gripper.linkage opens to {opens:.4f} m, but max_width is {self.max_width:g} m")
+        if self.effort > self.max_effort:
+            if "effort" in self.model_fields_set:
+                raise ValueError(f"gripper.effort is {self.effort:g} N, more than max_effort {self.max_effort:g} N")
+            object.__setattr__(self, "effort", self.max_effort)
         for name, width in self.named_widths.items():
             if width > self.max_width:
                 raise ValueError(f"named width {name} is {width:g} m, more than max_width {self.max_width:g} m")

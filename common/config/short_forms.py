@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -27,6 +27,9 @@ class KnownShort(Section):
     cameras: dict[str, CameraConfig] = Field({}, min_length=1, description="by name, in the place of a single one")
     ball_radius: float = Field(0.03, ge=0.01, le=0.035, description="[m]")
     ball_color: Rgb = (1.0, 0.15, 0.10)
+    grip_efforts: dict[str, Annotated[float, Field(gt=0, le=1e4)]] = Field(
+        {}, description="by kind of object, as detectors call it: force to grip it with [N]; else the gripper's effort"
+    )
 
     @model_validator(mode="before")
     @classmethod

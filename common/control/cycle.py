@@ -140,13 +140,14 @@ class ControlCycle:
             return None
         width = self._gripper.state.width if self._gripper else None
         told = self._gripper.told if self._gripper else None
-        mark = (self._q.tobytes(), width, told, self._world.version)
+        effort = self._gripper.effort if self._gripper else 0.0
+        mark = (self._q.tobytes(), width, told, effort, self._world.version)
         if mark == self._kept:
             return None
         self._kept = mark
         return Standing(
             layout=self._world.layout, q=self._q.tolist(), width=width, told_width=told,
-            objects=self._world.standing(),
+            told_effort=effort, objects=self._world.standing(),
         )
 
     def restore(self, state: Standing, now: float) -> None:
@@ -158,8 +159,8 @@ class ControlCycle:
         self._obstructible.place(state.width)
         self._obstructible.obstruct(self._world.obstruction(self._kinematics.fk(self._q), state.width))
         if state.told_width is not None:
-            self._gripper.resume(state.told_width, now)
-        self._gripper.update(self._obstructible.read(now))
+            self._gripper.resume(state.told_width, now, state.told_effort)
+        self._gripper.update(self._obstructible.read(now), now)
 
     def takes_long(self, request: ExecuteRequest) -> bool:
         """Whether to `judge` the request takes longer than there is time for between two cycles."""
@@ -285,7 +286,7 @@ class ControlCycle:
             else:
                 tick()
         self._width_rate = reading.velocity
-        self._gripper.update(reading)
+        self._gripper.update(reading, now)
 
     def _joint_state(self, header: Header, dq: Vector) -> JointState:
         names, positions, velocities = list(self._limits.names), self._q.tolist(), dq.tolist()

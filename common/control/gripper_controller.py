@@ -1,6 +1,11 @@
-"""Gripper goals: one at a time, a new one replaces the running one, a repeated id is only answered."""
+"""Gripper goals: one at a time, a new one replaces the running one, a repeated id is only answered.
+
+A grasp is judged by the width that is held, and what is held is watched until the next command.
+"""
 
 from __future__ import annotations
+
+import math
 
 from common.config import GripperConfig
 from common.control.goals import REMEMBERED, GoalMemory
@@ -10,6 +15,7 @@ from common.messages import GripperCommand, GripperState
 from common.robot.finger_joints import driven_position
 
 SETTLED = 1e-3  # fingers that stop this near to the width they were told are there [m]
+SLIPPED = 2e-3  # what is held slips once the fingers are so much closer than they were [m]
 
 
 class GripperController:
@@ -21,6 +27,10 @@ class GripperController:
         self._config = config
         self._memory: GoalMemory[GripperState] = GoalMemory(remember)
         self._target: float | None = None  # [m]; of whoever asked last
+        self._asked: GripperCommand | None = None
+        self._began = self._moved = -math.inf  # the newest command, the newest reading of fingers that move [s]
+        self._held: float | None = None  # width of what was grasped [m]
+        self._effort = config.effort
         self.state = GripperState(source=config.controller)
 
     def command(self, request: GripperCommand, now: float, objection: Refused | None = None) -> GripperState:
@@ -42,6 +52,9 @@ class GripperController:
             message = f"width {request.width:g} m is more than the fingers open ({self._config.max_width:g} m)"
         elif request.effort > self._config.max_effort:
             message = f"effort {request.effort:g} N is more than the fingers have ({self._config.max_effort:g} N)"
+        elif (request.expected_width or 0.0) > self._config.max_width:
+            message = (f"expected_width {request.expected_width:g} m is more than the fingers open "
+                       f"({self._config.max_width:g} m)")
         if message:
             rejected = GripperState.model_validate(
                 {**reading, "id": request.id, "state": "rejected", "error": code, "message": message})
@@ -49,8 +62,8 @@ class GripperController:
         if self.state.state == "active":
             replaced = {"state": "cancelled", "message": f"replaced by {request.id!r}"}
             self._memory.put(self.state.id, self.state.model_copy(update=replaced))
-        self._gripper.command(request.width, now, request.effort or self._config.max_effort)
-        self._target = request.width
+        self._tell(request.width, now, request.effort)
+        self._asked = request
         self.state = GripperState.model_validate({**reading, "moving": True, "id": request.id, "state": "active"})
         return self._memory.put(request.id, self.state)
 
@@ -59,26 +72,76 @@ class GripperController:
         """Width that the fingers were told last [m]; None when nobody has told them anything."""
         return self._target
 
-    def resume(self, width: float, now: float) -> None:
-        """Go on pressing or moving to the width [m] that was told before this process began."""
-        self._gripper.command(width, now, self._config.max_effort)
-        self._target = width
+    @property
+    def effort(self) -> float:
+        """What the fingers were told last to press with [N]."""
+        return self._effort
 
-    def update(self, reading: GripperReading) -> GripperState:
-        """The state with the newest reading: a goal is over when the fingers have stopped."""
+    def resume(self, width: float, now: float, effort: float = 0.0) -> None:
+        """Go on moving to the width [m] or pressing with the effort [N] that was told before this process began."""
+        self._tell(width, now, effort)
+
+    def _tell(self, width: float, now: float, effort: float) -> None:
+        self._effort = effort or self._config.effort
+        self._gripper.command(width, now, self._effort)
+        self._target, self._began, self._held = width, now, None
+
+    def update(self, reading: GripperReading, now: float) -> GripperState:
+        """The state with the newest reading, at a time [s]: a goal is over when the fingers have stopped."""
         state = self.state
+        self._moved = now if reading.moving else self._moved
+        over = state.state == "active" and self._has_stopped(reading, now)
         changes: dict[str, object] = {
             "width": reading.width, "position": driven_position(self._config, reading.width),
-            "effort": reading.effort, "holding": reading.holding, "moving": reading.moving,
+            "effort": reading.effort, "holding": reading.holding,
+            "moving": reading.moving or (state.state == "active" and not over),
         }
-        if state.state == "active" and not reading.moving:
-            changes["state"] = "succeeded"
-            assert self._target is not None
-            if abs(reading.width - self._target) > SETTLED and not reading.holding:
-                changes["state"] = "aborted"
-                changes["message"] = f"fingers stopped at {reading.width:.4f} m, not at {self._target:.4f} m"
+        if over:
+            changes |= self._judged(reading)
+        elif self._held is not None:
+            changes |= self._watched(reading, self._held)
         if not changes.items() <= vars(state).items():
             self.state = state.model_copy(update=changes)
         if self.state.id:
             self._memory.put(self.state.id, self.state)
         return self.state
+
+    def _has_stopped(self, reading: GripperReading, now: float) -> bool:
+        """Whether the fingers have done what they could; readings may be of before the command, or say late that they
+        press on something."""
+        assert self._target is not None
+        if reading.moving:
+            return False
+        if abs(reading.width - self._target) <= SETTLED:
+            return True
+        since = self._began if reading.holding else max(self._began, self._moved)
+        return now - since >= self._config.latency
+
+    def _judged(self, reading: GripperReading) -> dict[str, object]:
+        """What became of the goal, by a reading of fingers that have stopped."""
+        assert self._target is not None and self._asked is not None
+        expected, width = self._asked.expected_width, reading.width
+        if reading.holding and self._target <= width + SETTLED:
+            off = 0.0 if expected is None else width - expected
+            if expected is None or abs(off) <= self._asked.width_tolerance:
+                self._held = width
+                return {"state": "succeeded", "outcome": "grasped"}
+            found = "wide" if off > 0 else "narrow"
+            message = f"the fingers closed on something too {found} ({width:.4f} m, not {expected:.4f} m)"
+            return {"state": "aborted", "outcome": f"too_{found}", "message": message}
+        if abs(width - self._target) > SETTLED and not reading.holding:
+            message = f"fingers stopped at {width:.4f} m, not at {self._target:.4f} m"
+            return {"state": "aborted", "message": message}
+        if expected is not None:
+            return {"state": "aborted", "outcome": "empty", "message": "the fingers closed on nothing"}
+        return {"state": "succeeded"}
+
+    def _watched(self, reading: GripperReading, held: float) -> dict[str, object]:
+        """What has become of what was grasped, `held` [m] wide."""
+        if reading.holding and reading.width >= held - SLIPPED:
+            return {"outcome": "grasped", "message": ""}
+        if reading.holding:
+            message = f"what is held slips: it was {held:.4f} m wide, the fingers are {reading.width:.4f} m apart now"
+        else:
+            message = f"what was held slipped out: it was {held:.4f} m wide, nothing is between the fingers now"
+        return {"outcome": "slipping", "message": message}

@@ -11,6 +11,7 @@ from common.messages.basics import MOST_STAMP, SMALL, Finite, Fraction, Header, 
 from common.messages.robot import TRAJECTORY_BYTES, JointTrajectory
 
 GoalState = Literal["none", "rejected", "active", "succeeded", "aborted", "cancelled"]
+GripOutcome = Literal["", "grasped", "too_wide", "too_narrow", "empty", "slipping"]
 Holder = Literal["person", "watchdog", "controller"]
 Who = Label
 Since = Annotated[int, Field(ge=0, le=MOST_STAMP)]
@@ -127,17 +128,28 @@ class MotionStatus(Message):
 
 
 class GripperCommand(Message):
-    """Move the fingers to a width [m]. The requester mints `id`; the same id never moves them twice."""
+    """Move the fingers to a width [m]. The requester mints `id`; the same id never moves them twice.
+
+    With `expected_width` it is a grasp, which fails where what is held is wider or narrower, or nothing is.
+    """
 
     most_bytes: ClassVar[int] = SMALL
 
     id: Name
     width: Annotated[float, Field(ge=0, le=0.2)]
-    effort: Annotated[float, Field(ge=0, le=1e4, description="grip force [N]; 0: as much as the gripper has")] = 0.0
+    effort: Annotated[float, Field(ge=0, le=1e4, description="grip force [N]; 0: the gripper's own default")] = 0.0
+    expected_width: Annotated[float, Field(ge=0, le=0.2)] | None = Field(
+        None, description="of what is to be between the fingers, such as it was seen [m]"
+    )
+    width_tolerance: Annotated[float, Field(gt=0, le=0.2, description="of expected_width [m]")] = 0.005
 
 
 class GripperState(Message):
-    """Width between the fingers [m], whether something is between them, and the newest command."""
+    """Width between the fingers [m], whether something is between them, and the newest command.
+
+    `outcome` says what became of a grasp, `message` says it in a line: what is held is as expected, or wider, narrower,
+    nothing; slipping when it was held and then, without a command, the fingers closed on or it was lost.
+    """
 
     most_bytes: ClassVar[int] = SMALL
 
@@ -149,6 +161,7 @@ class GripperState(Message):
     moving: bool = False
     id: Label = ""
     state: GoalState = "none"
+    outcome: GripOutcome = ""
     error: Label = Field("", description="code of a refusal, such as stopped")
     message: Text = ""
     source: Label = Field("", description="name of the gripper's controller")

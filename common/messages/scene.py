@@ -26,6 +26,9 @@ class CollisionObject(Message):
     outline: Corners = Field([], description="cross-section of a prism [m], in its own frame")
     pose: Pose
     color: Color = Color()
+    grip_effort: Annotated[float, Field(ge=0, le=1e4)] = Field(
+        0.0, description="force that it is to be gripped with [N]; 0: the gripper's own default"
+    )
 
     @model_validator(mode="after")
     def _dimensions_fit_shape(self) -> CollisionObject:

@@ -36,6 +36,7 @@ class Standing(BaseModel):
     q: list[float]
     width: float | None = None
     told_width: float | None = None
+    told_effort: float = 0.0  # [N]
     objects: dict[str, StandingObject] = {}
 
 

@@ -102,11 +102,11 @@ class Deciding(Generic[V]):
         """Take note of what a stage has done."""
 
     def missed(self, stage: Grip, view: V) -> None:
-        """The fingers closed on nothing: open them, back off and look again."""
+        """The fingers closed on nothing, or on what is not as wide as expected: open, back off and look again."""
         self.status.retries += 1
-        self.fail(f"{stage.name}: the fingers closed on nothing", view, go_home=False)
+        self.fail(f"{stage.name}: {stage.problem}", view, go_home=False)
         if self.status.state != "ERROR":
-            self.row += [Grip("open", stage.state, width=self.gripper.max_width), *self.back_off(view)]
+            self.row += [Grip("open", stage.state, width=self.gripper.max_width), *self.back_off(view.let_go())]
 
     def forgotten(self, stage: Stage, view: V) -> None:
         """A controller that was started again knows nothing of a stage that it had begun."""

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 
 from common import messages as m
 from common.tasks.deciding import Deciding, V
-from common.tasks.stages import Command, Execution, Grip, Look, Move, Report, Stage
+from common.tasks.stages import MISSES, Command, Execution, Grip, Look, Move, Report, Stage
 
 ANEW = ("busy", "stale_request", "clock_ahead", "stopped")  # refusals that have nothing to do with the motion
 START = ": start to go on"
@@ -157,12 +157,15 @@ class Task(Deciding[V]):
             self.forgotten(stage, view)
         elif running.moves_arm and stage.carries and not view.holding:
             stop = self.stop(view, "what it held fell")
-            self.fail(f"what the hand held fell during {stage.name}", view, go_home=False)
+            slipped = f": {view.gripper.message}" if view.gripper.outcome == "slipping" else ""
+            self.fail(f"what the hand held fell during {stage.name}{slipped}", view, go_home=False)
             return stop
         elif running.spent > limit:
             stop = self.stop(view, "it takes too long")
             self.fail(f"{stage.name} took longer than {round(limit, 2):g} s", view)
             return stop
+        elif stage.carries and view.gripper.outcome == "slipping":  # it may still arrive
+            self.status.message = f"{stage.name}: {view.gripper.message}"
         return []
 
     def _decide_anew(self, message: str, view: V) -> None:
@@ -181,6 +184,9 @@ class Task(Deciding[V]):
             self.status.message = f"{stage.name} was stopped from outside ({reported.message}); resume to go on"
         elif reported.state == "cancelled":  # somebody else told the fingers something: no failure either
             self._decide_anew(f"{stage.name} was cancelled: {reported.message}", view)
+        elif isinstance(stage, Grip) and holds and isinstance(reported, m.GripperState) and reported.outcome in MISSES:
+            stage.problem = reported.message
+            self.missed(stage, view)
         elif reported.state != "succeeded":
             self.fail(f"{stage.name} {reported.state}: {reported.message}", view)
         elif isinstance(stage, Grip) and holds and not view.holding:
@@ -236,7 +242,10 @@ class Task(Deciding[V]):
             command = m.ExecuteRequest(id=self.mint(), trajectory=stage.trajectory)
         else:
             assert isinstance(stage, Grip)
-            command = m.GripperCommand(id=self.mint(), width=stage.width)
+            command = m.GripperCommand(
+                id=self.mint(), width=stage.width, expected_width=stage.expected_width,
+                width_tolerance=stage.width_tolerance, effort=stage.effort,
+            )
         if stage.cycle is not None:
             stage.cycle.begun = True
         self.running = Execution(stage, command, view.now)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
 
 from common import messages as m
+from common.robot.transforms import matrix_to_pose, pose_to_matrix
 
 Place = tuple[float, float, float]
 Goal = m.AnyGoal
@@ -13,6 +14,7 @@ Command = m.PlanRequest | m.ExecuteRequest | m.GripperCommand | m.StopRequest | 
 Report = m.MotionStatus | m.GripperState
 
 OVER = ("succeeded", "aborted", "cancelled")
+MISSES = ("too_wide", "too_narrow", "empty")  # outcomes of a grasp that did not take what was expected
 
 
 @dataclass(eq=False)
@@ -59,10 +61,17 @@ class Move(Stage):
 
 @dataclass(eq=False)
 class Grip(Stage):
-    """A motion of the fingers to a width [m]; `holds` says whether something must be between them at its end."""
+    """A motion of the fingers to a width [m]; `holds` says whether something must be between them at its end.
+
+    What is between them then must be as wide as expected, where that is known; `problem` says how it was not.
+    """
 
     width: float = field(kw_only=True)
     holds: bool | None = field(default=None, kw_only=True)
+    expected_width: float | None = field(default=None, kw_only=True)  # [m]
+    width_tolerance: float = field(default=0.01, kw_only=True)  # of expected_width [m]
+    effort: float = field(default=0.0, kw_only=True)  # [N]; 0: the gripper's own default
+    problem: str = field(default="the fingers closed on nothing", init=False)
 
 
 @dataclass(eq=False)
@@ -170,6 +179,20 @@ class View:
     def holding(self) -> bool:
         """Whether the gripper reports something between its fingers."""
         return self.gripper is not None and self.gripper.holding
+
+    def let_go(self) -> Self:
+        """The same, as it will be when the fingers have opened: what moved with the tool stays where it is."""
+        gripper = self.gripper and self.gripper.model_copy(update={"holding": False})
+        if self.scene is None or self.tcp is None:
+            return replace(self, gripper=gripper)
+        T_world_tcp = pose_to_matrix(self.tcp)
+        left = [
+            item.object.model_copy(update={
+                "role": "target", "pose": matrix_to_pose(T_world_tcp @ pose_to_matrix(item.object.pose))})
+            for item in self.scene.attached
+        ]
+        scene = self.scene.model_copy(update={"objects": [*self.scene.objects, *left], "attached": []})
+        return replace(self, gripper=gripper, scene=scene)
 
     def objects(self, role: str) -> list[m.CollisionObject]:
         """Objects of the planning scene with that role."""

@@ -115,7 +115,7 @@ def gripper(state: GripperState | None) -> str:
     if state is None:
         return "fingers not known yet"
     if state.holding:
-        return "fingers hold something"
+        return "fingers hold something" + (", which slips" if state.outcome == "slipping" else "")
     return f"fingers {1e3 * state.width:.0f} mm apart" if state.width >= CLOSED else "fingers closed"
 
 

@@ -27,7 +27,8 @@ SETTLING = 1.5  # [s] from letting go until the ball lies in the container and w
 class Target:
     """An object that was seen: its place [m] in world, and its track id in the planning scene.
 
-    `size` (x, y) [m] and `yaw` [rad] are those of a box seen from above; what is round has none.
+    `size` (x, y) [m] and `yaw` [rad] are those of a box seen from above; what is round has none. `grip_effort` [N] is
+    that of the planning scene, 0 where it says none.
     """
 
     id: str
@@ -35,15 +36,23 @@ class Target:
     radius: float = 0.0  # of the circle about it seen from above [m]
     size: tuple[float, float] | None = None
     yaw: float = 0.0
+    grip_effort: float = 0.0
 
     @classmethod
     def of(cls, thing: m.CollisionObject) -> Target:
         """An object of the planning scene."""
         d = thing.dimensions
         if thing.shape != "box":
-            return cls(thing.id, place_of(thing.pose), d[0])
+            return cls(thing.id, place_of(thing.pose), d[0], grip_effort=thing.grip_effort)
         yaw = matrix_to_rpy(pose_to_matrix(thing.pose)[:3, :3])[2]
-        return cls(thing.id, place_of(thing.pose), math.hypot(d[0], d[1]) / 2, (d[0], d[1]), yaw)
+        radius = math.hypot(d[0], d[1]) / 2
+        return cls(thing.id, place_of(thing.pose), radius, (d[0], d[1]), yaw, thing.grip_effort)
+
+    def width(self, yaw: float) -> float | None:
+        """Between fingers that are turned by `yaw` [rad] [m]; None where its size is not known."""
+        if self.size is None:
+            return 2 * self.radius or None
+        return self.size[1] if abs(math.cos(yaw - self.yaw)) > math.sqrt(0.5) else self.size[0]
 
 
 @dataclass(eq=False)
@@ -177,12 +186,12 @@ class Choice:
         self._expected = (self._contained(view) + 1, view.now + SETTLING)
         self._forget(target)
 
-    def missed(self, target: Target, view: PickPlaceView) -> None:
-        """The fingers closed on nothing there; after `max_retries` retries the place is given up."""
+    def missed(self, target: Target, view: PickPlaceView, problem: str) -> None:
+        """The fingers did not take there what was seen; after `max_retries` retries the place is given up."""
         count = 1 + next((n for p, n in self._misses if same_place(p, target.position, self.radius)), 0)
         self._forget(target)
         if count > self.p.max_retries:
-            self.give_up(target, f"the fingers closed on nothing {count} times", view)
+            self.give_up(target, f"{problem} {count} times", view)
         else:
             self._misses.append((target.position, count))
 

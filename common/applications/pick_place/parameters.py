@@ -62,6 +62,9 @@ class Config(TaskConfig):
     moved: Tunable[float] = Field(
         0.005, gt=0, le=0.05, description="an object that is further from where it was has moved [m]"
     )
+    width_tolerance: Tunable[float] = Field(
+        0.01, gt=0, le=0.05, description="what is grasped may be so much wider or narrower than it was seen [m]"
+    )
     hand: HandShape = HandShape()
 
     @model_validator(mode="after")

@@ -106,19 +106,19 @@ class PerceivedScene:
         if track is not None and track.sighting.shape != "sphere":
             T_tcp_object[:3, :3] = T_world_tcp[:3, :3].T @ pose_to_matrix(_pose(track))[:3, :3]
         pose = matrix_to_pose(T_tcp_object)
-        thing = _object(track.id, "attached", track.sighting, pose) if track else self._ball(
+        thing = self._object(track.id, "attached", track.sighting, pose) if track else self._ball(
             self._tracks.new_id(), "attached", pose)
         self._held = m.AttachedObject(link=self.tcp_link, object=thing)
 
     def scene(self) -> m.PlanningScene:
         """What is believed now; its stamp is that of the newest frame in it."""
-        table = [_object(t.id, "target", t.sighting, _pose(t)) for t in self._tracks.confirmed()]
+        table = [self._object(t.id, "target", t.sighting, _pose(t)) for t in self._tracks.confirmed()]
         contained = [self._in_slots[k] for k in sorted(self._occupied_slots())]
         beside: list[Sighting] = []
         for things in self._beside_slots.values():
             beside = things if len(things) > len(beside) else beside
         contained += [  # as the view has it that shows most of them
-            _object(f"contained_{k + 1}", "contained", thing, _pose(Track("", thing.position, 0, 0.0, thing)))
+            self._object(f"contained_{k + 1}", "contained", thing, _pose(Track("", thing.position, 0, 0.0, thing)))
             for k, thing in enumerate(beside)
         ]
         held = [self._held] if self._held is not None else []
@@ -140,15 +140,14 @@ class PerceivedScene:
             "color": color_of(self.around.ball_color),
         })
 
+    def _object(self, name: str, role: str, thing: Sighting, pose: m.Pose) -> m.CollisionObject:
+        """A solid of the planning scene, with shape, size and colour as they were seen."""
+        return m.CollisionObject.model_validate({
+            "id": name, "role": role, "shape": thing.shape, "dimensions": thing.dimensions, "pose": pose,
+            "color": thing.color, "grip_effort": self.around.grip_efforts.get(thing.kind, 0.0),
+        })
+
 
 def _pose(track: Track) -> m.Pose:
     x, y, z = track.position
     return m.Pose(position=m.Vector3(x=x, y=y, z=z), orientation=track.sighting.orientation)
-
-
-def _object(name: str, role: str, thing: Sighting, pose: m.Pose) -> m.CollisionObject:
-    """A solid of the planning scene, with shape, size and colour as they were seen."""
-    return m.CollisionObject.model_validate({
-        "id": name, "role": role, "shape": thing.shape, "dimensions": thing.dimensions, "pose": pose,
-        "color": thing.color,
-    })

@@ -30,10 +30,16 @@ class Rows:
             Move("pre-grasp", "GRASPING", cycle, whole=True, fresh=True,
                  goal=self._region((x, y, low + self.p.grasp.approach_clearance), yaw)),
             Move("descend", "GRASPING", cycle, goal=grasp, straight=True, fresh=True),
-            Grip("close", "GRASPING", cycle, width=0.0, holds=True),
+            self._close(cycle, yaw),
             self._lift((x, y, low + self.p.grasp.lift_height), yaw, cycle),
             *self._across(cycle, yaw),
         ]
+
+    def _close(self, cycle: Pick, yaw: float) -> Grip:
+        cup = self.gripper.cup is not None
+        return Grip("close", "GRASPING", cycle, width=0.0, holds=True, effort=cycle.target.grip_effort,
+                    expected_width=self.gripper.held_width if cup else cycle.target.width(yaw),
+                    width_tolerance=self.p.width_tolerance)
 
     def place_held(self, cycle: Pick, tcp: Place) -> list[Stage]:
         """What is left to do with a ball that is in the hand at `tcp`."""

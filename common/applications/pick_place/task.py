@@ -13,7 +13,7 @@ from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.parameters import Config
 from common.applications.pick_place.rows import Rows
 from common.tasks.engine import Task
-from common.tasks.stages import Cycle, Grip, Look, Move, Stage
+from common.tasks.stages import MISSES, Cycle, Grip, Look, Move, Stage
 from common.tasks.watchdogs import Patience
 
 CONTAINED_FOR = 0.5  # [s] balls that are seen in the container for so long are there
@@ -37,7 +37,10 @@ class PickPlace(Task[PickPlaceView]):
 
     def decide(self, view: PickPlaceView) -> None:
         """Carry what is held to the container, take the nearest ball, or find an end."""
-        if view.holding:
+        assert view.gripper is not None
+        if view.holding and view.gripper.outcome in MISSES:  # it is not what was to be taken
+            self._let_go(view)
+        elif view.holding:
             if view.attached:  # else the planning scene has not caught up yet
                 held = Pick(target=Target(view.attached, view.tool))
                 held.begun = True
@@ -112,15 +115,18 @@ class PickPlace(Task[PickPlaceView]):
             self._choice.released(pick.target, view)
 
     def missed(self, stage: Grip, view: PickPlaceView) -> None:
-        """The fingers closed on nothing: open, go up and look again."""
+        """The fingers closed on nothing, or on what is not as wide as it was seen: open, go up and look again."""
         pick = _pick_of(stage)
         assert pick is not None
         self.status.retries += 1
         x, y, _ = pick.target.position
-        self.status.message = f"the fingers closed on nothing at ({x:.3f}, {y:.3f})"
-        self._choice.missed(pick.target, view)
+        self.status.message = f"{stage.problem} at ({x:.3f}, {y:.3f})"
+        self._choice.missed(pick.target, view.let_go(), stage.problem)
+        self._let_go(view)
+
+    def _let_go(self, view: PickPlaceView) -> None:
         self.clear()
-        self.row += [self._rows.open(), *self.back_off(view)]
+        self.row += [self._rows.open(), *self.back_off(view.let_go())]
         self.look_after = view.now
 
     def plan_failed(self, move: Move, response: m.PlanResponse, view: PickPlaceView) -> None:

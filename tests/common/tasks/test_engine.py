@@ -254,3 +254,21 @@ def test_patience_counts_from_when_a_reason_was_given_first() -> None:
     assert [patience.lasts("a", 1.0), patience.lasts("a", 3.0), patience.lasts("b", 4.0)] == [0.0, 2.0, 0.0]
     patience.reset()
     assert patience.lasts("b", 9.0) == 0.0
+
+
+def test_grasp_of_something_else_is_let_go_and_what_slips_is_told() -> None:
+    cell = Cell()
+    cell.until("close")
+    cell.gripper = cell.gripper.model_copy(update={
+        "state": "aborted", "outcome": "too_narrow", "message": "a pencil", "holding": True, "moving": False})
+    cell.step()
+    status = cell.task.status
+    assert (status.message, status.retries, status.failures) == ("close: a pencil", 1, 1)
+    cell.until("open")
+    cell.finish()
+    cell.until("lift")
+    cell.gripper = cell.gripper.model_copy(update={"outcome": "slipping", "message": "it slips"})
+    assert cell.step() == [] and status.message == "lift: it slips"
+    cell.gripper = cell.gripper.model_copy(update={"holding": False, "message": "it slipped out"})
+    assert any(isinstance(command, m.StopRequest) for command in cell.step())
+    assert status.message == "what the hand held fell during lift: it slipped out"

@@ -134,3 +134,14 @@ def test_a_box_in_the_container_is_contained_as_what_it_is() -> None:
     s.see(shown(1.0, cube(c.x, c.y, 0.0, u_v=(u, v))), CAMERA, AWAY)
     (inside,) = (o for o in s.scene().objects if o.role == "contained")
     assert (inside.id, inside.shape) == ("contained_1", "box")
+
+
+def test_objects_of_a_kind_say_how_hard_they_are_to_be_gripped() -> None:
+    around = AROUND.model_copy(update={"grip_efforts": {"ball": 3.0}})
+    assert CELL.robot.gripper is not None
+    s = PerceivedScene(SceneParameters(), around, CELL.robot.gripper, "panda_hand_tcp")
+    for t in (1.0, 1.1):
+        s.see(frame(t, (0.4, 0.0, 0.03)), CAMERA, AWAY)
+    assert [o.grip_effort for o in s.scene().objects if o.role == "target"] == [3.0]
+    s.feel(gripper(1.2, True), tool_down(0.4, 0.0, 0.03))
+    assert s.scene().attached[0].object.grip_effort == 3.0

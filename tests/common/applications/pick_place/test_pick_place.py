@@ -1,10 +1,15 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common import messages as m
+from common.applications.pick_place.choice import Pick, Target
+from common.applications.pick_place.rows import Rows
+from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
 from tests.common.applications.pick_place.cell_double import CELL, CellDouble
 
 SEVEN = [tuple(spot) for spot in CELL.world.spots[:7]]
@@ -55,6 +60,55 @@ def test_grasp_that_closes_on_nothing_is_retried_from_a_fresh_picture() -> None:
     cell.until("DONE")
     assert (cell.contained, cell.task.status.retries, cell.task.status.failures) == (1, 2, 0)
     assert cell.stages().count("retreat") == 2
+
+
+def test_grasp_asks_for_what_was_seen_as_hard_as_the_scene_says() -> None:
+    cell = CellDouble([(0.40, -0.30)], width_tolerance=0.004)
+    cell.until("DONE")
+    close = next(r for r in cell.requests if isinstance(r, m.GripperCommand) and r.width == 0)
+    assert (close.expected_width, close.width_tolerance, close.effort) == (0.06, 0.004, 0.0)
+    bar = m.CollisionObject(id="bar", role="target", shape="box", dimensions=[0.05, 0.03, 0.02], grip_effort=2.0,
+                            pose=matrix_to_pose(transform(rpy_to_matrix(0, 0, 0.3), (0.4, 0.0, 0.01))))
+    rows = Rows(cell.task.p, cell.task.gripper)
+    for yaw, width in ((0.3, 0.03), (0.3 - math.pi / 2, 0.05), (0.3 - math.pi, 0.03)):
+        row = rows.pick_and_place(Pick(target=Target.of(bar), yaws=[yaw]))
+        close = next(stage for stage in row if stage.name == "close")
+        assert (close.expected_width, close.effort) == (pytest.approx(width), 2.0)
+
+
+def test_grasp_of_what_is_not_as_wide_as_it_was_seen_is_let_go_and_retried() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.odd = 2
+    cell.until("open")
+    assert cell.task.status.message == "the fingers closed on a brick at (0.400, -0.300)"
+    cell.until("DONE")
+    assert (cell.contained, cell.task.status.retries, cell.task.status.failures) == (1, 2, 0)
+    retreats = [r for r in cell.requests if isinstance(r, m.PlanRequest) and r.stage == "retreat"]
+    assert retreats and not any(r.attach or not r.release for r in retreats)
+    assert all(("panda_hand", "track_0") in r.allowed_collisions for r in retreats)
+
+
+def test_what_is_never_as_wide_as_it_was_seen_is_given_up() -> None:
+    cell = CellDouble([(0.40, -0.30)], max_retries=2)
+    cell.odd = 1000
+    cell.until("DONE")
+    assert (cell.contained, cell.task.status.retries) == (0, 3)
+    assert cell.task.status.skipped[0].reason == "the fingers closed on a brick 3 times"
+
+
+def test_what_was_not_to_be_taken_is_let_go_by_a_task_that_finds_it_in_the_hand() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.odd = 1
+    cell.until("open")
+    cell.tell("stop")
+    for _ in range(10):
+        cell.step()
+    cell.gripper = cell.gripper.model_copy(update={"holding": True, "outcome": "too_wide"})
+    cell.tell("start")
+    cell.until("retreat")
+    assert not cell.gripper.holding
+    cell.until("DONE")
+    assert cell.contained == 1
 
 
 def test_place_that_is_always_missed_is_given_up_and_reported() -> None:
