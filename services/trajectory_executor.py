@@ -254,6 +254,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         nonlocal due
         cycle.speed_scaling = config.speed_scaling
         report = cycle.step(bus.header("world"))
+        for note in report.notes:
+            bus.log.warning("%s", note)
         move_world()
         if memory is not None and (standing := cycle.standing()) is not None:
             memory.save(standing)

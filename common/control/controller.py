@@ -18,13 +18,14 @@ from common.control.goals import REMEMBERED, GoalMemory
 from common.control.limiter import SLACK, Limiter
 from common.control.trajectory import Pace, Trajectory
 from common.errors import Refused
-from common.hardware.interface import Limits, Vector
+from common.hardware.interface import HardwareFault, Limits, Vector
 from common.messages import GoalState, Holder, Inhibit, JointTrajectory, MotionStatus
 
 PERIOD = 0.01  # cell time between cycles, unless told otherwise [s]
-LATE = 2  # periods: a cycle that comes later is taken as so late, and motion is delayed instead of making up for it
-STALLED = 5  # periods, but at least LARGEST_STEP: after a cycle that comes later motion goes on from rest
-LARGEST_STEP = 0.1  # cell time [s]
+LATE = 2  # periods: a cycle that comes later moves the arm by no more, and
+STALLED = 2  # usual cycles: after one that comes later motion goes on from rest, where the arm is
+USUAL = 0.2  # of what is usual is how it was the last time
+RESEATED = 1.0  # cell time between two takings of an arm that was moved from outside: oftener it is not held [s]
 BLEND_TIME = 0.3  # the difference between the robot's and the trajectory's start fades in this time [s]
 BLEND_SHARE = 0.5  # of the limits is for that difference at most; else it takes longer
 BEHIND = 1e-3  # [rad] between path and set-point, at which the goal's time stands still
@@ -56,6 +57,8 @@ class _Goal:
     behind: float = 0.0  # the newest set-point, of the path [rad]
     stopping: bool = False
     reason: str = ""
+    error: str = ""  # why it is stopped, where nobody asked for it
+    source: str = ""
     ended: float | None = None  # cell time at which the set-points came to rest
 
     @property
@@ -148,11 +151,15 @@ class TrajectoryController:
         self._tolerances = tolerances or Tolerances()
         self._hold = start.copy()  # where to be; the newest set-point is the limiter's position
         self._limiter = Limiter(limits, start, period)
-        self._period = period
+        self._period = self._usual = period
         self._last: float | None = None  # cell time of the newest set-point
         self._goal: _Goal | None = None
         self._memory: GoalMemory[MotionStatus] = GoalMemory(remember)
         self._fault = ""
+        self._coasting = False  # from where the arm was found in motion to rest, on no path
+        self._missed = False  # a goal ended with the arm off: where it rests is held
+        self._reseated = -math.inf  # cell time at which the arm was found moved from outside [s]
+        self._moved = ""  # how it was, until it is told
         self._holds: dict[Holder, str] = {}  # the reasons, by who holds the robot
         self._status = MotionStatus()
         self.speed_scaling = 1.0
@@ -178,8 +185,11 @@ class TrajectoryController:
             "held": bool(self._holds), "held_by": sorted(self._holds), "speed_scaling": self.speed_scaling,
             "inhibits": self.inhibits,
         }
-        if self._holds and status.state != "active" and not status.message:
-            now["message"] = _told("held", self._holds.values())
+        if status.state != "active" and not status.message:
+            if self._fault:
+                now["message"] = f"hardware fault: {self._fault}"
+            elif self._holds:
+                now["message"] = _told("held", self._holds.values())
         return status.model_copy(update=now)
 
     def accept(
@@ -206,6 +216,10 @@ class TrajectoryController:
                 raise Refused("hardware_fault", self._fault)
             if self._goal is not None:
                 raise Refused("busy", f"goal {self._goal.id!r} is still being followed")
+            if self._last is None:
+                self._seat(measured)
+            elif self._coasting or not self._limiter.at_rest:
+                raise Refused("busy", "the arm is still coming to rest")
             begin = self._begin(measured)
             if judged is None:
                 judged = self.judge(trajectory, measured, begin)
@@ -221,10 +235,8 @@ class TrajectoryController:
             )
             return self._as_of_now(self._memory.put(goal, rejected, refused=True))
         if begin is not self._hold:
-            self._hold = measured.copy()
-            if self._limiter.at_rest:
-                self._limiter.rest(measured)
-        self._goal = taken
+            self._seat(measured)
+        self._goal, self._missed = taken, False
         return self._report("active", message=self._holding(taken))
 
     def takes_long(self, goal: str, trajectory: JointTrajectory) -> bool:
@@ -259,7 +271,7 @@ class TrajectoryController:
         offset = begin - judged.trajectory.positions[0]
         blend = blend_time(offset, judged.trajectory.duration, self._limits)
         pace = Pace(0.0, 0.0 * begin)
-        if not self._holds and self._limiter.at_rest:
+        if not self._holds:
             pace.rate = self.speed_scaling * judged.share
         return _Goal(goal, judged.trajectory, offset, blend, now, pace, judged.share)
 
@@ -310,22 +322,21 @@ class TrajectoryController:
             measured_velocity: (dof,) [rad/s].
         """
         if self._fault or (self._last is None and self._goal is None):  # it may have sagged, or begin anywhere
-            self._fault, self._hold = "", measured.copy()
-            self._limiter.rest(measured)
+            self._fault, self._last = "", None
+            self._seat(measured, measured_velocity)
         elapsed = self._period if self._last is None else max(now - self._last, 0.0)
         self._last = now
-        goal = self._goal
-        if elapsed > max(LARGEST_STEP, STALLED * self._period):  # the arm had no set-points meanwhile, and stands
+        late = elapsed > STALLED * self._usual + 1e-6
+        self._usual = max(self._period, self._usual + USUAL * (elapsed - self._usual))
+        if late:  # the arm had no set-points meanwhile, and stands
             elapsed = self._period
-            self._limiter.rest()
-            if goal is not None:
-                goal.last = now - elapsed
-                goal.pace.rest()
-        step = min(elapsed, LATE * self._period)
+            self._stalled(now - elapsed, measured)
+        elapsed = min(elapsed, LATE * self._period)
+        goal = self._goal
         if goal is not None:
             self._judge(goal, now, measured, measured_velocity)
         if goal is None or self._goal is None:
-            return self._limiter.step(self._hold, 0.0 * self._hold, step, self.speed_scaling, braking=True)
+            return self._still(now, elapsed, measured, measured_velocity)
         braking = goal.stopping or bool(self._holds)
         share = max(self.speed_scaling, goal.pace.rate)
         waiting = max(0.0, 1 - goal.behind / BEHIND)
@@ -337,7 +348,7 @@ class TrajectoryController:
         goal.last = now
         self._hold, change = goal.at(goal.time)
         set_point, velocity = self._limiter.step(
-            self._hold, change * goal.pace.rate, step, max(share, goal.pace.rate), braking
+            self._hold, change * goal.pace.rate, elapsed, max(share, goal.pace.rate), braking
         )
         goal.behind = float(np.abs(self._hold - set_point).max())
         over = goal.time >= goal.duration or (goal.stopping and goal.pace.rate == 0.0)
@@ -352,17 +363,79 @@ class TrajectoryController:
                 self._report("active", message=message)
         return set_point, velocity
 
-    def abort(self, error: str, message: str, measured: Vector | None = None, source: str = "") -> None:
-        """End the running goal and hold where the robot is."""
-        if measured is not None:
+    def _seat(self, measured: Vector, velocity: Vector | None = None) -> None:
+        """Have set-points begin where the arm is (dof,) [rad]; at the velocity it has [rad/s], if it moves."""
+        self._hold = measured.copy()
+        self._coasting = velocity is not None and bool(np.any(np.abs(velocity) > self._tolerances.stopped_velocity))
+        self._limiter.rest(measured, velocity if self._coasting else None)
+
+    def _stalled(self, now: float, measured: Vector) -> None:
+        """Go on from rest: at the newest set-point, or where the arm is when it is not there."""
+        off = float(np.abs(measured - self._limiter.position).max())
+        if self._goal is None:
+            self._limiter.rest()
+            return
+        if off > self._tolerances.start:
+            self._limiter.rest(measured)
+            self._goal.behind = off
+        else:
+            self._limiter.rest()
+        self._goal.last = now
+        self._goal.pace.rest()
+        if off > self._tolerances.path:
+            name = self._limits.names[int(np.argmax(np.abs(measured - self._hold)))]
             self._hold = measured.copy()
-        if self._goal is not None:
-            self._finish("aborted", error, message, source)
+            self._finish("aborted", "path_tolerance", f"{name} was moved by {off:.4f} rad while there were no "
+                                                      f"set-points (tolerance {self._tolerances.path:g})")
+
+    def _still(self, now: float, step: float, measured: Vector, velocity: Vector) -> tuple[Vector, Vector]:
+        """Set-points (dof,) [rad], [rad/s] while there is no goal: of an arm that is held, or comes to rest.
+
+        Raises:
+            HardwareFault: the arm does not stay where it is held.
+        """
+        if self._coasting:
+            set_point = self._limiter.brake(step)
+            self._coasting, self._hold = not self._limiter.at_rest, set_point[0]
+            return set_point
+        if self._limiter.at_rest and np.array_equal(self._limiter.position, self._hold):
+            off = np.abs(measured - self._hold)
+            moving = bool(np.any(np.abs(velocity) > self._tolerances.stopped_velocity))
+            if np.all(off <= self._tolerances.start):
+                self._missed = self._missed and moving
+            elif self._missed:  # it may follow yet; where it rests then it is held
+                if not moving:
+                    self._hold, self._missed = measured.copy(), False
+            else:
+                j = int(np.argmax(off))
+                told = f"{self._limits.names[j]} was moved from outside by {off[j]:.4f} rad"
+                again, self._reseated = now - self._reseated < RESEATED, now
+                if again:
+                    raise HardwareFault(f"{told} again: the arm does not stay where it is held")
+                self._moved = f"{told}: it is held where it is now"
+                if self._status.state != "active":
+                    self._status = self._status.model_copy(update={"message": self._moved})
+                self._seat(measured, velocity)
+                return self._still(now, step, measured, velocity)
+        return self._limiter.step(self._hold, 0.0 * self._hold, step, self.speed_scaling, braking=True)
+
+    def news(self) -> str:
+        """A line when the arm was found moved from outside since the last call; else empty."""
+        moved, self._moved = self._moved, ""
+        return moved
+
+    def abort(self, error: str, message: str, source: str = "") -> None:
+        """Begin to bring the robot to rest along its path; then the goal is aborted, and the robot held where it is."""
+        if self._goal is not None and not self._goal.error:
+            self._goal.stopping, self._goal.reason, self._goal.error = True, message, error
+            self._goal.source = source
+            self._report("active", message=f"stopping: {message}")
 
     def fault(self, message: str) -> None:
         """End the running goal: the hardware does not work. Goals are rejected until `update` is called again."""
         self._fault = message
-        self.abort("hardware_fault", message, source="hardware")
+        if self._goal is not None:
+            self._finish("aborted", "hardware_fault", message, "hardware")
 
     def _judge(self, goal: _Goal, now: float, measured: Vector, velocity: Vector) -> None:
         """End the goal when it is reached, or the robot is too far from the newest set-point."""
@@ -371,21 +444,24 @@ class TrajectoryController:
         j = int(np.argmax(off))
         name = self._limits.names[j]
         if off[j] > allowed.path:
-            return self.abort("path_tolerance", f"{name} is {off[j]:.4f} rad off its path (tolerance {allowed.path:g})",
-                              measured)
+            self.abort("path_tolerance", f"{name} is {off[j]:.4f} rad off its path (tolerance {allowed.path:g})")
         if goal.ended is None:
-            return None
+            return
         rest = bool(np.all(np.abs(velocity) <= allowed.stopped_velocity))
         waited = now - goal.ended > allowed.goal_time
         if goal.stopping:
             if rest or waited:
-                self._finish("cancelled", "cancelled", goal.reason)
+                self._missed = True
+                if goal.error:
+                    self._finish("aborted", goal.error, goal.reason, goal.source)
+                else:
+                    self._finish("cancelled", "cancelled", goal.reason)
         elif rest and off[j] <= allowed.goal:
             self._finish("succeeded")
         elif waited:
             what = f"{off[j]:.4f} rad off its goal (tolerance {allowed.goal:g})" if rest else "still moving"
-            self.abort("goal_tolerance", f"{name} is {what} {allowed.goal_time:g} s after the end", measured)
-        return None
+            self._missed = True
+            self._finish("aborted", "goal_tolerance", f"{name} is {what} {allowed.goal_time:g} s after the end")
 
     def _report(self, state: GoalState, error: str = "", message: str = "", source: str = "") -> MotionStatus:
         assert self._goal is not None

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from common.config import GripperConfig
 from common.control.checks import Tolerances
 from common.control.controller import PERIOD, Judged, TrajectoryController
+from common.control.faults import Fault, asked
 from common.control.gripper_controller import GripperController
 from common.control.inhibits import Inhibits
 from common.errors import ConfigError, Refused
@@ -57,6 +58,7 @@ class Report:
     gripper: GripperState | None = None
     objects: WorldObjects | None = None
     updates: list[SceneUpdate] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # for the log
 
 
 class ControlCycle:
@@ -99,6 +101,8 @@ class ControlCycle:
                 self._obstructible = hardware.gripper
             self._gripper = GripperController(hardware.gripper, gripper)
         self._q = start.copy()
+        self._found = False  # whether the arm was read
+        self._arm_fault, self._hand_fault = Fault("the arm"), Fault("the gripper")
         self._width_rate = 0.0
         self._told_motion: MotionStatus | None = None
         self._told_motion_at = self._told_gripper_at = self._told_world_at = -np.inf
@@ -116,14 +120,14 @@ class ControlCycle:
         """Do one cycle at the header's time and say what is new."""
         now = header.stamp * 1e-9
         report = Report()
-        try:
-            self._q, dq = self._hardware.read(now)
-            self._step_gripper(now)
-            self._hardware.write(*self._arm.update(now, self._q, dq), now)
-        except HardwareFault as fault:
-            self._arm.fault(str(fault))
-        else:
-            report.joints = self._joint_state(header, dq)
+        if not self._arm_fault.waits(now):
+            try:
+                report.joints = self._control(header, now)
+                self._arm_fault.works(now)
+            except HardwareFault as fault:
+                self._arm_fault.failed(str(fault), now)
+                self._arm.fault(str(fault))
+        report.notes = [*filter(None, (self._arm_fault.news(), self._hand_fault.news(), self._arm.news()))]
         report.motion = self._news_of_motion(header, now)
         report.gripper = self._news_of_gripper(header, now)
         if self._world is not None and not self.apart:
@@ -133,6 +137,27 @@ class ControlCycle:
                 report.objects = self._world.objects(header)
                 self._told_version, self._told_world_at = self._world.version, now
         return report
+
+    def _control(self, header: Header, now: float) -> JointState:
+        """The joints as they are, after new set-points were sent.
+
+        Raises:
+            HardwareFault: the arm does not work.
+        """
+        q, dq = asked("reading joints", self._hardware.read, now)
+        for what, values in (("positions", q), ("velocities", dq)):
+            if np.shape(values) != self._q.shape or not np.all(np.isfinite(values)):
+                raise HardwareFault(f"reading joints: {what} are not {len(self._q)} finite numbers: {values}")
+        self._q, self._found = q, True
+        try:
+            self._step_gripper(now)
+        except HardwareFault as fault:
+            self._hand_fault.failed(str(fault), now)
+            self._arm.abort("hardware_fault", str(fault), "hardware")
+            if self._gripper is not None:
+                self._gripper.fault(str(fault))
+        asked("sending set-points", self._hardware.write, *self._arm.update(now, self._q, dq), now)
+        return self._joint_state(header, dq)
 
     def standing(self) -> Standing | None:
         """What simulated hardware would be found like after a restart, if it has changed since the last call."""
@@ -175,7 +200,10 @@ class ControlCycle:
     ) -> MotionStatus:
         """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
         inhibited = self._inhibits.objection(request.id, request.owner, request.heard)
-        return self._arm.accept(request.id, request.trajectory, now, self._q, inhibited or objection, judged)
+        fault = self._hand_fault.objection
+        if fault is None and not self._found and not self._arm_fault.reason:
+            fault = Refused("hardware_fault", "nobody knows yet where the arm is")
+        return self._arm.accept(request.id, request.trajectory, now, self._q, inhibited or objection or fault, judged)
 
     def stop(self, request: StopRequest, now: float) -> MotionStatus:
         """The state of the goal, which is being brought to rest if it was moving the robot.
@@ -248,7 +276,13 @@ class ControlCycle:
         """
         if self._gripper is None:
             raise Refused("no_gripper", "this robot has no gripper")
-        return self._gripper.command(request, now, self._inhibits.objection(request.id))
+        objection = self._inhibits.objection(request.id) or self._hand_fault.objection
+        try:
+            return self._gripper.command(request, now, objection)
+        except HardwareFault as fault:
+            self._hand_fault.failed(str(fault), now)
+            self._gripper.fault(str(fault))
+            return self._gripper.command(request, now, self._hand_fault.objection)
 
     def edit_takes_long(self, request: WorldEdit) -> bool:
         """Whether an edit may take longer than a cycle: it is made beside them then, `apart`."""
@@ -271,14 +305,14 @@ class ControlCycle:
 
     def _step_gripper(self, now: float) -> None:
         gripper = self._hardware.gripper
-        if self._gripper is None or gripper is None:
+        if self._gripper is None or gripper is None or self._hand_fault.waits(now):
             return
         if self._world is None or self._kinematics is None or self._obstructible is None or self.apart:
-            reading = gripper.read(now)
+            reading = asked("reading the gripper", gripper.read, now)
         else:
             T_world_tcp = self._kinematics.fk(self._q)
             self._obstructible.obstruct(self._world.obstruction(T_world_tcp, self._gripper.state.width))
-            reading = gripper.read(now)
+            reading = asked("reading the gripper", gripper.read, now)
             tick = partial(self._world.tick, now, T_world_tcp, reading.width, reading.holding)
             takes_long = getattr(self._world, "takes_long", None)
             if self.beside and takes_long is not None and takes_long(reading.width, reading.holding):
@@ -287,6 +321,7 @@ class ControlCycle:
                 tick()
         self._width_rate = reading.velocity
         self._gripper.update(reading, now)
+        self._hand_fault.works(now)
 
     def _joint_state(self, header: Header, dq: Vector) -> JointState:
         names, positions, velocities = list(self._limits.names), self._q.tolist(), dq.tolist()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 from common.config import GripperConfig
+from common.control.faults import asked
 from common.control.goals import REMEMBERED, GoalMemory
 from common.errors import Refused
 from common.hardware.interface import Gripper, GripperReading
@@ -40,6 +41,9 @@ class GripperController:
             request: for the fingers.
             now: cell time [s].
             objection: what speaks against a new goal from the start.
+
+        Raises:
+            HardwareFault: the fingers do not work.
         """
         known = self._memory.get(request.id)
         if known is not None:
@@ -59,13 +63,19 @@ class GripperController:
             rejected = GripperState.model_validate(
                 {**reading, "id": request.id, "state": "rejected", "error": code, "message": message})
             return self._memory.put(request.id, rejected, refused=True)
+        self._tell(request.width, now, request.effort)
         if self.state.state == "active":
             replaced = {"state": "cancelled", "message": f"replaced by {request.id!r}"}
             self._memory.put(self.state.id, self.state.model_copy(update=replaced))
-        self._tell(request.width, now, request.effort)
         self._asked = request
         self.state = GripperState.model_validate({**reading, "moving": True, "id": request.id, "state": "active"})
         return self._memory.put(request.id, self.state)
+
+    def fault(self, message: str) -> None:
+        """End the goal of the fingers, which do not work."""
+        if self.state.state == "active":
+            failed = {"state": "aborted", "error": "hardware_fault", "message": message}
+            self.state = self._memory.put(self.state.id, self.state.model_copy(update=failed))
 
     @property
     def told(self) -> float | None:
@@ -82,8 +92,9 @@ class GripperController:
         self._tell(width, now, effort)
 
     def _tell(self, width: float, now: float, effort: float) -> None:
-        self._effort = effort or self._config.effort
-        self._gripper.command(width, now, self._effort)
+        effort = effort or self._config.effort
+        asked("moving the gripper", self._gripper.command, width, now, effort)
+        self._effort = effort
         self._target, self._began, self._held = width, now, None
 
     def update(self, reading: GripperReading, now: float) -> GripperState:

@@ -37,14 +37,17 @@ class Limiter:
         self._jerk = limits.jerks
         self.rest(start)
 
-    def rest(self, position: Vector | None = None) -> None:
-        """Go on from rest: where the set-point is, or at a position (dof,) [rad] where the arm was found."""
+    def rest(self, position: Vector | None = None, velocity: Vector | None = None) -> None:
+        """Go on from rest: where the set-point is, or at a position (dof,) [rad] where the arm was found.
+
+        An arm that was found in motion goes on at its velocity [rad/s].
+        """
         if position is not None:
             self.position = position.copy()
             # A joint that is found beyond its limit may stay there or come in, and then has no more room than that.
             self._lowest, self._highest = np.minimum(self._lower, position), np.maximum(self._upper, position)
         self._step = self._period  # duration of the newest step [s]
-        self._way = 0.0 * self.position  # mean velocity in it
+        self._way = 0.0 * self.position if velocity is None else velocity.copy()  # mean velocity in it
         self._change = 0.0 * self.position  # mean acceleration up to the middle of it
         self._kept: tuple[Vector, Vector] | None = None  # velocity and acceleration where a way back goes on
         self._braked = False
@@ -74,16 +77,28 @@ class Limiter:
         most = self._braking if braking or self._braked else self._acceleration
         self._braked = braking  # a difference of second order reaches one step further back
         if self._passes(target, velocity, way, change, seconds, between, share, most):
-            self._kept = None
-        else:
-            target, velocity, acceleration = self._approach(target, velocity, seconds, share)
-            self._kept = velocity, acceleration
-            way = (target - self.position) / seconds
-            change = (way - self._way) / between
-        self.position, self._way, self._change, self._step = target, way, change, seconds
+            return self._go(target, velocity, None, seconds)
+        return self._go(*self._approach(target, velocity, seconds, share), seconds)
+
+    def _go(
+        self, target: Vector, velocity: Vector, acceleration: Vector | None, seconds: float
+    ) -> tuple[Vector, Vector]:
+        """Be at a target; on a way of our own with an acceleration (dof,) [rad/s^2]."""
+        self._kept = None if acceleration is None else (velocity, acceleration)
+        way = (target - self.position) / seconds
+        self._change = (way - self._way) / ((self._step + seconds) / 2)
+        self.position, self._way, self._step = target, way, seconds
         self._lowest = np.minimum(self._lower, np.maximum(self._lowest, target))
         self._highest = np.maximum(self._upper, np.minimum(self._highest, target))
         return target, velocity
+
+    def brake(self, seconds: float) -> tuple[Vector, Vector]:
+        """The set-point after a step (dof,) [rad], [rad/s] on the shortest way to rest, wherever that is."""
+        given = self._given(self._braking)
+        given.control_interface = ruckig.ControlInterface.Velocity
+        given.target_velocity = [0.0] * len(self.position)
+        target, velocity, acceleration = _after(given, seconds)
+        return self._go(target, velocity, acceleration, seconds)
 
     def _passes(
         self, target: Vector, velocity: Vector, way: Vector, change: Vector, seconds: float, between: float,
@@ -110,26 +125,38 @@ class Limiter:
         self, target: Vector, velocity: Vector, seconds: float, share: float
     ) -> tuple[Vector, Vector, Vector]:
         """Positions, velocities and accelerations (dof,) after a step on the fastest way to a target."""
-        if self._kept is None:
-            self._kept = self._way + self._change * (self._step / 2), self._change
-        v0, a0 = self._kept
         fastest, hardest = share * self._velocity, self._acceleration
         lower, upper = self._lowest, self._highest
         target = np.clip(np.where(np.isfinite(target), target, self.position), lower, upper)
         free = np.minimum(upper - target, target - lower)  # to come to that velocity, and to rest again
         ending = np.minimum(fastest, np.sqrt(hardest * free))
         velocity = np.clip(np.where(np.isfinite(velocity), velocity, 0.0), -ending, ending)
+        given = self._given(hardest)
+        given.target_position, given.target_velocity = target.tolist(), velocity.tolist()
+        given.max_velocity = fastest.tolist()
+        return _after(given, seconds)
+
+    def _given(self, hardest: Vector) -> ruckig.InputParameter:
+        """The state of now, and an acceleration that is not exceeded (dof,) [rad/s^2]."""
+        if self._kept is None:
+            self._kept = self._way + self._change * (self._step / 2), self._change
+        v0, a0 = self._kept
         given = ruckig.InputParameter(len(v0))
         given.synchronization = ruckig.Synchronization.No
         given.current_position = self.position.tolist()
         given.current_velocity, given.current_acceleration = v0.tolist(), a0.tolist()
-        given.target_position, given.target_velocity = target.tolist(), velocity.tolist()
-        given.max_velocity, given.max_acceleration = fastest.tolist(), hardest.tolist()
-        given.max_jerk = self._jerk.tolist()
-        otg, motion = ruckig.Ruckig(len(v0)), ruckig.Trajectory(len(v0))
-        if otg.calculate(given, motion) not in RUCKIG_OK:
-            given.control_interface = ruckig.ControlInterface.Velocity  # come to rest, which always has a solution
-            given.target_velocity = [0.0] * len(v0)
-            otg.calculate(given, motion)
-        q, dq, ddq = motion.at_time(seconds)
-        return np.array(q), np.array(dq), np.array(ddq)
+        given.max_velocity = self._velocity.tolist()
+        given.max_acceleration, given.max_jerk = hardest.tolist(), self._jerk.tolist()
+        return given
+
+
+def _after(given: ruckig.InputParameter, seconds: float) -> tuple[Vector, Vector, Vector]:
+    """Positions, velocities and accelerations (dof,) after a step on the fastest way to what is given."""
+    dof = len(given.current_position)
+    otg, motion = ruckig.Ruckig(dof), ruckig.Trajectory(dof)
+    if otg.calculate(given, motion) not in RUCKIG_OK:
+        given.control_interface = ruckig.ControlInterface.Velocity  # come to rest, which always has a solution
+        given.target_velocity = [0.0] * dof
+        otg.calculate(given, motion)
+    q, dq, ddq = motion.at_time(seconds)
+    return np.array(q), np.array(dq), np.array(ddq)

@@ -25,7 +25,10 @@ Vector = NDArray[np.float64]
 
 
 class HardwareFault(ZencellError):
-    """Raised by a backend when it cannot read or move: ends the goal, and new ones are rejected until it is gone."""
+    """Raised by a backend when it cannot read or move: ends the goal, and new ones are rejected until it is gone.
+
+    What else a backend raises is taken for one; it is told with its type then.
+    """
 
 
 @dataclass(frozen=True)

@@ -275,6 +275,8 @@ class Invariants:
             return
         if self._broke((way <= fastest * min(passed, self._cycle) + 1e-3).all(), LIMITS):
             self._tell(LIMITS, f"a step of {way.max():.4f} rad in {passed * 1e3:.1f} ms")
+        if passed > self._cycle:  # it goes on from rest
+            last = (last[0], 0.0 * last[1], last[2])
         change = np.abs(dq - last[1])
         if self._broke((change <= 1.1 * limits.braking * max(passed, self._cycle / CYCLES) + 1e-3).all(), LIMITS):
             self._tell(LIMITS, f"velocity changes by {change.max():.3f} rad/s in {passed * 1e3:.1f} ms")

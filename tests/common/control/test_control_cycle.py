@@ -174,9 +174,103 @@ def test_fault_of_the_hardware_is_reported_and_survived(limits, rest_to_rest):
     assert rig.execute("b", rest_to_rest([0, 0], [0.5, 0.5])).error == "hardware_fault"
     assert rig.step().joints is None, "nothing is invented"
     hardware.broken = False
-    rig.step()
+    rig.run(0.5)
     here = rig.joints[-1].position[:2]
     assert rig.execute("c", rest_to_rest(here, [0.5, 0.5])).state == "active"
+
+
+class Broken(MockHardware):
+    """Hardware that raises what it is given, and counts how often it is asked in vain."""
+
+    def __init__(self):
+        super().__init__(START, Fingers(GRIPPER, 0.08))
+        self.failing, self.error, self.failed = "", None, 0
+
+    def ask(self, what):
+        if what == self.failing:
+            self.failed += 1
+            raise self.error
+
+    def read(self, now):
+        self.ask("read")
+        return super().read(now)
+
+    def write(self, positions, velocities, now):
+        self.ask("write")
+        super().write(positions, velocities, now)
+
+
+@pytest.mark.parametrize("failing", ["read", "write"])
+@pytest.mark.parametrize("error", [HardwareFault("cable is off"), OSError(5, "no route"), KeyError("q"), TypeError()])
+def test_whatever_a_backend_raises_it_is_left_alone_and_recovers_by_itself(limits, rest_to_rest, failing, error):
+    hardware = Broken()
+    rig = Rig(limits, hardware)
+    rig.step()
+    rig.execute("a", rest_to_rest([0, 0], [0.5, 0.5]))
+    rig.run(0.3)
+    hardware.failing, hardware.error = failing, error
+    notes = [note for _ in range(100) for note in rig.step().notes]
+    assert hardware.failed <= 4 and len(notes) == 1 and notes[0].startswith("the arm does not work: ")
+    assert (rig.motions[-1].state, rig.motions[-1].error) == ("aborted", "hardware_fault")
+    assert rig.motions[-1].message and rig.motions[-1].message in notes[0]
+    refused = rig.execute("b", rest_to_rest([0, 0], [0.5, 0.5]))
+    assert refused.error == "hardware_fault" and refused.message in notes[0]
+    rig.run(30.0)
+    assert hardware.failed <= 12
+    hardware.failing = ""
+    hardware._positions, hardware._velocities = np.array([0.3, -0.2]), START  # it sagged meanwhile
+    notes = [note for _ in range(600) for note in rig.step().notes]
+    assert len(notes) == 1 and notes[0].startswith("the arm works again")
+    assert rig.joints[-1].position[:2] == [0.3, -0.2] and not any(rig.joints[-1].velocity[:2])
+    assert rig.execute("c", rest_to_rest([0.3, -0.2], [0.5, 0.5])).state == "active"
+
+
+@pytest.mark.parametrize("strange", [np.zeros(3), np.array([np.nan, 0.0]), None])
+def test_what_is_no_position_is_a_fault_and_moves_nothing(limits, strange):
+    hardware = Broken()
+    rig = Rig(limits, hardware)
+    rig.step()
+    hardware.read = lambda now: (strange, START)
+    report = rig.step()
+    assert "reading joints: positions are not 2 finite numbers" in report.notes[0] and report.joints is None
+    assert "hardware fault" in rig.motions[-1].message
+
+
+def test_gripper_that_fails_brakes_the_arm_which_stays_held_and_refuses_goals(limits, rest_to_rest, monkeypatch):
+    rig = Rig(limits, Broken())
+    rig.step()
+    rig.execute("a", rest_to_rest([0, 0], [0.5, 0.5], 2.0))
+    rig.run(0.2)
+    rig.grip("close", 0.0)
+    rig.run(0.1)
+
+    def fail(*_):
+        raise TimeoutError("no answer")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(rig.hardware.gripper, "read", fail)
+        notes = [note for _ in range(100) for note in rig.step().notes]
+        assert notes == ["the gripper does not work: reading the gripper: TimeoutError: no answer"]
+        assert (rig.motions[-1].state, rig.motions[-1].error) == ("aborted", "hardware_fault")
+        assert (rig.grippers[-1].state, rig.grippers[-1].error) == ("aborted", "hardware_fault")
+        assert 0 < rig.joints[-1].position[0] < 0.2 and not any(rig.joints[-1].velocity[:2])
+        assert rig.execute("b", rest_to_rest(rig.joints[-1].position[:2], [0.5, 0.5])).error == "hardware_fault"
+        assert rig.grip("open", 0.08).error == "hardware_fault"
+    rig.run(6.0)
+    with monkeypatch.context() as broken:
+        broken.setattr(rig.hardware.gripper, "command", fail)
+        assert "no answer" in rig.grip("again", 0.08).message
+    rig.run(6.0)
+    assert rig.grip("now", 0.08).state == "active"
+    assert rig.execute("c", rest_to_rest(rig.joints[-1].position[:2], [0.5, 0.5])).state == "active"
+
+
+def test_nothing_moves_before_the_arm_was_read(limits, rest_to_rest):
+    rig = Rig(limits, MockHardware(np.array([0.5, 0.0]), Fingers(GRIPPER, 0.08)))
+    answer = rig.execute("a", rest_to_rest([0, 0], [0.2, 0.2]))
+    assert answer.error == "hardware_fault" and "where the arm is" in answer.message
+    rig.step()
+    assert rig.execute("b", rest_to_rest([0.5, 0], [0.2, 0.2])).state == "active"
 
 
 def test_real_hardware_has_no_world_to_edit(limits):
