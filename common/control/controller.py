@@ -156,8 +156,10 @@ class TrajectoryController:
         self._goal: _Goal | None = None
         self._memory: GoalMemory[MotionStatus] = GoalMemory(remember)
         self._fault = ""
+        self._found: Vector | None = None  # where the arm was read once, which says that it moves
         self._coasting = False  # from where the arm was found in motion to rest, on no path
-        self._missed = False  # a goal ended with the arm off: where it rests is held
+        self._missed = self._let_go = False  # a goal ended with the arm off: where it rests is held; it was tried
+        self._amiss = 0.0 * start  # of what is measured of an arm that stays off wherever it is held [rad]
         self._reseated = -math.inf  # cell time at which the arm was found moved from outside [s]
         self._moved = ""  # how it was, until it is told
         self._holds: dict[Holder, str] = {}  # the reasons, by who holds the robot
@@ -218,8 +220,10 @@ class TrajectoryController:
                 raise Refused("busy", f"goal {self._goal.id!r} is still being followed")
             if self._last is None:
                 self._seat(measured)
-            elif self._coasting or not self._limiter.at_rest:
+            elif self._coasting or self._found is not None or not self._limiter.at_rest:
                 raise Refused("busy", "the arm is still coming to rest")
+            if self._missed or np.any(np.abs(self._amiss) > self._tolerances.start):
+                self._require_followed(measured)
             begin = self._begin(measured)
             if judged is None:
                 judged = self.judge(trajectory, measured, begin)
@@ -265,6 +269,14 @@ class TrajectoryController:
         """Where a motion begins (dof,) [rad]: at the set-point, unless the arm was moved from outside since."""
         near = np.all(np.abs(self._hold - measured) <= self._tolerances.start)
         return self._hold if near else measured
+
+    def _require_followed(self, measured: Vector) -> None:
+        """Return when an arm that was off where it is held is no more."""
+        off = np.abs(measured - self._hold)
+        j = int(np.argmax(off))
+        if off[j] > self._tolerances.start:
+            raise Refused("not_followed", f"{self._limits.names[j]} is {off[j]:.4f} rad off where it is held")
+        self._amiss = 0.0 * self._amiss
 
     def _taken(self, goal: str, judged: Judged, begin: Vector, now: float) -> _Goal:
         assert judged.trajectory is not None
@@ -313,8 +325,10 @@ class TrajectoryController:
             return ""
         return _told("held" if goal.pace.rate == 0.0 else "coming to rest", self._holds.values())
 
-    def update(self, now: float, measured: Vector, measured_velocity: Vector) -> tuple[Vector, Vector]:
-        """The set-points (dof,) [rad], [rad/s] for now. `status` says what became of the goal.
+    def update(self, now: float, measured: Vector, measured_velocity: Vector) -> tuple[Vector, Vector] | None:
+        """The set-points (dof,) [rad], [rad/s] for now; none before it is known where the arm is.
+
+        `status` says what became of the goal.
 
         Args:
             now: cell time [s].
@@ -323,7 +337,15 @@ class TrajectoryController:
         """
         if self._fault or (self._last is None and self._goal is None):  # it may have sagged, or begin anywhere
             self._fault, self._last = "", None
-            self._seat(measured, measured_velocity)
+            self._seat(measured)
+            if np.any(np.abs(measured_velocity) > self._tolerances.stopped_velocity):
+                self._found, self._last = measured.copy(), now
+                return None  # does it move, or is that how fast it was told to?
+        if self._found is not None:
+            went = (measured - self._found) / max(now - (self._last or now), 1e-9)
+            self._found, self._last = None, None
+            self._seat(measured, np.where(went * np.sign(measured_velocity) > np.abs(measured_velocity) / 2,
+                                          measured_velocity, 0.0))
         elapsed = self._period if self._last is None else max(now - self._last, 0.0)
         self._last = now
         late = elapsed > STALLED * self._usual + 1e-6
@@ -365,7 +387,7 @@ class TrajectoryController:
 
     def _seat(self, measured: Vector, velocity: Vector | None = None) -> None:
         """Have set-points begin where the arm is (dof,) [rad]; at the velocity it has [rad/s], if it moves."""
-        self._hold = measured.copy()
+        self._hold, self._amiss = measured.copy(), 0.0 * measured
         self._coasting = velocity is not None and bool(np.any(np.abs(velocity) > self._tolerances.stopped_velocity))
         self._limiter.rest(measured, velocity if self._coasting else None)
 
@@ -399,13 +421,15 @@ class TrajectoryController:
             self._coasting, self._hold = not self._limiter.at_rest, set_point[0]
             return set_point
         if self._limiter.at_rest and np.array_equal(self._limiter.position, self._hold):
-            off = np.abs(measured - self._hold)
+            off = np.abs(measured - self._hold - self._amiss)
             moving = bool(np.any(np.abs(velocity) > self._tolerances.stopped_velocity))
             if np.all(off <= self._tolerances.start):
                 self._missed = self._missed and moving
-            elif self._missed:  # it may follow yet; where it rests then it is held
+            elif self._missed:  # it may follow yet; where it rests then it is held, which is tried once
                 if not moving:
-                    self._hold, self._missed = measured.copy(), False
+                    self._amiss = measured - self._hold if self._let_go else self._amiss
+                    self._hold = self._hold if self._let_go else measured.copy()
+                    self._missed, self._let_go = not self._let_go, True
             else:
                 j = int(np.argmax(off))
                 told = f"{self._limits.names[j]} was moved from outside by {off[j]:.4f} rad"
@@ -451,7 +475,7 @@ class TrajectoryController:
         waited = now - goal.ended > allowed.goal_time
         if goal.stopping:
             if rest or waited:
-                self._missed = True
+                self._missed, self._let_go = True, False
                 if goal.error:
                     self._finish("aborted", goal.error, goal.reason, goal.source)
                 else:
@@ -460,7 +484,7 @@ class TrajectoryController:
             self._finish("succeeded")
         elif waited:
             what = f"{off[j]:.4f} rad off its goal (tolerance {allowed.goal:g})" if rest else "still moving"
-            self._missed = True
+            self._missed, self._let_go = True, False
             self._finish("aborted", "goal_tolerance", f"{name} is {what} {allowed.goal_time:g} s after the end")
 
     def _report(self, state: GoalState, error: str = "", message: str = "", source: str = "") -> MotionStatus:

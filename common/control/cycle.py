@@ -123,7 +123,6 @@ class ControlCycle:
         if not self._arm_fault.waits(now):
             try:
                 report.joints = self._control(header, now)
-                self._arm_fault.works(now)
             except HardwareFault as fault:
                 self._arm_fault.failed(str(fault), now)
                 self._arm.fault(str(fault))
@@ -156,7 +155,10 @@ class ControlCycle:
             self._arm.abort("hardware_fault", str(fault), "hardware")
             if self._gripper is not None:
                 self._gripper.fault(str(fault))
-        asked("sending set-points", self._hardware.write, *self._arm.update(now, self._q, dq), now)
+        set_points = self._arm.update(now, self._q, dq)
+        if set_points is not None:
+            asked("sending set-points", self._hardware.write, *set_points, now)
+            self._arm_fault.works(now)
         return self._joint_state(header, dq)
 
     def standing(self) -> Standing | None:

@@ -215,21 +215,77 @@ def test_arm_that_does_not_stay_where_it_is_held_is_left_alone():
         rig.step()
 
 
-def test_set_points_begin_where_and_as_fast_as_the_arm_is_found_in_motion():
+class Coasting(Pushed):
+    """An arm that goes on at its speed while nobody tells it anything."""
+
+    def __init__(self, start, speed):
+        super().__init__(start)
+        self._velocities, self.then = speed, None
+
+    def read(self, now):
+        if self.then is not None:
+            self._positions = self._positions + self._velocities * (now - self.then)
+        self.then = now
+        return super().read(now)
+
+    def write(self, positions, velocities, now):
+        self.then = None
+        super().write(positions, velocities, now)
+
+
+def test_arm_that_is_found_in_motion_is_braked_from_where_it_is():
     """As after a restart of the executor in the middle of a motion."""
+    speed = np.array([1.5, -0.4])
+    rig = Sampled(HARD, Coasting(START, speed))
+    rig.step()
+    assert len(rig.positions) == 1 and rig.accept("a", winding(0, 0.9)).error == "busy"
+    rig.pieces = [[speed * STEP * k for k in (-2, -1, 0, 1)]]
+    for _ in range(100):
+        rig.step()
+    assert not rig.velocities[-1].any() and np.all(np.abs(rig.q) < 0.3) and not rig.controller.news()
+    rig.assert_within(HARD)
+
+
+def test_arm_that_only_says_that_it_moves_is_held_where_it_is_read():
+    """As one that reports the speed which it was told last."""
     rig = Sampled(LIMITS)
     rig.accept("a", winding(0, 0.9))
     while rig.velocities[-1][0] < 1.0:
         rig.step()
-    again = Sampled(LIMITS, rig.hardware)
-    again.pieces = [rig.positions[-4:]]
-    again.now = rig.now
-    again.step()
-    assert again.accept("b", winding(0, 0.9)).error == "busy"
-    for _ in range(100):
-        again.step()
-    assert not again.velocities[-1].any() and 0 < again.q[0] - rig.positions[-1][0] < 0.2
-    again.assert_within(LIMITS)
+    for again in (Rig(LIMITS, rig.hardware), rig):
+        rig.controller.fault("cable is off")
+        where = rig.q
+        again.now += 1.0
+        for _ in range(5):
+            again.step()
+        assert np.array_equal(again.positions[-4:], [where] * 4)
+
+
+@pytest.mark.parametrize("amiss", [0.11, -0.3])
+def test_arm_that_reads_off_wherever_it_is_held_gets_no_jump_and_no_goal(amiss):
+    class Amiss(MockHardware):
+        by = 0.0
+
+        def read(self, now):
+            q, dq = super().read(now)
+            return q + self.by, dq
+
+    hardware = Amiss(START, None)
+    rig = Sampled(LIMITS, hardware)
+    rig.accept("a", winding(0, 0.9))
+    while rig.velocities[-1][0] < 1.0:
+        rig.step()
+    hardware.by = np.array([amiss, 0.0])
+    assert rig.until_over().error == "path_tolerance"
+    for _ in range(300):
+        rig.step()
+    assert np.array_equal(rig.positions[-1], rig.positions[-100])
+    rig.assert_within(HARD)
+    assert rig.accept("b", goal_at(rig.q, 1e-6)).error == "not_followed"
+    hardware.by = 0.0
+    for _ in range(3):
+        rig.step()
+    assert rig.accept("c", goal_at(rig.q, 1e-6)).state == "active"
 
 
 @pytest.mark.parametrize("seconds", [0.03, 0.4, 3.0])

@@ -26,7 +26,10 @@ class Rig:
     def step(self, seconds=STEP):
         self.now += seconds
         q, dq = self.hardware.read(self.now)
-        set_point, velocity = self.controller.update(self.now, q, dq)
+        set_points = self.controller.update(self.now, q, dq)
+        if set_points is None:
+            return self.controller.status
+        set_point, velocity = set_points
         self.hardware.write(set_point, velocity, self.now)
         self.positions.append(set_point)
         self.velocities.append(velocity)
