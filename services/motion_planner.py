@@ -17,6 +17,7 @@ from common.planning.points import PointObstacle
 from common.planning.problem import Cancel
 from common.planning.seeing import Camera, JointHistory, PointsOptions, Seeing, Seen
 from common.process.service import main
+from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 from common.transport.reader import Reader
@@ -51,7 +52,9 @@ async def run(bus: Bus, config: Config) -> None:
             if not request.start and current is None:
                 raise Refused("no_state", f"{request.stage or request.id}: the joint states are not known yet")
             see = None if eyes is None else eyes.look(scene, request.stage or request.id)
-            response = await _plan(pipeline, request, scene, None if current is None else current.tolist(), see)
+            width = None if state is None else measured_width(config.robot.gripper, state.name, state.position)
+            joints = None if current is None else current.tolist()
+            response = await _plan(pipeline, request, scene, joints, width, see)
         response.header = bus.header()
         if response.trajectory is not None:
             response.trajectory.header = bus.header()
@@ -122,6 +125,7 @@ async def _plan(
     request: PlanRequest,
     scene: PlanningScene,
     current: list[float] | None,
+    width: float | None,
     see: Callable[[], list[PointObstacle]] | None,
 ) -> PlanResponse:
     """Plan in a thread; when this is cancelled the planner is told and waited for: never two at once."""
@@ -129,7 +133,7 @@ async def _plan(
 
     def plan() -> PlanResponse:
         points = [] if see is None else see()
-        return pipeline.plan(request, scene, current, cancel, points)
+        return pipeline.plan(request, scene, current, cancel, points, width)
 
     planning = asyncio.create_task(asyncio.to_thread(plan))
     try:

@@ -137,7 +137,9 @@ class RobotConfig(Section):
     )
     tcp_link: str = Field("", description="link of the tool centre point; may be left out when `tcp` defines it")
     tcp: TcpConfig | None = Field(None, description="the tool centre point, when the URDF has no link for it")
-    locked_joints: dict[str, Number] = Field({}, description="joints outside the group and where planning holds them")
+    locked_joints: dict[str, Number] = Field(
+        {}, description="joints outside the group and where planning holds them; fingers while their width is not known"
+    )
     named_poses: dict[str, list[Number]] = Field(description="joint positions [rad]; must have home")
     velocity_limits: list[Annotated[float, Field(gt=0, le=100)]] = Field([], description="[rad/s]; else the URDF's")
     acceleration_limits: list[Annotated[float, Field(gt=0, le=1000)]] = Field(description="[rad/s^2]")

@@ -138,6 +138,7 @@ class Message(BaseModel):
 
     most_bytes: ClassVar[int] = 1024 * 1024  # of an encoded message; readers and the router take no more
     most_parts: ClassVar[int] = 32 * 1024  # lists and maps in it, all levels together: they cost most time to read
+    later: ClassVar[tuple[str, ...]] = ()  # fields that are sent only where they say something: others do not know them
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:

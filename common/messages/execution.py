@@ -134,6 +134,7 @@ class GripperCommand(Message):
     """
 
     most_bytes: ClassVar[int] = SMALL
+    later: ClassVar[tuple[str, ...]] = ("expected_width", "width_tolerance")
 
     id: Name
     width: Annotated[float, Field(ge=0, le=0.2)]
@@ -152,6 +153,7 @@ class GripperState(Message):
     """
 
     most_bytes: ClassVar[int] = SMALL
+    later: ClassVar[tuple[str, ...]] = ("outcome",)
 
     header: Header = Header()
     width: Finite = 0.0

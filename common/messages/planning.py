@@ -170,6 +170,9 @@ class PlanRequest(Message):
     release: bool = False
     contact_distance: Annotated[float, Field(ge=0, le=0.2)] = 0.02
     constraints: PathConstraints | None = Field(None, description="of the way, whoever plans it")
+    gripper_width: Annotated[float, Field(ge=0, le=0.2)] | None = Field(
+        None, description="between the fingers on the way, the widest where they move [m]; else as they stand now"
+    )
     velocity_scaling: Annotated[float, Field(ge=1e-4, le=1)] | None = None
     acceleration_scaling: Annotated[float, Field(ge=1e-4, le=1)] | None = None
     planning_time: Annotated[float, Field(gt=0, le=600)] | None = Field(None, description="wall time [s]")
@@ -179,10 +182,11 @@ class PlanRequest(Message):
 
     @model_serializer(mode="wrap")
     def _written(self, write: SerializerFunctionWrapHandler) -> Any:
-        """The fields; constraints only where there are some, so that who knows none of them can read the rest."""
+        """The fields; those that came later only where there are some, so that who knows none can read the rest."""
         fields: dict[str, Any] = write(self)
-        if self.constraints is None:
-            fields.pop("constraints", None)
+        for name in ("constraints", "gripper_width"):
+            if getattr(self, name) is None:
+                fields.pop(name, None)
         return fields
 
 

@@ -19,6 +19,8 @@ class CollisionObject(Message):
     prism has the convex hull of `outline` [m] as its cross-section and, as all shapes, its pose at half its length.
     """
 
+    later: ClassVar[tuple[str, ...]] = ("grip_effort",)
+
     id: Name
     role: Literal["fixture", "container", "target", "contained", "attached"]
     shape: Literal["box", "sphere", "cylinder", "prism"]

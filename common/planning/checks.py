@@ -71,6 +71,10 @@ def check_request(
         raise BadRequest("bad_scene", f"planning scene is in frame {frame!r}, not in world")
     if request.attach and request.release:
         raise BadRequest("bad_request", f"attach {request.attach!r} and release contradict each other")
+    gripper, width = robot.config.gripper, request.gripper_width
+    if width is not None and gripper is not None and width > gripper.max_width:
+        message = f"gripper_width {width:g} m is more than the fingers open ({gripper.max_width:g} m)"
+        raise BadRequest("bad_request", message)
     if request.start:
         start = _positions(robot, request.start, "start", "bad_start")
     elif current is None:

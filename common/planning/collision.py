@@ -77,6 +77,7 @@ class CollisionWorld:
         cache: ObstacleCache | None = None,
         constraints: ToolConstraints | None = None,
         points: Sequence[PointObstacle] = (),
+        width: float | None = None,
     ) -> None:
         """Set up the scene for a motion that begins at `start` (dof,) [rad].
 
@@ -94,6 +95,7 @@ class CollisionWorld:
             cache: built geometry to use again; the world made before with it must not be used any more.
             constraints: what the tool keeps to.
             points: what cameras saw and the scene does not have; kept away from as perceived objects are.
+            width: between the fingers [m], the widest where they move on the way; None: as the robot file holds them.
 
         Raises:
             UnknownName: `attach` is not in the scene.
@@ -110,6 +112,7 @@ class CollisionWorld:
         solids = [Solid.of(o) for o in environment]
         solids += [Solid.of(o, robot.model.frames[frame].parentJoint, frame) for o, frame, _ in held]
         self._bank = self.cache.bank(tuple(solids), len(points))
+        self._bank.open_fingers(width)
         self._bank.set_points([seen.spheres for seen in points])
         self._bank.place([pose_to_matrix(o.pose) for o in environment] + [pose for _, _, pose in held])
         self._names = [*self.cache.robot.links, *(o.id for o in objects), *(seen.name for seen in points)]

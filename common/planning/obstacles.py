@@ -198,6 +198,9 @@ class ObstacleBank:
         self._solids = solids
         self._kernel: KernelWorld | None = None
         self._kernel_tried = self._kernel_placed = False
+        self._width: float | None = None
+        self._fingers_placed = True  # in the kernel, which takes them as they are when it is made
+        self._levers = list(robot.levers)
         self.near = Rules(self)
         self.far = Rules(self)
         self.sunk = Rules(self)
@@ -221,6 +224,16 @@ class ObstacleBank:
         self._kernel_placed = False
         if moved:
             self._measure()
+
+    def open_fingers(self, width: float | None) -> None:
+        """Put the fingers' links where they are at a width [m]; None: where the robot file holds them."""
+        if width == self._width:
+            return
+        self._width, items = width, self.geometry.geometryObjects
+        for index, placement, lever in self._robot.opening(width):
+            items[index].placement, self._levers[index] = placement, lever
+        self._fingers_placed = self._kernel_placed = False
+        self._measure()
 
     def set_points(self, sets: Sequence[Array]) -> None:
         """Put spheres (N, 4), middle and radius [m] in the world, into each set of points, without a copy."""
@@ -282,6 +295,10 @@ class ObstacleBank:
                 return None
         if self._kernel is not None and not self._kernel_placed:
             items = self.geometry.geometryObjects
+            if not self._fingers_placed:
+                for index, placement, _ in self._robot.opening(self._width):
+                    self._kernel.place(index, placement.homogeneous)
+            self._fingers_placed = True
             for index in range(self.robot_count, self._points_from):
                 self._kernel.place(index, items[index].placement.homogeneous)
             if not self._points_placed:
@@ -302,7 +319,7 @@ class ObstacleBank:
         """Levers, and each pair's share: joints between two links alone move them towards each other."""
         items = self.geometry.geometryObjects
         held = [self._robot.lever(items[i]) for i in range(self.robot_count, len(items))]
-        levers = np.array([*self._robot.levers, *held])
+        levers = np.array([*self._levers, *held])
         self.lever = largest(list(levers))
         between = np.where((levers[self.first] > 0) & (levers[self.second] > 0), 0.0, 1.0)
         way = np.maximum(levers[self.first], levers[self.second]) * between

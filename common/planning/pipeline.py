@@ -73,6 +73,7 @@ class PlanningPipeline:
         current: ArrayLike | None = None,
         cancel: Cancel | None = None,
         points: Sequence[PointObstacle] = (),
+        width: float | None = None,
     ) -> PlanResponse:
         """A validated trajectory, or the error of the planner that got furthest; never raises for a bad request.
 
@@ -82,6 +83,7 @@ class PlanningPipeline:
             current: (dof,) [rad] where the robot is, used when the request has no start.
             cancel: set from another thread to end planning early.
             points: what cameras saw and the scene does not have.
+            width: between the fingers now [m], used when the request says none; None: as the robot file holds them.
         """
         began = monotonic()
         flag = cancel or Cancel()
@@ -91,7 +93,7 @@ class PlanningPipeline:
             state = None if current is None else np.asarray(current, dtype=float)
             checked = check_request(self.robot, request, scene, state, self._motion.start_tolerance)
             constraints = check_constraints(self.robot, request, checked)
-            world = self._world(request, scene, checked, constraints, points)
+            world = self._world(request, scene, checked, constraints, points, width)
             check_collisions(world, checked)
         except BadRequest as error:
             failure = Result(error=error.code, message=str(error), colliding=error.colliding)
@@ -135,10 +137,12 @@ class PlanningPipeline:
         """The robot's collision geometry."""
         return self._cache.robot
 
-    def world(self, request: PlanRequest, scene: PlanningScene, start: ArrayLike) -> CollisionWorld:
+    def world(
+        self, request: PlanRequest, scene: PlanningScene, start: ArrayLike, width: float | None = None
+    ) -> CollisionWorld:
         """The collision world of a request, apart from those that `plan` uses: to check a trajectory again."""
         geometry = ObstacleCache(self._cache.robot)
-        return self._make_world(request, scene, np.asarray(start, dtype=float), geometry)
+        return self._make_world(request, scene, np.asarray(start, dtype=float), geometry, width=width)
 
     def _chosen(self, request: PlanRequest) -> dict[str, tuple[Plan, Parameters]]:
         """The pipeline's planners; or the one that is asked for, with its default options if the pipeline lacks it."""
@@ -161,9 +165,10 @@ class PlanningPipeline:
         checked: CheckedRequest,
         constraints: ToolConstraints | None,
         points: Sequence[PointObstacle],
+        width: float | None,
     ) -> CollisionWorld:
         try:
-            return self._make_world(request, scene, checked.start, self._cache, constraints, points)
+            return self._make_world(request, scene, checked.start, self._cache, constraints, points, width)
         except UnknownName as error:
             raise BadRequest(f"unknown_{error.what}", str(error)) from None
         except BadShape as error:
@@ -177,6 +182,7 @@ class PlanningPipeline:
         cache: ObstacleCache,
         constraints: ToolConstraints | None = None,
         points: Sequence[PointObstacle] = (),
+        width: float | None = None,
     ) -> CollisionWorld:
         return CollisionWorld(
             self.robot,
@@ -191,6 +197,7 @@ class PlanningPipeline:
             cache=cache,
             constraints=constraints,
             points=points,
+            width=width if request.gripper_width is None else request.gripper_width,
         )
 
     def _problem(

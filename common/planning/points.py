@@ -40,12 +40,13 @@ class View:
     Attributes:
         name: of the obstacle that comes of it.
         points: (N, 3) [m] in the world; what is no number is no point.
-        q: (dof,) [rad] where the robot was.
+        q: (dof,) [rad] where the robot was; width: between its fingers [m], None as the robot file holds them.
     """
 
     name: str
     points: Array
     q: Array
+    width: float | None = None
 
 
 def thinned(points: Array, side: float, skip: Mask | None = None) -> Array:
@@ -136,14 +137,18 @@ class KnownShapes:
     def __init__(self, robot: RobotGeometry) -> None:
         self._cache = ObstacleCache(robot)  # apart from the planner's, whose banks belong to its worlds
 
-    def mask(self, scene: PlanningScene, q: Array, points: Array, *, margin: float, object_margin: float) -> Mask:
+    def mask(
+        self, scene: PlanningScene, q: Array, points: Array, *, margin: float, object_margin: float,
+        width: float | None = None,
+    ) -> Mask:
         """(N,) which of points (N, 3), world, are within a margin [m] of the robot at q, or of what it holds or avoids.
 
         Args:
             scene: objects where they are, and what is attached; both by `object_margin`.
-            q: (dof,) [rad]; margin: of the robot's own links.
+            q: (dof,) [rad]; margin: of the robot's own links; width: between its fingers [m].
         """
         bank = self._bank(scene)
+        bank.open_fingers(width)
         count = len(scene.objects) + len(scene.attached)
         margins = np.array([margin] * bank.robot_count + [object_margin] * count)
         return bank.near_shapes(q, margins, points)
@@ -163,13 +168,15 @@ class KnownShapes:
         self, view: View, scene: PlanningScene, *, side: float = 0.01, margin: float = 0.03, object_margin: float = 0.02
     ) -> PointObstacle:
         """The obstacle that a view shows: its points without those that are known, thinned to cubes of a side [m]."""
-        known = self.mask(scene, view.q, view.points, margin=margin, object_margin=object_margin)
+        known = self.mask(scene, view.q, view.points, margin=margin, object_margin=object_margin, width=view.width)
         return PointObstacle(view.name, thinned(view.points, side, known))
 
     def unknown(
-        self, name: str, spheres: Array, scene: PlanningScene, q: Array, *, margin: float, object_margin: float
+        self, name: str, spheres: Array, scene: PlanningScene, q: Array, *, margin: float, object_margin: float,
+        width: float | None = None,
     ) -> PointObstacle:
         """The obstacle of space that was not seen: spheres (N, 4) without those that reach into what is known."""
         reach = float(spheres[:, 3].max(initial=0.0))
-        known = self.mask(scene, q, spheres[:, :3], margin=margin + reach, object_margin=object_margin + reach)
+        known = self.mask(
+            scene, q, spheres[:, :3], margin=margin + reach, object_margin=object_margin + reach, width=width)
         return PointObstacle(name, spheres[~known])

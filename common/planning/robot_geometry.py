@@ -11,9 +11,12 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from common.planning.kernel.world import Shape
+from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
+
+_KEPT = 32  # openings of the fingers
 
 
 class RobotGeometry:
@@ -37,8 +40,11 @@ class RobotGeometry:
         if robot.srdf is not None:
             pin.removeCollisionPairs(robot.model, geometry, str(robot.srdf), False)
         self.geometry = geometry
+        self._full_data = robot.full_model.createData()
         self.links: list[str] = [robot.model.frames[item.parentFrame].name for item in geometry.geometryObjects]
         self.joints: list[int] = [item.parentJoint for item in geometry.geometryObjects]
+        self._fingers = self._moved_by_fingers(full)
+        self._openings: dict[float | None, list[tuple[int, pin.SE3, Array]]] = {}
         self._axes = _joint_axes(robot.model)
         self.levers = [self.lever(item) for item in geometry.geometryObjects]
 
@@ -50,6 +56,52 @@ class RobotGeometry:
             NoKernel: one is a shape that it does not know.
         """
         return [Shape.of(item.geometry) for item in self.geometry.geometryObjects]
+
+    def _moved_by_fingers(self, full: pin.GeometryModel) -> list[tuple[int, int, int, pin.SE3]]:
+        """Hulls that the fingers' joints move: index, joints of the full model that carry it with fingers locked and
+        not, and its placement in the latter."""
+        robot, gripper = self.robot, self.robot.config.gripper
+        joints = {robot.full_model.getJointId(name) for name in (gripper.joints if gripper else [])}
+        found = []
+        for index, (item, joint) in enumerate(zip(full.geometryObjects, self.joints, strict=True)):
+            if joints & set(robot.full_model.supports[item.parentJoint]):
+                carrier = robot.full_model.getJointId(robot.model.names[joint]) if joint else 0
+                found.append((index, carrier, item.parentJoint, item.placement.copy()))
+        return found
+
+    def finger_placements(self, width: float | None) -> list[tuple[int, pin.SE3]]:
+        """Index of each hull that the fingers move, and its placement in the joint that carries it, at a width [m].
+
+        None: where the robot file holds them.
+        """
+        if width is None:
+            return [(index, self.geometry.geometryObjects[index].placement) for index, *_ in self._fingers]
+        gripper, full = self.robot.config.gripper, self.robot.full_model
+        if gripper is None or not self._fingers:
+            return []
+        q = self.robot.full_reference.copy()
+        for name, position in zip(gripper.joints, finger_positions(gripper, width), strict=True):
+            q[full.joints[full.getJointId(name)].idx_q] = position
+        pin.forwardKinematics(full, self._full_data, q)
+        placed = self._full_data.oMi
+        return [
+            (index, placed[carrier].actInv(placed[joint]) * placement)
+            for index, carrier, joint, placement in self._fingers
+        ]
+
+    def opening(self, width: float | None) -> list[tuple[int, pin.SE3, Array]]:
+        """As `finger_placements`, each with its lever; those of the newest widths are kept."""
+        found = self._openings.get(width)
+        if found is None:
+            found = []
+            for index, placement in self.finger_placements(width):
+                item = self.geometry.geometryObjects[index]
+                moved = pin.GeometryObject(item.name, item.parentJoint, item.parentFrame, placement, item.geometry)
+                found.append((index, placement, self.lever(moved)))
+            if len(self._openings) >= _KEPT:
+                self._openings.pop(next(iter(self._openings)))
+            self._openings[width] = found
+        return found
 
     def lever(self, item: pin.GeometryObject) -> Array:
         """(dof,) [m]: while joint j turns by one radian no point of the shape moves farther than lever[j].

@@ -19,6 +19,7 @@ from common.perception.pinhole import CameraError, Pinhole
 from common.planning.obstacles import BadShape
 from common.planning.points import KnownShapes, PointObstacle, View, depth_points, unseen
 from common.planning.robot_geometry import RobotGeometry
+from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
 
@@ -130,7 +131,8 @@ class Seeing:
             if options.box is not None:
                 q = self._q(joints, latest, "unknown space")
                 spheres = unseen(pictures, np.array(options.box.low), np.array(options.box.high), options.unknown_voxel)
-                found.append(self._known.unknown("unknown space", spheres, scene, q, **margins))
+                width = joints.width(latest)
+                found.append(self._known.unknown("unknown space", spheres, scene, q, width=width, **margins))
         except BadShape as error:
             raise Refused("bad_scene", str(error)) from None
         return found
@@ -146,12 +148,12 @@ class Seeing:
         if age > self._options.max_age:
             raise Refused("old_points", f"{name}: the newest is {age:.2f} s old; points.max_age is "
                                         f"{self._options.max_age:g} s")
-        q = self._q(joints, picture.header.stamp, name)
+        q, width = self._q(joints, picture.header.stamp, name), joints.width(picture.header.stamp)
         try:
             T = frame_pose(picture.header.frame_id, poses, self._robot, q)
             if isinstance(picture, PointCloud2):
                 points = cloud_points(picture)
-                return View(f"points of {name}", points @ T[:3, :3].T + T[:3, 3], q), None
+                return View(f"points of {name}", points @ T[:3, :3].T + T[:3, 3], q, width), None
             if seen.info is None:
                 raise Refused("no_points", f"{seen.camera.info}: nothing came yet, so {name} cannot be measured")
             camera = Pinhole.from_info(seen.info, T)
@@ -162,7 +164,7 @@ class Seeing:
             coarse = Pinhole(
                 camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step, camera.width, camera.height, T
             )
-            return View(f"points of {name}", depth_points(depth[::step, ::step], coarse), q), (depth, camera)
+            return View(f"points of {name}", depth_points(depth[::step, ::step], coarse), q, width), (depth, camera)
         except (Unusable, CameraError) as error:
             raise Refused("bad_points", f"{name}: {error}") from None
         except ZencellError as error:
@@ -182,23 +184,31 @@ class JointHistory:
 
     def __init__(self, robot: RobotModel) -> None:
         self._robot = robot
-        self._states: deque[tuple[int, Array]] = deque(maxlen=_KEPT)
+        self._states: deque[tuple[int, Array, float | None]] = deque(maxlen=_KEPT)
 
     def note(self, state: JointState) -> None:
         """Take over joint states; those without all joints, or older than the newest, are left out."""
         q = self._robot.order(state.name, state.position)
         if q is not None and (not self._states or state.header.stamp > self._states[-1][0]):
-            self._states.append((state.header.stamp, q))
+            width = measured_width(self._robot.config.gripper, state.name, state.position)
+            self._states.append((state.header.stamp, q, width))
 
     def at(self, stamp: int) -> Array | None:
         """(dof,) [rad] at a time [ns], between the states before and after it; None when too far from any."""
-        states = list(self._states)
-        after = next((i for i, (at, _) in enumerate(states) if at >= stamp), len(states))
-        near = [state for state in states[max(after - 1, 0) : after + 1] if abs(state[0] - stamp) <= _BETWEEN * 1e9]
+        near = self._about(stamp)
         if len(near) < 2:
             return near[0][1] if near else None
-        (t0, q0), (t1, q1) = near
+        (t0, q0, _), (t1, q1, _) = near
         return np.asarray(q0 + (stamp - t0) / (t1 - t0) * (q1 - q0))
+
+    def width(self, stamp: int) -> float | None:
+        """Between the fingers at a time [ns], the wider of the states before and after it [m]; None when not known."""
+        return max((width for _, _, width in self._about(stamp) if width is not None), default=None)
+
+    def _about(self, stamp: int) -> list[tuple[int, Array, float | None]]:
+        states = list(self._states)
+        after = next((i for i, (at, _, _) in enumerate(states) if at >= stamp), len(states))
+        return [state for state in states[max(after - 1, 0) : after + 1] if abs(state[0] - stamp) <= _BETWEEN * 1e9]
 
 
 def frame_pose(frame: str, poses: TFMessage | None, robot: RobotModel, q: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,14 @@ def width_at(gripper: GripperConfig, position: float) -> float:
     if bars is None:
         return 2 * position
     return 2 * bars.length * (math.sin(bars.open_angle - position) - math.sin(bars.open_angle - bars.closed))
+
+
+def measured_width(gripper: GripperConfig | None, names: Sequence[str], positions: Sequence[float]) -> float | None:
+    """Width [m] that positions of named joints say; None where there are no fingers, or nothing is said of them."""
+    if gripper is None or not gripper.joints or gripper.joints[0] not in names:
+        return None
+    width = width_at(gripper, positions[list(names).index(gripper.joints[0])])
+    return min(max(width, 0.0), gripper.max_width)
 
 
 def finger_positions(gripper: GripperConfig, width: float) -> list[float]:

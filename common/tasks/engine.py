@@ -20,6 +20,7 @@ from common.tasks.stages import MISSES, Command, Execution, Grip, Look, Move, Re
 ANEW = ("busy", "stale_request", "clock_ahead", "stopped")  # refusals that have nothing to do with the motion
 START = ": start to go on"
 FOUND_HELD = "the robot was found held; resume or start to go on"
+FINGERS_OFF = 0.003  # [m] by which fingers may stand elsewhere than a motion was planned with
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 
 
@@ -204,12 +205,19 @@ class Task(Deciding[V]):
             return
         running = self.running.stage if self.running else None
         end = running.end() if isinstance(running, Move) else []
+        width = self._width(view)
+        if width is not None and isinstance(running, Grip):
+            width = running.width_after(width)
         for move in self.row:
+            if width is not None and isinstance(move, Grip):
+                width = move.width_after(width)
             if not isinstance(move, Move):
                 continue
             if move.trajectory is None:
-                move.planned_around = self.obstacles(move, view)
+                move.planned_around, move.planned_width = self.obstacles(move, view), width
                 request = self.request(move, end, view)
+                if request.gripper_width is None:
+                    request.gripper_width = width
                 self._planning = (move, request.id)
                 yield request
                 return
@@ -225,7 +233,9 @@ class Task(Deciding[V]):
             return
         if (isinstance(stage, Move) and not self._is_planned(stage)) or not self.may_begin(stage, view):
             return
-        if isinstance(stage, Move) and appeared(self.obstacles(stage, view), stage.planned_around, self.moved):
+        if isinstance(stage, Move) and (
+            appeared(self.obstacles(stage, view), stage.planned_around, self.moved) or self._fingers_differ(stage, view)
+        ):
             for later in self.row:
                 if isinstance(later, Move):
                     later.trajectory = None
@@ -233,6 +243,20 @@ class Task(Deciding[V]):
             yield from self._plan_ahead(view)
             return
         yield self._begin(stage, view)
+
+    def _width(self, view: V) -> float | None:
+        """Between the fingers now [m]; None without any."""
+        gripper = self.p.robot.gripper
+        if gripper is None or not gripper.joints or view.gripper is None:
+            return None
+        return min(max(view.gripper.width, 0.0), gripper.max_width)
+
+    def _fingers_differ(self, move: Move, view: V) -> bool:
+        """Whether the fingers stand elsewhere than planned; about what they hold they may be closer."""
+        width, planned = self._width(view), move.planned_width
+        if width is None or planned is None:
+            return False
+        return width > planned + FINGERS_OFF or (width < planned - FINGERS_OFF and not move.carries)
 
     def _begin(self, stage: Stage, view: V) -> Command:
         self.row.popleft()
@@ -242,10 +266,9 @@ class Task(Deciding[V]):
             command = m.ExecuteRequest(id=self.mint(), trajectory=stage.trajectory)
         else:
             assert isinstance(stage, Grip)
-            command = m.GripperCommand(
-                id=self.mint(), width=stage.width, expected_width=stage.expected_width,
-                width_tolerance=stage.width_tolerance, effort=stage.effort,
-            )
+            command = m.GripperCommand(id=self.mint(), width=stage.width, effort=stage.effort)
+            if stage.expected_width is not None:
+                command.expected_width, command.width_tolerance = stage.expected_width, stage.width_tolerance
         if stage.cycle is not None:
             stage.cycle.begun = True
         self.running = Execution(stage, command, view.now)

@@ -48,6 +48,7 @@ class Move(Stage):
     whole: bool = field(default=False, kw_only=True)  # begins only once all of its cycle is planned
     trajectory: m.JointTrajectory | None = field(default=None, init=False)
     planned_around: list[tuple[float, float]] = field(default_factory=list, init=False)  # (x, y) [m]
+    planned_width: float | None = field(default=None, init=False)  # between the fingers on the way [m]
 
     def end(self) -> list[float]:
         """Joint positions [rad] at its end; empty when it is not planned."""
@@ -72,6 +73,12 @@ class Grip(Stage):
     width_tolerance: float = field(default=0.01, kw_only=True)  # of expected_width [m]
     effort: float = field(default=0.0, kw_only=True)  # [N]; 0: the gripper's own default
     problem: str = field(default="the fingers closed on nothing", init=False)
+
+    def width_after(self, before: float) -> float:
+        """The most that the fingers may be apart at its end [m], from where they were before."""
+        if not self.holds:
+            return self.width
+        return before if self.expected_width is None else min(self.expected_width + self.width_tolerance, before)
 
 
 @dataclass(eq=False)

@@ -43,7 +43,11 @@ def _fields(value: object) -> dict[str, Any]:
     """The fields of a message, which msgpack asks for one after the other: half the time of a dump of the whole."""
     if not isinstance(value, Message):
         raise TypeError(f"a {type(value).__name__} cannot be sent")
-    return value.__dict__ if _is_plain(type(value)) else value.model_dump()
+    fields = value.__dict__ if _is_plain(type(value)) else value.model_dump()
+    if not value.later:
+        return fields
+    known = type(value).model_fields
+    return {name: own for name, own in fields.items() if name not in value.later or own != known[name].default}
 
 
 @lru_cache

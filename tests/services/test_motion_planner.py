@@ -90,6 +90,19 @@ async def test_request_is_answered_with_a_trajectory_that_is_also_displayed(plan
         assert (await planner.display.next()).points == response.trajectory.points
 
 
+async def test_plan_is_for_the_fingers_as_joint_states_tell_them(planner):
+    wall = CollisionObject(id="wall", role="fixture", shape="box", dimensions=[0.1, 0.04, 0.04],
+                           pose=Pose(position=Vector3(x=0.5, z=0.02)))
+    planner.scenes.put(scene(wall))
+    about = PlanRequest(id="1", goal=PoseGoal(pose=matrix_to_pose(tool_down(0.5, 0.0, 0.02))))
+    names = [*ROBOT.joint_names, "panda_finger_joint1", "panda_finger_joint2"]
+    planner.stand_at([*HOME, 0.04, 0.04], names)
+    assert (await planner.plan.call(about, timeout=30)).ok, "they are about the wall"
+    planner.stand_at([*HOME, 0.0, 0.0], names)
+    refused = await planner.plan.call(about, timeout=30)
+    assert not refused.ok and "finger" in refused.message
+
+
 async def test_request_without_a_scene_is_refused(planner):
     planner.stand_at(HOME)
     refusal = await planner.refusal(to_home(stage="homing", start=list(HOME)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, TypeVar
@@ -17,6 +17,7 @@ from common.messages import CollisionObject, GripperState, JointState, PlanningS
 from common.planning.collision import CollisionWorld, Pair, interpolate
 from common.planning.obstacles import ObstacleCache
 from common.planning.robot_geometry import RobotGeometry
+from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_pose
 from common.scene.fixtures import fixed_objects
@@ -81,7 +82,7 @@ class Recheck:
         self.cache = ObstacleCache(RobotGeometry(self.robot))
         self.around = Surroundings.model_validate(cell.section(Surroundings).model_dump())
         assert cell.robot.gripper is not None
-        self.gripper_links = cell.robot.gripper.links
+        self.gripper, self.gripper_links = cell.robot.gripper, cell.robot.gripper.links
         self.checked = 0  # positions so far
 
     def contacts(self, recording: Recording) -> list[Contact]:
@@ -103,7 +104,9 @@ class Recheck:
                 allowed = [
                     (link, w.ball) for w in windows if w.first <= begin and end <= w.last for link in self.gripper_links
                 ]
-                world = self._world(truth, path, stamps, first, allowed)
+                widths = [measured_width(self.gripper, state.name, state.position)
+                          for state in recording.joints[begin : end + 1]]
+                world = self._world(truth, path, stamps, first, allowed, _widest(widths))
                 for index, pair in self._touching(world, path[begin : end + 1]):
                     found.append(Contact((stamps[begin + index] - stamps[0]) * 1e-9, pair))
         return found
@@ -156,7 +159,8 @@ class Recheck:
                     yield _Window(name, first, last)
 
     def _world(
-        self, truth: PoseArray, path: Array, stamps: NDArray[np.int64], first: int, allowed: list[Pair]
+        self, truth: PoseArray, path: Array, stamps: NDArray[np.int64], first: int, allowed: list[Pair],
+        width: float | None,
     ) -> CollisionWorld:
         held = next((i for i, label in enumerate(truth.labels) if label == "held"), None)
         objects = fixed_objects(self.around)
@@ -176,7 +180,14 @@ class Recheck:
         return CollisionWorld(
             self.robot, PlanningScene(header=truth.header, objects=objects), start=path[first], padding=0.0,
             allowed=allowed, attach=truth.ids[held] if held is not None else "", attach_pose=grip, cache=self.cache,
+            width=width,
         )
+
+
+def _widest(widths: Sequence[float | None]) -> float | None:
+    """Of measured widths [m]; None where one is not known."""
+    known = [width for width in widths if width is not None]
+    return max(known) if known and len(known) == len(widths) else None
 
 
 def _resting(balls: PoseArray) -> tuple[object, ...]:

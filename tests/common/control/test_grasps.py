@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
+import msgpack
 import pytest
 from pydantic import ValidationError
 
@@ -11,7 +12,8 @@ from common.config import GripperConfig, load_cell
 from common.control.gripper_controller import GripperController
 from common.hardware.fingers import Fingers
 from common.hardware.interface import GripperReading
-from common.messages import GripperCommand, GripperState
+from common.messages import CollisionObject, GripperCommand, GripperState, Header, PlanningScene, Pose
+from common.transport.codec import decode, encode
 
 CONFIG = GripperConfig(joints=["left", "right"], links=[], max_effort=235.0)
 
@@ -162,3 +164,17 @@ def test_robot_file_says_how_hard_they_press():
     assert GripperConfig(joints=["a"], links=[], max_effort=3.0).effort == 3.0
     with pytest.raises(ValidationError, match=r"gripper\.effort is 9 N, more than max_effort 3 N"):
         GripperConfig(joints=["a"], links=[], max_effort=3.0, effort=9.0)
+
+
+def test_on_the_wire_only_what_says_something_is_new():
+    ball = {"id": "ball", "role": "target", "shape": "sphere", "dimensions": [0.03], "pose": Pose()}
+    plain = [GripperCommand(id="a", width=0.0), GripperState(), CollisionObject.model_validate(ball)]
+    new = {"expected_width", "width_tolerance", "outcome", "grip_effort"}
+    for message in plain:
+        assert not new & set(msgpack.unpackb(encode(message)))
+    says = [GripperCommand(id="a", width=0.0, expected_width=0.05, width_tolerance=0.01),
+            GripperState(outcome="empty"), CollisionObject.model_validate({**ball, "grip_effort": 2.0})]
+    for message in plain + says:
+        assert decode(type(message), encode(message)) == message
+    scene = PlanningScene(header=Header(), objects=[says[2]])
+    assert decode(PlanningScene, encode(scene)) == scene

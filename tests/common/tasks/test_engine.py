@@ -256,6 +256,30 @@ def test_patience_counts_from_when_a_reason_was_given_first() -> None:
     assert patience.lasts("b", 9.0) == 0.0
 
 
+def test_motions_are_planned_with_the_fingers_as_they_will_stand() -> None:
+    cell = Cell()
+    cell.gripper.width = 0.03
+    cell.until("close")
+    close = cell.task.running.stage
+    assert [(p.stage, p.gripper_width) for p in cell.plans()] == [("reach", 0.03), ("lift", 0.03)]
+    assert close.width_after(0.08) == 0.08, "what is held may be as wide"
+    close.expected_width = 0.05
+    assert close.width_after(0.08) == pytest.approx(0.06) and close.width_after(0.02) == 0.02
+    assert Grip("open", "", width=0.08).width_after(0.0) == 0.08
+    cell.finish()
+    cell.until("lift")
+    assert len(cell.plans()) == 2, "about what they hold they may be closer"
+
+
+def test_motion_is_planned_anew_when_the_fingers_stand_elsewhere() -> None:
+    cell = Cell()
+    cell.gripper.width = 0.03
+    cell.step()
+    cell.gripper.width = 0.06
+    cell.until("reach")
+    assert [p.gripper_width for p in cell.plans() if p.stage == "reach"] == [0.03, 0.06]
+
+
 def test_grasp_of_something_else_is_let_go_and_what_slips_is_told() -> None:
     cell = Cell()
     cell.until("close")
