@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
+import re
 import socket
 import subprocess
 import urllib.error
@@ -26,10 +27,12 @@ from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.errors import NoRouter
 from common.recording.reading import Recording
 from common.security.certificates import Authority
-from common.transport.codec import DEFAULT_LIMIT, decode, encode
+from common.topics import of_service
+from common.transport.codec import DEFAULT_LIMIT, decode, decode_attachment, encode
 from common.transport.connect import connect
 from common.transport.credentials import ROUTER_NAME, Credentials, credentials_of
 from common.transport.endpoint import MOST_BYTES, MOST_BYTES_BESIDES, client_config, router_config
+from common.transport.session import RawSample
 from common.viewer.access import ROLES, tokens_in
 from tests.harness import RunningCell, command_line, environment, until
 from tests.security.holders import REFUSED, Heard, Holder
@@ -60,11 +63,11 @@ class Secured:
     def environment(self) -> dict[str, str]:
         return {**environment(), "ZENCELL_SECURE": str(self.folder), "ZENCELL_DOMAIN": str(self.cell.domain)}
 
-    def tool(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """A command of zencell that is told of the certificates."""
+    def tool(self, *arguments: str, **told: str) -> subprocess.CompletedProcess[str]:
+        """A command of zencell that is told of the certificates, and of what else stands in its environment."""
         return subprocess.run(
-            command_line(*arguments), env=self.environment, cwd=self.cell.folder, capture_output=True, text=True,
-            timeout=60, check=False,
+            command_line(*arguments), env={**self.environment, **told}, cwd=self.cell.folder, capture_output=True,
+            text=True, timeout=60, check=False,
         )
 
 
@@ -252,6 +255,31 @@ def test_a_service_can_not_pass_for_another(secured: Secured) -> None:
         assert operator.ask("ur5/outline/select", b"\x80") == [MARK]
         assert {"panda/alive/evil", "panda/alive/camera_opencv"}.isdisjoint(there.keys)
         assert "panda/serves/motion/plan/camera_simulator" not in served.keys
+
+
+async def test_a_second_executor_with_the_same_certificate_is_refused_and_both_say_so(
+    secured: Secured, tmp_path: Path
+) -> None:
+    writers = set()
+
+    def take(sample: RawSample) -> None:
+        sent = decode_attachment(sample.attachment)
+        assert sent is not None
+        writers.add(sent.writer)
+
+    async with connect(cell="panda", service="watcher", endpoint=secured.cell.endpoint, timeout=120) as bus:
+        bus.raw_subscriber("panda/joint_states", take)
+        log = bus.reader(of_service(topics.LOG, "trajectory_executor"))
+        second = asyncio.create_task(asyncio.to_thread(  # with a record of its own: its name alone is taken
+            secured.tool, "service", "trajectory_executor", "--cell", "panda", ZENCELL_STATE=str(tmp_path)))
+        told = await until(log, lambda line: "another trajectory_executor" in line.message, 120)
+        refused = await second
+    assert re.search(r"another trajectory_executor \(process \w+\) claims \S+ too and gives way: this one was there "
+                     r"first", told.message)
+    assert refused.returncode == 2
+    assert re.search(r"services\.trajectory_executor: another trajectory_executor is up, which has \S+ already: end it "
+                     r"first, or start one$", refused.stderr.strip()), refused.stderr
+    assert len(writers) == 1
 
 
 @pytest.mark.parametrize("name", ["ur5.motion_planner", "ur5.supervisor"])
