@@ -138,6 +138,7 @@ class Invariants:
         self._last_word = ""  # of persons: what they told the task, or "stop" to the executor
         self._ended = False  # the arm was stopped or is held, as a person said last
         self._ended_at: float | None = None  # cell time of the first set-point since
+        self._ended_by: Life | None = None  # the process that was told so, which brakes first
         self._unasked = 0  # set-points that moved nevertheless
         self._by_persons: set[str] = set()  # goals
         self._cap = 1.0  # share of the velocity that a person allows
@@ -280,6 +281,10 @@ class Invariants:
         change = np.abs(dq - last[1])
         if self._broke((change <= 1.1 * limits.braking * max(passed, self._cycle / CYCLES) + 1e-3).all(), LIMITS):
             self._tell(LIMITS, f"velocity changes by {change.max():.3f} rad/s in {passed * 1e3:.1f} ms")
+        if self._cap_at is None:
+            self._cap_at = now
+        if self._ended and self._ended_at is None:
+            self._ended_at = now
         if way.max() <= STILL or passed > 2 * self._cycle:
             return
         goals = self._goals.get(self._motion)
@@ -290,16 +295,12 @@ class Invariants:
         self._restless = self._restless + 1 if resting else 0
         if self._broke(self._restless <= UNTOLD, HELD):
             self._tell(HELD, f"it moves {way.max():.4f} rad")
-        if self._cap_at is None:
-            self._cap_at = now
         if self._cap < 1 and now - self._cap_at >= AT_REST:
             too_fast = np.abs(dq) > fastest * self._cap + 1e-3
             if self._broke(not too_fast.any(), SLOW):
                 self._tell(SLOW, f"dq {np.round(dq, 3).tolist()} at {self._cap:.0%}")
-        if self._ended and self._ended_at is None:
-            self._ended_at = now
-        unasked = self._ended_at is not None and now - self._ended_at >= AT_REST
-        unasked = unasked and (goals is None or goals.active not in self._by_persons)
+        brakes = current_life() is self._ended_by and self._ended_at is not None and now - self._ended_at < AT_REST
+        unasked = self._ended and not brakes and (goals is None or goals.active not in self._by_persons)
         self._unasked = self._unasked + 1 if unasked else 0
         if self._broke(self._unasked <= UNTOLD, ASKED):
             self._tell(ASKED, f"it moves {way.max():.4f} rad for {goals.active if goals else 'nobody'}")
@@ -333,15 +334,15 @@ class Invariants:
     def _on_serve(self, life: str, request: Message, answer: Message) -> None:
         """Who asks for a goal again hears what became of it: what was accepted stays so, and what was refused too."""
         if isinstance(request, StopRequest) and request.id:
-            known = [getattr(answer, "id", ""), *(goals.active for goals in self._goals.values())]
-            if request.id not in known and (self._motion, request.id) not in self._over:
+            unknown = getattr(answer, "error", "") == "unknown_goal"
+            if unknown and (self._motion, request.id) not in self._over:
                 self._never.add(request.id)
         if isinstance(request, ParameterRequest):
             for speed in _speeds(request):
                 self._cap, self._cap_at = speed, None
         stop = isinstance(request, StopRequest) or (isinstance(request, HoldRequest) and request.hold)
         if stop and getattr(request, "by", "") == "person" and self._last_word in ENDS:
-            self._ended, self._ended_at = True, None
+            self._ended, self._ended_at, self._ended_by = True, None, current_life()
         if isinstance(request, GOALS) and isinstance(answer, MotionStatus | GripperState):
             accepted = answer.state != "rejected"
             before = self._told.setdefault((life, request.id), accepted)

@@ -46,6 +46,8 @@ LOOKS_ON = 3.0, 8.0  # [s] for which it rests then
 PERSON_TIMEOUT = 2.0  # [s] of a person's request
 SURE = 2.5  # [s] after which a person looks again: what was read may have been older than the stop
 PERSON_SLOW = 0.3  # [s] that a message takes to or from a person on average, at most
+START_LATE = 0.3, 1.0  # [s] by which a start comes late when somebody stops the robot meanwhile
+GOAL_LATE = 0.5, 1.8  # [s] by which the goal comes late that a person gives up: less than what is refused as too old
 PERSON_LATE = 1.0  # [s] at most between a person's stop and what is done next, in two places at once
 
 
@@ -73,13 +75,15 @@ class Misfortune:
         self._network = host.network
         self._random = np.random.default_rng([seed, 6])
         self._ends = np.random.default_rng([seed, 8])
+        self._late = np.random.default_rng([seed, 12])
 
     async def run(self) -> None:
         """Return when all has happened; cancelled, nothing more does."""
         loop, speed = self._host.loop, self._plan.speed
         began, persons = loop.time(), list[asyncio.Task[None]]()
         begins = {"person": self._begin_person, "ended": self._begin_ending, "slowed": self._begin_slowing,
-                  "second instance": self._begin_second, "hostile": self._begin_strange}
+                  "second instance": self._begin_second, "hostile": self._begin_strange,
+                  "stopped again": self._begin_stopping_again, "gave up": self._begin_giving_up}
         try:
             for fault in self._plan.faults:
                 await asyncio.sleep(max(0.0, began + fault.at / speed - loop.time()))
@@ -271,6 +275,67 @@ class Misfortune:
         context = context_of(Life(PERSON))
         session = self._network.attach(context, PERSON, 2000 + self.made["slowed"])
         return context.run(lambda: asyncio.create_task(self._slow_down(session, fault.seconds)))
+
+    def _begin_stopping_again(self, _fault: Fault) -> asyncio.Task[None]:
+        self._tell("FAULT stopped again: a person stops the robot while a start is on its way")
+        context = context_of(Life(PERSON))
+        session = self._network.attach(context, PERSON, 3000 + self.made["stopped again"])
+        return context.run(lambda: asyncio.create_task(self._stop_again(session)))
+
+    async def _stop_again(self, session: VirtualSession) -> None:
+        """Start the task; stop the robot while that is on its way; start it again some time later."""
+        host, random = self._host, self._late
+        bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
+        command, heard_of = bus.client(topics.TASK_COMMAND), bus.reader(topics.MOTION_STATUS)
+        seconds = float(random.uniform(*START_LATE))
+
+        async def start() -> None:
+            heard = heard_of.latest.newest if heard_of.latest else 0
+            with contextlib.suppress(RequestFailed):
+                await command.call(m.TaskCommand(command="start", heard=heard), PERSON_TIMEOUT)
+
+        try:
+            with contextlib.suppress(RequestFailed):
+                await command.wait_available(PERSON_TIMEOUT)
+            if (task := self._host.processes[host.cell.task].session) is not None:
+                self._network.hold_up(session, task, f"{host.cell.name}/{topics.TASK_COMMAND.key}", seconds)
+            starting = asyncio.create_task(start())
+            await asyncio.sleep(seconds * float(random.random()))
+            await persist(bus.client(topics.MOTION_STOP), m.StopRequest(owner=PAGE), PERSON_TIMEOUT,
+                          lambda error: m.MotionStatus(), lambda problem: None)
+            await starting
+            await asyncio.sleep(float(random.uniform(*LOOKS_ON)))
+            await self._start(bus, heard_of)
+        finally:
+            await bus.close()
+            self._network.detach(session)
+
+    def _begin_giving_up(self, _fault: Fault) -> asyncio.Task[None]:
+        self._tell("FAULT gave up: a person asks for a motion and gives up before that is heard")
+        context = context_of(Life(PERSON))
+        session = self._network.attach(context, PERSON, 4000 + self.made["gave up"])
+        return context.run(lambda: asyncio.create_task(self._give_up(session)))
+
+    async def _give_up(self, session: VirtualSession) -> None:
+        """Stop the task; send the arm home, which comes late; give that up; start the task."""
+        host, random = self._host, self._late
+        bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
+        heard_of, motion = bus.reader(topics.MOTION_STATUS), OperatorMotion(bus, [bus.reader(self._status)])
+        executor = next(entry.name for entry in host.cell.services.values() if entry.kind == EXECUTOR)
+        try:
+            await persist(bus.client(topics.TASK_COMMAND), m.TaskCommand(command="stop"), PERSON_TIMEOUT,
+                          lambda error: m.TaskStatus(), lambda problem: None)
+            seconds = float(random.uniform(*GOAL_LATE))
+            if (controller := host.processes[executor].session) is not None:
+                self._network.hold_up(session, controller, f"{host.cell.name}/{topics.MOTION_EXECUTE.key}", seconds)
+            with contextlib.suppress(MotionFailed, RequestFailed, TimeoutError):
+                async with asyncio.timeout(seconds * float(random.uniform(0.5, 1.0))):
+                    await motion.move(m.JointGoal(named="home"))
+            await asyncio.sleep(GOAL_LATE[1])
+            await self._start(bus, heard_of)
+        finally:
+            await bus.close()
+            self._network.detach(session)
 
     async def _slow_down(self, session: VirtualSession, seconds: float) -> None:
         """Set the speed, and set it back some time later."""

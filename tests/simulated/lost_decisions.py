@@ -57,8 +57,8 @@ DECISIONS = {
 }
 
 
-def found_in(name, bug, seeds):
-    """Seeds that told of the bug, and what the first told."""
+def found_in(name, bug, seeds, enough=None):
+    """Seeds that told of the bug, and what the first told; the search ends when there are enough."""
     application = load_cell(name).application
     cell, found, first = with_doubles(load_cell(name, settings_of(application))), [], ""
     for seed in seeds:
@@ -67,6 +67,8 @@ def found_in(name, bug, seeds):
         if not outcome.ok or outcome.crashes:
             found.append(seed)
             first = first or f"{outcome.state} {outcome.message}"
+            if len(found) == enough:
+                break
     return found, first
 
 

@@ -15,6 +15,7 @@ from common.virtual.faults import LAST, make_plan
 from common.virtual.simulation import Outcome, Simulation
 from tests.harness import until
 from tests.simulated.known_bugs import BUGS
+from tests.simulated.lost_decisions import DECISIONS, found_in
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
 
@@ -79,6 +80,13 @@ def test_doubles_stand_for_perception_and_planner_and_leave_task_and_executor_as
 
 def test_same_seed_is_the_same_run_with_doubles():
     assert outcome_of("panda", 2).digest == outcome_of("panda", 2).digest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bug", DECISIONS)
+def test_bug_about_what_persons_decided_is_found_within_some_tens_of_seeds(bug):
+    [seed], told = found_in("panda", bug, range(1, 101), enough=1)
+    assert told.startswith("BROKEN"), f"{seed}: {told}"
 
 
 def test_only_the_double_may_see_the_truth():

@@ -1,8 +1,10 @@
-"""What the invariants make of goals that are asked for again."""
+"""What the invariants make of goals that are asked for again, and of motion after a person's stop."""
 
+import numpy as np
 import pytest
 
 from common.config import load_cell
+from common.hardware.interface import Limits
 from common.messages import (
     ExecuteRequest,
     GripperCommand,
@@ -11,8 +13,12 @@ from common.messages import (
     JointTrajectory,
     MotionStatus,
     PlanRequest,
+    StopRequest,
 )
-from common.virtual.invariants import Invariants
+from common.transport.codec import encode
+from common.transport.session import RawSample
+from common.virtual.invariants import ASKED, NEVER, Invariants, _Goals
+from common.virtual.loop import Life, context_of
 from common.virtual.process import Requests
 
 MOTION = ExecuteRequest(id="a-1", trajectory=JointTrajectory(joint_names=["j"], points=[]))
@@ -55,3 +61,40 @@ def test_an_id_stands_for_one_thing(seen, other, holds):
     requests.on_ask("task", MOTION)
     requests.on_ask("task", other)
     assert (invariants.broken == []) == holds
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_goal_that_was_stopped_before_it_was_heard_of_never_moves(seen, known):
+    invariants, requests = seen
+    known_of = MotionStatus(id="a-1", state="active") if known else MotionStatus(id="a-1", error="unknown_goal")
+    requests.on_serve("executor 1", StopRequest(id="a-1", by="requester"), known_of)
+    moving = encode(MotionStatus(id="a-1", state="active"))
+    invariants.on_put("executor", "executor 1", RawSample("panda/motion/status", moving, "application/msgpack", b""))
+    assert invariants.broken == ([] if known else [f"1.000 s: {NEVER}: a-1"])
+
+
+@pytest.mark.parametrize(("begun_later", "seconds", "holds"), [
+    (False, 1.0, True), (False, 3.0, False), (True, 1.0, False),
+])
+def test_arm_that_a_person_stopped_brakes_and_rests_and_does_not_move_when_its_process_is_another(
+    seen, begun_later, seconds, holds
+):
+    invariants, requests = seen
+    limits = Limits(("j",), np.array([-3.0]), np.array([3.0]), np.array([1.0]), np.array([1.0]))
+    stop = StopRequest(owner="anna")
+    first = context_of(Life("executor"))
+    then = context_of(Life("executor")) if begun_later else first
+
+    def move(begin, count):
+        q = np.array([0.5])
+        for cycle in range(count):
+            q = q + 1e-4
+            invariants.on_set_point(limits, q, q, np.array([0.01]), begin + 0.01 * cycle)
+
+    requests.on_ask("person", stop)
+    first.run(requests.on_serve, "executor 1", stop, MotionStatus(id="a-1", state="active"))
+    invariants._goals["panda/motion/status"] = _Goals("a-1", "executor 1")
+    first.run(move, 0.0, 10)
+    invariants._last = None
+    then.run(move, seconds, 20)
+    assert any(ASKED in line for line in invariants.broken) != holds
