@@ -25,12 +25,14 @@ from common.control.inhibits import SOMEBODY, Inhibits, Speed, speed_of
 from common.control.record_file import record_file
 from common.control.requester import Alone, WhenAlone, objection
 from common.control.sole_use import sole_use
+from common.errors import Refused
 from common.hardware.interface import Limits
 from common.hardware.loading import find_backend, load_hardware
 from common.messages import (
     ExecuteRequest,
     GripperCommand,
     GripperState,
+    Header,
     HoldRequest,
     MotionStatus,
     StopRequest,
@@ -139,9 +141,14 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     views = find_application(application).views if simulated and application else {}
     called = [(bus.writer(topic), view) for topic, view in views.items()]  # the truth in the application's words
 
+    began = bus.clock.now_ns()
+
+    def too_late(header: Header) -> Refused | None:
+        age, uptime = (bus.clock.age_ms(stamp) * 1e-3 for stamp in (header.stamp, began))
+        return objection(age, config.request_timeout, config.clock_tolerance, uptime)
+
     async def execute(request: ExecuteRequest) -> MotionStatus:
-        age = bus.clock.age_ms(request.header.stamp) * 1e-3
-        late = objection(age, config.request_timeout, config.clock_tolerance)
+        late = too_late(request.header)
         judged = None
         if late is None and cycle.takes_long(request):  # set-points go on leaving meanwhile
             judged = await asyncio.to_thread(cycle.judge, request)
@@ -186,7 +193,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
             await decisions.keep()
 
     async def command(request: GripperCommand) -> GripperState:
-        return cycle.command(request, bus.clock.now()).model_copy(update={"header": bus.header()})
+        late = too_late(request.header) if request.header.stamp else None
+        return cycle.command(request, bus.clock.now(), late).model_copy(update={"header": bus.header()})
 
     async def edit(request: WorldEdit) -> WorldEditReply:
         if not world_changes.locked() and not cycle.edit_takes_long(request):

@@ -270,15 +270,15 @@ class ControlCycle:
     def speed_scaling(self, share: float) -> None:
         self._arm.speed_scaling = share
 
-    def command(self, request: GripperCommand, now: float) -> GripperState:
-        """The state of the gripper's goal.
+    def command(self, request: GripperCommand, now: float, late: Refused | None = None) -> GripperState:
+        """The state of the gripper's goal, unless it comes too `late`.
 
         Raises:
             Refused: this robot has no gripper.
         """
         if self._gripper is None:
             raise Refused("no_gripper", "this robot has no gripper")
-        objection = self._inhibits.objection(request.id) or self._hand_fault.objection
+        objection = self._inhibits.objection(request.id) or late or self._hand_fault.objection
         try:
             return self._gripper.command(request, now, objection)
         except HardwareFault as fault:

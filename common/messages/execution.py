@@ -130,12 +130,14 @@ class MotionStatus(Message):
 class GripperCommand(Message):
     """Move the fingers to a width [m]. The requester mints `id`; the same id never moves them twice.
 
-    With `expected_width` it is a grasp, which fails where what is held is wider or narrower, or nothing is.
+    With `expected_width` it is a grasp, which fails where what is held is wider or narrower, or nothing is. The header
+    says when it was decided: a command that comes too late is refused; one without a stamp never is.
     """
 
     most_bytes: ClassVar[int] = SMALL
     later: ClassVar[tuple[str, ...]] = ("expected_width", "width_tolerance")
 
+    header: Header = Header()
     id: Name
     width: Annotated[float, Field(ge=0, le=0.2)]
     effort: Annotated[float, Field(ge=0, le=1e4, description="grip force [N]; 0: the gripper's own default")] = 0.0

@@ -230,7 +230,7 @@ class TaskRunner(Generic[V]):
 
     def _begin(self, group: asyncio.TaskGroup, command: Command) -> None:
         """Send a command; what it makes void is not asked for again, should it still be without an answer."""
-        if isinstance(command, m.ExecuteRequest):
+        if isinstance(command, m.ExecuteRequest | m.GripperCommand):
             command.header = self._bus.header()  # of the decision, however often it is sent
         keeps = {keeping for keeping in self._keeping if not keeping.done()}
         lets_go = isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold

@@ -408,6 +408,22 @@ async def test_request_that_was_carried_out_is_not_again_when_it_is_replayed_lat
         assert (await person.execute.call(again)).error == "stale_request"
 
 
+async def test_what_was_decided_before_it_began_may_have_been_done_and_is_not_done_again(robot: RobotModel) -> None:
+    home = robot.named("home")
+    net, clock, name = LocalNetwork(), Clock(SPEED), "trajectory_executor"
+    async with running_service(net, trajectory_executor.run, config(), name=name, cell=CELL, clock=clock):
+        person = Person(net, clock)
+        there = person.asks(id="a", trajectory=move(robot, home, home + 0.2))
+        close = GripperCommand(header=person.bus.header(), id="b", width=0.02)
+    async with running_service(net, trajectory_executor.run, config(), name=name, cell=CELL, clock=clock):
+        again = Person(net, clock)
+        for answer in (await again.execute.call(there), await again.command.call(close)):
+            assert (answer.state, answer.error) == ("rejected", "stale_request") and "began" in answer.message
+        now = close.model_copy(update={"header": again.bus.header()})
+        assert (await again.command.call(now.model_copy(update={"id": "c"}))).state == "active"
+        assert (await again.command.call(GripperCommand(id="d", width=0.03))).state == "active", "nobody can know"
+
+
 async def alone(net: LocalNetwork, clock: Clock, given: object, robot: RobotModel) -> tuple[Person, object]:
     """A person who sees an arm in the middle of a motion, whose task is still there."""
     person, task = Person(net, clock), net.bus("smart_pick_place", cell=CELL, clock=clock)
