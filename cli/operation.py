@@ -33,7 +33,7 @@ T = TypeVar("T")
 START_REQUEST_TIMEOUT = 5.0  # [s]
 LAST_WORDS = 5.0  # [s] for whoever is slow to read what became of a run
 FIRST_WORD = 2.0  # [s] in which the executor of a cell that is up has said how the robot is
-EXECUTOR, OURSELVES = "trajectory_executor", ("watchdog", "controller")
+EXECUTOR, OURSELVES = "trajectory_executor", ("watchdog", "controller", "scene_monitor")
 
 
 class Disturbance(NamedTuple):

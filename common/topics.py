@@ -108,6 +108,7 @@ COUNTERS = Topic("counters/<service>", m.ServiceCounters, "state",
 MOTION_PLAN = Request("motion/plan", m.PlanRequest, m.PlanResponse, "plan a trajectory")
 MOTION_EXECUTE = Request("motion/execute", m.ExecuteRequest, m.MotionStatus,
                          "follow a trajectory; the result appears on motion/status")
+MOTION_FOLLOWED = Request("motion/followed", m.FollowedRequest, m.ExecuteRequest, "what the goal is that is followed")
 MOTION_STOP = Request("motion/stop", m.StopRequest, m.MotionStatus, "bring the robot to rest")
 MOTION_HOLD = Request("motion/hold", m.HoldRequest, m.MotionStatus, "pause the robot on its path, or let it go on")
 GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState,

@@ -1,26 +1,45 @@
-"""Answers motion/plan: trajectories that were checked against the planning scene. Plans one request at a time."""
+"""Answers motion/plan: trajectories that were checked against the planning scene. Plans one request at a time.
+
+It also watches the motion that runs, and holds the arm while the newest scene has something in its way.
+"""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, Literal
 
 from pydantic import Field
 
 from common import topics
 from common.config import Motion, Parameters, Pipeline, RobotConfig, Run
-from common.errors import Refused
-from common.messages import CameraInfo, Image, PlanningScene, PlanRequest, PlanResponse, PointCloud2
+from common.errors import Refused, RemoteError, RequestFailed
+from common.messages import (
+    CameraInfo,
+    FollowedRequest,
+    HoldRequest,
+    Image,
+    MotionStatus,
+    PlanningScene,
+    PlanRequest,
+    PlanResponse,
+    PointCloud2,
+)
 from common.planning.pipeline import PlanningPipeline
 from common.planning.points import PointObstacle
 from common.planning.problem import Cancel
 from common.planning.seeing import Camera, JointHistory, PointsOptions, Seeing, Seen
+from common.planning.watching import NotWatched, SceneMonitor
 from common.process.service import main
 from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 from common.transport.reader import Reader
+
+HOLDER: Literal["scene_monitor"] = "scene_monitor"
+REQUEST_TIMEOUT = 0.2  # [s] wall; it is asked again after that
+AGAIN_AFTER = 0.05  # [s] wall
 
 
 class Config(Parameters):
@@ -30,6 +49,8 @@ class Config(Parameters):
     motion: Motion
     pipeline: Pipeline
     run: Run
+    watch: bool = Field(True, description="hold the arm while something in the newest planning scene is in the way of "
+                                          "the motion that runs; one planner of a cell does so")
     points: PointsOptions | None = Field(None, description="cameras whose points are obstacles")
 
 
@@ -39,6 +60,7 @@ async def run(bus: Bus, config: Config) -> None:
     states = bus.reader(topics.JOINT_STATES)
     display = bus.writer(topics.DISPLAY_TRAJECTORY)
     eyes = None if config.points is None else Eyes(bus, config.points)
+    watcher = Watcher(bus, scenes) if config.watch else None
     one_at_a_time = asyncio.Lock()
     loaded: list[PlanningPipeline] = []
 
@@ -58,6 +80,8 @@ async def run(bus: Bus, config: Config) -> None:
         response.header = bus.header()
         if response.trajectory is not None:
             response.trajectory.header = bus.header()
+            if watcher is not None:
+                watcher.monitor.note(request, scene, response.trajectory, width)
             display.put(response.trajectory)
         else:
             bus.log.warning("%s [%s]", response.message, response.error)
@@ -67,12 +91,90 @@ async def run(bus: Bus, config: Config) -> None:
     loaded.append(await asyncio.to_thread(_load, config))
     if eyes is not None:
         await asyncio.to_thread(eyes.load, loaded[0])
+    if watcher is not None:
+        watcher.loaded.append(await asyncio.to_thread(SceneMonitor, config.robot, config.motion.object_padding))
     await bus.ready()
-    await (asyncio.Event().wait() if eyes is None else eyes.follow())
+    async with asyncio.TaskGroup() as group:
+        group.create_task(asyncio.Event().wait() if eyes is None else eyes.follow())
+        if watcher is not None:
+            group.create_task(watcher.run())
 
 
 def _load(config: Config) -> PlanningPipeline:
     return PlanningPipeline(RobotModel.load(config.robot), config.motion, config.pipeline, seed=config.run.seed)
+
+
+class Watcher:
+    """Judges the motion that runs on every scene message, and has the arm held while something is in its way.
+
+    It computes on the loop, for a millisecond where something has moved: planning goes on in threads.
+    """
+
+    def __init__(self, bus: Bus, scenes: Reader[PlanningScene]) -> None:
+        self._bus, self._scenes, self._motion = bus, scenes, bus.reader(topics.MOTION_STATUS)
+        self._hold, self._followed = bus.client(topics.MOTION_HOLD), bus.client(topics.MOTION_FOLLOWED)
+        self._woken = asyncio.Event()
+        self._answer: MotionStatus | None = None  # to the newest hold
+        self.loaded: list[SceneMonitor] = []
+
+    @property
+    def monitor(self) -> SceneMonitor:
+        """What judges."""
+        return self.loaded[0]
+
+    async def run(self) -> None:
+        """Watch until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            for reader in (self._scenes, self._motion):
+                group.create_task(self._wake_on(reader))
+            while True:
+                await self._woken.wait()
+                self._woken.clear()
+                try:
+                    await self._look()
+                except NotWatched as error:
+                    self._bus.log.warning("the motion that runs is not watched: %s", error)
+                except RequestFailed as error:
+                    self._bus.log.warning("%s", error)
+                    group.create_task(self._look_again())
+
+    async def _wake_on(self, reader: Reader[Any]) -> None:
+        async for _ in reader:
+            self._woken.set()
+
+    async def _look_again(self) -> None:
+        await asyncio.sleep(AGAIN_AFTER)
+        self._woken.set()
+
+    async def _look(self) -> None:
+        status, scene = self._motion.latest, self._scenes.latest
+        if status is not None and self._answer is not None and self._answer.header.stamp > status.header.stamp:
+            status = self._answer
+        if status is None or scene is None or status.state != "active":
+            self.monitor.forget()
+            return
+        if status.id != self.monitor.goal:
+            await self._follow(status)
+        problem, held = self.monitor.in_the_way(scene, status.progress), HOLDER in status.held_by
+        if bool(problem) == held:
+            return
+        request = HoldRequest(hold=bool(problem), reason=problem, by=HOLDER, goal=status.id)
+        self._answer = await self._hold.call(request, REQUEST_TIMEOUT)
+        if problem:
+            self._bus.log.warning("the arm is held: %s", problem)
+        else:
+            self._bus.log.info("the arm goes on: nothing is in its way any more")
+
+    async def _follow(self, status: MotionStatus) -> None:
+        if self.monitor.knows(status.plan):
+            self.monitor.follow(status.id, status.plan)
+            return
+        try:
+            asked = await self._followed.call(FollowedRequest(id=status.id), REQUEST_TIMEOUT)
+        except RemoteError as error:  # it is over by now
+            self.monitor.forget(status.id)
+            raise NotWatched(str(error)) from None
+        self.monitor.follow(status.id, asked.plan, asked.trajectory)
 
 
 class Eyes:

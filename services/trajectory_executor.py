@@ -30,6 +30,7 @@ from common.hardware.interface import Limits
 from common.hardware.loading import find_backend, load_hardware
 from common.messages import (
     ExecuteRequest,
+    FollowedRequest,
     GripperCommand,
     GripperState,
     Header,
@@ -192,6 +193,9 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
             inhibits.speed = Speed(scaling=config.speed_scaling, configured=configured)
             await decisions.keep()
 
+    async def followed(request: FollowedRequest) -> ExecuteRequest:
+        return cycle.followed(request.id)
+
     async def command(request: GripperCommand) -> GripperState:
         late = too_late(request.header) if request.header.stamp else None
         return cycle.command(request, bus.clock.now(), late).model_copy(update={"header": bus.header()})
@@ -225,6 +229,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
 
     bus.keep_parameters = keep_speed
     bus.serve(topics.MOTION_EXECUTE, execute)
+    bus.serve(topics.MOTION_FOLLOWED, followed)
     bus.serve(topics.MOTION_STOP, stop)
     bus.serve(topics.MOTION_HOLD, hold)
     if gripper is not None:

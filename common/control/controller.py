@@ -59,6 +59,8 @@ class _Goal:
     reason: str = ""
     error: str = ""  # why it is stopped, where nobody asked for it
     source: str = ""
+    plan: str = ""  # id of the plan request that it answers
+    scene_stamp: int = 0  # of the planning scene that it was planned on
     ended: float | None = None  # cell time at which the set-points came to rest
 
     @property
@@ -196,7 +198,7 @@ class TrajectoryController:
 
     def accept(
         self, goal: str, trajectory: JointTrajectory, now: float, measured: Vector, objection: Refused | None = None,
-        judged: Judged | None = None,
+        judged: Judged | None = None, plan: str = "", scene_stamp: int = 0,
     ) -> MotionStatus:
         """The state of the goal: active, or rejected with code and message; for a known id what became of it.
 
@@ -207,6 +209,8 @@ class TrajectoryController:
             measured: where the robot is, (dof,) [rad].
             objection: what speaks against a new goal from the start.
             judged: what `judge` found out about the trajectory before.
+            plan: id of the plan request that it answers, and
+            scene_stamp: when the scene was seen that it was planned on [ns]: reports tell of both.
         """
         known = self._memory.get(goal)
         if known is not None:
@@ -233,6 +237,7 @@ class TrajectoryController:
                 assert judged.refusal is not None
                 raise judged.refusal
             taken = self._taken(goal, judged, begin, now)
+            taken.plan, taken.scene_stamp = plan, scene_stamp
         except Refused as refusal:
             rejected = MotionStatus(
                 id=goal, state="rejected", error=refusal.code, message=str(refusal), source=self._name
@@ -491,7 +496,8 @@ class TrajectoryController:
         assert self._goal is not None
         progress = 1.0 if state == "succeeded" else self._goal.progress
         self._status = MotionStatus(
-            id=self._goal.id, state=state, progress=progress, error=error, message=message, source=source or self._name
+            id=self._goal.id, state=state, progress=progress, error=error, message=message, source=source or self._name,
+            plan=self._goal.plan, scene_stamp=self._goal.scene_stamp,
         )
         return self._as_of_now(self._memory.put(self._goal.id, self._status))
 

@@ -113,6 +113,8 @@ class ControlCycle:
         self.apart = False  # the world is changed by somebody else, and stands still here
         self._kept: object = None
         self._waits = False  # held by ourselves
+        self._followed: ExecuteRequest | None = None  # the newest goal that was accepted
+        self._held_goal = ""  # that the scene monitor holds
         self._inhibits = inhibits or Inhibits()
         self.tell_inhibits()
 
@@ -127,6 +129,8 @@ class ControlCycle:
                 self._arm_fault.failed(str(fault), now)
                 self._arm.fault(str(fault))
         report.notes = [*filter(None, (self._arm_fault.news(), self._hand_fault.news(), self._arm.news()))]
+        if self._held_goal and self._held_goal != self._arm.goal:  # nothing is in the way of what is over
+            self.hold(HoldRequest(hold=False, by="scene_monitor"))
         report.motion = self._news_of_motion(header, now)
         report.gripper = self._news_of_gripper(header, now)
         if self._world is not None and not self.apart:
@@ -205,7 +209,23 @@ class ControlCycle:
         fault = self._hand_fault.objection
         if fault is None and not self._found and not self._arm_fault.reason:
             fault = Refused("hardware_fault", "nobody knows yet where the arm is")
-        return self._arm.accept(request.id, request.trajectory, now, self._q, inhibited or objection or fault, judged)
+        status = self._arm.accept(
+            request.id, request.trajectory, now, self._q, inhibited or objection or fault, judged, request.plan,
+            request.scene_stamp,
+        )
+        if request.id == self._arm.goal and (self._followed is None or self._followed.id != request.id):
+            self._followed = request
+        return status
+
+    def followed(self, goal: str) -> ExecuteRequest:
+        """What was asked for with the goal that is followed.
+
+        Raises:
+            Refused: it is not that one.
+        """
+        if self._followed is None or not goal == self._followed.id == self._arm.goal:
+            raise Refused("unknown_goal", f"goal {goal!r} is not followed now")
+        return self._followed
 
     def stop(self, request: StopRequest, now: float) -> MotionStatus:
         """The state of the goal, which is being brought to rest if it was moving the robot.
@@ -231,7 +251,11 @@ class ControlCycle:
 
         The arm is being brought to rest on its path, or goes on when nobody holds it; the fingers finish their motion.
         """
+        if request.by != "person" and request.hold and request.goal not in ("", self._arm.goal):
+            return self._arm.status, []  # that one is over
         let_go = self._inhibits.hold(request)
+        if request.by == "scene_monitor":
+            self._held_goal = request.goal if request.hold else ""
         if request.by != "person":
             self._arm.hold(request.hold, request.reason, request.by)
         self.tell_inhibits()

@@ -12,6 +12,7 @@ from common.messages.basics import SCHEMA_VERSION, Finite, Fraction, Header, Mes
 from common.messages.camera import CameraInfo, Image, Marker, MarkerArray, PointCloud2, Rejection, Rejections
 from common.messages.execution import (
     ExecuteRequest,
+    FollowedRequest,
     GoalState,
     GripperCommand,
     GripperState,

@@ -12,7 +12,7 @@ from common.messages.robot import TRAJECTORY_BYTES, JointTrajectory
 
 GoalState = Literal["none", "rejected", "active", "succeeded", "aborted", "cancelled"]
 GripOutcome = Literal["", "grasped", "too_wide", "too_narrow", "empty", "slipping"]
-Holder = Literal["person", "watchdog", "controller"]
+Holder = Literal["person", "watchdog", "controller", "scene_monitor"]
 Who = Label
 Since = Annotated[int, Field(ge=0, le=MOST_STAMP)]
 MOST_INHIBITS = 32  # that are told of
@@ -27,6 +27,7 @@ class ExecuteRequest(Message):
 
     most_bytes: ClassVar[int] = TRAJECTORY_BYTES + SMALL
     most_parts: ClassVar[int] = 128 * 1024
+    later: ClassVar[tuple[str, ...]] = ("plan", "scene_stamp")
 
     header: Header = Header()
     id: Name
@@ -34,6 +35,16 @@ class ExecuteRequest(Message):
     owner: Who = Field("", description="the person who asks for it, whom a stop of their own does not keep from moving "
                                        "the robot; empty for a task")
     heard: Since | None = Field(None, description="`since` of the newest inhibit that this person had heard of")
+    plan: Label = Field("", description="id of the plan request that was answered with it")
+    scene_stamp: Since = Field(0, description="of the planning scene that it was planned on; 0: not known")
+
+
+class FollowedRequest(Message):
+    """Ask for the trajectory of the goal that is followed now."""
+
+    most_bytes: ClassVar[int] = SMALL
+
+    id: Name
 
 
 class StopRequest(Message):
@@ -58,12 +69,15 @@ class HoldRequest(Message):
     """
 
     most_bytes: ClassVar[int] = SMALL
+    later: ClassVar[tuple[str, ...]] = ("goal",)
 
     hold: bool
     reason: Text = ""
-    by: Literal["person", "watchdog"] = Field(
+    by: Literal["person", "watchdog", "scene_monitor"] = Field(
         "person", description="each lets go only of its own hold; the robot moves when nobody holds it"
     )
+    goal: Label = Field("", description="hold only while this goal is followed; empty: until it is let go. Not for "
+                                        "persons")
     owner: Who = Field("", description="name of the person: holds of others stay")
     stops: bool = Field(False, description="lets go of stops too, whoever said so: a person starts the task")
     override: bool = Field(False, description="lets go of all that any person said; is logged")
@@ -76,7 +90,7 @@ class Inhibit(Message):
     """Why the robot does not move: it was stopped, and no motion begins, or is held on its path."""
 
     kind: Literal["stopped", "held"]
-    by: Who = Field(description="name of a person; watchdog; controller")
+    by: Who = Field(description="name of a person; watchdog; controller; scene_monitor")
     reason: Remark = ""
     since: Since = Field(description="when that was said last [ns since the Unix epoch], later than all before it")
 
@@ -92,6 +106,7 @@ class MotionStatus(Message):
 
     most_bytes: ClassVar[int] = 4 * SMALL  # with all that keeps the robot from moving
     most_parts: ClassVar[int] = 256
+    later: ClassVar[tuple[str, ...]] = ("plan", "scene_stamp")
 
     header: Header = Header()
     id: Label = ""
@@ -105,6 +120,8 @@ class MotionStatus(Message):
     speed_scaling: Fraction = Field(1.0, description="trajectories are followed at this share of their speed")
     inhibits: Annotated[list[Inhibit], Field(max_length=MOST_INHIBITS)] = Field(
         [], description="who stopped or holds the robot")
+    plan: Label = Field("", description="id of the plan request that the goal answers, where it was told")
+    scene_stamp: Since = Field(0, description="of the planning scene that it was planned on; 0: not known")
 
     @property
     def stopped(self) -> str:
@@ -123,7 +140,7 @@ class MotionStatus(Message):
 
     @property
     def paused(self) -> bool:
-        """Whether somebody has to let go of the robot: watchdog and controller do so by themselves."""
+        """Whether somebody has to let go of the robot: all but persons do so by themselves."""
         return self.held and (not self.held_by or "person" in self.held_by)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from common.messages.basics import SMALL, Count, Finite, Fraction, Header, Label, Message, Name, Text
+from common.messages.basics import MOST_STAMP, SMALL, Count, Finite, Fraction, Header, Label, Message, Name, Text
 from common.messages.geometry import Pose, Vector3
 from common.messages.robot import TRAJECTORY_BYTES, Joints, JointTrajectory
 from common.messages.scene import Pairs
@@ -207,6 +207,7 @@ class PlanResponse(Message):
 
     most_bytes: ClassVar[int] = TRAJECTORY_BYTES + 64 * SMALL  # with all that was tried
     most_parts: ClassVar[int] = 128 * 1024
+    later: ClassVar[tuple[str, ...]] = ("scene_stamp",)
 
     header: Header = Header()
     id: Name
@@ -215,6 +216,8 @@ class PlanResponse(Message):
     planner: Label = ""
     goal_index: Count = Field(0, description="which goal of a set is reached, from 0")
     seconds: Finite = Field(0.0, description="wall time [s] of the whole request")
+    scene_stamp: Annotated[int, Field(ge=0, le=MOST_STAMP)] = Field(
+        0, description="of the planning scene that it was planned on; 0: not known")
     fraction: Finite = 0.0
     error: Label = Field("", description="code: start_in_collision, no_ik, collision, incomplete, timeout, ...")
     message: Text = Field("", description="one line naming stage, planner, waypoint and colliding pair")

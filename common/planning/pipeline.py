@@ -121,6 +121,7 @@ class PlanningPipeline:
                     trajectory=message,
                     planner=name,
                     seconds=monotonic() - began,
+                    scene_stamp=scene.header.stamp,
                     goal_index=_reached(problem, trajectory.positions[-1]),
                     fraction=result.fraction,
                     attempts=attempts,

@@ -28,7 +28,7 @@ REQUEST_TIMEOUT = 2.0  # [s] wall
 PATIENCE = 10.0  # [s] wall without progress, unless the robot is held
 FIRST_WORD = 0.5  # [s] wall in which a state that there is has arrived
 COME_TO_REST = 1.0  # [s] wall: for a motion that is being stopped
-SOMEBODY, OURSELVES = "person", ("watchdog", "controller")  # who gave no name; who lets go by itself
+SOMEBODY, OURSELVES = "person", ("watchdog", "controller", "scene_monitor")  # who gave no name; who lets go by itself
 AT_REST = ("IDLE", "DONE", "ERROR")  # states in which a task does not move the robot
 
 A = TypeVar("A", bound=m.Message)
@@ -104,19 +104,22 @@ class OperatorMotion:
         response = await self.plan(goal, planner=planner, straight=straight)
         if not response.ok or response.trajectory is None:
             raise MotionFailed(response.error, response.message)
-        return await self._follow(response.trajectory, timeout, before.newest)
+        return await self._follow(response.trajectory, timeout, before.newest, response)
 
     async def follow(self, trajectory: m.JointTrajectory, *, timeout: float = PATIENCE) -> m.MotionStatus:
         """The last status of following a trajectory that was planned before; as `move` otherwise."""
         return await self._follow(trajectory, timeout, (await self._require_free()).newest)
 
-    async def _follow(self, trajectory: m.JointTrajectory, timeout: float, heard: int) -> m.MotionStatus:
+    async def _follow(
+        self, trajectory: m.JointTrajectory, timeout: float, heard: int, plan: m.PlanResponse | None = None
+    ) -> m.MotionStatus:
         """As `follow`; what was said later than `heard`, when the motion was asked for, keeps the robot."""
         if (await self._require_free()).held:  # with nothing under way, letting go moves nothing, nor does it later
             await self._hold.call(m.HoldRequest(hold=False, reason="a person moves the robot", owner=self._owner(),
                                                 into_stop=True, heard=heard), REQUEST_TIMEOUT)
         request = m.ExecuteRequest(
-            header=self._bus.header(), id=_mint(), trajectory=trajectory, owner=self._owner(), heard=heard)
+            header=self._bus.header(), id=_mint(), trajectory=trajectory, owner=self._owner(), heard=heard,
+            plan=plan.id if plan else "", scene_stamp=plan.scene_stamp if plan else 0)
         try:
             answer = await self._execute.call(request, REQUEST_TIMEOUT)
             if answer.state == "rejected":

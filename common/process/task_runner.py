@@ -33,7 +33,7 @@ REFUSED_AGAIN = 0.1  # [s] wall: what is told of the second refusal of a motion 
 LONGEST_REFUSED = 2.0  # [s] wall
 LONGEST_STEP = LOOK_PERIOD  # [s] wall: time passes too
 WAITS = "the arm waits: "
-SOMEBODY = ("", "person", "watchdog", "controller")  # whose holds are nobody's own
+SOMEBODY = ("", "person", "watchdog", "controller", "scene_monitor")  # whose holds are nobody's own
 
 LETS_GO = "lets go"  # of what a person said
 

@@ -40,6 +40,9 @@ class TaskConfig(Parameters):
     joint_states_timeout: Tunable[float] = Field(
         0.2, ge=0.05, le=60, description="without joint states for so long the arm is held on its path [s, wall time]"
     )
+    obstacle_patience: Tunable[float] = Field(
+        1.0, ge=0, le=3600, description="what is in the way of a motion for longer has it planned anew [s]"
+    )
 
 
 class Deciding(Generic[V]):
@@ -65,6 +68,7 @@ class Deciding(Generic[V]):
         self.look_after = 0.0  # only a picture that is later decides [s]
         self._frames = FrameAge(speed)
         self._planning: tuple[Move, str] | None = None
+        self._in_the_way = Patience()
         self._stopping = False
         self._found = False  # whether the robot was looked at, or a person has said what to do
         self._began: float | None = None
@@ -115,6 +119,10 @@ class Deciding(Generic[V]):
     def displaced(self, stage: Stage, view: V, problem: str) -> None:
         """The robot is not where the plan began: by hand, or by a controller that has forgotten how it got there."""
         self.fail(problem, view, go_home=False)  # all it needs is a new plan
+
+    def obstructed(self, stage: Stage, view: V, problem: str) -> None:
+        """Something came in the way of a motion and stays there: what is held is brought on around it."""
+        self.fail(problem, view, go_home=not view.holding)
 
     def plan_failed(self, move: Move, response: m.PlanResponse, view: V) -> None:
         """There is no way: free the arm from what it stands against, or go home and decide anew."""

@@ -19,6 +19,7 @@ from common.tasks.stages import MISSES, Command, Execution, Grip, Look, Move, Re
 
 ANEW = ("busy", "stale_request", "clock_ahead", "stopped")  # refusals that have nothing to do with the motion
 START = ": start to go on"
+BLOCKED_BY = "scene_monitor"  # holds the arm while something is in the way
 FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] by which fingers may stand elsewhere than a motion was planned with
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
@@ -63,7 +64,7 @@ class Task(Deciding[V]):
         self._note_plan(response)
         self.planned(move, response)
         if response.ok and response.trajectory is not None:
-            move.trajectory = response.trajectory
+            move.trajectory, move.plan, move.scene_stamp = response.trajectory, response.id, response.scene_stamp
         else:
             self.plan_failed(move, response, view)
 
@@ -165,9 +166,23 @@ class Task(Deciding[V]):
             stop = self.stop(view, "it takes too long")
             self.fail(f"{stage.name} took longer than {round(limit, 2):g} s", view)
             return stop
+        elif blocked := self._blocked(view):
+            stop = self.stop(view, blocked)
+            self.obstructed(stage, view, f"{stage.name}: {blocked}")
+            return stop
         elif stage.carries and view.gripper.outcome == "slipping":  # it may still arrive
             self.status.message = f"{stage.name}: {view.gripper.message}"
         return []
+
+    def _blocked(self, view: V) -> str:
+        """What stays in the way of the motion that runs; empty while nothing does, or it may still go away."""
+        assert view.motion is not None and self.running is not None
+        ours = view.motion.id == self.running.command.id and view.motion.state == "active"
+        held = [one.reason for one in view.motion.inhibits if one.by == BLOCKED_BY and one.kind == "held"]
+        if not held or not ours or view.trouble or view.motion.paused or self.status.paused:
+            self._in_the_way.reset()
+            return ""
+        return held[0] if self._in_the_way.lasts("in the way", view.now) >= self.p.obstacle_patience else ""
 
     def _decide_anew(self, message: str, view: V) -> None:
         self.clear()
@@ -263,7 +278,8 @@ class Task(Deciding[V]):
         command: m.ExecuteRequest | m.GripperCommand
         if isinstance(stage, Move):
             assert stage.trajectory is not None
-            command = m.ExecuteRequest(id=self.mint(), trajectory=stage.trajectory)
+            command = m.ExecuteRequest(
+                id=self.mint(), trajectory=stage.trajectory, plan=stage.plan, scene_stamp=stage.scene_stamp)
         else:
             assert isinstance(stage, Grip)
             command = m.GripperCommand(id=self.mint(), width=stage.width, effort=stage.effort)

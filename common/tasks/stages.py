@@ -49,6 +49,8 @@ class Move(Stage):
     trajectory: m.JointTrajectory | None = field(default=None, init=False)
     planned_around: list[tuple[float, float]] = field(default_factory=list, init=False)  # (x, y) [m]
     planned_width: float | None = field(default=None, init=False)  # between the fingers on the way [m]
+    plan: str = field(default="", init=False)  # id of the request that the trajectory answers
+    scene_stamp: int = field(default=0, init=False)  # of the planning scene that it was planned on [ns]
 
     def end(self) -> list[float]:
         """Joint positions [rad] at its end; empty when it is not planned."""

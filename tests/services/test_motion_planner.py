@@ -176,6 +176,6 @@ async def test_service_that_is_stopped_ends_a_running_plan():
 async def test_wiring_reads_no_truth():
     found = await wiring(motion_planner.run, CONFIG)
     assert SCENE_BALLS not in found.reads
-    assert found.reads == {topics.PLANNING_SCENE, topics.JOINT_STATES}
+    assert found.reads == {topics.PLANNING_SCENE, topics.JOINT_STATES, topics.MOTION_STATUS}
     assert found.serves == {topics.MOTION_PLAN}
     assert found.writes == {topics.DISPLAY_TRAJECTORY}

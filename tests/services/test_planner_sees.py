@@ -202,7 +202,7 @@ async def test_who_asks_before_the_first_picture_asks_again() -> None:
 
 async def test_it_reads_cameras_where_it_is_told_to() -> None:
     plain = {topic.key for topic in (await wiring(motion_planner.run, PLANNER)).reads}
-    assert plain == {topics.PLANNING_SCENE.key, topics.JOINT_STATES.key}
+    assert plain == {topics.PLANNING_SCENE.key, topics.JOINT_STATES.key, topics.MOTION_STATUS.key}
     other = {"points": "left/points"}
     found = {topic.key for topic in (await wiring(motion_planner.run, sees(cameras=[DEPTH, other]))).reads}
     assert found - plain == {topics.TF_STATIC.key, "left/points", *DEPTH.values()}

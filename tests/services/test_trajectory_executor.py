@@ -124,8 +124,8 @@ async def test_it_reads_nothing_and_serves_motion_gripper_and_world() -> None:
     assert found.reads == set() and found.calls == set()
     assert found.writes == {topics.JOINT_STATES, topics.MOTION_STATUS, topics.GRIPPER_STATE, SCENE_BALLS,
                             topics.SCENE_OBJECTS, topics.SCENE_OBJECT_UPDATES}
-    assert found.serves == {topics.MOTION_EXECUTE, topics.MOTION_STOP, topics.MOTION_HOLD, topics.GRIPPER_COMMAND,
-                            topics.WORLD_EDIT}
+    assert found.serves == {topics.MOTION_EXECUTE, topics.MOTION_FOLLOWED, topics.MOTION_STOP, topics.MOTION_HOLD,
+                            topics.GRIPPER_COMMAND, topics.WORLD_EDIT}
 
 
 async def test_it_starts_at_home_with_open_fingers_and_the_balls_of_the_world(robot: RobotModel) -> None:

@@ -169,6 +169,10 @@ class Outline(Task[OutlineView]):
         self.status.failures += 1
         self._returned, self.status.message = False, problem
 
+    def obstructed(self, stage: Stage, view: OutlineView, problem: str) -> None:
+        """Decide anew, from home: half an outline is none, and from home it is seen what is in the way."""
+        self.displaced(stage, view, problem)
+
     # --- failure ---------------------------------------------------------------------------------------------
 
     def plan_failed(self, move: Move, response: m.PlanResponse, view: OutlineView) -> None:

@@ -9,7 +9,7 @@ from common.hardware.fingers import Fingers
 from common.hardware.interface import HardwareFault
 from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware
-from common.messages import ExecuteRequest, GripperCommand, Header, StopRequest, Vector3, WorldEdit
+from common.messages import ExecuteRequest, GripperCommand, Header, HoldRequest, StopRequest, Vector3, WorldEdit
 from common.robot.transforms import tool_down
 from common.sim.kinematic import KinematicWorld
 
@@ -335,3 +335,50 @@ def test_what_takes_long_in_the_world_is_left_to_others_and_the_arm_goes_on(rig,
     rig.cycle.due, rig.cycle.apart = None, False
     rig.step()
     assert rig.world.held == "ball_1" and rig.cycle.standing() is not None
+
+
+def in_the_way(goal, hold=True):
+    return HoldRequest(hold=hold, reason="mug is in the way of hand", by="scene_monitor", goal=goal)
+
+
+def test_hold_for_a_goal_keeps_that_goal_and_ends_with_it(rig, rest_to_rest):
+    trajectory = rest_to_rest([0, 0], [0.3, 0.3])
+    assert rig.execute("a", trajectory).state == "active"
+    rig.run(0.3)
+    assert rig.cycle.hold(in_the_way("a"))[0].held_by == ["scene_monitor"]
+    rig.run(2.0)
+    status = rig.motions[-1]
+    assert status.state == "active" and not status.paused and "held: mug is in the way of hand" in status.message
+    assert [(one.by, one.reason) for one in status.inhibits] == [("scene_monitor", "mug is in the way of hand")]
+    rig.cycle.stop(StopRequest(id="a", by="requester"), rig.now)
+    rig.run(0.5)
+    assert (rig.motions[-1].state, rig.motions[-1].held) == ("cancelled", False)
+    assert rig.execute("b", trajectory).state == "rejected"  # the arm has moved on since
+    assert not rig.cycle.hold(in_the_way("a"))[0].held, "what was said of a goal that is over holds no other"
+
+
+def test_the_scene_monitor_lets_go_of_nobody_elses_hold(rig, rest_to_rest):
+    rig.execute("a", rest_to_rest([0, 0], [0.3, 0.3]))
+    rig.cycle.hold(HoldRequest(hold=True, owner="anna"))
+    rig.cycle.hold(in_the_way("a"))
+    rig.cycle.hold(in_the_way("a", hold=False))
+    rig.run(1.0)
+    assert rig.motions[-1].held_by == ["person"] and rig.motions[-1].progress < 0.1
+    rig.cycle.hold(in_the_way("a"))
+    rig.cycle.hold(HoldRequest(hold=False, owner="anna"))
+    rig.run(1.0)
+    assert rig.motions[-1].held_by == ["scene_monitor"], "nor a person of the scene monitor's"
+
+
+def test_goal_tells_of_its_plan_and_what_is_followed_can_be_asked_for(rig, rest_to_rest):
+    request = ExecuteRequest(id="a", trajectory=rest_to_rest([0, 0], [0.3, 0.3]), plan="p", scene_stamp=7)
+    rig.cycle.execute(request, rig.now)
+    rig.step()
+    assert (rig.motions[-1].plan, rig.motions[-1].scene_stamp) == ("p", 7)
+    assert rig.cycle.followed("a") == request
+    for goal in ("b", ""):
+        with pytest.raises(Refused, match=f"goal '{goal}' is not followed now"):
+            rig.cycle.followed(goal)
+    rig.run(5.0)
+    with pytest.raises(Refused):
+        rig.cycle.followed("a")

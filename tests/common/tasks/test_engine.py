@@ -57,7 +57,7 @@ class Cell:
         if isinstance(command, m.PlanRequest):
             point = m.JointTrajectoryPoint(
                 time_from_start=1.0, positions=[len(self.asked)], velocities=[0.0], accelerations=[0.0])
-            self.task.on_plan(m.PlanResponse(id=command.id, ok=True, planner="double", trajectory=m.JointTrajectory(
+            self.task.on_plan(m.PlanResponse(id=command.id, ok=True, scene_stamp=7, trajectory=m.JointTrajectory(
                 joint_names=["j"], points=[point])), self.view)
         elif isinstance(command, m.ExecuteRequest):
             self.motion = m.MotionStatus(header=header, id=command.id, state="active")
@@ -296,3 +296,59 @@ def test_grasp_of_something_else_is_let_go_and_what_slips_is_told() -> None:
     cell.gripper = cell.gripper.model_copy(update={"holding": False, "message": "it slipped out"})
     assert any(isinstance(command, m.StopRequest) for command in cell.step())
     assert status.message == "what the hand held fell during lift: it slipped out"
+
+
+def blocked(cell: Cell, *held_by: m.Holder) -> None:
+    """The arm is held by these, the scene monitor with its reason."""
+    inhibits = [m.Inhibit(kind="held", by=by, reason="mug is in the way of hand", since=1) for by in held_by]
+    cell.motion = cell.motion.model_copy(update={
+        "held": bool(held_by), "held_by": list(held_by), "inhibits": inhibits})
+
+
+def test_motion_goes_on_when_what_was_in_its_way_goes_away_and_is_planned_anew_when_it_stays() -> None:
+    cell = Cell()
+    cell.until("reach")
+    for _ in range(3):
+        blocked(cell, "scene_monitor")
+        for _ in range(8):
+            cell.step()
+        blocked(cell)
+        cell.step()
+    assert cell.task.running is not None and cell.task.status.failures == 0
+    reach = cell.motion.id
+    blocked(cell, "scene_monitor")
+    asked = [command for _ in range(12) for command in cell.step()]
+    assert [(type(c), c.id, c.by) for c in asked] == [(m.StopRequest, reach, "requester")]
+    assert cell.task.status.message == "reach: mug is in the way of hand" and cell.task.status.failures == 1
+    blocked(cell)
+    cell.motion = cell.motion.model_copy(update={"state": "cancelled"})
+    cell.step()
+    cell.step()
+    assert cell.plans()[-1].stage == "home" and cell.task.status.state == "HOMING"
+
+
+def test_what_is_in_the_way_changes_nothing_while_a_person_holds_or_the_planner_is_gone() -> None:
+    cell = Cell()
+    cell.until("reach")
+    blocked(cell, "scene_monitor", "person")
+    for _ in range(30):
+        assert cell.step() == []
+    blocked(cell, "scene_monitor")
+    for _ in range(8):
+        assert cell.step() == [], "time begins when the person has let go"
+
+
+def test_what_is_carried_is_brought_on_from_where_it_was_stopped() -> None:
+    cell = Cell()
+    cell.until("lift")
+    blocked(cell, "scene_monitor")
+    for _ in range(12):
+        cell.step()
+    assert not cell.task.row, "not home: it is decided anew from here"
+
+
+def test_motion_is_asked_for_with_its_plan_and_the_scene_of_it() -> None:
+    cell = Cell()
+    cell.until("reach")
+    executed = next(c for c in cell.asked if isinstance(c, m.ExecuteRequest))
+    assert executed.plan == cell.plans()[0].id and executed.scene_stamp == 7
