@@ -109,8 +109,11 @@ class GripperController:
         }
         if over:
             changes |= self._judged(reading)
-        elif self._held is not None:
-            changes |= self._watched(reading, self._held)
+        else:
+            if state.state == "none" and self._held is None and reading.holding and not reading.moving:
+                self._held = reading.width  # by a process before this one
+            if self._held is not None:
+                changes |= self._watched(reading, self._held)
         if not changes.items() <= vars(state).items():
             self.state = state.model_copy(update=changes)
         if self.state.id:

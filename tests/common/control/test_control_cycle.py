@@ -110,6 +110,33 @@ def test_ball_taken_from_the_fingers_is_reported(rig):
     assert not rig.grippers[-1].holding and rig.grippers[-1].width == 0.0
 
 
+@pytest.mark.parametrize(("expected", "state", "outcome"), [
+    (0.058, "succeeded", "grasped"), (0.04, "aborted", "too_wide"), (0.075, "aborted", "too_narrow")])
+def test_grasp_is_checked_against_what_the_world_puts_between_the_fingers(rig, expected, state, outcome):
+    rig.cycle.command(GripperCommand(id="close", width=0.0, expected_width=expected), rig.now)
+    rig.run(1.0)
+    told = rig.grippers[-1]
+    assert (told.state, told.outcome, told.holding, told.effort) == (state, outcome, True, GRIPPER.effort)
+    rig.cycle.edit(WorldEdit(op="drop", id="ball_1"), rig.now)
+    rig.run(1.0)
+    told = rig.grippers[-1]
+    assert not told.holding and told.outcome == ("slipping" if state == "succeeded" else outcome)
+
+
+def test_after_a_restart_what_is_held_is_pressed_as_before_and_watched(limits, rig):
+    rig.cycle.command(GripperCommand(id="close", width=0.0, effort=40.0), rig.now)
+    rig.run(1.0)
+    again = Rig(limits)
+    again.stamp = rig.stamp
+    again.cycle.restore(rig.cycle.standing(), again.now)
+    again.run(0.5)
+    told = again.grippers[-1]
+    assert (told.id, told.holding, told.effort, told.outcome) == ("", True, 40.0, "grasped")
+    again.cycle.edit(WorldEdit(op="drop", id="ball_1"), again.now)
+    again.run(1.0)
+    assert again.grippers[-1].outcome == "slipping"
+
+
 def test_same_gripper_id_again_moves_nothing(rig):
     rig.grip("close", 0.0)
     rig.run(1.0)

@@ -63,6 +63,7 @@ def test_arm_and_fingers_are_told_in_words() -> None:
     assert words.motion(MotionStatus(state="active", progress=0.25, held=True)) == "held on its path"
     assert words.gripper(GripperState(width=0.08)) == "fingers 80 mm apart"
     assert words.gripper(GripperState(width=0.06, holding=True)) == "fingers hold something"
+    assert words.gripper(GripperState(width=0.06, holding=True, outcome="slipping")).endswith(", which slips")
     assert words.gripper(GripperState(width=0.0)) == "fingers closed"
 
 
