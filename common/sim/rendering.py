@@ -8,6 +8,7 @@ sight; spheres in it are exact and cost a few tenths of a millisecond for all of
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -72,6 +73,7 @@ class Renderer:
         self._objects: list[WorldObject] | None = None
         self._joints: Array | None = None
         self._still = self._seen = self._behind
+        self._spheres: dict[tuple[float, ...], _Sphere | None] = {}  # of the last plain picture, by centre and radius
 
     def takes_long(self, objects: Sequence[WorldObject]) -> bool:
         """Whether to `see` the objects may take longer than a moment: rays are cast at all but a few spheres."""
@@ -115,10 +117,15 @@ class Renderer:
         plain = View(self._behind.colour.copy(), self._behind.depth)
         view = cast(solid, self.camera, self._behind) if solid else plain
         distances = [float(np.linalg.norm(_centre(thing) - self.camera.position)) for thing in spheres]
+        hidden, before, self._spheres = self._deep or bool(solid), self._spheres, {}
         for index in sorted(range(len(spheres)), key=lambda i: -distances[i]):  # what is nearer hides what is farther
             thing = spheres[index]
-            _blend_sphere(view, self.camera, _centre(thing), thing.size.x / 2, color=_bgr(thing),
-                          rim_width=self._rim_width, hidden=self._deep or bool(solid))
+            key = *_centre(thing).tolist(), thing.size.x / 2
+            shape = before[key] if key in before else _seen_sphere(
+                self.camera, _centre(thing), thing.size.x / 2, self._rim_width)
+            self._spheres[key] = shape
+            if shape is not None:
+                _blend_sphere(view, shape, _bgr(thing), hidden=hidden)
         return view
 
     def _mesh(self, thing: WorldObject) -> Mesh:
@@ -183,23 +190,30 @@ def disturbed_depth(depth: Depth, rng: np.random.Generator, noise_std: float, dr
     return measured
 
 
-def _blend_sphere(
-    view: View, camera: Pinhole, center: Array, radius: float, *, color: tuple[int, int, int], rim_width: float,
-    hidden: bool,
-) -> None:
-    """Blend one sphere into the picture, each pixel by how much of it is covered.
+@dataclass(frozen=True)
+class _Sphere:
+    """How a sphere is seen within columns and rows `low` to `high` of a picture; arrays are (rows, columns, 1)."""
+
+    low: npt.NDArray[np.int_]
+    high: npt.NDArray[np.int_]
+    rim: Array  # how much of each pixel its outline covers
+    inner: Array  # and what lies inside of that
+    near: Array  # depth [m]
+
+
+def _seen_sphere(camera: Pinhole, center: Array, radius: float, rim_width: float) -> _Sphere | None:
+    """How much of each pixel a sphere covers; None where nothing of it is seen.
 
     The rim straddles the outline. OpenCV's filled polygons are half a pixel too large all the way round, which is as
-    much as the whole error of a good fit; the distance of a pixel from the outline is exact. With `hidden`, what is
-    nearer in the view's depth stays before it.
+    much as the whole error of a good fit; the distance of a pixel from the outline is exact.
     """
     outline = silhouette(camera, center, radius, 32)
     if not len(outline):
-        return
+        return None
     low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 4 - int(rim_width), 0)
     high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 5 + int(rim_width), (camera.width, camera.height))
     if (high - low < 2).any():
-        return
+        return None
     x, y, z = camera.to_camera(center)
     a = ((np.arange(low[0], high[0]) - camera.cx) / camera.fx)[None, :]
     b = ((np.arange(low[1], high[1]) - camera.cy) / camera.fy)[:, None]
@@ -208,17 +222,22 @@ def _blend_sphere(
     beyond = np.sqrt(away) - radius  # distance of rays from the sphere [m]
     slope = np.hypot(*np.gradient(beyond))  # [m/px]
     outside = beyond / np.maximum(slope, 1e-9)  # [px]
+    near = (np.sqrt(along) - np.sqrt(np.maximum(radius**2 - away, 0.0))) / np.sqrt(1 + a * a + b * b)
+    rim = np.clip(0.5 + rim_width / 2 - outside, 0, 1) if rim_width else np.zeros_like(outside)
+    inner = np.clip(0.5 - rim_width / 2 - outside, 0, 1)
+    return _Sphere(low, high, rim[..., None], inner[..., None], near[..., None])
+
+
+def _blend_sphere(view: View, sphere: _Sphere, color: tuple[int, int, int], *, hidden: bool) -> None:
+    """Blend one sphere into the picture; with `hidden`, what is nearer in the view's depth stays before it."""
+    (left, top), (right, bottom) = sphere.low, sphere.high
     shows: float | npt.NDArray[np.float32] = 1.0
     if hidden:
-        near = (np.sqrt(along) - np.sqrt(np.maximum(radius**2 - away, 0.0))) / np.sqrt(1 + a * a + b * b)
-        shows = (near < view.depth[low[1] : high[1], low[0] : high[0]])[..., None].astype(np.float32)
-    cut = view.colour[low[1] : high[1], low[0] : high[0]]
+        shows = (sphere.near < view.depth[top:bottom, left:right, None]).astype(np.float32)
+    cut = view.colour[top:bottom, left:right]
     blended = cut.astype(np.float32)
-    if rim_width:
-        rim = np.clip(0.5 + rim_width / 2 - outside, 0, 1)[..., None]
-        blended += shows * rim * (np.array(RIM, np.float32) - blended)
-    inner = np.clip(0.5 - rim_width / 2 - outside, 0, 1)[..., None]
-    blended += shows * inner * (np.array(color, np.float32) - blended)
+    for part, paint in ((sphere.rim, RIM), (sphere.inner, color)):
+        blended += shows * part * (np.array(paint, np.float32) - blended)
     cut[...] = np.rint(blended).astype(np.uint8)
 
 

@@ -13,6 +13,7 @@ from common.config import Fixture, Surroundings, World
 from common.errors import ConfigError, DecodeError
 from common.messages import Color, Header, WorldObject, WorldObjects
 from common.perception.pinhole import Pinhole
+from common.sim import rendering
 from common.sim.kinematic import KinematicWorld
 from common.sim.layout import layout
 from common.sim.objects import solid_of_message, world_object
@@ -101,6 +102,27 @@ def test_colour_and_turn_of_a_thing_are_news_for_a_camera() -> None:
     green = thing(**THINGS["box"]).model_copy(update={"color": Color(r=0, g=1, b=0)})
     assert is_color(renderer.see([green]).colour, (0.0, 1.0, 0.0)).any()
     np.testing.assert_array_equal(renderer.see([thing(**THINGS["box"])]).colour, first)
+
+
+def test_spheres_that_lie_as_before_are_drawn_as_before_and_not_worked_out_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    worked_out = []
+
+    def seen(*arguments: Any) -> Any:
+        worked_out.append(1)
+        return seen_sphere(*arguments)
+
+    seen_sphere = rendering._seen_sphere
+    monkeypatch.setattr(rendering, "_seen_sphere", seen)
+    renderer, places = Renderer(AROUND, plain=True), [(0.4, 0.1, 0.03), (0.45, 0.15, 0.03), (0.6, -0.2, 0.03)]
+    renderer.see(spheres(places, AROUND).objects)
+    for moved in ((0.43, 0.14, 0.03), (0.43, 0.14, 0.05)):
+        places[0] = moved
+        worked_out.clear()
+        picture = renderer.see(spheres(places, AROUND).objects).colour
+        assert len(worked_out) == 1
+        np.testing.assert_array_equal(picture, Renderer(AROUND, plain=True).see(spheres(places, AROUND).objects).colour)
 
 
 # --- messages ---
