@@ -15,7 +15,7 @@ from common.applications.outlining.messages import OutlinePoints
 from common.applications.pick_place.topics import REJECTED_TARGETS, WORKSPACE_MARKERS
 from common.config import Parameters, World
 from common.config.tunables import apply, checked, leaves, tunable_sections
-from common.messages import PlanRequest
+from common.messages import Inhibit, PlanRequest, StopRequest
 from common.robot.transforms import tool_down
 from common.sim.interface import GraspTolerances
 from common.sim.kinematic import KinematicWorld
@@ -80,6 +80,22 @@ def test_a_motion_under_way_is_stopped_after_a_shorter_time() -> None:
     cell.step()
     cell.step()
     assert "took longer than 0.05 s" in cell.task.status.message
+
+
+@pytest.mark.parametrize("make", [lambda: CellDouble([(0.40, -0.30)], obstacle_patience=600.0),
+                                  lambda: OutlineDouble(obstacle_patience=600.0)])
+def test_what_is_in_the_way_is_planned_around_after_a_shorter_time(make: Callable[[], Any]) -> None:
+    cell = make()
+    cell.until("pre-grasp" if isinstance(cell, CellDouble) else "trace")
+    in_the_way = Inhibit(kind="held", by="scene_monitor", reason="a mug is in the way", since=1)
+    cell.motion = cell.motion.model_copy(update={
+        "held": True, "held_by": ["scene_monitor"], "inhibits": [in_the_way]})
+    for _ in range(50):
+        cell.step()
+    assert cell.task.running is not None
+    change(cell.task.p, obstacle_patience=1.0)
+    assert any(isinstance(asked, StopRequest) for asked in cell.step())
+    assert "a mug is in the way" in cell.task.status.message
 
 
 def test_the_task_gives_up_after_fewer_failures() -> None:
@@ -173,6 +189,8 @@ RARE: dict[str, Callable[..., Any]] = {
     "services.smart_pick_place.empty": test_the_task_waits_as_long_as_it_is_told_while_it_waits,
     "services.smart_pick_place.goal_timeout": test_a_motion_under_way_is_stopped_after_a_shorter_time,
     "services.smart_pick_place.max_failures": test_the_task_gives_up_after_fewer_failures,
+    "services.smart_pick_place.obstacle_patience": test_what_is_in_the_way_is_planned_around_after_a_shorter_time,
+    "services.contour_tracer.obstacle_patience": test_what_is_in_the_way_is_planned_around_after_a_shorter_time,
     "services.contour_tracer.overtime": test_an_outline_under_way_is_stopped_after_a_shorter_time,
     "services.contour_tracer.picture_timeout":
         test_the_outline_waits_for_a_contour_as_long_as_it_is_told_while_it_waits,
