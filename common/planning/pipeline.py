@@ -29,7 +29,16 @@ from common.planning.problem import (
     ToolPath,
     not_timed,
 )
-from common.planning.retiming import RetimingFailed, TimedPath, TooLong, cubics, join, require_tellable, stretch
+from common.planning.retiming import (
+    RetimingFailed,
+    TimedPath,
+    TooLong,
+    cubics,
+    join,
+    limited_jerk,
+    require_tellable,
+    stretch,
+)
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.timing import BLENDS, retime, slowed
 from common.planning.validation import Fault, validate
@@ -39,6 +48,7 @@ from common.sources import monotonic
 Array = NDArray[np.float64]
 
 CHECKS = "request_checks"
+CYCLE = 0.01  # [s] between set-points: acceleration reaches its limit no faster, whatever the arm can do
 FINISHING = 0.1  # of the time for planning, on top of it: for timing and checking a path that was found in time
 
 
@@ -215,7 +225,7 @@ class PlanningPipeline:
             straight=request.straight or isinstance(checked.goal, ToolPath),
             velocity=robot.velocity * (request.velocity_scaling or motion.velocity_scaling),
             acceleration=robot.acceleration * acceleration,
-            jerk=robot.jerk * acceleration,
+            jerk=np.minimum(robot.jerk * acceleration, robot.acceleration / CYCLE),
             attempts=request.planning_attempts or motion.planning_attempts,
             deadline=began + budget,
             latest=began + (1 + FINISHING) * budget,
@@ -256,7 +266,7 @@ class PlanningPipeline:
         """The planner's own trajectory, or its path timed with smaller and smaller blends."""
         robot, limit = problem.robot, problem.tool_speed
         if result.trajectory is not None:
-            yield slowed(robot, result.trajectory, limit)
+            yield slowed(robot, limited_jerk(result.trajectory, problem.jerk), limit)
             return
         scale = self._motion.cartesian_speed_scale if result.tool_line else 1.0
         for blend in BLENDS[:1] if result.dense or result.way else BLENDS:

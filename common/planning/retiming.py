@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -236,6 +237,78 @@ def stretch(trajectory: TimedPath, scale: float) -> TimedPath:
         trajectory.velocities * scale,
         trajectory.accelerations * scale**2,
     )
+
+
+_SHARP = 0.02  # of the largest jump of acceleration: at one that is larger states tell where that begins and ends
+_BENDS = 0.2  # of the jerk limit: the same where acceleration's slope changes by more
+_CLOSEST = 0.005  # of the time that is averaged over, between two states
+_KEPT = 0.02  # share of a limit of jerk by which it may be exceeded
+_ROUNDING = 1e-3  # of the largest jump of acceleration: one that is smaller is none
+
+
+def limited_jerk(trajectory: TimedPath, jerk: ArrayLike) -> TimedPath:
+    """The trajectory with limited jerk (dof,) [rad/s^3]: its average over a short time T, by which it takes longer.
+
+    An average keeps all bounds of positions, velocities and accelerations, and changes acceleration by no more than
+    twice its peak in T. From the path it is off by at most a T^2 / 24: 0.1 mrad at 5 rad/s^2 and 20 ms. The states lie
+    where the acceleration's slope changes, so that cubics and quintics between them are the same but for a trifle.
+    Where it rests it rests afterwards, too.
+    """
+    rests = np.flatnonzero(np.abs(trajectory.velocities[1:-1]).max(axis=1, initial=0.0) < _TINY) + 1
+    if not len(rests):
+        return _averaged(trajectory, np.asarray(jerk, dtype=float))
+    parts = [
+        TimedPath(trajectory.times[a : b + 1] - trajectory.times[a], *(values[a : b + 1] for values in (
+            trajectory.positions, trajectory.velocities, trajectory.accelerations)))
+        for a, b in pairwise([0, *rests.tolist(), len(trajectory.times) - 1])
+    ]
+    return join([limited_jerk(part, jerk) for part in parts])
+
+
+def _averaged(trajectory: TimedPath, limit: Array) -> TimedPath:
+    """A trajectory that does not rest between its ends, averaged for a limit of jerk (dof,) [rad/s^3]."""
+    begin, finish = end_accelerations(trajectory)
+    still = np.zeros((1, begin.shape[1]))
+    jumps = np.abs(np.concatenate([begin, still]) - np.concatenate([still, finish]))
+    peaks = np.maximum(np.abs(begin), np.abs(finish)).max(axis=0)
+    slopes = (finish - begin) / np.diff(trajectory.times)[:, None]
+    span = float((2 * peaks / limit).max())
+    if (np.abs(slopes) <= limit * (1 + _KEPT)).all() and (jumps <= _ROUNDING * span * limit).all():
+        return trajectory
+    bends = np.abs(np.diff(np.concatenate([still, slopes, still]), axis=0))
+    sharp = (jumps > _SHARP * span * limit).any(axis=1) | (bends > _BENDS * limit).any(axis=1)
+    sharp[[0, -1]] = True
+    at, end = trajectory.times, trajectory.duration + span
+    wanted = np.unique(np.concatenate([at[sharp], at[sharp] + span, at[~sharp] + span / 2]))
+    times = [0.0]
+    for time in wanted[:-1].tolist():
+        if times[-1] + _CLOSEST * span < time < end - _CLOSEST * span:
+            times.append(time)
+    t = np.array([*times, end])
+    now, before = _with_integral(trajectory, t), _with_integral(trajectory, t - span)
+    positions, velocities, accelerations = ((one - other) / span for one, other in zip(now, before, strict=True))
+    positions += trajectory.positions[0]
+    positions[0], positions[-1] = trajectory.positions[0], trajectory.positions[-1]
+    velocities[[0, -1]] = accelerations[[0, -1]] = 0.0
+    return TimedPath(t, positions, velocities, accelerations)
+
+
+def _with_integral(trajectory: TimedPath, times: Array) -> tuple[Array, Array, Array]:
+    """(N, dof) integrals of the way from the start, that way, and its change per second; at rest outside."""
+    t, ends = trajectory.times, np.clip(times, 0.0, trajectory.duration)
+    i = np.clip(np.searchsorted(t, ends, side="right") - 1, 0, len(t) - 2)
+    h = np.diff(t)[:, None]
+    pieces = cubics(trajectory)
+    pieces[:, 0] -= trajectory.positions[0]
+    whole = (pieces / np.array([1, 2, 3, 4])[:, None]).sum(axis=1) * h
+    sums = np.concatenate([np.zeros((1, whole.shape[1])), np.cumsum(whole, axis=0)])
+    r, h = ((ends - t[i]) / (t[i + 1] - t[i]))[:, None], h[i]
+    c0, c1, c2, c3 = pieces[i].transpose(1, 0, 2)
+    way = c0 + r * (c1 + r * (c2 + r * c3))
+    integral = sums[i] + h * r * (c0 + r * (c1 / 2 + r * (c2 / 3 + r * c3 / 4)))
+    beyond = (times - ends)[:, None]
+    speed = np.where(beyond == 0.0, (c1 + r * (2 * c2 + 3 * r * c3)) / h, 0.0)
+    return integral + np.maximum(beyond, 0.0) * way, way, speed
 
 
 def join(parts: Sequence[TimedPath]) -> TimedPath:

@@ -14,12 +14,12 @@ from common.config import Parameters
 from common.planning.collision import CollisionWorld
 from common.planning.path import SmoothPath, blended_path, dense_path, distinct
 from common.planning.problem import Problem, Result
-from common.planning.retiming import RetimingFailed, TimedPath, join, moving_samples, parametrise, stretch
+from common.planning.retiming import RetimingFailed, TimedPath, join, limited_jerk, moving_samples, parametrise, stretch
 from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
 
-LIMIT_SHARE = 0.98  # of the limits: between two states the controller's cubic may exceed them a little
+LIMIT_SHARE = 0.985  # of the limits: between two states the controller's cubic may exceed them a little
 # [rad] taken from both edges at a corner, where that is free. A blend that passes within a hair of something may be
 # found free here and not by validation, which looks at other positions: then smaller ones are tried, in the end none.
 BLENDS = (0.25, 0.06, 0.0)
@@ -29,7 +29,7 @@ _SMALLEST_BLEND = 0.02  # [rad] below it the robot stops at the corner
 
 
 def retime(problem: Problem, result: Result, blend: float = BLENDS[0], tool_speed: float = math.inf) -> TimedPath:
-    """The time-optimal trajectory of a planner's path, at rest at both ends.
+    """The time-optimal trajectory of a planner's path, at rest at both ends, its jerk limited.
 
     Args:
         problem: limits and the collision world.
@@ -52,10 +52,12 @@ def retime(problem: Problem, result: Result, blend: float = BLENDS[0], tool_spee
             raise RetimingFailed("two waypoints are one: the steps are finer than joint positions are solved")
         paths = blended_path(result.waypoints, result.way.cuts, result.way.lengths)
         speed = min(result.way.speed or math.inf, tool_speed)
-        return join([parametrise(path, velocity, acceleration, speed=speed, deadline=deadline) for path in paths])
+        parts = [parametrise(path, velocity, acceleration, speed=speed, deadline=deadline) for path in paths]
+        return limited_jerk(join(parts), problem.jerk)
     paths = [dense_path(waypoints)] if result.dense else free_blends(waypoints, problem.world, blend)
     most = math.inf if math.isinf(tool_speed) else partial(_rates_at, problem.robot, tool_speed)
-    return join([parametrise(path, velocity, acceleration, speed=most, deadline=deadline) for path in paths])
+    parts = [parametrise(path, velocity, acceleration, speed=most, deadline=deadline) for path in paths]
+    return limited_jerk(join(parts), problem.jerk)
 
 
 def _rates_at(robot: RobotModel, tool_speed: float, path: SmoothPath) -> Array:

@@ -6,8 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from common.control.trajectory import Trajectory
 from common.planning.path import blended_path, dense_path, distinct
-from common.planning.retiming import TimedPath, join, parametrise, sample, stretch
+from common.planning.planners.joint_move import straight_profile
+from common.planning.retiming import TimedPath, join, limited_jerk, parametrise, sample, stretch
 
 V = np.array([2.175, 2.175, 2.61])
 A = np.array([15.0, 7.5, 20.0])
@@ -135,3 +137,35 @@ def test_stretching_to_something_faster_or_nothing_is_refused(scale):
 def test_repeated_waypoints_are_one():
     points = np.array([[0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0.0]])
     assert np.array_equal(distinct(points), [[0, 0, 0], [1, 0, 0]])
+
+
+@settings(max_examples=40, deadline=None)
+@given(waypoints, st.floats(0, 0.5), st.floats(10, 1000))
+def test_limited_jerk_keeps_all_four_limits_at_a_millisecond_and_stays_on_the_path(points, blend, quickness):
+    """Between the states as the executor has it, and as validation does."""
+    points, jerk = distinct(points), quickness * A
+    parts = [parametrise(path, V, A) for path in blended_path(points, np.full(len(points), blend))]
+    given_, limited = join(parts), limited_jerk(join(parts), jerk)
+    assert np.array_equal(limited.positions[[0, -1]], given_.positions[[0, -1]])
+    assert not limited.velocities[[0, -1]].any() and not limited.accelerations[[0, -1]].any()
+    assert max(hermite_peaks(limited)) <= 1.02
+    longer = limited.duration - given_.duration
+    assert 0 < longer <= len(parts) * 2.05 / quickness
+    longer /= len(parts)  # with a rest at each end of a part
+    quintic = Trajectory(limited.times, limited.positions, limited.velocities, limited.accelerations, quintic=True)
+    step = max(1e-3, longer / 20)  # differences of finer ones are of rounded numbers
+    t = np.arange(-3, limited.duration / step + 3) * step
+    q = quintic.positions_at(t)
+    for order, limit in ((1, V), (2, A), (3, jerk)):
+        assert (np.abs(np.diff(q, order, axis=0)) <= 1.03 * limit * step**order + 1e-12).all(), order
+    assert np.abs(sample(limited, t) - q).max() <= 1e-5 * max(1.0, (longer / 0.02) ** 2)
+    if len(parts) == 1:
+        centred = sample(given_, t - longer / 2)
+        assert (np.abs(q - centred) <= A * longer**2 / 8 + 1e-9).all()
+
+
+def test_what_keeps_its_jerk_is_left_as_it_is():
+    start, goal = np.zeros(3), np.array([1.0, -0.3, 1e-7])
+    profile = straight_profile(start, goal, V, A, 100 * A)
+    assert limited_jerk(profile, 100 * A) is profile
+    assert limited_jerk(profile, 50 * A).duration > profile.duration
