@@ -94,3 +94,55 @@ def test_service_that_is_killed_is_started_again(cell: Containers) -> None:
         lambda: (now := cell.inspect("panda-vision_detector")["State"])["Pid"] not in (0, before["State"]["Pid"])
         and now["Health"]["Status"] == "healthy", 60,
     )
+
+
+def said(cell: Containers, *arguments: str) -> str:
+    """What a zencell command says that is run in the router's container."""
+    return cell.compose("exec", "-T", "router", "zencell", *arguments, "--cell", "panda", timeout=120)
+
+
+def heard(cell: Containers, key: str) -> dict[str, Any]:
+    """The next message of a topic."""
+    message: dict[str, Any] = json.loads(said(cell, "topic", "echo", key, "--count", "1", "--json"))
+    return message
+
+
+def test_what_a_person_stopped_stays_so_when_containers_are_started_again_or_made_anew(cell: Containers) -> None:
+    executor, task = "panda-trajectory_executor", "panda-smart_pick_place"
+    patience = 240.0  # [s] only ever waited for by a test that fails
+
+    def rests() -> tuple[list[float], dict[str, Any]]:
+        """Where the arm is, and who stopped it, once the task that was started again has said that it waits."""
+        cell.wait_for("the task waits", lambda: heard(cell, "pick_place_status")["message"].startswith("stopped since"),
+                      patience)
+        (stop,) = heard(cell, "motion/status")["inhibits"]
+        return heard(cell, "joint_states")["position"], stop
+
+    cell.wait_for("the task is ready", lambda: cell.is_ready(task), patience)
+    if heard(cell, "pick_place_status")["state"] == "DONE":
+        said(cell, "world", "reset")
+    said(cell, "task", "start")
+    cell.wait_for("the arm moves", lambda: heard(cell, "motion/status")["state"] == "active", patience)
+    said(cell, "task", "stop")
+    cell.wait_for("the arm is at rest", lambda: heard(cell, "motion/status")["state"] != "active", patience)
+    where, stop = rests()
+    assert stop["kind"] == "stopped" and "@" in stop["by"]
+
+    before = {service: cell.inspect(service)["State"]["Pid"] for service in (executor, task)}
+    for pid in before.values():
+        os.kill(pid, signal.SIGKILL)
+    for service, pid in before.items():
+        cell.wait_for(f"{service} is back", lambda service=service, pid=pid: (  # type: ignore[misc]
+            cell.inspect(service)["State"]["Pid"] not in (0, pid) and cell.is_ready(service)), patience)
+    assert rests() == (where, stop)
+
+    cell.compose("down", "-t", "10", timeout=180)  # the volume stays
+    cell.compose("up", "-d", "--no-build", timeout=180)
+    for service in (executor, task):  # what is simulated begins anew with new containers
+        cell.wait_for(f"{service} is ready", lambda service=service: cell.is_ready(service), patience)  # type: ignore[misc]
+        where = heard(cell, "joint_states")["position"] if service == executor else where
+    assert rests() == (where, stop)
+
+    said(cell, "task", "start")
+    cell.wait_for("the arm moves", lambda: heard(cell, "joint_states")["position"] != where, patience)
+    assert heard(cell, "motion/status")["inhibits"] == []
