@@ -115,11 +115,13 @@ def possible_share(goal: _Goal, limits: Limits, period: float) -> float:
     while share >= SLOWEST:
         step = share * period / 2  # of trajectory's time: differences over two, from every second one on
         count = min(int(goal.duration / step) + 1, MOST_SAMPLES)
-        q = goal.positions_at(np.arange(-4.0, count + 4) * step)
+        q = goal.positions_at(np.arange(-6.0, count + 6) * step)
         v = (q[2:] - q[:-2]) / period
         a = (v[2:] - v[:-2]) / period
+        j = (a[2:] - a[:-2]) / period
         over = max(float((np.abs(v) / limits.velocity).max()) / most,
-                   math.sqrt(float((np.abs(a) / limits.acceleration).max()) / most))
+                   math.sqrt(float((np.abs(a) / limits.acceleration).max()) / most),
+                   float(np.cbrt((np.abs(j) / limits.jerks).max() / most)))
         if over <= 1.0:
             return share
         share /= 1.01 * over

@@ -316,3 +316,20 @@ def test_arm_that_was_moved_far_during_a_stall_is_held_there_and_the_goal_is_ove
     status = rig.step(3.0)
     assert (status.state, status.error) == ("aborted", "path_tolerance") and "no set-points" in status.message
     assert np.array_equal(rig.positions[-1], there)
+
+
+@pytest.mark.parametrize("cycles", [1.0, 2.0, 5.0])
+def test_steps_of_acceleration_are_followed_so_slowly_that_jerk_keeps_its_limit(cycles):
+    """From the fullest acceleration to the fullest braking within no time, of arms that take some cycles for it."""
+    limits = replace(LIMITS, jerk=LIMITS.acceleration / (cycles * STEP))
+    rig = Sampled(limits)
+    a, half = 0.98 * LIMITS.acceleration, 0.15
+    points = [JointTrajectoryPoint(time_from_start=t, positions=q.tolist(), velocities=v.tolist(), accelerations=[0, 0])
+              for t, q, v in ((0.0, 0 * a, 0 * a), (half, a * half**2 / 2, a * half), (2 * half, a * half**2, 0 * a))]
+    given_ = JointTrajectory(joint_names=list(LIMITS.names), points=points)
+    begin = rig.now
+    assert rig.accept("a", given_).state == "active" and rig.until_over().state == "succeeded"
+    rig.assert_within(limits)
+    jerk = np.diff([START] * 3 + rig.positions, 3, axis=0) / STEP**3
+    assert np.all(np.abs(jerk) <= 1.021 * limits.jerks)
+    assert rig.now - begin <= 2 * half * np.cbrt(2 * cycles) * 1.3 + 0.1
