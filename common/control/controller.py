@@ -28,6 +28,7 @@ USUAL = 0.2  # of what is usual is how it was the last time
 RESEATED = 1.0  # cell time between two takings of an arm that was moved from outside: oftener it is not held [s]
 BLEND_TIME = 0.3  # the difference between the robot's and the trajectory's start fades in this time [s]
 BLEND_SHARE = 0.5  # of the limits is for that difference at most; else it takes longer
+RAMP_SHARE = 0.95  # of the accelerations is for going on: the rest is for what differences see of a bend
 BEHIND = 1e-3  # [rad] between path and set-point, at which the goal's time stands still
 ARRIVED = 1e-6  # [rad] nearer, the set-point is on the path
 SLOWEST = 0.01  # of its speed, at which a trajectory is refused instead of being followed so slowly
@@ -372,7 +373,7 @@ class TrajectoryController:
         goal.time = goal.pace.advance(
             goal.at, goal.time, 0.0 if braking else self.speed_scaling * goal.share * waiting,
             min(max(now - goal.last, 0.0), LATE * self._period),
-            self._limits.braking if braking else self._limits.acceleration, self._limits.jerks,
+            self._limits.braking if braking else RAMP_SHARE * self._limits.acceleration, self._limits.jerks,
         )
         goal.last = now
         self._hold, change = goal.at(goal.time)

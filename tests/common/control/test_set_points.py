@@ -11,6 +11,8 @@ from common.control.controller import LATE
 from common.hardware.interface import HardwareFault
 from common.hardware.mock import MockHardware
 from common.messages import JointTrajectory, JointTrajectoryPoint
+from common.planning.path import blended_path
+from common.planning.retiming import limited_jerk, parametrise
 from tests.common.control.test_holding import LIMITS, winding
 from tests.common.control.test_limiter import assert_within
 from tests.common.hardware.rig import START, STEP, Rig
@@ -333,3 +335,25 @@ def test_steps_of_acceleration_are_followed_so_slowly_that_jerk_keeps_its_limit(
     jerk = np.diff([START] * 3 + rig.positions, 3, axis=0) / STEP**3
     assert np.all(np.abs(jerk) <= 1.021 * limits.jerks)
     assert rig.now - begin <= 2 * half * np.cbrt(2 * cycles) * 1.3 + 0.1
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_trajectory_at_the_limits_is_gone_on_with_on_its_path_after_a_stall(seed):
+    bends = np.concatenate([np.zeros((1, 2)), np.random.default_rng(seed).uniform(-1, 1, (4, 2))])
+    path = blended_path(bends, np.full(5, 0.3))[0]
+    timed = parametrise(path, 0.985 * LIMITS.velocity, 0.985 * LIMITS.acceleration)
+    timed = limited_jerk(timed, 100 * LIMITS.acceleration)
+    states = zip(timed.times.tolist(), timed.positions.tolist(), timed.velocities.tolist(),
+                 timed.accelerations.tolist(), strict=True)
+    points = [JointTrajectoryPoint(time_from_start=t, positions=q, velocities=dq, accelerations=ddq)
+              for t, q, dq, ddq in states]
+    for share in np.linspace(0.05, 0.9, 12):
+        rig = Sampled(LIMITS)
+        rig.accept("a", JointTrajectory(joint_names=list(LIMITS.names), points=points))
+        for _ in range(int(share * timed.duration / STEP)):
+            rig.step()
+        rig.step(0.4)
+        while rig.step().state == "active":
+            assert rig.controller._goal.behind == 0.0, "every set-point is on the path"
+        assert rig.controller.status.state == "succeeded"
+        rig.assert_within(LIMITS)
