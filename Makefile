@@ -8,13 +8,18 @@ STAMP := $(VENV)/.up-to-date
 
 setup: $(STAMP)
 
+# Drivers of real arms and the like, as `make setup EXTRAS=ur`; what was asked for once stays.
+EXTRAS := $(if $(EXTRAS),$(EXTRAS),$(shell cat $(VENV)/.extras 2>/dev/null))
+COMMA := ,
+$(shell mkdir -p $(VENV); [ "$$(cat $(VENV)/.extras 2>/dev/null)" = "$(EXTRAS)" ] || echo "$(EXTRAS)" > $(VENV)/.extras)
+
 # What the compiled planning kernel is made of: it is compiled anew when that changes.
 KERNEL := setup.py common/planning/kernel/build.py $(wildcard common/planning/kernel/src/*)
 
-$(STAMP): pyproject.toml constraints.txt $(KERNEL)
+$(STAMP): pyproject.toml constraints.txt $(KERNEL) $(wildcard $(VENV)/.extras)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "zencell needs Python 3.11 or newer: make PYTHON=python3.11 ...")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev$(addprefix $(COMMA),$(EXTRAS))]'
 	@touch $@
 
 run: setup  ## clear the table into the box, print a summary

@@ -221,9 +221,9 @@ class Operation:
 
     @property
     def _simulated(self) -> bool:
-        from common.hardware.loading import find_backend
+        from common.hardware.loading import is_simulated
 
-        return find_backend(self.cell.robot).simulated
+        return is_simulated(self.cell.robot)
 
     async def _in_cell(self, work: Callable[[Bus], Awaitable[int]]) -> int:
         from common.supervision.interrupts import Interrupts

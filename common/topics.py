@@ -89,6 +89,8 @@ TF = Topic("tf", m.TFMessage, "stream", "poses of the robot's links")
 TF_STATIC = Topic("tf_static", m.TFMessage, "state", "poses that never change: base, camera")
 GRIPPER_STATE = Topic("gripper/state", m.GripperState, "state", "width, whether it holds something, newest command")
 MOTION_STATUS = Topic("motion/status", m.MotionStatus, "state", "newest goal: state, progress, error, source")
+ROBOT_STATUS = Topic("robot/status", m.RobotStatus, "state",
+                     "what the arm's own controller says: mode, why it cannot be moved, speed slider")
 DISPLAY_TRAJECTORY = Topic("display_trajectory", m.JointTrajectory, "state", "newest plan")
 SCENE_OBJECTS = Topic("scene_objects", m.WorldObjects, "state",
                       "the truth: where every object is; simulated hardware only")
@@ -113,6 +115,8 @@ MOTION_STOP = Request("motion/stop", m.StopRequest, m.MotionStatus, "bring the r
 MOTION_HOLD = Request("motion/hold", m.HoldRequest, m.MotionStatus, "pause the robot on its path, or let it go on")
 GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState,
                           "move the fingers; the result appears on gripper/state")
+ROBOT_COMMAND = Request("robot/command", m.RobotCommand, m.RobotStatus,
+                        "enable, recover, freedrive, payload: what the arm's own controller does beside motion")
 WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "add, move, remove, reset; simulated hardware only")
 TASK_COMMAND = Request("task/command", m.TaskCommand, m.TaskStatus, "start, pause, resume or stop the task")
 PARAMETERS = Request("param/<service>", m.ParameterRequest, m.ParameterReply,

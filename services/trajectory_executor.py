@@ -25,9 +25,9 @@ from common.control.inhibits import SOMEBODY, Inhibits, Speed, speed_of
 from common.control.record_file import record_file
 from common.control.requester import Alone, WhenAlone, objection
 from common.control.sole_use import sole_use
-from common.errors import Refused
-from common.hardware.interface import Limits
-from common.hardware.loading import find_backend, load_hardware
+from common.errors import ConfigError, Refused
+from common.hardware.interface import ControlledArm, Limits
+from common.hardware.loading import is_simulated, load_hardware
 from common.messages import (
     ExecuteRequest,
     FollowedRequest,
@@ -36,6 +36,8 @@ from common.messages import (
     Header,
     HoldRequest,
     MotionStatus,
+    RobotCommand,
+    RobotStatus,
     StopRequest,
     WorldEdit,
     WorldEditReply,
@@ -82,12 +84,12 @@ class Config(Parameters):
 
 def make_cycle(
     config: Config, simulated: bool, kept: Standing | None, now: float, inhibits: Inhibits | None = None,
-    period: float = PERIOD,
+    period: float = PERIOD, speed: float = 1.0,
 ) -> ControlCycle:
     """The controller with its hardware at the home pose and, when simulated, everything laid out.
 
-    Its cycles come every `period` of cell time [s]. Simulated hardware is found as it was `kept`, if that was of the
-    same world.
+    Its cycles come every `period` of cell time [s], which passes at this `speed`. Simulated hardware is found as it was
+    `kept`, if that was of the same world.
     """
     robot = RobotModel.load(config.robot)
     deceleration = np.array(config.robot.deceleration_limits) if config.robot.deceleration_limits else None
@@ -105,8 +107,12 @@ def make_cycle(
             kept = None
         if kept is not None:
             start = np.array(kept.q)
+    hardware = load_hardware(config.robot, limits, start)
+    if isinstance(hardware, ControlledArm) and speed != 1.0:
+        hardware.close()
+        raise ConfigError("speed", speed, "must be 1: the arm has a controller with a clock of its own")
     cycle = ControlCycle(
-        load_hardware(config.robot, limits, start), limits, start,
+        hardware, limits, start,
         tolerances=config.tolerances, gripper=config.robot.gripper, controller=config.robot.controller,
         kinematics=robot, world=world, inhibits=inhibits, period=period,
     )
@@ -133,8 +139,9 @@ async def run(bus: Bus, config: Config) -> None:
 
 async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> None:
     """Control the arm until cancelled; what is ours alone meanwhile is let go of afterwards."""
-    simulated = find_backend(config.robot).simulated
+    simulated = is_simulated(config.robot)
     joints, motion = bus.writer(topics.JOINT_STATES), bus.writer(topics.MOTION_STATUS)
+    robot = bus.writer(topics.ROBOT_STATUS)
     gripper = bus.writer(topics.GRIPPER_STATE) if config.robot.gripper else None
     updates = bus.writer(topics.SCENE_OBJECT_UPDATES) if simulated else None
     objects = bus.writer(topics.SCENE_OBJECTS) if simulated else None
@@ -200,6 +207,14 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         late = too_late(request.header) if request.header.stamp else None
         return cycle.command(request, bus.clock.now(), late).model_copy(update={"header": bus.header()})
 
+    async def order(request: RobotCommand) -> RobotStatus:
+        who = request.owner or SOMEBODY
+        bus.log.info("%s asks the arm: %s", who, request.act + (f" {request.value:g}" if request.value else ""))
+        ordered[number := cycle.order(request)] = asyncio.get_running_loop().create_future()
+        if outcome := await ordered[number]:
+            raise Refused("robot", f"{request.act}: {outcome}")
+        return cycle.robot.model_copy(update={"header": bus.header()})
+
     async def edit(request: WorldEdit) -> WorldEditReply:
         if not world_changes.locked() and not cycle.edit_takes_long(request):
             return cycle.edit(request, bus.clock.now())
@@ -214,6 +229,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
             finally:
                 cycle.apart = False
 
+    ordered: dict[int, asyncio.Future[str]] = {}  # of the arm's own controller, and what became of it
     world_changes = asyncio.Lock()
     moving: asyncio.Task[None] | None = None
 
@@ -232,6 +248,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     bus.serve(topics.MOTION_FOLLOWED, followed)
     bus.serve(topics.MOTION_STOP, stop)
     bus.serve(topics.MOTION_HOLD, hold)
+    bus.serve(topics.ROBOT_COMMAND, order)
     if gripper is not None:
         bus.serve(topics.GRIPPER_COMMAND, command)
     if simulated:
@@ -252,7 +269,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     kept = standing_file.load() if standing_file else None
     period = 1 / bus.clock.wall_rate(config.joint_state_rate, MOST_CYCLES)
     cycle = await asyncio.to_thread(
-        make_cycle, config, simulated, kept, bus.clock.now(), inhibits, period * bus.clock.speed
+        make_cycle, config, simulated, kept, bus.clock.now(), inhibits, period * bus.clock.speed,
+        bus.clock.speed,
     )
     cycle.beside = True
     decisions.on_change = cycle.tell_inhibits
@@ -278,6 +296,11 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
             motion.put(report.motion)
             if report.motion.state == "aborted":
                 bus.log.warning("goal %s: %s [%s]", report.motion.id, report.motion.message, report.motion.error)
+        for number in list(ordered):
+            if (outcome := cycle.outcome(number)) is not None and not (asked := ordered.pop(number)).done():
+                asked.set_result(outcome)
+        if report.robot is not None:
+            robot.put(report.robot)
         if report.gripper is not None and gripper is not None:
             gripper.put(report.gripper)
         if report.objects is not None and objects is not None:

@@ -9,7 +9,7 @@ from common.application import all_topics, find_application
 from common.chaos.agent import Chaos
 from common.chaos.plan import CELL_SECONDS, faults, plan
 from common.config import Cell
-from common.hardware.loading import find_backend
+from common.hardware.loading import is_simulated
 from common.supervision.supervisor import Supervisor
 from common.topics import AnyTopic
 from common.transport.bus import Bus
@@ -36,7 +36,7 @@ def chaos_in(
     processes = [status.name for status in supervisor.statuses if status.name in (ROUTER, *ours)]
     grasps = find_application(cell.application).grasps and cell.task in ours
     keys = list(known)
-    objects = grasps and find_backend(cell.robot).simulated
+    objects = grasps and is_simulated(cell.robot)
     if until_ended:
         seconds = CELL_SECONDS / bus.clock.speed
         planned = iter(plan(seed, processes, keys, objects=objects, seconds=seconds, per_minute=per_minute))

@@ -7,6 +7,7 @@ robot is held its goal stays active, at rest on its path; one that comes meanwhi
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TypeVar
@@ -170,6 +171,9 @@ class TrajectoryController:
         self._holds: dict[Holder, str] = {}  # the reasons, by who holds the robot
         self._status = MotionStatus()
         self.speed_scaling = 1.0
+        self.delay = 0.0  # [s] that the arm is behind its set-points
+        self.bridges = 0.0  # [s] between set-points that it fills by itself, as they are sent ahead of time
+        self._sent: deque[tuple[float, Vector]] = deque()  # set-points of that time, and one before
         self.inhibits: list[Inhibit] = []  # that reports tell of
 
     @property
@@ -190,7 +194,7 @@ class TrajectoryController:
     def _as_of_now(self, status: MotionStatus) -> MotionStatus:
         now: dict[str, object] = {
             "held": bool(self._holds), "held_by": sorted(self._holds), "speed_scaling": self.speed_scaling,
-            "inhibits": self.inhibits,
+            "inhibits": self.inhibits, "fault": self._fault,
         }
         if status.state != "active" and not status.message:
             if self._fault:
@@ -356,12 +360,13 @@ class TrajectoryController:
                                           measured_velocity, 0.0))
         elapsed = self._period if self._last is None else max(now - self._last, 0.0)
         self._last = now
-        late = elapsed > STALLED * self._usual + 1e-6
+        late = elapsed > max(STALLED * self._usual, self.bridges) + 1e-6
         self._usual = max(self._period, self._usual + USUAL * (elapsed - self._usual))
         if late:  # the arm had no set-points meanwhile, and stands
             elapsed = self._period
             self._stalled(now - elapsed, measured)
-        elapsed = min(elapsed, LATE * self._period)
+        most = max(LATE * self._period, self.bridges)
+        elapsed = min(elapsed, most)
         goal = self._goal
         if goal is not None:
             self._judge(goal, now, measured, measured_velocity)
@@ -372,7 +377,7 @@ class TrajectoryController:
         waiting = max(0.0, 1 - goal.behind / BEHIND)
         goal.time = goal.pace.advance(
             goal.at, goal.time, 0.0 if braking else self.speed_scaling * goal.share * waiting,
-            min(max(now - goal.last, 0.0), LATE * self._period),
+            min(max(now - goal.last, 0.0), most),
             self._limits.braking if braking else RAMP_SHARE * self._limits.acceleration, self._limits.jerks,
         )
         goal.last = now
@@ -469,10 +474,19 @@ class TrajectoryController:
         if self._goal is not None:
             self._finish("aborted", "hardware_fault", message, "hardware")
 
+    def _due(self, now: float) -> Vector:
+        """Where the arm is to be now (dof,) [rad]: at the newest set-point, or at an older one if it is behind them."""
+        if self.delay == 0.0:
+            return self._limiter.position
+        self._sent.append((now, self._limiter.position))
+        while len(self._sent) > 1 and self._sent[1][0] <= now - self.delay:
+            self._sent.popleft()
+        return self._sent[0][1]
+
     def _judge(self, goal: _Goal, now: float, measured: Vector, velocity: Vector) -> None:
         """End the goal when it is reached, or the robot is too far from the newest set-point."""
         allowed = self._tolerances
-        off = np.abs(measured - self._limiter.position)
+        off = np.abs(measured - self._due(now))
         j = int(np.argmax(off))
         name = self._limits.names[j]
         if off[j] > allowed.path:

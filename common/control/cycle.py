@@ -17,7 +17,7 @@ from common.control.faults import Fault, asked
 from common.control.gripper_controller import GripperController
 from common.control.inhibits import Inhibits
 from common.errors import ConfigError, Refused
-from common.hardware.interface import Hardware, HardwareFault, Limits, SimulatedGripper, Vector
+from common.hardware.interface import ControlledArm, Hardware, HardwareFault, Limits, SimulatedGripper, Vector
 from common.messages import (
     ExecuteRequest,
     GripperCommand,
@@ -28,6 +28,8 @@ from common.messages import (
     JointState,
     Message,
     MotionStatus,
+    RobotCommand,
+    RobotStatus,
     SceneUpdate,
     StopRequest,
     WorldEdit,
@@ -58,6 +60,7 @@ class Report:
     gripper: GripperState | None = None
     objects: WorldObjects | None = None
     updates: list[SceneUpdate] = field(default_factory=list)
+    robot: RobotStatus | None = None
     notes: list[str] = field(default_factory=list)  # for the log
 
 
@@ -102,6 +105,11 @@ class ControlCycle:
             self._gripper = GripperController(hardware.gripper, gripper)
         self._q = start.copy()
         self._found = False  # whether the arm was read
+        self._own = hardware if isinstance(hardware, ControlledArm) else None
+        if self._own is not None:
+            self._arm.delay, self._arm.bridges = self._own.delay, self._own.ahead
+        self._cap = 1.0  # of the speed, as persons and programs say
+        self._told_robot: RobotStatus | None = None
         self._arm_fault, self._hand_fault = Fault("the arm"), Fault("the gripper")
         self._width_rate = 0.0
         self._told_motion: MotionStatus | None = None
@@ -128,6 +136,7 @@ class ControlCycle:
             except HardwareFault as fault:
                 self._arm_fault.failed(str(fault), now)
                 self._arm.fault(str(fault))
+        report.robot = self._news_of_robot(header)
         report.notes = [*filter(None, (self._arm_fault.news(), self._hand_fault.news(), self._arm.news()))]
         if self._held_goal and self._held_goal != self._arm.goal:  # nothing is in the way of what is over
             self.hold(HoldRequest(hold=False, by="scene_monitor"))
@@ -159,6 +168,12 @@ class ControlCycle:
             self._arm.abort("hardware_fault", str(fault), "hardware")
             if self._gripper is not None:
                 self._gripper.fault(str(fault))
+        if self._own is not None:
+            own = self._own.state
+            self._arm.speed_scaling = self._cap * own.speed
+            if own.mode != "running":  # there is no need to leave it alone: it says how it is
+                self._arm.fault(own.message or own.mode)
+                return self._joint_state(header, dq)
         set_points = self._arm.update(now, self._q, dq)
         if set_points is not None:
             asked("sending set-points", self._hardware.write, *set_points, now)
@@ -288,11 +303,12 @@ class ControlCycle:
     @property
     def speed_scaling(self) -> float:
         """Share of their speed at which trajectories are followed, 0 to 1."""
-        return self._arm.speed_scaling
+        return self._cap
 
     @speed_scaling.setter
     def speed_scaling(self, share: float) -> None:
-        self._arm.speed_scaling = share
+        self._cap = share
+        self._arm.speed_scaling = share * (self._own.state.speed if self._own is not None else 1.0)
 
     def command(self, request: GripperCommand, now: float, late: Refused | None = None) -> GripperState:
         """The state of the gripper's goal, unless it comes too `late`.
@@ -309,6 +325,33 @@ class ControlCycle:
             self._hand_fault.failed(str(fault), now)
             self._gripper.fault(str(fault))
             return self._gripper.command(request, now, self._hand_fault.objection)
+
+    @property
+    def robot(self) -> RobotStatus:
+        """What the arm's own controller says; one that has none runs, unless it does not work."""
+        if self._own is None:
+            fault = self._arm_fault.reason
+            return RobotStatus(mode="fault" if fault else "running", message=fault)
+        own = self._own.state
+        return RobotStatus(mode=own.mode, message=own.message, speed=own.speed, late=self._own.late,
+                           inputs=own.inputs, outputs=own.outputs)
+
+    def order(self, request: RobotCommand) -> int:
+        """A number to ask about what the arm's own controller was told to do.
+
+        Raises:
+            Refused: it has none, or the request is none for this moment.
+        """
+        if self._own is None:
+            raise Refused("no_controller", "this arm has no controller of its own that could do that")
+        if request.act == "freedrive" and request.value and self._arm.goal:
+            raise Refused("busy", f"goal {self._arm.goal!r} is still being followed: stop it first")
+        return self._own.order(request.act, request.value)
+
+    def outcome(self, number: int) -> str | None:
+        """None while it is being done; empty once it was; else why not."""
+        assert self._own is not None
+        return self._own.outcome(number)
 
     def edit_takes_long(self, request: WorldEdit) -> bool:
         """Whether an edit may take longer than a cycle: it is made beside them then, `apart`."""
@@ -366,6 +409,13 @@ class ControlCycle:
             return None
         self._told_motion, self._told_motion_at = status, now
         return status.model_copy(update={"header": header})
+
+    def _news_of_robot(self, header: Header) -> RobotStatus | None:
+        robot, told = self.robot, self._told_robot
+        if told is not None and _same(told, robot, "late"):
+            return None
+        self._told_robot = robot
+        return robot.model_copy(update={"header": header})
 
     def _news_of_gripper(self, header: Header, now: float) -> GripperState | None:
         if self._gripper is None:

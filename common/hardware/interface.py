@@ -3,7 +3,7 @@
 Times are cell time [s], passed in; a backend keeps no clock of its own. A backend is a module (of this folder, or a
 dotted one of the user's own) with
 
-    simulated: bool          # whether the simulated world goes with it
+    simulated: bool          # whether the simulated world goes with it; or a function of the options that says so
     class Options(Parameters)
     def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> Hardware
 
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import ZencellError
+from common.messages import RobotMode
 
 Vector = NDArray[np.float64]
 
@@ -56,6 +57,21 @@ class Limits:
     def braking(self) -> Vector:
         """Largest change of velocity for a hold or a stop (dof,) [rad/s^2]."""
         return self.acceleration if self.deceleration is None else np.maximum(self.acceleration, self.deceleration)
+
+
+class ArmState(NamedTuple):
+    """What the arm says of itself: positions [rad], velocities [rad/s], and whether it could be moved.
+
+    `speed` is the share at which its own slider lets it move; `message` says why it cannot be moved.
+    """
+
+    q: list[float]
+    dq: list[float]
+    mode: RobotMode
+    message: str = ""
+    speed: float = 1.0
+    inputs: int = 0
+    outputs: int = 0
 
 
 class GripperReading(NamedTuple):
@@ -110,3 +126,26 @@ class Hardware(Protocol):
 
     def close(self) -> None:
         """Let go of the device."""
+
+
+@runtime_checkable
+class ControlledArm(Hardware, Protocol):
+    """An arm with a controller of its own, which says how it is and does things beside motion.
+
+    Its joints are `delay` [s] behind its set-points, `ahead` [s] of it because those are sent early. The latest cycle
+    of its driver so far was `late` by so much [s].
+    """
+
+    delay: float
+    ahead: float
+    late: float
+
+    @property
+    def state(self) -> ArmState:
+        """What the arm said last, or that it says nothing."""
+
+    def order(self, act: str, value: float) -> int:
+        """Have it `enable`, `recover`, `freedrive` (1 or 0) or take a `payload` (kg): a number to ask about."""
+
+    def outcome(self, number: int) -> str | None:
+        """None while it is being done; empty once it was; else why not."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Callable
 from typing import Any, Protocol, cast
 
 from common.config import Parameters, RobotConfig, check
@@ -23,7 +24,7 @@ def backend_names() -> list[str]:
 class Backend(Protocol):
     """A module that moves joints: see common.hardware.interface."""
 
-    simulated: bool
+    simulated: bool | Callable[[Any], bool]
     Options: type[Parameters]
 
     def create(self, robot: RobotConfig, limits: Limits, start: Vector, options: Any, /) -> Hardware:
@@ -48,6 +49,18 @@ def find_backend(robot: RobotConfig) -> Backend:
     if missing:
         raise ConfigError("robot.hardware.backend", name, f"is no backend: it has no {', '.join(missing)}")
     return cast(Backend, module)
+
+
+def is_simulated(robot: RobotConfig) -> bool:
+    """Whether the simulated world goes with the robot's hardware; some backends leave that to their options.
+
+    Raises:
+        UnknownName, ConfigError: no such backend, or an option that does not fit.
+    """
+    backend = find_backend(robot)
+    if callable(backend.simulated):
+        return backend.simulated(check(backend.Options, robot.hardware.options, "robot.hardware.options"))
+    return backend.simulated
 
 
 def load_hardware(robot: RobotConfig, limits: Limits, start: Vector) -> Hardware:

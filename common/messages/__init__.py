@@ -20,6 +20,9 @@ from common.messages.execution import (
     HoldRequest,
     Inhibit,
     MotionStatus,
+    RobotCommand,
+    RobotMode,
+    RobotStatus,
     StopRequest,
 )
 from common.messages.geometry import Color, Pose, PoseArray, Quaternion, TFMessage, TransformStamped, Vector3

@@ -12,6 +12,9 @@ from common.messages.robot import TRAJECTORY_BYTES, JointTrajectory
 
 GoalState = Literal["none", "rejected", "active", "succeeded", "aborted", "cancelled"]
 GripOutcome = Literal["", "grasped", "too_wide", "too_narrow", "empty", "slipping"]
+RobotMode = Literal[
+    "disconnected", "off", "idle", "running", "freedrive", "protective_stop", "emergency_stop", "fault"
+]
 Holder = Literal["person", "watchdog", "controller", "scene_monitor"]
 Who = Label
 Since = Annotated[int, Field(ge=0, le=MOST_STAMP)]
@@ -106,7 +109,7 @@ class MotionStatus(Message):
 
     most_bytes: ClassVar[int] = 4 * SMALL  # with all that keeps the robot from moving
     most_parts: ClassVar[int] = 256
-    later: ClassVar[tuple[str, ...]] = ("plan", "scene_stamp")
+    later: ClassVar[tuple[str, ...]] = ("fault", "plan", "scene_stamp")
 
     header: Header = Header()
     id: Label = ""
@@ -120,6 +123,7 @@ class MotionStatus(Message):
     speed_scaling: Fraction = Field(1.0, description="trajectories are followed at this share of their speed")
     inhibits: Annotated[list[Inhibit], Field(max_length=MOST_INHIBITS)] = Field(
         [], description="who stopped or holds the robot")
+    fault: Text = Field("", description="why the hardware does not move the robot, while that is so")
     plan: Label = Field("", description="id of the plan request that the goal answers, where it was told")
     scene_stamp: Since = Field(0, description="of the planning scene that it was planned on; 0: not known")
 
@@ -186,3 +190,28 @@ class GripperState(Message):
     error: Label = Field("", description="code of a refusal, such as stopped")
     message: Text = ""
     source: Label = Field("", description="name of the gripper's controller")
+
+
+class RobotStatus(Message):
+    """What the arm's own controller says: whether it could be moved, by whom, and how well time is kept."""
+
+    header: Header = Header()
+    mode: RobotMode
+    message: Text = Field("", description="why it cannot be moved; empty while it can")
+    speed: Fraction = Field(1.0, description="share at which the arm's own slider lets it move")
+    late: Finite = Field(0.0, description="the latest cycle of its driver so far [s]")
+    inputs: int = Field(0, ge=0, lt=2**32, description="digital inputs, a bit each")
+    outputs: int = Field(0, ge=0, lt=2**32, description="digital outputs, a bit each")
+
+
+class RobotCommand(Message):
+    """Have the arm's own controller do something that is no motion."""
+
+    most_bytes: ClassVar[int] = SMALL
+
+    act: Literal["enable", "recover", "freedrive", "payload"] = Field(
+        description="enable: power and brakes; recover: from a protective stop; freedrive: moved by hand, value 1 or "
+                    "0; payload: what the tool carries, value in kg"
+    )
+    value: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 0.0
+    owner: Who = Field("", description="name of the person")

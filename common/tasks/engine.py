@@ -113,7 +113,9 @@ class Task(Deciding[V]):
             self._began = view.now
         commands = self._watch(view)
         self._stopping = self._stopping and view.motion.state == "active"
-        waits = status.paused or view.motion.held or not status.started or status.state == "ERROR"
+        if view.motion.fault and not commands and self.running is None:
+            status.message = f"the arm waits: {view.motion.fault}"
+        waits = status.paused or view.motion.held or view.motion.fault or not status.started or status.state == "ERROR"
         if waits or view.motion.stopped or commands or self._stopping:
             self._count(view)
             return commands
@@ -203,6 +205,8 @@ class Task(Deciding[V]):
         elif isinstance(stage, Grip) and holds and isinstance(reported, m.GripperState) and reported.outcome in MISSES:
             stage.problem = reported.message
             self.missed(stage, view)
+        elif reported.error == "hardware_fault" and isinstance(stage, Move):  # the motion is not to blame
+            self._decide_anew(f"{stage.name} {reported.state}: {reported.message}", view)
         elif reported.state != "succeeded":
             self.fail(f"{stage.name} {reported.state}: {reported.message}", view)
         elif isinstance(stage, Grip) and holds and not view.holding:

@@ -66,7 +66,7 @@ def with_watched_arm(cell: Cell) -> Cell:
         ConfigError: its arm is a real one, for which time cannot stand still.
     """
     hardware = cell.robot.hardware
-    if not find_backend(cell.robot).simulated:
+    if find_backend(cell.robot).simulated is not True:  # one that talks to an arm has a clock of its own
         raise ConfigError("robot.hardware.backend", hardware.backend, "is a real arm: simulate needs a simulated one")
     watched = HardwareConfig(backend=__name__, options={"backend": hardware.backend, "options": hardware.options})
     return cell.model_copy(update={"robot": cell.robot.model_copy(update={"hardware": watched})})

@@ -7,7 +7,7 @@ import pytest
 from common.config import HardwareConfig, Parameters, RobotConfig
 from common.errors import ConfigError, UnknownName
 from common.hardware.interface import Limits, SimulatedGripper
-from common.hardware.loading import backend_names, find_backend, load_hardware
+from common.hardware.loading import backend_names, find_backend, is_simulated, load_hardware
 
 START = np.array([0.1, -0.2])
 
@@ -32,12 +32,12 @@ def test_every_backend_starts_at_the_start_at_rest_and_goes_where_it_is_sent(lim
 
 
 def test_backends_are_found_by_name() -> None:
-    assert backend_names() == ["lag", "mock"]
-    assert all(find_backend(robot(name)).simulated for name in backend_names())
+    assert backend_names() == ["lag", "mock", "ur"]
+    assert all(is_simulated(robot(name)) for name in ("lag", "mock"))
 
 
 def test_unknown_backend_names_the_choices() -> None:
-    with pytest.raises(UnknownName, match=r"'mok' \(did you mean 'mock'\?\); choices: lag, mock"):
+    with pytest.raises(UnknownName, match=r"'mok' \(did you mean 'mock'\?\); choices: lag, mock, ur"):
         find_backend(robot("mok"))
 
 

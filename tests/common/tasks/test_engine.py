@@ -185,6 +185,19 @@ def late_answer(cell: Cell, state: str) -> None:
         header=m.Header(stamp=int(cell.now * 1e9)), id=running.command.id, state=state, holding=True), cell.view)
 
 
+def test_motion_that_the_hardware_gave_up_is_decided_anew_once_it_works_and_no_failure() -> None:
+    cell = Cell()
+    cell.until("lift")
+    cell.motion = cell.motion.model_copy(update={
+        "state": "aborted", "error": "hardware_fault", "message": "the cable", "fault": "the cable"})
+    for _ in range(50):
+        assert not cell.step(), "nothing is asked for of an arm that does not work"
+    assert "the arm waits: the cable" in cell.task.status.message and cell.task.status.failures == 0
+    cell.motion = cell.motion.model_copy(update={"fault": ""})
+    cell.step()
+    assert cell.task.status.state == "DONE" and cell.task.status.failures == 0, "it sees that it has what it wanted"
+
+
 def test_grip_that_another_replaced_is_decided_anew_and_no_failure() -> None:
     cell = Cell()
     cell.until("close")

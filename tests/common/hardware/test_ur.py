@@ -1,0 +1,229 @@
+"""The backend of Universal Robots, by the vendor-neutral client library, against a double of a controller."""
+
+import os
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from common.errors import ConfigError
+from common.hardware.driver import DrivenArm
+from common.hardware.interface import HardwareFault, Limits
+from common.hardware.loading import is_simulated
+from common.hardware.ur import Options, create
+from tests.common.hardware.test_backends import robot
+from tests.doubles.ur_host import UrHost
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
+if os.environ.get("CI") != "true":
+    pytest.importorskip("rtde_control", reason="make setup EXTRAS=ur")
+
+SIX = np.ones(6)
+LIMITS = Limits(tuple("abcdef"), -6 * SIX, 6 * SIX, 3 * SIX, 5 * SIX, 10 * SIX, 500 * SIX)
+PERIOD, TIMEOUT = 0.01, 30.0
+
+
+class Rig:
+    """The backend, and cycles of 10 ms as the controller has them."""
+
+    def __init__(self, arm: DrivenArm) -> None:
+        self.arm, self.told, self.measured = arm, [""], 0 * SIX
+
+    def cycle(self, q: np.ndarray | None, dq: np.ndarray) -> str:
+        """One cycle: empty when the set-points were taken, else why not."""
+        try:
+            measured, _ = self.arm.read(0.0)
+            self.measured = measured
+            self.arm.write(measured if q is None else q, dq, 0.0)
+            problem = ""
+        except HardwareFault as fault:
+            problem = str(fault)
+        if problem != self.told[-1]:
+            self.told.append(problem)
+        time.sleep(PERIOD)
+        return problem
+
+    def until(self, wanted: str) -> str:
+        """Rest until a cycle ends with what is wanted: empty for set-points that are taken."""
+        end = time.monotonic() + TIMEOUT
+        q = None
+        while True:
+            problem = self.cycle(q, 0 * SIX)
+            q = None if problem else self.measured if q is None else q
+            if problem == wanted or (wanted and wanted in problem):
+                return problem
+            assert time.monotonic() < end, f"{wanted!r} did not come: {self.told}"
+
+    def wave(self, seconds: float) -> str:
+        """Swing every joint by 0.2 rad: empty at the end, or why it ended before."""
+        q0, _ = self.arm.read(0.0)
+        began = time.monotonic()
+        while (t := time.monotonic() - began) < seconds:
+            if problem := self.cycle(q0 + 0.1 * (1 - np.cos(2 * t)) * SIX, 0.2 * np.sin(2 * t) * SIX):
+                return problem
+        return ""
+
+    def until_it_moves(self) -> None:
+        """Try until a motion is not cut short: a link that was lost may be lost once more before it is there again."""
+        end = time.monotonic() + TIMEOUT
+        self.until("")
+        while self.wave(0.3):
+            assert time.monotonic() < end, self.told[-6:]
+            self.until("")
+
+    def done(self, number: int) -> str:
+        """What became of an order."""
+        end = time.monotonic() + TIMEOUT
+        while (outcome := self.arm.outcome(number)) is None:
+            assert time.monotonic() < end
+            time.sleep(PERIOD)
+        return outcome
+
+
+def made(host: str, **options: object) -> DrivenArm:
+    given = Options(host=host, **{"model": "ur5e", "ahead": 0.2, **options})  # type: ignore[arg-type]
+    return create(SimpleNamespace(gripper=None), LIMITS, 0 * SIX, given)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def host() -> Iterator[UrHost]:
+    with UrHost("127.0.0.41") as host:
+        yield host
+
+
+@pytest.fixture(scope="module")
+def rig(host: UrHost) -> Iterator[Rig]:
+    rig = Rig(made(host.host))
+    yield rig
+    rig.arm.close()
+
+
+def test_the_arm_is_read_where_it_stands_and_follows_from_there(host: UrHost, rig: Rig) -> None:
+    rig.until("")
+    assert np.allclose(rig.arm.read(0.0)[0], host.tell()["q"], atol=1e-3)
+    assert np.allclose(rig.arm.read(0.0)[0], [0, -1.57, 0.5, -1.57, 0, 0], atol=1e-6), "nothing has moved it"
+    assert rig.wave(np.pi) == ""
+    rig.until("")
+    told = host.tell()
+    assert told["commands"] > 200 and told["stops"] == 0 and told["fastest"] < 1.0
+
+
+def test_set_points_that_cease_bring_the_arm_to_rest_by_itself(host: UrHost, rig: Rig) -> None:
+    rig.until("")
+    assert rig.wave(0.7) == ""
+    end = time.monotonic() + TIMEOUT
+    while max(map(abs, host.tell()["qd"])) > 1e-3:  # nobody sends anything
+        assert time.monotonic() < end
+        time.sleep(PERIOD)
+    assert "ceased to come" in rig.until("ceased to come")
+    rig.until_it_moves()  # from where it is
+
+
+def test_a_protective_stop_says_so_and_is_left_only_when_somebody_asks(host: UrHost, rig: Rig) -> None:
+    rig.until("")
+    host.tell("protect")
+    assert rig.wave(2.0) != ""
+    rig.until("protective stop")
+    assert rig.arm.state.mode == "protective_stop"
+    host.tell("normal")  # a person at the pendant: that alone moves nothing
+    rig.until("was stopped for safety")
+    where = host.tell()["q"]
+    assert rig.done(rig.arm.order("recover")) == ""
+    rig.until("")
+    assert np.allclose(host.tell()["q"], where) and rig.wave(0.3) == "", rig.told[-6:]
+
+
+def test_an_emergency_stop_is_not_recovered_from_by_a_request(host: UrHost, rig: Rig) -> None:
+    rig.until("")
+    host.tell("emergency")
+    rig.until("emergency stop")
+    assert "pressed" in rig.done(rig.arm.order("recover"))
+    host.tell("normal")
+    rig.until("was stopped for safety")
+    assert rig.done(rig.arm.order("recover")) == ""
+    rig.until("")
+
+
+def test_a_pulled_cable_is_told_and_the_arm_found_where_it_stopped(host: UrHost, rig: Rig) -> None:
+    rig.until("")
+    host.tell("pull 1")
+    problem = rig.wave(3.0)
+    assert "no word" in problem or "does not take" in problem
+    rig.until("")
+    assert np.allclose(rig.arm.read(0.0)[0], host.tell()["q"], atol=1e-3)
+    rig.until_it_moves()
+
+
+def test_a_controller_that_was_started_again_waits_for_its_joints_to_be_powered(host: UrHost, rig: Rig) -> None:
+    rig.until("")
+    host.tell("reboot 1")
+    assert rig.wave(3.0) != ""
+    rig.until("without power")
+    assert rig.arm.state.mode == "off"
+    assert rig.done(rig.arm.order("enable")) == ""
+    rig.until_it_moves()
+
+
+def test_a_jump_is_not_played(host: UrHost, rig: Rig) -> None:
+    rig.until("")
+    end = time.monotonic() + TIMEOUT
+    q = rig.measured
+    while np.abs(np.array((before := host.tell())["q"]) - q).max() > 1e-3 or max(map(abs, before["qd"])) > 1e-3:
+        rig.cycle(q, 0 * SIX)  # what was sent before is still played
+        assert time.monotonic() < end
+    rig.cycle(q + 0.5, 0 * SIX)
+    assert "would jump" in rig.until("would jump")
+    after = host.tell()
+    assert after["stops"] == before["stops"] and np.allclose(after["q"], before["q"], atol=2e-3)
+
+
+def test_freedrive_lets_go_of_the_arm_until_it_is_ended(host: UrHost, rig: Rig) -> None:
+    rig.until("")
+    assert rig.done(rig.arm.order("freedrive", 1.0)) == "" and host.tell()["freedrive"]
+    assert "moved by hand" in rig.until("moved by hand")
+    assert rig.done(rig.arm.order("freedrive", 0.0)) == "" and not host.tell()["freedrive"]
+    rig.until("")
+
+
+def test_what_the_tool_carries_and_the_slider_are_told(host: UrHost, rig: Rig) -> None:
+    rig.until("")
+    assert rig.done(rig.arm.order("payload", 1.25)) == "" and host.tell()["payload"][0] == 1.25
+    host.tell("slider 0.3")
+    end = time.monotonic() + TIMEOUT
+    while rig.arm.state.speed != 0.3:
+        rig.cycle(None, 0 * SIX)
+        assert time.monotonic() < end
+    host.tell("slider 1")
+    assert "no act 'dance'" in rig.done(rig.arm.order("dance"))
+
+
+def test_nobody_at_the_address_is_told_without_end() -> None:
+    rig = Rig(made("127.0.0.42"))
+    try:
+        problem = rig.until("Timeout connecting")
+        assert "ur5e at 127.0.0.42" in problem and rig.arm.state.mode == "disconnected"
+        assert "ur5e at" in rig.done(rig.arm.order("enable"))
+    finally:
+        rig.arm.close()
+
+
+def test_a_controller_of_the_older_series_is_served_at_its_rate() -> None:
+    with UrHost("127.0.0.43", "--cb3") as host:
+        rig = Rig(made(host.host, model="ur5"))
+        try:
+            rig.until("")
+            assert rig.wave(1.0) == ""
+            assert 50 < host.tell()["commands"] < 1000
+        finally:
+            rig.arm.close()
+
+
+def test_the_simulated_world_goes_with_it_when_it_is_asked_for() -> None:
+    assert not is_simulated(robot("ur", host="10.0.0.1", model="ur10e"))
+    assert is_simulated(robot("ur", host="10.0.0.1", model="ur10e", world="simulated"))
+    with pytest.raises(ConfigError, match=r"model"):
+        is_simulated(robot("ur", host="10.0.0.1", model="ur6"))
+    with pytest.raises(ConfigError, match=r"host"):
+        is_simulated(robot("ur"))
