@@ -20,6 +20,7 @@ from common.tasks.stages import MISSES, Command, Execution, Grip, Look, Move, Re
 ANEW = ("busy", "stale_request", "clock_ahead", "stopped")  # refusals that have nothing to do with the motion
 START = ": start to go on"
 BLOCKED_BY = "scene_monitor"  # holds the arm while something is in the way
+NO_ARM = "the arm cannot be moved: "
 FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] by which fingers may stand elsewhere than a motion was planned with
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
@@ -114,7 +115,9 @@ class Task(Deciding[V]):
         commands = self._watch(view)
         self._stopping = self._stopping and view.motion.state == "active"
         if view.motion.fault and not commands and self.running is None:
-            status.message = f"the arm waits: {view.motion.fault}"
+            status.message = f"{NO_ARM}{view.motion.fault}"
+        elif status.message.startswith(NO_ARM):
+            status.message = ""
         waits = status.paused or view.motion.held or view.motion.fault or not status.started or status.state == "ERROR"
         if waits or view.motion.stopped or commands or self._stopping:
             self._count(view)

@@ -53,9 +53,11 @@ def test_every_plan_has_hostile_payloads_and_some_have_each_other_fault():
         fault for fault in make_plan(1, ["one"]).faults if fault.kind not in LAST)
 
 
+@pytest.mark.slow
 def test_run_that_a_person_stops_for_good_ends_with_the_robot_at_rest():
-    outcome = outcome_of("panda", 10)
-    assert (outcome.state, outcome.ok, outcome.faults["left so"]) == ("LEFT", True, 1)
+    outcomes = (outcome_of("panda", seed) for seed in range(1, 101))  # about every tenth
+    outcome = next(outcome for outcome in outcomes if outcome.faults["left so"])
+    assert (outcome.state, outcome.ok) == ("LEFT", True)
 
 
 def test_newest_stop_is_heard_of_before_a_start_is_asked_for():

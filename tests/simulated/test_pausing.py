@@ -115,6 +115,7 @@ def test_stopped_robot_is_brought_home_by_a_person_and_the_task_starts_again() -
         await until(status, lambda s: s.stage == "pre-grasp", 90)
         with pytest.raises(MotionFailed, match=r"the task is GRASPING .*stop the task first"):
             await person.move(JointGoal(named="home"))
+        await until(motion, lambda m: m.state == "active")
         await tell(bus, "pause")
         await held(motion)
         await tell(bus, "stop")

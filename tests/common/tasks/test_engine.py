@@ -192,9 +192,10 @@ def test_motion_that_the_hardware_gave_up_is_decided_anew_once_it_works_and_no_f
         "state": "aborted", "error": "hardware_fault", "message": "the cable", "fault": "the cable"})
     for _ in range(50):
         assert not cell.step(), "nothing is asked for of an arm that does not work"
-    assert "the arm waits: the cable" in cell.task.status.message and cell.task.status.failures == 0
+    assert cell.task.status.message == "the arm cannot be moved: the cable" and cell.task.status.failures == 0
     cell.motion = cell.motion.model_copy(update={"fault": ""})
     cell.step()
+    assert "cable" not in cell.task.status.message
     assert cell.task.status.state == "DONE" and cell.task.status.failures == 0, "it sees that it has what it wanted"
 
 
