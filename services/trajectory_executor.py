@@ -279,10 +279,10 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         bus.log.info("the arm and what is about it are as they were")
     alone, task = Alone(), config.members.task
     loop = asyncio.get_running_loop()
-    due = loop.time()
+    due, aborted = loop.time(), ""
 
     def turn() -> None:
-        nonlocal due
+        nonlocal due, aborted
         cycle.speed_scaling = config.speed_scaling
         report = cycle.step(bus.header("world"))
         for note in report.notes:
@@ -294,7 +294,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
             joints.put(report.joints)
         if report.motion is not None:
             motion.put(report.motion)
-            if report.motion.state == "aborted":
+            if report.motion.state == "aborted" and report.motion.id != aborted:
+                aborted = report.motion.id
                 bus.log.warning("goal %s: %s [%s]", report.motion.id, report.motion.message, report.motion.error)
         for number in list(ordered):
             if (outcome := cycle.outcome(number)) is not None and not (asked := ordered.pop(number)).done():

@@ -401,6 +401,7 @@ class TrajectoryController:
     def _seat(self, measured: Vector, velocity: Vector | None = None) -> None:
         """Have set-points begin where the arm is (dof,) [rad]; at the velocity it has [rad/s], if it moves."""
         self._hold, self._amiss = measured.copy(), 0.0 * measured
+        self._sent.clear()  # what was sent before is not followed any more
         self._coasting = velocity is not None and bool(np.any(np.abs(velocity) > self._tolerances.stopped_velocity))
         self._limiter.rest(measured, velocity if self._coasting else None)
 
@@ -412,6 +413,7 @@ class TrajectoryController:
             return
         if off > self._tolerances.start:
             self._limiter.rest(measured)
+            self._sent.clear()
             self._goal.behind = off
         else:
             self._limiter.rest()

@@ -1,4 +1,5 @@
 import re
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -201,6 +202,38 @@ def test_fault_ends_the_goal_and_rejects_others_until_it_is_gone(rig, rest_to_re
     assert (refused.error, refused.message) == ("hardware_fault", "bus is off")
     rig.step()
     assert rig.accept("c", rest_to_rest(rig.q.tolist(), [1, 1])).state == "active"
+
+
+class Behind(MockHardware):
+    """An arm that is at its set-points some cycles later, and stays where it is when it is stopped."""
+
+    def __init__(self, cycles: int) -> None:
+        super().__init__(START, None)
+        self._coming = deque([(START, START)] * cycles)
+
+    def write(self, positions, velocities, now):
+        self._coming.append((positions, velocities))
+        super().write(*self._coming.popleft(), now)
+
+    def stop(self):
+        here = self.read(0.0)[0]
+        super().write(here, 0 * here, 0.0)
+        self._coming = deque([(here, 0 * here)] * len(self._coming))
+
+
+def test_arm_that_is_behind_its_set_points_is_judged_by_those_of_then_and_by_none_of_before_it_was_stopped(
+    limits, rest_to_rest
+):
+    rig = Rig(limits, Behind(10), path=0.02)
+    rig.controller.delay = 0.1
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    for _ in range(60):
+        assert rig.step().state == "active", "0.1 s at 1.9 rad/s is ten times the tolerance"
+    rig.controller.fault("it was stopped")
+    rig.hardware.stop()
+    rig.step()
+    assert rig.accept("b", rest_to_rest(rig.q.tolist(), [0, 0])).state == "active"
+    assert rig.until_over().state == "succeeded"
 
 
 def test_trajectory_at_the_limits_can_be_stopped(limits, rest_to_rest):
