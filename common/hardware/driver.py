@@ -28,6 +28,8 @@ import numpy as np
 from common.hardware.interface import ArmState, Gripper, HardwareFault, Limits, Vector
 from common.hardware.streaming import REST, SetPointStream
 
+STOPS, RELEASES = ("protective_stop", "emergency_stop"), ("enable", "recover")
+STOPPED = "was stopped for safety: `zencell robot recover` lets it move again"
 SILENT = 0.25  # [s] without a word from the process or the arm, after which there is no knowing where it is
 FIRST_PAUSE, LONGEST_PAUSE = 0.5, 8.0  # [s] before a process that failed is begun again
 PRIORITY = 20  # real-time priority of the process, where the system grants one
@@ -101,6 +103,8 @@ class DrivenArm:
         self._problem = f"connecting to {name}"
         self._pause, self._due = FIRST_PAUSE, 0.0
         self._orders: dict[int, str | None] = {}
+        self._releases: set[int] = set()  # of them, those that let the arm move again
+        self._stopped = False  # for safety, also by a process before this one, and nobody has let it move again
         self._number = 0
         self._keep_up()
 
@@ -110,7 +114,10 @@ class DrivenArm:
         if self._newest is None or time.monotonic() - self._newest.stamp > SILENT:
             q = self._newest.state.q if self._newest else [0.0] * self._dof
             return ArmState(q, [0.0] * self._dof, "disconnected", self._problem)
-        return self._newest.state
+        newest = self._newest.state
+        if self._stopped and newest.mode == "running":  # somebody may stand there, whoever ended the stop
+            return newest._replace(mode="protective_stop", message=STOPPED)
+        return newest
 
     def read(self, now: float) -> tuple[Vector, Vector]:
         """Positions (dof,) [rad] and velocities [rad/s], as the arm said them last.
@@ -136,8 +143,8 @@ class DrivenArm:
         newest = self._newest
         if newest is None or self._ours is None:
             raise HardwareFault(self._problem or f"{self._name}: its driver has ended")
-        if newest.state.mode != "running":
-            raise HardwareFault(_told(self._name, newest.state))
+        if (state := self.state).mode != "running":
+            raise HardwareFault(_told(self._name, state))
         if newest.epoch != self._epoch:
             first, self._epoch = self._epoch < 0, newest.epoch
             raise HardwareFault(f"{self._name}: {newest.why or 'was connected anew'}" if not first or newest.why
@@ -149,6 +156,8 @@ class DrivenArm:
         """Have the arm do something beside motion: `outcome` of the number that is returned says what became of it."""
         self._number += 1
         self._orders[self._number] = None
+        if act in RELEASES:
+            self._releases.add(self._number)
         if not self._send(("do", self._number, act, value)):
             self._orders[self._number] = self._problem or f"{self._name} is not connected"
         return self._number
@@ -198,9 +207,12 @@ class DrivenArm:
             while True:
                 told = pipe.recv()
                 if isinstance(told, Reading):
+                    self._stopped = self._stopped or told.state.mode in STOPS
                     self._newest, self._problem, self._pause = told, "", FIRST_PAUSE
                     self.late = max(self.late, told.late)
                 elif told[0] == "done":
+                    if told[1] in self._releases and not told[2]:
+                        self._stopped = False
                     self._orders[told[1]] = told[2]
                 else:
                     self._problem = f"{self._name}: {told[1]}"

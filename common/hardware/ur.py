@@ -96,7 +96,6 @@ class UrArm:
         self._control: Any = None
         self._using = threading.Lock()  # the control interface, which is not made for two
         self._stamp, self._since = -1.0, time.monotonic()
-        self._stopped = ""  # why a person has to say that the arm may move again
         self._freedrive = self._servoing = False
         self._taken = 0.0  # monotonic time of the newest set-point that the arm took [s]
 
@@ -126,13 +125,9 @@ class UrArm:
     def _mode(self) -> tuple[RobotMode, str]:
         safety, robot = self._receive.getSafetyMode(), self._receive.getRobotMode()
         if safety in SAFETY:
-            mode, message = SAFETY[safety]
-            self._stopped = message
-            return mode, message
+            return SAFETY[safety]
         if robot != 7:
             return MODES.get(robot, ("fault", f"robot mode {robot}"))
-        if self._stopped:
-            return "protective_stop", "was stopped for safety: `zencell robot recover` lets it move again"
         if self._freedrive:
             return "freedrive", "is moved by hand: `zencell robot freedrive off`"
         return "running", ""
@@ -213,7 +208,7 @@ class UrArm:
             if time.monotonic() > end:
                 raise ValueError(f"the arm is in mode {robot}, safety mode {self._receive.getSafetyMode()}")
             time.sleep(0.02)
-        self._stopped, self._freedrive = "", False
+        self._freedrive = False
 
     def close(self) -> None:
         """Let go of the arm, at rest."""

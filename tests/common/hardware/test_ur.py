@@ -135,6 +135,18 @@ def test_a_protective_stop_says_so_and_is_left_only_when_somebody_asks(host: UrH
     assert np.allclose(host.tell()["q"], where) and rig.wave(0.3) == "", rig.told[-6:]
 
 
+def test_a_protective_stop_outlives_the_link_that_told_of_it(host: UrHost, rig: Rig) -> None:
+    rig.until("")
+    host.tell("protect")
+    rig.until("protective stop")
+    host.tell("pull 1")
+    rig.until("no word")
+    host.tell("normal")
+    rig.until("was stopped for safety")
+    assert rig.done(rig.arm.order("recover")) == ""
+    rig.until_it_moves()
+
+
 def test_an_emergency_stop_is_not_recovered_from_by_a_request(host: UrHost, rig: Rig) -> None:
     rig.until("")
     host.tell("emergency")
