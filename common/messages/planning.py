@@ -72,13 +72,25 @@ class ArcGoal(Message):
         return self
 
 
+class GoalSet(Message):
+    """Several goals of which any will do, such as all grasps of an object.
+
+    With `straight` it is the one at the end of the shortest line that can be followed; else the one that the arm can
+    turn straight to in the least time; where obstacles are in the way of all, the one of the best of the attempts.
+    """
+
+    kind: Literal["any"] = "any"
+    goals: list[Annotated[JointGoal | PoseGoal, Field(discriminator="kind")]] = Field(min_length=1, max_length=100)
+
+
 class SequenceItem(Message):
     """One motion of a sequence: point to point, a straight line where `straight`, an arc for an arc goal.
 
     The tool rounds the corner to the next item off within `blend_radius` of this goal; with none it stops there.
+    Where the goal leaves some freedom, it is reached where the whole motion takes the least time that was found.
     """
 
-    goal: Annotated[JointGoal | PoseGoal | ArcGoal, Field(discriminator="kind")]
+    goal: Annotated[JointGoal | PoseGoal | ArcGoal | GoalSet, Field(discriminator="kind")]
     straight: bool = False
     blend_radius: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="[m]")
 
@@ -94,17 +106,6 @@ class SequenceGoal(Message):
         if self.items[-1].blend_radius:
             raise ValueError(f"the last item has blend_radius {self.items[-1].blend_radius:g}, but nothing follows it")
         return self
-
-
-class GoalSet(Message):
-    """Several goals of which any will do, such as all grasps of an object.
-
-    With `straight` it is the one at the end of the shortest line that can be followed; else the one that the arm can
-    turn straight to in the least time; where obstacles are in the way of all, the one of the best of the attempts.
-    """
-
-    kind: Literal["any"] = "any"
-    goals: list[Annotated[JointGoal | PoseGoal, Field(discriminator="kind")]] = Field(min_length=1, max_length=100)
 
 
 AnyGoal = JointGoal | PoseGoal | PathGoal | ArcGoal | SequenceGoal | GoalSet
@@ -214,7 +215,7 @@ class PlanResponse(Message):
     ok: bool
     trajectory: JointTrajectory | None = None
     planner: Label = ""
-    goal_index: Count = Field(0, description="which goal of a set is reached, from 0")
+    goal_index: Count = Field(0, description="which goal of a set is reached, from 0; of a sequence, of its last")
     seconds: Finite = Field(0.0, description="wall time [s] of the whole request")
     scene_stamp: Annotated[int, Field(ge=0, le=MOST_STAMP)] = Field(
         0, description="of the planning scene that it was planned on; 0: not known")

@@ -90,11 +90,15 @@ def _goal(robot: RobotModel, goal: AnyGoal, start: Array) -> Goal:
     if isinstance(goal, PathGoal):
         return _tool_path(robot, start, goal)
     if isinstance(goal, SequenceGoal):
-        parts = [Part(_single_goal(robot, item.goal), item.straight, item.blend_radius) for item in goal.items]
+        parts = [Part(_item_goal(robot, item.goal), item.straight, item.blend_radius) for item in goal.items]
         return GoalSequence(tuple(parts))
     if isinstance(goal, GoalSet):
         return GoalChoice(tuple(_goals_of(robot, goal)))
     return _single_goal(robot, goal)
+
+
+def _item_goal(robot: RobotModel, goal: JointGoal | PoseGoal | ArcGoal | GoalSet) -> Array | Region | Arc | GoalChoice:
+    return GoalChoice(tuple(_goals_of(robot, goal))) if isinstance(goal, GoalSet) else _single_goal(robot, goal)
 
 
 def _goals_of(robot: RobotModel, choice: GoalSet) -> Iterator[Array | Region]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +16,7 @@ from common.planning.checks import BadRequest, CheckedRequest, check_collisions,
 from common.planning.collision import CollisionWorld, Pair
 from common.planning.constraints import CHECKED, ToolConstraints
 from common.planning.goal_sampling import missed_by
+from common.planning.legs import LEGS, NoOptions, join_legs
 from common.planning.obstacles import BadShape, ObstacleCache
 from common.planning.planners import Plan, load_planner, planner_names
 from common.planning.planners.joint_move import straight_profile
@@ -110,7 +112,12 @@ class PlanningPipeline:
             return _failed(request, began, CHECKS, failure, attempts)
         problem = self._problem(request, checked, world, began)
         best: tuple[str, Result] | None = None
-        for name, (plan, options) in planners.items():
+        last: dict[str, tuple[Plan, Parameters]] = {}
+        if problem.sequence is not None:
+            last = {LEGS: (partial(join_legs, planners=list(planners.values())), NoOptions())}
+        for name, (plan, options) in {**planners, **last}.items():
+            if name in last and best is not None and best[1].error != NOT_APPLICABLE:
+                break  # there is a planner for sequences
             failed: dict[int, Result] = {}  # goals of a set to which a line was found that is not good in the end
             while True:
                 since = monotonic()
@@ -138,7 +145,7 @@ class PlanningPipeline:
                 )
             if best is None or best[1].error == NOT_APPLICABLE or _further(result, best[1]):
                 best = (name, result)
-            if flag.reason(problem):
+            if result.error != NOT_APPLICABLE and flag.reason(problem):
                 break
         assert best is not None  # a pipeline has at least one planner
         return _failed(request, began, best[0], best[1], attempts)
@@ -304,12 +311,13 @@ def _from_beyond(problem: Problem, beyond: Array, trajectory: TimedPath) -> Time
 
 def _reached(problem: Problem, q: Array) -> int:
     """Which of several goals to choose from q (dof,) [rad] is at."""
-    if not isinstance(problem.goal, GoalChoice):
+    choice = problem.sequence[-1].goal if problem.sequence else problem.goal
+    if not isinstance(choice, GoalChoice):
         return 0
     T_world_tcp = problem.robot.fk(q)
     missed = [
         missed_by(goal, T_world_tcp) if isinstance(goal, Region) else float(np.abs(goal - q).max())
-        for goal in problem.goal.goals
+        for goal in choice.goals
     ]
     return int(np.argmin(missed))
 

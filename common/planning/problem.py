@@ -58,9 +58,9 @@ class Arc:
 class Part:
     """One motion of a sequence; the corner to the next is rounded off within `blend_radius` [m] of the goal."""
 
-    goal: Array | Region | Arc
-    straight: bool
-    blend_radius: float
+    goal: Array | Region | Arc | GoalChoice
+    straight: bool = False
+    blend_radius: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -111,6 +111,11 @@ class Problem:
     rng: np.random.Generator
     beyond: Array | None = None
     failed: dict[int, Result] = field(default_factory=dict)
+
+    @property
+    def sequence(self) -> tuple[Part, ...] | None:
+        """Goals to reach one after the other, where there are such."""
+        return self.goal.parts if isinstance(self.goal, GoalSequence) else None
 
     @property
     def tool_speed(self) -> float:
@@ -173,6 +178,7 @@ class Result:
         waypoints: (N, dof) [rad], to be retimed.
         dense: the waypoints lie close together: smooth through all of them; else blend at the corners.
         tool_line: the TCP follows a straight line (its speed scale applies).
+        cuts: (N,) how much of the edges before and after each waypoint may be rounded off [rad]; None: as is usual.
         way: the TCP follows a path with corners, at a speed of its own: rounds them and times its way.
         trajectory: already timed; then there are no waypoints.
         fraction: how much of the way is covered.
@@ -182,6 +188,7 @@ class Result:
 
     waypoints: Array | None = None
     dense: bool = False
+    cuts: Array | None = None
     tool_line: bool = False
     way: ToolWay | None = None
     trajectory: TimedPath | None = None

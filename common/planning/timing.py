@@ -54,7 +54,8 @@ def retime(problem: Problem, result: Result, blend: float = BLENDS[0], tool_spee
         speed = min(result.way.speed or math.inf, tool_speed)
         parts = [parametrise(path, velocity, acceleration, speed=speed, deadline=deadline) for path in paths]
         return limited_jerk(join(parts), problem.jerk)
-    paths = [dense_path(waypoints)] if result.dense else free_blends(waypoints, problem.world, blend)
+    most_cut = blend if result.cuts is None else result.cuts * (blend / BLENDS[0])
+    paths = [dense_path(waypoints)] if result.dense else free_blends(waypoints, problem.world, most_cut)
     most = math.inf if math.isinf(tool_speed) else partial(_rates_at, problem.robot, tool_speed)
     parts = [parametrise(path, velocity, acceleration, speed=most, deadline=deadline) for path in paths]
     return limited_jerk(join(parts), problem.jerk)
@@ -75,13 +76,13 @@ def slowed(robot: RobotModel, trajectory: TimedPath, tool_speed: float) -> Timed
     return trajectory if peak <= tool_speed else stretch(trajectory, _BELOW * tool_speed / peak)
 
 
-def free_blends(waypoints: Array, world: CollisionWorld, blend: float, step: float = 0.003) -> list[SmoothPath]:
+def free_blends(waypoints: Array, world: CollisionWorld, blend: float | Array, step: float = 0.003) -> list[SmoothPath]:
     """Blended paths whose corners are free of collision: a blend that is not is halved, in the end to a stop."""
-    blends = np.full(len(waypoints), blend)
+    blends = np.array(np.broadcast_to(blend, len(waypoints)))
     for i in range(1, len(waypoints) - 1):
         a, b, c = waypoints[i - 1 : i + 2]
         half = 0.5 * min(float(np.linalg.norm(b - a)), float(np.linalg.norm(c - b)))
-        blends[i] = min(blend, half)
+        blends[i] = min(blends[i], half)
         while blends[i] > 0:
             corner = blended_path(np.array([a, b, c]), np.array([0.0, blends[i], 0.0]))
             if len(corner) > 1 or world.bends_free(corner[0], step):
