@@ -17,15 +17,17 @@ import numpy as np
 from common.control.checks import Tolerances, checked_trajectory
 from common.control.goals import REMEMBERED, GoalMemory
 from common.control.limiter import SLACK, Limiter
-from common.control.trajectory import Pace, Trajectory
+from common.control.trajectory import Trajectory
 from common.errors import Refused
 from common.hardware.interface import HardwareFault, Limits, Vector
+from common.hardware.pace import Pace
 from common.messages import GoalState, Holder, Inhibit, JointTrajectory, MotionStatus
 
 PERIOD = 0.01  # cell time between cycles, unless told otherwise [s]
 LATE = 2  # periods: a cycle that comes later moves the arm by no more, and
 STALLED = 2  # usual cycles: after one that comes later motion goes on from rest, where the arm is
 USUAL = 0.2  # of what is usual is how it was the last time
+LATER = 0.1  # cell time that an arm behind its set-points may be later than that: hosts and networks are no clocks [s]
 RESEATED = 1.0  # cell time between two takings of an arm that was moved from outside: oftener it is not held [s]
 BLEND_TIME = 0.3  # the difference between the robot's and the trajectory's start fades in this time [s]
 BLEND_SHARE = 0.5  # of the limits is for that difference at most; else it takes longer
@@ -476,23 +478,32 @@ class TrajectoryController:
         if self._goal is not None:
             self._finish("aborted", "hardware_fault", message, "hardware")
 
-    def _due(self, now: float) -> Vector:
-        """Where the arm is to be now (dof,) [rad]: at the newest set-point, or at an older one if it is behind them."""
+    def _due(self, now: float, measured: Vector) -> tuple[Vector, Vector]:
+        """Where the arm is to be now (dof,) [rad]: at the newest set-point, or at an older one if it is behind them.
+
+        And of where it was to be within LATER before, if it is behind them, the nearest to where it is measured.
+        """
+        newest = self._limiter.position
         if self.delay == 0.0:
-            return self._limiter.position
-        self._sent.append((now, self._limiter.position))
-        while len(self._sent) > 1 and self._sent[1][0] <= now - self.delay:
+            return newest, newest
+        self._sent.append((now, newest))
+        while len(self._sent) > 1 and self._sent[1][0] <= now - self.delay - LATER:
             self._sent.popleft()
-        return self._sent[0][1]
+        due = [q for sent, q in self._sent if sent <= now - self.delay + 1e-6] or [self._sent[0][1]]
+        return due[-1], min(due, key=lambda q: float(np.abs(measured - q).max()))
 
     def _judge(self, goal: _Goal, now: float, measured: Vector, velocity: Vector) -> None:
         """End the goal when it is reached, or the robot is too far from the newest set-point."""
         allowed = self._tolerances
-        off = np.abs(measured - self._due(now))
+        due, nearest = self._due(now, measured)
+        off = np.abs(measured - nearest)
         j = int(np.argmax(off))
         name = self._limits.names[j]
         if off[j] > allowed.path:
             self.abort("path_tolerance", f"{name} is {off[j]:.4f} rad off its path (tolerance {allowed.path:g})")
+        off = np.abs(measured - due)
+        j = int(np.argmax(off))
+        name = self._limits.names[j]
         if goal.ended is None:
             return
         rest = bool(np.all(np.abs(velocity) <= allowed.stopped_velocity))

@@ -169,7 +169,7 @@ class ControlCycle:
             if self._gripper is not None:
                 self._gripper.fault(str(fault))
         if self._own is not None:
-            own = self._own.state
+            own, self._arm.delay = self._own.state, self._own.delay
             self._arm.speed_scaling = self._cap * own.speed
             if own.mode != "running":  # there is no need to leave it alone: it says how it is
                 self._arm.fault(own.message or own.mode)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import math
 import multiprocessing
 import os
 import select
@@ -66,7 +67,8 @@ class Reading(NamedTuple):
     """What the process tells: the state of the arm at `stamp`, and how well the process keeps time.
 
     `epoch` counts how often set-points were cut off; what was sent in an earlier one is not played any more. `late` is
-    the longest that a cycle came late [s] since the last reading.
+    the longest that a cycle came late [s] since the last reading, and `behind` how much later than they should be [s]
+    set-points are played for that. `ceased` says why the arm is being brought to rest by itself, which ends the epoch.
     """
 
     stamp: float
@@ -74,6 +76,8 @@ class Reading(NamedTuple):
     epoch: int
     why: str
     late: float
+    behind: float = 0.0
+    ceased: str = ""
 
 
 class DrivenArm:
@@ -88,7 +92,7 @@ class DrivenArm:
         Set-points are sent `ahead` of time [s]; the arm is at them after `delay` [s].
         """
         self.gripper = gripper
-        self.ahead, self.delay = ahead, delay
+        self.ahead, self._delay = ahead, delay
         self.late = 0.0  # [s] the latest cycle of the process so far
         self._begin: Callable[[Connection], multiprocessing.process.BaseProcess] = lambda theirs: context.Process(
             target=drive, args=(module, dict(options), limits, ahead, theirs), name=f"driver of {name}", daemon=True
@@ -106,7 +110,14 @@ class DrivenArm:
         self._releases: set[int] = set()  # of them, those that let the arm move again
         self._stopped = False  # for safety, also by a process before this one, and nobody has let it move again
         self._number = 0
+        self._older = 0.0  # what was read last is older by this than it would be if nobody was ever held up [s]
+        self._offset = math.inf  # from the controller's time to that of the host [s]
         self._keep_up()
+
+    @property
+    def delay(self) -> float:
+        """By which the arm, as it was read last, is behind its set-points [s]."""
+        return self._delay + self._older
 
     @property
     def state(self) -> ArmState:
@@ -132,10 +143,11 @@ class DrivenArm:
         silent = time.monotonic() - newest.stamp
         if silent > SILENT:
             raise HardwareFault(self._problem or f"no word from {self._name} for {silent:.1f} s")
+        self._older = silent + newest.state.age + newest.behind
         return np.array(newest.state.q), np.array(newest.state.dq)
 
     def write(self, positions: Vector, velocities: Vector, now: float) -> None:
-        """Send set-points (dof,) [rad], [rad/s].
+        """Send set-points (dof,) [rad], [rad/s]: for when they were made, however late they are sent.
 
         Raises:
             HardwareFault: the arm cannot be moved now, or has let the motion go: what comes next begins where it is.
@@ -145,11 +157,15 @@ class DrivenArm:
             raise HardwareFault(self._problem or f"{self._name}: its driver has ended")
         if (state := self.state).mode != "running":
             raise HardwareFault(_told(self._name, state))
+        if newest.ceased and newest.epoch <= self._epoch:
+            self._epoch = newest.epoch + 1  # what is sent once it rests
+            raise HardwareFault(f"{self._name}: {newest.ceased}")
         if newest.epoch != self._epoch:
             first, self._epoch = self._epoch < 0, newest.epoch
             raise HardwareFault(f"{self._name}: {newest.why or 'was connected anew'}" if not first or newest.why
                                 else f"{self._name} was connected")
-        if not self._send(("set", self._epoch, time.monotonic(), positions, velocities)):
+        self._offset = min(self._offset, time.monotonic() - now)
+        if not self._send(("set", self._epoch, now + self._offset, positions, velocities)):
             raise HardwareFault(self._problem or f"{self._name}: its driver has ended")
 
     def order(self, act: str, value: float = 0.0) -> int:
@@ -242,7 +258,7 @@ def drive(module: str, options: dict[str, Any], limits: Limits, ahead: float, pi
         arm: Arm = importlib.import_module(module).connect(options, limits)
         _hurry()
         with contextlib.suppress(EOFError, BrokenPipeError):  # nobody is there any more who could send set-points
-            _follow(arm, SetPointStream(limits, ahead), pipe)
+            _follow(arm, SetPointStream(limits, ahead, 1 / arm.rate), pipe)
         arm.close()
     except Exception as error:  # of whatever type: the reason is for the person, the process is done
         with contextlib.suppress(OSError):
@@ -305,6 +321,7 @@ def _follow(arm: Arm, stream: SetPointStream, pipe: Connection) -> None:
         else:
             arm.wait()
         if select.select([], [pipe], [], 0.0)[1]:  # else nobody takes it: the arm is not to wait for that
-            pipe.send(Reading(now, state, epoch, why, max(0.0, now - due)))
+            behind, ceased = (stream.behind, stream.ceased) if taken else (0.0, "")
+            pipe.send(Reading(now, state, epoch, why, max(0.0, now - due), behind, ceased))
         due = max(due + period, now)
         time.sleep(max(LEAST, due - time.monotonic()))

@@ -62,7 +62,8 @@ class Limits:
 class ArmState(NamedTuple):
     """What the arm says of itself: positions [rad], velocities [rad/s], and whether it could be moved.
 
-    `speed` is the share at which its own slider lets it move; `message` says why it cannot be moved.
+    `speed` is the share at which its own slider lets it move; `message` says why it cannot be moved; all of it is `age`
+    [s] old.
     """
 
     q: list[float]
@@ -72,6 +73,7 @@ class ArmState(NamedTuple):
     speed: float = 1.0
     inputs: int = 0
     outputs: int = 0
+    age: float = 0.0
 
 
 class GripperReading(NamedTuple):
@@ -136,9 +138,12 @@ class ControlledArm(Hardware, Protocol):
     of its driver so far was `late` by so much [s].
     """
 
-    delay: float
     ahead: float
     late: float
+
+    @property
+    def delay(self) -> float:
+        """By which its joints, as they were read last, are behind its set-points [s]; more after a hold-up."""
 
     @property
     def state(self) -> ArmState:

@@ -2,47 +2,88 @@
 
 They are played `ahead` late, so that the next one is there when it is needed; between two of them the curve is the
 cubic with their velocities. When they cease in the middle of a motion it comes to rest by itself within the limits.
+
+Who plays them may be held up. The arm slows down meanwhile, as it gets nothing new: the curve goes on where it was, as
+slow as the arm is then, and comes back to its speed by a ramp; the time is caught up with where limits leave room, and
+at the next rest.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 import ruckig
 
 from common.hardware.interface import Limits, Vector
+from common.hardware.pace import QUICKEST, Pace
 
-STALL = 0.05  # [s] without being asked where to be
+STALL = 0.09  # [s] without being asked where to be, in which an arm's own program has ended, or is about to
+JITTER = 1e-3  # [s] that being asked may be late without being held up
+SMOOTHING = 0.03  # [s] in which an arm without new set-points loses 63 % of its speed
+FASTER = 1.1  # of their speed, at which late set-points are played where there is room
+UNHURRIED = 1.0  # [s] in which that speed would rise from 0 to 1
+CAUGHT_UP = 2e-3  # [s] that they may be late for good
+RAMP_SHARE = 0.4  # of the limits of jerk is for ramps: the rest is the motion's
+HOPELESS = 0.3  # [s] that they are late at most: a stop would come as late
 REST = 1e-6  # [rad/s] slower, a set-point is at rest
 JUMP = 1e-3  # [rad] by which a step may be longer than the velocity limit allows: numbers are rounded, cycles jitter
 MOST = 1000  # set-points that wait; a sender that is so far ahead is broken
 
 
-class SetPointStream:
-    """What is played of the set-points that came; times are [s] of one clock, whichever."""
+class Point(NamedTuple):
+    """A set-point (dof,) [rad], [rad/s], and how much faster one may come to it than it was sent."""
 
-    def __init__(self, limits: Limits, ahead: float) -> None:
-        """Nothing is played before `begin`; `ahead` is the time [s] between a set-point's own and its turn."""
-        self._limits, self._ahead = limits, ahead
-        self._points: deque[tuple[float, Vector, Vector]] = deque(maxlen=MOST)
+    time: float
+    q: Vector
+    dq: Vector
+    faster: float = FASTER
+
+
+class SetPointStream:
+    """What is played of the set-points that came; times are [s] of one clock, whichever.
+
+    Attributes:
+        ceased: why nothing is taken until the next `begin`; empty while all is well.
+    """
+
+    def __init__(self, limits: Limits, ahead: float, period: float = 0.002) -> None:
+        """Nothing is played before `begin`; `ahead` is the time [s] between a set-point's own and its turn.
+
+        The arm takes what it is told every `period` [s] for where it has to be a period later.
+        """
+        self._limits, self._ahead, self._period = limits, ahead, period
+        self._points: deque[Point] = deque(maxlen=MOST)
         self._braking: tuple[float, ruckig.Trajectory] | None = None
         self._last = np.zeros(0)  # acceleration at the end of the newest piece (dof,) [rad/s^2]
-        self._asked, self._played = 0.0, (np.zeros(0), np.zeros(0))
-        self.ceased = ""  # why nothing is taken until the next `begin`; empty while all is well
+        self._came = np.zeros(0)  # at the end of the newest set-point that came
+        self._asked = self._time = 0.0  # when, and of the set-points' time, how far they were played
+        self._pace = Pace(1.0, np.zeros(0))
+        self._played = np.zeros(0), np.zeros(0)
+        self.ceased = ""
+
+    @property
+    def behind(self) -> float:
+        """How much later than they should be set-points are played [s]."""
+        return max(0.0, self._asked - self._ahead - self._time)
 
     def begin(self, q: Vector, now: float) -> None:
         """Rest at q (dof,) [rad], and take set-points again that begin there."""
+        rest = np.zeros_like(q)
         self._points.clear()
-        self._points.append((now - self._ahead, q.copy(), np.zeros_like(q)))
+        self._points.append(Point(now - self._ahead, q.copy(), rest))
         self._braking, self.ceased = None, ""
-        self._asked, self._played = now, (q.copy(), np.zeros_like(q))
+        self._last = self._came = rest
+        self._asked, self._time, self._pace = now, now - self._ahead, Pace(1.0, rest)
+        self._played = q.copy(), rest
 
     def put(self, time: float, q: Vector, dq: Vector) -> None:
         """Take a set-point (dof,) [rad], [rad/s] for `time`; one that nobody could follow ends the motion instead."""
         if self.ceased or not self._points:
             return
-        before, q0, _ = self._points[-1]
+        before, q0, dq0, _ = self._points[-1]
         step = time - before
         if step <= 0:
             return
@@ -51,54 +92,123 @@ class SetPointStream:
             j = int(np.argmax(np.where(np.isfinite(off), off, np.inf)))
             self.ceased = f"{self._limits.names[j]} would jump by {abs(q[j] - q0[j]):.4g} rad in {step * 1e3:.1f} ms"
             return
-        if np.all(np.abs(self._points[-1][2]) <= REST) and np.all(q == q0):
+        if np.all(np.abs(dq0) <= REST) and np.all(q == q0):
             self._points.pop()  # rests: a later motion begins where the rest ends
-            if self._points and np.any(self._points[-1][2]):
-                self._points.append((before, q0, 0 * q0))
-        self._points.append((time, q.copy(), dq.copy()))
+            if self._points and np.any(self._points[-1].dq):
+                self._points.append(Point(before, q0, 0 * q0))
+        a0, a1 = accelerations(step, q0, dq0, q, dq)
+        jerk = np.maximum(np.abs(a0 - self._came), np.abs(a1 - a0)) / step
+        self._came = a1
+        over = max(
+            float((np.maximum(np.abs(dq0), np.abs(dq)) / self._limits.velocity).max()),
+            math.sqrt(float((np.maximum(np.abs(a0), np.abs(a1)) / self._limits.acceleration).max())),
+            float(np.cbrt((jerk / (RAMP_SHARE * self._limits.jerks)).max())),
+        )
+        self._points.append(Point(time, q.copy(), dq.copy(), min(max(1 / max(over, 1e-9), 1.0), FASTER)))
 
     def at(self, now: float) -> tuple[Vector, Vector]:
         """Where to be (dof,) [rad], and how fast [rad/s], at a time that does not go back.
 
-        Who asks too seldom in the middle of a motion was held up, and the arm has come to rest meanwhile where it was
-        sent last: there it stays.
+        Who asks far too seldom in the middle of a motion finds the arm at rest where it was sent last: there it stays.
 
         Raises:
             IndexError: before `begin`.
         """
-        held_up = now - self._asked
-        self._asked = now
-        if held_up > STALL and np.any(np.abs(self._played[1]) > REST):
-            self.ceased = self.ceased or f"the driver was held up for {held_up * 1e3:.0f} ms"
-            rest = 0 * self._played[1]
-            self._braking = now - self._ahead, braking(self._limits, self._played[0], rest, rest)
-        self._played = self._at(now)
+        elapsed, self._asked = now - self._asked, now
+        q, dq = self._played
+        if elapsed > STALL and np.any(np.abs(dq) > REST):
+            self._cease(f"the driver was held up for {elapsed * 1e3:.0f} ms")
+            self._brake(q, 0 * q, 0 * q)
+        self._advance(elapsed, now - self._ahead)
+        self._played = self._now()
+        if self.behind > HOPELESS and self._braking is None:
+            self._cease(f"the driver was held up too often: it is {self.behind * 1e3:.0f} ms late")
         return self._played
 
-    def _at(self, now: float) -> tuple[Vector, Vector]:
-        time = now - self._ahead
-        if self._braking is not None:
-            return self._brake(time)
-        while len(self._points) > 1 and self._points[1][0] <= time:
-            before, q, dq = self._points.popleft()
-            time1, q1, dq1 = self._points[0]
-            step = time1 - before
-            self._last = (6 * (q - q1) + 2 * step * (dq + 2 * dq1)) / step**2
-        t0, q0, dq0 = self._points[0]
-        if len(self._points) > 1:
-            t1, q1, dq1 = self._points[1]
-            return hermite((time - t0) / (t1 - t0), t1 - t0, q0, dq0, q1, dq1) if time > t0 else (q0, dq0)
-        if np.all(np.abs(dq0) <= REST):
-            return q0, 0 * q0
-        self.ceased = self.ceased or f"set-points ceased to come {(time - t0 + self._ahead) * 1e3:.0f} ms ago"
-        self._braking = t0, braking(self._limits, q0, dq0, self._last)
-        return self._brake(time)
+    def _cease(self, why: str) -> None:
+        self.ceased = self.ceased or why
 
-    def _brake(self, time: float) -> tuple[Vector, Vector]:
-        assert self._braking is not None
-        began, motion = self._braking
-        q, dq, _ = motion.at_time(min(max(time - began, 0.0), motion.duration))
-        return np.array(q), np.array(dq)
+    def _advance(self, elapsed: float, wanted: float) -> None:
+        """Play on for so long [s], where the set-points' time should be the one that is wanted."""
+        pace, held_up = self._pace, elapsed > self._period + JITTER
+        rests = self._rests_until()
+        if self._time < min(rests, wanted):
+            self._time = min(rests, wanted)
+            pace.rate, pace.slope = 1.0, 0.0
+            elapsed = wanted - self._time
+            held_up = elapsed > self._period + JITTER
+        elif held_up:
+            pace.rate, pace.slope = pace.rate * math.exp(-(elapsed - self._period) / SMOOTHING), 0.0
+        step = self._period if held_up else elapsed
+        late = wanted - self._time - step
+        target = 1.0
+        if self._braking is None and self.ceased:
+            target = 0.0  # along what came of the path
+        elif self._braking is None and late > (CAUGHT_UP if pace.rate <= 1.0 else 0.0):
+            target = min(point.faster for point in self._points)
+        if pace.rate == target == 1.0 and pace.slope == 0.0:
+            self._time += step
+            pace.acceleration = 0 * pace.acceleration
+            return
+        pace.gentle = QUICKEST if pace.rate < 1.0 else UNHURRIED
+        if held_up or not np.any(pace.acceleration):  # how it would go on
+            dq = self._path(self._time)[1]
+            pace.acceleration = (self._path(self._time + pace.rate * self._period)[1] - dq) * pace.rate / self._period
+        most = self._limits.braking if self.ceased else self._limits.acceleration
+        self._time = pace.advance(self._path, self._time, target, step, most, RAMP_SHARE * self._limits.jerks)
+
+    def _rests_until(self) -> float:
+        """The time [s] until which the arm is to be where it rests now; minus infinity while it moves."""
+        if self._braking is not None:
+            began, motion = self._braking
+            return math.inf if self._time >= began + motion.duration else -math.inf
+        end = -math.inf
+        for n, point in enumerate(self._points):
+            if np.any(np.abs(point.dq) > REST) or (n and np.any(point.q != self._points[0].q)):
+                return end
+            end = point.time
+        return math.inf
+
+    def _now(self) -> tuple[Vector, Vector]:
+        while self._braking is None and len(self._points) > 1 and self._points[1].time <= self._time:
+            before, q, dq, _ = self._points.popleft()
+            time1, q1, dq1, _ = self._points[0]
+            self._last = accelerations(time1 - before, q, dq, q1, dq1)[1]
+        time, q, dq, _ = self._points[0]
+        moves = self._pace.rate > 0.0 and np.any(np.abs(dq) > REST)
+        if self._braking is None and len(self._points) == 1 and moves:
+            over = (self._time - time) / self._pace.rate
+            self._cease(f"set-points ceased to come {(over + self._ahead) * 1e3:.0f} ms ago")
+            rate, self._time = self._pace.rate, time + over
+            self._brake(q, dq * rate, self._last * rate**2, time)
+        q, dq = self._path(self._time)
+        return q, dq * self._pace.rate
+
+    def _brake(self, q: Vector, dq: Vector, ddq: Vector, began: float | None = None) -> None:
+        self._braking = self._time if began is None else began, braking(self._limits, q, dq, ddq)
+        self._pace = Pace(1.0, 0 * q)
+
+    def _path(self, time: float) -> tuple[Vector, Vector]:
+        """Where to be (dof,) [rad], and its change per second of the set-points' time."""
+        if self._braking is not None:
+            began, motion = self._braking
+            q, dq, _ = motion.at_time(min(max(time - began, 0.0), motion.duration))
+            return np.array(q), np.array(dq)
+        t0, q0, dq0, _ = self._points[0]
+        if time <= t0:
+            return q0, dq0
+        for n in range(1, len(self._points)):
+            t1, q1, dq1, _ = self._points[n]
+            if time < t1:
+                return hermite((time - t0) / (t1 - t0), t1 - t0, q0, dq0, q1, dq1)
+            t0, q0, dq0 = t1, q1, dq1
+        return q0 + (time - t0) * dq0, dq0
+
+
+def accelerations(step: float, q0: Vector, dq0: Vector, q1: Vector, dq1: Vector) -> tuple[Vector, Vector]:
+    """Accelerations (dof,) at both ends of the cubic with these at its ends, a step [s] apart."""
+    moved = 6 * (q1 - q0)
+    return (moved - 2 * step * (2 * dq0 + dq1)) / step**2, (2 * step * (dq0 + 2 * dq1) - moved) / step**2
 
 
 def hermite(

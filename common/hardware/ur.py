@@ -24,6 +24,7 @@ MODELS = r"^ur((3|5|10)e?|16e|15|20|30)$"
 CB3 = re.compile(r"^ur(3|5|10)$")
 LATEST = 0.15  # [s] without a new state of the arm, after which it counts as gone
 WATCHDOG = 10.0  # [Hz] less often, the arm's program ends by itself
+PROGRAM_RUNS = 2  # of the robot's status bits
 POWER = 30.0  # [s] in which joints are powered, and brakes released
 VARIABLES = ["timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "safety_status_bits", "runtime_state",
              "target_speed_fraction", "speed_scaling", "robot_status_bits", "actual_digital_input_bits",
@@ -97,6 +98,8 @@ class UrArm:
         self._using = threading.Lock()  # the control interface, which is not made for two
         self._stamp, self._since = -1.0, time.monotonic()
         self._freedrive = self._servoing = False
+        self._began = False  # whether the program that was uploaded was seen to run
+        self._ending: threading.Thread | None = None
         self._taken = 0.0  # monotonic time of the newest set-point that the arm took [s]
 
     def read(self) -> ArmState:
@@ -111,6 +114,11 @@ class UrArm:
         elif now - self._since > LATEST:
             raise ConnectionError(f"no word from the controller for {now - self._since:.2f} s")
         mode, message = self._mode()
+        if self._control is not None:
+            runs = bool(self._receive.getRobotStatus() & PROGRAM_RUNS)
+            if self._began and not runs and mode == "running":
+                mode, message = "idle", "its program has ended, and is begun again"
+            self._began = self._began or runs
         with self._using:
             if mode == "running" and self._control is None:
                 self._upload()
@@ -119,7 +127,7 @@ class UrArm:
         speed = self._receive.getTargetSpeedFraction()
         return ArmState(
             self._receive.getActualQ(), self._receive.getActualQd(), mode, message, min(max(speed, 0.0), 1.0),
-            self._receive.getActualDigitalInputBits(), self._receive.getActualDigitalOutputBits(),
+            self._receive.getActualDigitalInputBits(), self._receive.getActualDigitalOutputBits(), now - self._since,
         )
 
     def _mode(self) -> tuple[RobotMode, str]:
@@ -135,13 +143,17 @@ class UrArm:
     def _upload(self) -> None:
         import rtde_control
 
+        if self._ending is not None:
+            self._ending.join()  # the registers are for one at a time
+        self._began = False
         flags = rtde_control.RTDEControlInterface.FLAG_UPLOAD_SCRIPT
         self._control = rtde_control.RTDEControlInterface(self._options.host, self.rate, flags)
         self._control.setWatchdog(WATCHDOG)
 
     def _drop(self) -> None:
         control, self._control, self._servoing = self._control, None, False
-        threading.Thread(target=control.disconnect, daemon=True).start()  # it waits for threads of its own
+        self._ending = threading.Thread(target=control.disconnect, daemon=True)  # it waits for threads of its own
+        self._ending.start()
 
     def servo(self, q: Vector) -> None:
         """Go to q (6,) [rad] within one period.

@@ -54,7 +54,7 @@ def _hold_without_brakes():
         return target, velocity
 
     brakes = contextlib.ExitStack()
-    brakes.enter_context(patch("common.control.trajectory.next_rate", lambda path, time, pace, target, *_: target))
+    brakes.enter_context(patch("common.hardware.pace.next_rate", lambda path, time, pace, target, *_: target))
     brakes.enter_context(patch.object(Limiter, "step", step))
     return brakes
 

@@ -236,6 +236,32 @@ def test_arm_that_is_behind_its_set_points_is_judged_by_those_of_then_and_by_non
     assert rig.until_over().state == "succeeded"
 
 
+def test_arm_whose_readings_are_held_up_is_judged_by_where_it_was_to_be_when_they_were_made(limits, rest_to_rest):
+    rig = Rig(limits, Behind(10), path=0.02)
+    rig.controller.delay = 0.1
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    for _ in range(60):
+        rig.step()
+    honest, old = rig.hardware.read, rig.hardware.read(rig.now)
+    rig.hardware.read = lambda now: old
+    for _ in range(10):
+        rig.controller.delay += STEP
+        assert rig.step().state == "active" and not rig.controller.status.message
+    rig.hardware.read, rig.controller.delay = honest, 0.1
+    assert rig.until_over().state == "succeeded"
+
+
+def test_arm_that_is_later_than_usual_is_on_its_path_and_one_that_stays_behind_is_not(limits, rest_to_rest):
+    rig = Rig(limits, Behind(18), path=0.02)
+    rig.controller.delay = 0.1
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    assert rig.until_over().state == "succeeded"
+    rig = Rig(limits, Behind(25), path=0.02)
+    rig.controller.delay = 0.1
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    assert rig.until_over().error == "path_tolerance"
+
+
 def test_trajectory_at_the_limits_can_be_stopped(limits, rest_to_rest):
     tight = replace(limits, acceleration=limits.acceleration * 0.58)  # the quintic peaks at 5.77 rad/s^2
     rig = Rig(tight)

@@ -1,6 +1,8 @@
 """The backend of Universal Robots, by the vendor-neutral client library, against a double of a controller."""
 
+import multiprocessing
 import os
+import signal
 import time
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -33,10 +35,11 @@ class Rig:
 
     def cycle(self, q: np.ndarray | None, dq: np.ndarray) -> str:
         """One cycle: empty when the set-points were taken, else why not."""
+        now = time.monotonic()
         try:
-            measured, _ = self.arm.read(0.0)
+            measured, _ = self.arm.read(now)
             self.measured = measured
-            self.arm.write(measured if q is None else q, dq, 0.0)
+            self.arm.write(measured if q is None else q, dq, now)
             problem = ""
         except HardwareFault as fault:
             problem = str(fault)
@@ -119,6 +122,60 @@ def test_set_points_that_cease_bring_the_arm_to_rest_by_itself(host: UrHost, rig
         time.sleep(PERIOD)
     assert "ceased to come" in rig.until("ceased to come")
     rig.until_it_moves()  # from where it is
+
+
+def test_a_driver_that_is_held_up_for_a_moment_is_no_reason_for_the_arm_to_stop(host: UrHost, rig: Rig) -> None:
+    rig.until_it_moves()
+    rig.until("")
+    stops, (driver,) = host.tell()["stops"], [child for child in multiprocessing.active_children() if child.is_alive()]
+    q0, _ = rig.arm.read(0.0)
+    began, gaps = time.monotonic(), [0.4, 0.8, 1.2]
+    while (t := time.monotonic() - began) < np.pi and not rig.cycle(
+        q0 + 0.5 * (1 - np.cos(2 * t)) * SIX, np.sin(2 * t) * SIX
+    ):
+        if gaps and t > gaps[0]:
+            gaps.pop(0)
+            os.kill(driver.pid or 0, signal.SIGSTOP)
+            time.sleep(0.04)
+            rig.arm.read(0.0)
+            assert rig.arm.delay > rig.arm.ahead + 0.03 + 0.03, "what is read is as old as that"
+            os.kill(driver.pid or 0, signal.SIGCONT)
+    assert host.tell()["stops"] == stops and rig.arm.late > 0.03, rig.told[-3:]
+    rig.until_it_moves()
+
+
+def test_set_points_are_for_when_they_were_made_however_late_they_are_sent(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.until("")
+    sent: list[tuple[object, ...]] = []
+    monkeypatch.setattr(rig.arm, "_send", lambda message: sent.append(message) or True)
+    q, now = rig.measured, time.monotonic()
+    for n in range(5):
+        time.sleep(0.01 + 0.004 * (n % 2))
+        rig.arm.write(q, 0 * SIX, now + 0.01 * n)
+    stamps = [message[2] for message in sent]
+    assert np.allclose(np.diff(np.array(stamps, dtype=float)), 0.01, atol=1e-6)
+
+
+def test_a_program_that_ended_is_told_at_once_and_begun_again(host: UrHost, rig: Rig) -> None:
+    rig.until_it_moves()
+    driver = multiprocessing.active_children()
+    host.tell("end")
+    assert "its program has ended" in rig.wave(2.0)
+    rig.until_it_moves()
+    assert multiprocessing.active_children() == driver, "by the same process"
+
+
+def test_an_arm_that_comes_to_rest_by_itself_says_so_before_it_rests(host: UrHost, rig: Rig) -> None:
+    rig.until_it_moves()
+    rig.until("")
+    assert rig.wave(0.7) == ""
+    time.sleep(rig.arm.ahead + 0.05)  # nobody sends anything
+    assert "ceased to come" in rig.cycle(rig.measured, 0 * SIX) and max(map(abs, host.tell()["qd"])) > 0.01
+    while problem := rig.cycle(None, 0 * SIX):
+        assert "ceased to come" in problem, "nor does it say anything else until it rests"
+    assert max(map(abs, host.tell()["qd"])) < 0.05, "but for what servoJ smooths"
 
 
 def test_a_protective_stop_says_so_and_is_left_only_when_somebody_asks(host: UrHost, rig: Rig) -> None:
