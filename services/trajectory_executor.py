@@ -232,6 +232,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     ordered: dict[int, asyncio.Future[str]] = {}  # of the arm's own controller, and what became of it
     world_changes = asyncio.Lock()
     moving: asyncio.Task[None] | None = None
+    keeping: asyncio.Task[str] | None = None
 
     def move_world() -> None:
         """Have done beside the loop what takes long of what the hand does to the world."""
@@ -279,14 +280,17 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         bus.log.info("the arm and what is about it are as they were")
     alone, task = Alone(), config.members.task
     loop = asyncio.get_running_loop()
-    due, aborted = loop.time(), ""
+    due, aborted, arm_stopped = loop.time(), "", inhibits.arm_stopped
 
     def turn() -> None:
-        nonlocal due, aborted
+        nonlocal due, aborted, arm_stopped, keeping
         cycle.speed_scaling = config.speed_scaling
         report = cycle.step(bus.header("world"))
         for note in report.notes:
             bus.log.warning("%s", note)
+        if inhibits.arm_stopped != arm_stopped:
+            arm_stopped = inhibits.arm_stopped
+            keeping = asyncio.create_task(decisions.keep(), name="keep")
         move_world()
         if memory is not None and (standing := cycle.standing()) is not None:
             memory.save(standing)
@@ -328,6 +332,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     finally:
         if moving is not None:
             moving.cancel()
+        if keeping is not None:
+            await keeping
         decisions.close()
         cycle.close()
         if memory is not None:

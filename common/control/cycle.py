@@ -124,6 +124,8 @@ class ControlCycle:
         self._followed: ExecuteRequest | None = None  # the newest goal that was accepted
         self._held_goal = ""  # that the scene monitor holds
         self._inhibits = inhibits or Inhibits()
+        if self._own is not None:
+            self._own.stopped = self._own.stopped or self._inhibits.arm_stopped
         self.tell_inhibits()
 
     def step(self, header: Header) -> Report:
@@ -136,6 +138,8 @@ class ControlCycle:
             except HardwareFault as fault:
                 self._arm_fault.failed(str(fault), now)
                 self._arm.fault(str(fault))
+        if self._own is not None:
+            self._inhibits.arm_stopped = self._own.stopped
         report.robot = self._news_of_robot(header)
         report.notes = [*filter(None, (self._arm_fault.news(), self._hand_fault.news(), self._arm.news()))]
         if self._held_goal and self._held_goal != self._arm.goal:  # nothing is in the way of what is over

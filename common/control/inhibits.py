@@ -43,6 +43,7 @@ class Record(BaseModel):
     goals: list[str] = []
     speed: Speed | None = None
     newest: int = 0  # `since` of the newest inhibit there ever was
+    arm_stopped: bool = False  # the arm's own controller had stopped it for safety, and nobody has had it recover yet
 
 
 class Inhibits:
@@ -57,12 +58,13 @@ class Inhibits:
         self._newest = record.newest
         self._now = now
         self._problem, self._kept = "", record.inhibits
-        self.speed = record.speed
+        self.speed, self.arm_stopped = record.speed, record.arm_stopped
 
     @property
     def record(self) -> Record:
         """What has to outlive the process."""
-        return Record(inhibits=[*self._persons.values()], goals=[*self._goals], speed=self.speed, newest=self._newest)
+        return Record(inhibits=[*self._persons.values()], goals=[*self._goals], speed=self.speed, newest=self._newest,
+                      arm_stopped=self.arm_stopped)
 
     @property
     def all(self) -> list[Inhibit]:
@@ -173,4 +175,4 @@ def damaged(why: str) -> Record:
     """A record in the place of one that cannot be read: stopped, and slow."""
     reason = f"what persons decided cannot be read: {why}. Look at the cell before you start it"
     stop = Inhibit(kind="stopped", by="trajectory_executor", reason=reason[:MOST_REASON], since=wall_ns())
-    return Record(inhibits=[stop], speed=Speed(scaling=SLOWEST), newest=stop.since)
+    return Record(inhibits=[stop], speed=Speed(scaling=SLOWEST), newest=stop.since, arm_stopped=True)

@@ -108,7 +108,7 @@ class DrivenArm:
         self._pause, self._due = FIRST_PAUSE, 0.0
         self._orders: dict[int, str | None] = {}
         self._releases: set[int] = set()  # of them, those that let the arm move again
-        self._stopped = False  # for safety, also by a process before this one, and nobody has let it move again
+        self.stopped = False  # for safety, also by a process before this one, and nobody has let it move again
         self._number = 0
         self._older = 0.0  # what was read last is older by this than it would be if nobody was ever held up [s]
         self._offset = math.inf  # from the controller's time to that of the host [s]
@@ -126,7 +126,7 @@ class DrivenArm:
             q = self._newest.state.q if self._newest else [0.0] * self._dof
             return ArmState(q, [0.0] * self._dof, "disconnected", self._problem)
         newest = self._newest.state
-        if self._stopped and newest.mode == "running":  # somebody may stand there, whoever ended the stop
+        if self.stopped and newest.mode == "running":  # somebody may stand there, whoever ended the stop
             return newest._replace(mode="protective_stop", message=STOPPED)
         return newest
 
@@ -161,9 +161,9 @@ class DrivenArm:
             self._epoch = newest.epoch + 1  # what is sent once it rests
             raise HardwareFault(f"{self._name}: {newest.ceased}")
         if newest.epoch != self._epoch:
-            first, self._epoch = self._epoch < 0, newest.epoch
-            raise HardwareFault(f"{self._name}: {newest.why or 'was connected anew'}" if not first or newest.why
-                                else f"{self._name} was connected")
+            connected, self._epoch = self._epoch < 0, newest.epoch
+            if not connected:  # else nothing was sent yet, and what is sent now begins where the arm was read
+                raise HardwareFault(f"{self._name}: {newest.why or 'was let go of for a moment'}")
         self._offset = min(self._offset, time.monotonic() - now)
         if not self._send(("set", self._epoch, now + self._offset, positions, velocities)):
             raise HardwareFault(self._problem or f"{self._name}: its driver has ended")
@@ -223,12 +223,12 @@ class DrivenArm:
             while True:
                 told = pipe.recv()
                 if isinstance(told, Reading):
-                    self._stopped = self._stopped or told.state.mode in STOPS
+                    self.stopped = self.stopped or told.state.mode in STOPS
                     self._newest, self._problem, self._pause = told, "", FIRST_PAUSE
                     self.late = max(self.late, told.late)
                 elif told[0] == "done":
                     if told[1] in self._releases and not told[2]:
-                        self._stopped = False
+                        self.stopped = False
                     self._orders[told[1]] = told[2]
                 else:
                     self._problem = f"{self._name}: {told[1]}"

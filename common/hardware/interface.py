@@ -135,11 +135,13 @@ class ControlledArm(Hardware, Protocol):
     """An arm with a controller of its own, which says how it is and does things beside motion.
 
     Its joints are `delay` [s] behind its set-points, `ahead` [s] of it because those are sent early. The latest cycle
-    of its driver so far was `late` by so much [s].
+    of its driver so far was `late` by so much [s]. It is `stopped` from when it stops for safety until somebody has it
+    recover, whoever ended the stop; who knows of one from before sets it.
     """
 
     ahead: float
     late: float
+    stopped: bool
 
     @property
     def delay(self) -> float:

@@ -26,6 +26,7 @@ from common.messages import (
     JointTrajectory,
     JointTrajectoryPoint,
     ParameterRequest,
+    RobotCommand,
     StopRequest,
     Vector3,
     WorldEdit,
@@ -41,6 +42,7 @@ from common.sim.standing import STANDING_VARIABLE, STATE_VARIABLE, StateFile
 from common.transport.local import LocalNetwork
 from services import trajectory_executor
 from services.trajectory_executor import Config
+from tests.doubles import stopping_arm
 
 CELL = "test"
 SPEED = 10.0
@@ -96,8 +98,8 @@ class Person:
 
 
 @asynccontextmanager
-async def executor(*overrides: str):
-    net, clock = LocalNetwork(), Clock(SPEED)
+async def executor(*overrides: str, speed: float = SPEED):
+    net, clock = LocalNetwork(), Clock(speed)
     given = config(*overrides)
     async with running_service(net, trajectory_executor.run, given, name="trajectory_executor", cell=CELL, clock=clock):
         yield Person(net, clock)
@@ -675,3 +677,22 @@ async def test_joint_states_go_on_while_the_disk_is_stuck_on_which_the_simulated
         await goes_on(person)
     async with executor() as person:
         assert np.allclose((await person.joints.next()).position[:7], home + 0.1, atol=2e-3), "the newest was kept"
+
+
+async def test_a_stop_for_safety_outlives_the_executor_until_somebody_has_the_arm_recover(tmp_path, monkeypatch):
+    monkeypatch.setenv(STATE_VARIABLE, str(tmp_path))
+    own = "robot.hardware.backend=tests.doubles.stopping_arm"
+    async with executor(own, speed=1.0) as person:
+        await person.joints.next()
+        assert not stopping_arm.made[-1].stopped
+        stopping_arm.made[-1].stopped = True
+        await person.see(person.motion, lambda m: "stopped for safety" in m.fault)
+    async with executor(own, speed=1.0) as person:  # the stop was ended at the pendant meanwhile
+        arm, told = stopping_arm.made[-1], person.bus.reader(topics.ROBOT_STATUS)
+        assert (await person.see(told, lambda status: True)).mode == "protective_stop" and arm.stopped
+        answer = await person.bus.client(topics.ROBOT_COMMAND).call(RobotCommand(act="recover", owner="tester"))
+        assert answer.mode == "running"
+        await person.see(told, lambda status: status.mode == "running")
+    async with executor(own, speed=1.0) as person:
+        await person.joints.next()
+        assert not stopping_arm.made[-1].stopped

@@ -138,7 +138,7 @@ def test_what_was_saved_is_found_again(tmp_path: Path) -> None:
     inhibits = made()
     inhibits.stop(StopRequest(owner="anna", reason="fire"))
     inhibits.never(["a"])
-    inhibits.speed = Speed(scaling=0.05, configured=1.0)
+    inhibits.speed, inhibits.arm_stopped = Speed(scaling=0.05, configured=1.0), True
     file = record_file("panda", {"ZENCELL_STATE": str(tmp_path / "new" / "folder")})
     file.require_writable()
     assert file.load() == (Record(), "")
@@ -297,6 +297,7 @@ def test_record_that_cannot_be_read_counts_as_stopped_and_slow(tmp_path: Path, c
     inhibits = Inhibits(record)
     refused = inhibits.objection("a")
     assert refused is not None and str(path) in str(refused) and speed_of(inhibits.speed, 1.0) == SLOWEST
+    assert inhibits.arm_stopped, "nobody knows that it was not"
     inhibits.hold(HoldRequest(hold=False, stops=True))
     assert inhibits.objection("a") is None
 

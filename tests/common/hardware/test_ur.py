@@ -204,6 +204,14 @@ def test_a_protective_stop_outlives_the_link_that_told_of_it(host: UrHost, rig: 
     rig.until_it_moves()
 
 
+def test_a_stop_of_before_this_process_lets_nothing_move_either(host: UrHost, rig: Rig) -> None:
+    rig.until("")
+    rig.arm.stopped = True
+    rig.until("was stopped for safety")
+    assert rig.done(rig.arm.order("recover")) == "" and not rig.arm.stopped
+    rig.until_it_moves()
+
+
 def test_an_emergency_stop_is_not_recovered_from_by_a_request(host: UrHost, rig: Rig) -> None:
     rig.until("")
     host.tell("emergency")
@@ -283,6 +291,7 @@ def test_a_controller_of_the_older_series_is_served_at_its_rate() -> None:
         rig = Rig(made(host.host, model="ur5"))
         try:
             rig.until("")
+            assert not any("was connected" in told for told in rig.told), "that is no fault"
             assert rig.wave(1.0) == ""
             assert 50 < host.tell()["commands"] < 1000
         finally:

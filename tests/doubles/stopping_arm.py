@@ -1,0 +1,53 @@
+"""A backend for tests: a simulated arm with a controller of its own, which a test stops for safety."""
+
+from __future__ import annotations
+
+from common.config import Parameters, RobotConfig
+from common.hardware.fingers import Fingers
+from common.hardware.interface import ArmState, HardwareFault, Limits, Vector
+from common.hardware.mock import MockHardware
+
+simulated = True
+made: list[StoppingArm] = []  # the newest last
+
+
+class Options(Parameters):
+    """None."""
+
+
+class StoppingArm(MockHardware):
+    """Does all it is told at once."""
+
+    delay = ahead = late = 0.0
+
+    def __init__(self, start: Vector, gripper: Fingers | None) -> None:
+        """Not stopped."""
+        super().__init__(start, gripper)
+        self.stopped = False
+
+    @property
+    def state(self) -> ArmState:
+        """Stopped or running."""
+        q, dq = self.read(0.0)
+        return ArmState(q.tolist(), dq.tolist(), "protective_stop" if self.stopped else "running", "stopped for safety")
+
+    def write(self, positions: Vector, velocities: Vector, now: float) -> None:
+        """Move, unless it is stopped."""
+        if self.stopped:
+            raise HardwareFault("stopped for safety")
+        super().write(positions, velocities, now)
+
+    def order(self, act: str, value: float) -> int:
+        """Recover, whatever was asked for."""
+        self.stopped = False
+        return 1
+
+    def outcome(self, number: int) -> str:
+        """It is done."""
+        return ""
+
+
+def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> StoppingArm:
+    """The arm at `start` with open fingers."""
+    made.append(StoppingArm(start, Fingers(robot.gripper, robot.gripper.max_width) if robot.gripper else None))
+    return made[-1]
