@@ -127,7 +127,7 @@ def _bound(schema: Any) -> None:
 
 
 
-class Message(BaseModel):
+class Message(BaseModel):  # noqa: PLW1641 - it can change, and so has no hash
     """Base of everything that is sent.
 
     Whatever the fields of a message say of themselves: numbers are numbers and text is text, never one for the other;
@@ -146,6 +146,14 @@ class Message(BaseModel):
         schema = handler(source)
         _bound(schema)
         return schema
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all fields are the same: messages have nothing else, for which pydantic would look."""
+        return self.__dict__ == other.__dict__ if type(self) is type(other) else NotImplemented
+
+    def same_but(self, other: Self, *fields: str) -> bool:
+        """Whether all is the same but for these fields."""
+        return vars(self) | {name: getattr(other, name) for name in fields} == vars(other)
 
     def __deepcopy__(self, memo: dict[int, Any] | None = None) -> Self:
         """A copy that shares nothing that can be changed; pydantic makes one of each default that is a message."""

@@ -34,7 +34,7 @@ class Quaternion(Message):
 
     @model_validator(mode="after")
     def _is_unit(self) -> Quaternion:
-        norm = math.sqrt(self.x**2 + self.y**2 + self.z**2 + self.w**2)
+        norm = math.hypot(self.x, self.y, self.z, self.w)
         if abs(norm - 1) > 1e-3:
             raise ValueError(f"quaternion has norm {norm:.4f}, not 1")
         return self

@@ -211,7 +211,7 @@ class TaskRunner(Generic[V]):
             now.message = f"{WAITS}{trouble}"
         elif now.message.startswith(WAITS):
             now.message = ""
-        if before and now.model_copy(update={"task_seconds": before.task_seconds, "header": before.header}) == before:
+        if before and before.same_but(now, "task_seconds", "header"):
             return
         if now.state == "ERROR" and (before is None or before.state != "ERROR"):
             self._bus.log.error("%s", now.message)

@@ -77,7 +77,8 @@ class Renderer:
 
     def takes_long(self, objects: Sequence[WorldObject]) -> bool:
         """Whether to `see` the objects may take longer than a moment: rays are cast at all but a few spheres."""
-        return objects != self._asked and (len(objects) > FEW or any(thing.shape != "sphere" for thing in objects))
+        slow = len(objects) > FEW or any(thing.shape != "sphere" for thing in objects)
+        return slow and objects != self._asked
 
     def see(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
         """The view of the objects and of the arm in that state; without a complete state, of the objects alone.
