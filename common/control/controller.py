@@ -66,6 +66,7 @@ class _Goal:
     plan: str = ""  # id of the plan request that it answers
     scene_stamp: int = 0  # of the planning scene that it was planned on
     ended: float | None = None  # cell time at which the set-points came to rest
+    _newest: tuple[float, tuple[Vector, Vector]] | None = None  # time and answer: most are asked for three times
 
     @property
     def duration(self) -> float:
@@ -74,6 +75,11 @@ class _Goal:
 
     def at(self, time: float) -> tuple[Vector, Vector]:
         """Positions [rad] and their change per second of the trajectory (dof,), blended from where the robot was."""
+        if self._newest is None or self._newest[0] != time:
+            self._newest = time, self._blended(time)
+        return self._newest[1]
+
+    def _blended(self, time: float) -> tuple[Vector, Vector]:
         q, dq = self.trajectory.at(time)
         if time >= self.blend:
             return q, dq
@@ -182,6 +188,16 @@ class TrajectoryController:
     def status(self) -> MotionStatus:
         """What became of the newest goal, and whether and how fast the robot may move."""
         return self._as_of_now(self._status)
+
+    @property
+    def said(self) -> tuple[object, ...]:
+        """What the status is made of, but for its progress: nothing else of it is new while this is the same."""
+        return self._status, *self._holds.items(), self.speed_scaling, self.inhibits, self._fault
+
+    @property
+    def progress(self) -> float:
+        """That of the status."""
+        return self._status.progress
 
     @property
     def goal(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ from common.messages import (
     HoldRequest,
     Inhibit,
     JointState,
-    Message,
     MotionStatus,
     RobotCommand,
     RobotStatus,
@@ -37,7 +36,7 @@ from common.messages import (
     WorldObjects,
 )
 from common.robot.finger_joints import finger_positions, finger_velocities
-from common.sim.interface import SimulatedWorld
+from common.sim.interface import SimulatedWorld, StandingObject
 from common.sim.standing import Standing
 
 PROGRESS_PERIOD = 0.1  # cell time between reports of progress [s]
@@ -109,10 +108,11 @@ class ControlCycle:
         if self._own is not None:
             self._arm.delay, self._arm.bridges = self._own.delay, self._own.ahead
         self._cap = 1.0  # of the speed, as persons and programs say
-        self._told_robot: RobotStatus | None = None
+        self._told_robot: dict[str, Any] | None = None
         self._arm_fault, self._hand_fault = Fault("the arm"), Fault("the gripper")
         self._width_rate = 0.0
         self._told_motion: MotionStatus | None = None
+        self._said: tuple[object, ...] = ()  # by the arm, when that was told
         self._told_motion_at = self._told_gripper_at = self._told_world_at = -np.inf
         self._told_gripper: GripperState | None = None
         self._told_version = -1
@@ -120,6 +120,7 @@ class ControlCycle:
         self.due: Callable[[], None] | None = None  # to be done beside the cycles: the world stands still until then
         self.apart = False  # the world is changed by somebody else, and stands still here
         self._kept: object = None
+        self._stood: tuple[int, dict[str, StandingObject]] | None = None  # the objects, as of a version of the world
         self._waits = False  # held by ourselves
         self._followed: ExecuteRequest | None = None  # the newest goal that was accepted
         self._held_goal = ""  # that the scene monitor holds
@@ -162,7 +163,7 @@ class ControlCycle:
         """
         q, dq = asked("reading joints", self._hardware.read, now)
         for what, values in (("positions", q), ("velocities", dq)):
-            if np.shape(values) != self._q.shape or not np.all(np.isfinite(values)):
+            if np.shape(values) != self._q.shape or not np.isfinite(values).all():
                 raise HardwareFault(f"reading joints: {what} are not {len(self._q)} finite numbers: {values}")
         self._q, self._found = q, True
         try:
@@ -194,10 +195,12 @@ class ControlCycle:
         mark = (self._q.tobytes(), width, told, effort, self._world.version)
         if mark == self._kept:
             return None
+        if self._stood is None or self._stood[0] != self._world.version:
+            self._stood = self._world.version, dict(self._world.standing())
         self._kept = mark
-        return Standing(
+        return Standing.model_construct(  # which copies nothing: what is the same object need not be written anew
             layout=self._world.layout, q=self._q.tolist(), width=width, told_width=told,
-            told_effort=effort, objects=self._world.standing(),
+            told_effort=effort, objects=self._stood[1],
         )
 
     def restore(self, state: Standing, now: float) -> None:
@@ -333,12 +336,16 @@ class ControlCycle:
     @property
     def robot(self) -> RobotStatus:
         """What the arm's own controller says; one that has none runs, unless it does not work."""
+        return RobotStatus(**self._robot(), late=self._own.late if self._own is not None else 0.0)
+
+    def _robot(self) -> dict[str, Any]:
+        """What is told of it whenever it has changed."""
         if self._own is None:
             fault = self._arm_fault.reason
-            return RobotStatus(mode="fault" if fault else "running", message=fault)
+            return {"mode": "fault" if fault else "running", "message": fault}
         own = self._own.state
-        return RobotStatus(mode=own.mode, message=own.message, speed=own.speed, late=self._own.late,
-                           inputs=own.inputs, outputs=own.outputs)
+        return {"mode": own.mode, "message": own.message, "speed": own.speed, "inputs": own.inputs,
+                "outputs": own.outputs}
 
     def order(self, request: RobotCommand) -> int:
         """A number to ask about what the arm's own controller was told to do.
@@ -403,23 +410,24 @@ class ControlCycle:
             names += self._fingers.joints
             positions += finger_positions(self._fingers, width)
             velocities += finger_velocities(self._fingers, width, self._width_rate)
-        return JointState(header=header, name=names, position=positions, velocity=velocities)
+        return JointState(header=header, name=names, position=positions, velocity=velocities, effort=[])
 
     def _news_of_motion(self, header: Header, now: float) -> MotionStatus | None:
-        status, told = self._arm.status, self._told_motion
-        if told is not None and _same(told, status, "progress") and (
-            told.progress == status.progress or now - self._told_motion_at < PROGRESS_PERIOD
-        ):
+        told, said = self._told_motion, self._arm.said
+        if told is not None and (
+            told.progress == self._arm.progress or now - self._told_motion_at < PROGRESS_PERIOD
+        ) and (said == self._said or told.same_but(self._arm.status, "progress")):
+            self._said = said
             return None
-        self._told_motion, self._told_motion_at = status, now
-        return status.model_copy(update={"header": header})
+        self._told_motion, self._told_motion_at, self._said = self._arm.status, now, said
+        return self._told_motion.model_copy(update={"header": header})
 
     def _news_of_robot(self, header: Header) -> RobotStatus | None:
-        robot, told = self.robot, self._told_robot
-        if told is not None and _same(told, robot, "late"):
+        robot = self._robot()
+        if robot == self._told_robot:
             return None
         self._told_robot = robot
-        return robot.model_copy(update={"header": header})
+        return self.robot.model_copy(update={"header": header})
 
     def _news_of_gripper(self, header: Header, now: float) -> GripperState | None:
         if self._gripper is None:
@@ -427,15 +435,9 @@ class ControlCycle:
         state, told = self._gripper.state, self._told_gripper
         if told is state:
             return None
-        if told is not None and _same(told, state, "width", "position") and (
+        if told is not None and told.same_but(state, "width", "position") and (
             told.width == state.width or now - self._told_gripper_at < PROGRESS_PERIOD
         ):
             return None
         self._told_gripper, self._told_gripper_at = state, now
         return state.model_copy(update={"header": header})
-
-
-def _same(told: Message, state: Message, *but: str) -> bool:
-    """Whether all fields are as they were told, but for those named."""
-    now = vars(state)
-    return vars(told) | {name: now[name] for name in but} == now

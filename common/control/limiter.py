@@ -45,7 +45,7 @@ class Limiter:
         if position is not None:
             self.position = position.copy()
             # A joint that is found beyond its limit may stay there or come in, and then has no more room than that.
-            self._lowest, self._highest = np.minimum(self._lower, position), np.maximum(self._upper, position)
+            self._leave_room(position, position)
         self._step = self._period  # duration of the newest step [s]
         self._way = 0.0 * self.position if velocity is None else velocity.copy()  # mean velocity in it
         self._change = 0.0 * self.position  # mean acceleration up to the middle of it
@@ -88,9 +88,14 @@ class Limiter:
         way = (target - self.position) / seconds
         self._change = (way - self._way) / ((self._step + seconds) / 2)
         self.position, self._way, self._step = target, way, seconds
-        self._lowest = np.minimum(self._lower, np.maximum(self._lowest, target))
-        self._highest = np.maximum(self._upper, np.minimum(self._highest, target))
+        if self._beyond:
+            self._leave_room(np.maximum(self._lowest, target), np.minimum(self._highest, target))
         return target, velocity
+
+    def _leave_room(self, lowest: Vector, highest: Vector) -> None:
+        """Have all positions (dof,) [rad] between the limits allowed, and beyond them up to these."""
+        self._lowest, self._highest = np.minimum(self._lower, lowest), np.maximum(self._upper, highest)
+        self._beyond = bool((self._lowest < self._lower).any() or (self._highest > self._upper).any())
 
     def brake(self, seconds: float) -> tuple[Vector, Vector]:
         """The set-point after a step (dof,) [rad], [rad/s] on the shortest way to rest, wherever that is."""
@@ -104,22 +109,27 @@ class Limiter:
         self, target: Vector, velocity: Vector, way: Vector, change: Vector, seconds: float, between: float,
         share: float, most: Vector,
     ) -> bool:
+        speed = np.abs(way)
+        if not (speed <= self._velocity * (share * (1 + SLACK)) + ROUNDING).all():
+            return False
         room = ROUNDING / between
         hardest = most * (1 + SLACK) + room
         jump = np.abs(change - self._change)
         goes_on = 1.0 if self._kept is None else 0.5  # what is caught up with is left no faster than it was reached
         # With the velocity that it has it must be possible to stop before the end of the joint.
         free = np.where(way > 0, self._highest - target, target - self._lowest)
-        beyond = np.where(way > 0, self._highest > self._upper, self._lowest < self._lower)
-        free += np.where(beyond, ROUNDING, POSITION_SLACK)
-        speed = np.abs(way)
-        return bool(
-            np.all(speed <= self._velocity * (share * (1 + SLACK)) + ROUNDING)
-            and np.all(np.abs(velocity - way) <= hardest * (seconds * goes_on) + ROUNDING)
-            and np.all(np.abs(change) <= hardest)
-            and np.all(jump <= np.maximum(self._jerk * between, 2 * hardest))
-            and np.all(speed * (seconds + speed / (2 * self._braking)) <= free)
+        if self._beyond:
+            beyond = np.where(way > 0, self._highest > self._upper, self._lowest < self._lower)
+            free += np.where(beyond, ROUNDING, POSITION_SLACK)
+        else:
+            free += POSITION_SLACK
+        passes = (
+            (np.abs(velocity - way) <= hardest * (seconds * goes_on) + ROUNDING)
+            & (np.abs(change) <= hardest)
+            & (jump <= np.maximum(self._jerk * between, 2 * hardest))
+            & (speed * (seconds + speed / (2 * self._braking)) <= free)
         )
+        return bool(passes.all())
 
     def _approach(
         self, target: Vector, velocity: Vector, seconds: float, share: float

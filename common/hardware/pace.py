@@ -52,9 +52,10 @@ class Pace:
         """
         if step <= 0.0:
             return time
+        before = path(time)[1] * self.rate
         rate = next_rate(path, time, self, target, step, acceleration, jerk)
         after = time + way(self.rate, rate, step)
-        self.acceleration = (path(after)[1] * rate - path(time)[1] * self.rate) / step
+        self.acceleration = (path(after)[1] * rate - before) / step
         self.rate, self.slope = rate, (rate - self.rate) / step
         return after
 

@@ -69,7 +69,6 @@ class KinematicWorld:
         self._bodies: dict[str, Body] = {}
         self._between: dict[str, tuple[float, float]] = {}  # what the fingers would press on: its ends along tool y [m]
         self._events: list[SceneUpdate] = []
-        self._kept: tuple[int, dict[str, StandingObject]] | None = None  # as of a version
         try:
             self._lay_out()
         except Refused as refusal:
@@ -85,9 +84,7 @@ class KinematicWorld:
 
     def standing(self) -> dict[str, StandingObject]:
         """Everything as it is, for `restore`."""
-        if self._kept is None or self._kept[0] != self.version:
-            self._kept = self.version, {name: body.standing() for name, body in self._bodies.items()}
-        return self._kept[1]
+        return {name: body.standing() for name, body in self._bodies.items()}
 
     def restore(self, objects: Mapping[str, StandingObject]) -> None:
         """Put everything where it was; what is of a shape that there is not is passed over."""

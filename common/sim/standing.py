@@ -48,6 +48,8 @@ class StateFile:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
         self._number = 0
+        self._packer = msgpack.Packer(default=vars)
+        self._packed: dict[str, tuple[object, bytes]] = {}  # of the maps in the newest state, most of which stay
 
     def load(self) -> Standing | None:
         """The newest state that is whole; None when there is none."""
@@ -68,12 +70,21 @@ class StateFile:
 
     def save(self, state: Standing) -> None:
         """Write a state, which outlives this process at once, but not the machine."""
-        body = msgpack.packb(state, default=vars)
+        fields = vars(state)
+        packed = [self._packer.pack(name) + self._pack(name, value) for name, value in fields.items()]
+        body = self._packer.pack_map_header(len(fields)) + b"".join(packed)
         if _HEAD.size + len(body) > SLOT:  # it must not be written over the one before
             return
         self._number += 1
         place = SLOT * (self._number % 2)
         os.pwrite(self._descriptor, _HEAD.pack(self._number, len(body), _checksum(self._number, body)) + body, place)
+
+    def _pack(self, name: str, value: object) -> bytes:
+        before, packed = self._packed.get(name, (None, b""))
+        if value is not before or not isinstance(value, dict):
+            packed = self._packer.pack(value)
+            self._packed[name] = value, packed
+        return packed
 
     def close(self) -> None:
         """Close the file, which stays."""
