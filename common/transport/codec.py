@@ -90,7 +90,8 @@ def _decode(model: type[M], payload: bytes, limit: int, in_pieces: bool) -> M:
     if not isinstance(value, dict):
         raise DecodeError(f"{model.__name__}: payload is {_kind(value)}, not a map")
     try:
-        return model.model_validate(value)
+        message: M = model.__pydantic_validator__.validate_python(value)  # `model_validate` without its options
+        return message
     except ValidationError as error:
         raise DecodeError(_first_error(error, model.__name__)) from None
     except Exception as error:  # a check of a message of somebody's own that did not think of everything
@@ -195,6 +196,9 @@ class Attachment(NamedTuple):
     checksum: int | None = None  # `checksum_of` key and payload
 
 
+_PARTS = (str, int, int, str, int)  # of an attachment; the last may be missing
+
+
 def checksum_of(key: str, payload: bytes) -> int:
     """CRC-32 of the full key and a payload's first 64 kB, begun with its length: tells damage, not intent."""
     return zlib.crc32(payload[:CHECKED_BYTES], zlib.crc32(key.encode(), len(payload) & 0xFFFFFFFF))
@@ -227,17 +231,12 @@ def decode_attachment(data: bytes | None) -> Attachment | None:
     if not data:
         return None
     value = _unpack(data, 1024, "attachment")
-    match value:
-        case [str(writer), int(sequence), int(schema), str(trace), *rest] if (
-            is_name(writer) and is_name(trace) and 0 <= sequence <= MOST_STAMP
-        ):
-            if schema != SCHEMA_VERSION:
-                raise DecodeError(f"attachment: schema version {schema}, this side has {SCHEMA_VERSION}")
-            match rest:
-                case []:
-                    return Attachment(writer, sequence, schema, trace)
-                case [int(checksum)]:
-                    return Attachment(writer, sequence, schema, trace, checksum)
+    if isinstance(value, list) and len(value) in (4, 5) and all(map(isinstance, value, _PARTS)):
+        attachment = Attachment(*value)
+        if is_name(attachment.writer) and is_name(attachment.trace) and 0 <= attachment.sequence <= MOST_STAMP:
+            if attachment.schema != SCHEMA_VERSION:
+                raise DecodeError(f"attachment: schema version {attachment.schema}, this side has {SCHEMA_VERSION}")
+            return attachment
     raise DecodeError("attachment: not [writer, sequence, schema version, trace, checksum]")
 
 

@@ -119,6 +119,7 @@ class Invariants:
         self._objects = f"{cell.name}/{topics.SCENE_OBJECTS.key}"
         self._truth = [self._objects, *(f"{cell.name}/{view.key}" for view in application.views)]
         self._messages = {t.message.__name__: t.message for t in known.values()}
+        self._log = f"/{topics.LOG.expression.partition('/')[0]}/"
         self._motion = f"{cell.name}/{topics.MOTION_STATUS.key}"
         self._gripper = f"{cell.name}/{topics.GRIPPER_STATE.key}"
         self._goals: dict[str, _Goals] = {}
@@ -174,7 +175,7 @@ class Invariants:
             parted: whether it was cut off from the others before, so that another may have taken its place meanwhile.
         """
         self._parted |= {life} if parted else set()
-        if f"/{topics.LOG.expression.partition('/')[0]}/" not in sample.key:  # who is refused may say so
+        if self._log not in sample.key:  # who is refused may say so
             speaks = self._speaks.setdefault(service, life)
             after = self._silent.get(life, "")
             if self._broke(not after or self._parted & {life, after}, ALONE):
