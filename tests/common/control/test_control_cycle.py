@@ -67,6 +67,15 @@ def rig(limits):
     return made
 
 
+def test_what_stands_still_while_the_arm_moves_is_written_down_once(rig, rest_to_rest):
+    rig.execute("a", rest_to_rest([0, 0], [0, 0.1]))
+    rig.run(0.2)
+    first = rig.cycle.standing()
+    rig.step()
+    second = rig.cycle.standing()
+    assert first.q != second.q and first.objects is second.objects and first.layout is second.layout
+
+
 def test_first_cycle_tells_everything_and_then_only_the_joints(rig):
     assert rig.motions[0].state == "none" and rig.grippers[0].width == 0.08 and rig.balls[0].ids == ["ball_1"]
     assert rig.joints[0].name == ["shoulder", "elbow", "left", "right"]

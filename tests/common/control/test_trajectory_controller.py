@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from common.control.controller import LATE
 from common.control.goals import REMEMBERED, GoalMemory
+from common.control.trajectory import Trajectory
 from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware
 from tests.common.hardware.rig import START, STEP, T0, Rig
@@ -22,6 +23,15 @@ def test_goal_is_followed_to_its_end(limits, rest_to_rest, hardware):
     status = rig.until_over()
     assert (status.id, status.state, status.progress) == ("a", "succeeded", 1.0)
     assert np.allclose(rig.q, [1, -0.5], atol=2e-3)
+
+
+def test_each_place_of_a_path_is_worked_out_once(rig, rest_to_rest, monkeypatch):
+    asked, honest = [], Trajectory.at
+    monkeypatch.setattr(Trajectory, "at", lambda self, time: (asked.append(time), honest(self, time))[1])
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    for _ in range(50):
+        rig.step()
+    assert len(asked) == len(set(asked)) >= 50
 
 
 def test_progress_grows_with_time(rig, rest_to_rest):

@@ -163,3 +163,9 @@ def test_plain_values_are_not_nested_deeply() -> None:
         value = [value]
     with pytest.raises(DecodeError, match="16 levels"):
         decode(m.ParameterRequest, pack(set={"a": value}))
+
+
+def test_messages_are_the_same_when_their_fields_are() -> None:
+    here, there = (m.Vector3(x=x) for x in (1.0, 2.0))
+    assert here == m.Vector3(x=1.0, y=0.0) and here != there and here != m.Pose() and here != vars(here)
+    assert here.same_but(there, "x") and not here.same_but(there, "y")

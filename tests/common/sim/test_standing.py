@@ -63,6 +63,14 @@ def world(world_config) -> KinematicWorld:
     return world
 
 
+def test_a_state_with_some_of_the_one_before_is_found_whole(tmp_path: Path) -> None:
+    file, first, other = StateFile(tmp_path / "state"), a_state(1), a_state(2)
+    for objects in (first.objects, first.objects, other.objects):
+        state = Standing.model_construct(**vars(first) | {"q": [0.1 * len(objects)], "objects": objects})
+        file.save(state)
+        assert StateFile(tmp_path / "state").load() == state
+
+
 def test_balls_that_are_held_that_fall_and_that_lie_in_the_box_go_on_where_they_were(
     world: KinematicWorld, world_config, tmp_path: Path
 ) -> None:
