@@ -114,7 +114,7 @@ class PlanningPipeline:
         best: tuple[str, Result] | None = None
         last: dict[str, tuple[Plan, Parameters]] = {}
         if problem.sequence is not None:
-            last = {LEGS: (partial(join_legs, planners=list(planners.values())), NoOptions())}
+            last = {LEGS: (partial(join_legs, planners=planners), NoOptions())}
         for name, (plan, options) in {**planners, **last}.items():
             if name in last and best is not None and best[1].error != NOT_APPLICABLE:
                 break  # there is a planner for sequences
@@ -136,7 +136,7 @@ class PlanningPipeline:
                     id=request.id,
                     ok=True,
                     trajectory=message,
-                    planner=name,
+                    planner=result.planner or name,
                     seconds=monotonic() - began,
                     scene_stamp=scene.header.stamp,
                     goal_index=_reached(problem, trajectory.positions[-1]),

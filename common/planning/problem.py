@@ -183,6 +183,7 @@ class Result:
         trajectory: already timed; then there are no waypoints.
         fraction: how much of the way is covered.
         waypoint, colliding: where and between what a failure was found.
+        planner: which found the way, where others were asked for it.
         goal: number from 1 of the one of several goals to which its line leads; another may be tried in its place.
     """
 
@@ -198,6 +199,7 @@ class Result:
     waypoint: int | None = None
     colliding: Pair | None = None
     goal: int | None = None
+    planner: str = ""
     attempts: list[PlanAttempt] = field(default_factory=list)
 
 

@@ -99,6 +99,10 @@ class Deciding(Generic[V]):
             self.status.message = ""
         return True
 
+    def outdated(self, stage: Stage, view: V) -> str:
+        """Why what runs makes no sense any more: the arm is stopped then, and all decided anew. Empty while it does."""
+        return ""
+
     def planned(self, move: Move, response: m.PlanResponse) -> None:
         """Take note of the answer to a plan request, good or bad."""
 

@@ -66,6 +66,11 @@ class Task(Deciding[V]):
         self.planned(move, response)
         if response.ok and response.trajectory is not None:
             move.trajectory, move.plan, move.scene_stamp = response.trajectory, response.id, response.scene_stamp
+        elif move.otherwise and move in self.row and not response.error.startswith("start_"):
+            at = self.row.index(move)
+            self.row.remove(move)
+            for stage in reversed(move.otherwise):
+                self.row.insert(at, stage)
         else:
             self.plan_failed(move, response, view)
 
@@ -170,6 +175,10 @@ class Task(Deciding[V]):
         elif running.spent > limit:
             stop = self.stop(view, "it takes too long")
             self.fail(f"{stage.name} took longer than {round(limit, 2):g} s", view)
+            return stop
+        elif running.moves_arm and (why := self.outdated(stage, view)):
+            stop = self.stop(view, why)
+            self.status.message = f"{stage.name}: {why}"
             return stop
         elif blocked := self._blocked(view):
             stop = self.stop(view, blocked)

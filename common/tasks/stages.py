@@ -37,7 +37,10 @@ class Stage:
 
 @dataclass(eq=False)
 class Move(Stage):
-    """A motion of the arm; `trajectory` is there once it was planned, around what stood at `planned_around`."""
+    """A motion of the arm; `trajectory` is there once it was planned, around what stood at `planned_around`.
+
+    Where there is no way, the stages of `otherwise` take its place: such as one motion for each goal of a sequence.
+    """
 
     goal: Goal = field(kw_only=True)
     straight: bool = field(default=False, kw_only=True)
@@ -46,6 +49,7 @@ class Move(Stage):
     attach_pose: m.Pose | None = field(default=None, kw_only=True)  # in the tool's frame, when not held yet
     fresh: bool = field(default=False, kw_only=True)  # begins only while pictures come
     whole: bool = field(default=False, kw_only=True)  # begins only once all of its cycle is planned
+    otherwise: list[Stage] = field(default_factory=list, kw_only=True)
     trajectory: m.JointTrajectory | None = field(default=None, init=False)
     planned_around: list[tuple[float, float]] = field(default_factory=list, init=False)  # (x, y) [m]
     planned_width: float | None = field(default=None, init=False)  # between the fingers on the way [m]

@@ -39,6 +39,13 @@ def waypoints(robot: RobotModel, start: Array, goal: object) -> list[Array]:
     """
     if isinstance(goal, m.JointGoal):
         return [robot.named(goal.named) if goal.named else np.array(goal.positions)]
+    if isinstance(goal, m.GoalSet):
+        return waypoints(robot, start, goal.goals[0])
+    if isinstance(goal, m.SequenceGoal):
+        passed = [start]
+        for item in goal.items:
+            passed += waypoints(robot, passed[-1], item.goal)
+        return passed[1:]
     if not isinstance(goal, m.PoseGoal | m.PathGoal):
         raise Refused("not_applicable", f"the planner's double knows no {type(goal).__name__}")
     poses = [goal.pose] if isinstance(goal, m.PoseGoal) else goal.waypoints[1:MOST_POSES]

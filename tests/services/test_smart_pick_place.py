@@ -49,9 +49,11 @@ async def test_validated_target_makes_it_ask_for_a_plan_to_above_that_ball() -> 
         show(bus, [(0.40, -0.17)])
         request = await asyncio.wait_for(asked.get(), 5)
         assert request.stage == "pre-grasp"
-        assert isinstance(request.goal, m.PoseGoal)
-        assert (request.goal.pose.position.x, request.goal.pose.position.y) == (0.40, -0.17)
-        assert abs(request.goal.pose.position.z - 0.13) < 1e-9
+        assert isinstance(request.goal, m.SequenceGoal)
+        for goal, height in zip([item.goal for item in request.goal.items], (0.13, 0.03), strict=True):
+            assert isinstance(goal, m.PoseGoal)
+            assert (goal.pose.position.x, goal.pose.position.y) == (0.40, -0.17)
+            assert abs(goal.pose.position.z - height) < 1e-9
 
 
 async def test_picture_that_is_late_by_the_fast_clock_of_the_cell_only_is_fresh() -> None:

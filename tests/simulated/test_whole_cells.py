@@ -33,7 +33,7 @@ def test_panda_clears_the_table_without_any_time_passing():
     summary = SimulatedCell("panda").summary
     assert (summary["state"], summary["placed"], summary["targets"], summary["rejected"]) == ("DONE", 7, 7, [])
     assert summary["truth"] == {"in_box": 7, "on_table": 0, "elsewhere": 0, "containers": {"box": 7}}
-    assert len(summary["plans"]) >= 4 * 7 and (summary["failures"], summary["retries"]) == (0, 0)
+    assert len(summary["plans"]) >= 2 * 7 and (summary["failures"], summary["retries"]) == (0, 0)
     assert summary["restarts"] == {}
 
 

@@ -19,7 +19,9 @@ from common.tasks.engine import appeared
 from common.tasks.stages import Cycle, Place, View, place_of
 
 Spots = list[tuple[float, float]]
+YawRange = tuple[float, float]  # its middle, and how far it reaches to either side [rad]
 FULL = "the container is full"
+FINE = 36  # yaws in half a turn at which it is looked whether the hand is clear
 SETTLING = 1.5  # [s] from letting go until the ball lies in the container and was seen there
 
 
@@ -61,8 +63,10 @@ class Pick(Cycle):
 
     target: Target = field(kw_only=True)
     yaws: list[float] = field(default_factory=list, kw_only=True)
+    ranges: list[YawRange] = field(default_factory=list, kw_only=True)  # of the hand, for what is round
     yaw: float = field(default=0.0, kw_only=True)  # of the hand, of those the one that is tried
     again: bool = field(default=False, kw_only=True)  # there was no way to it from another posture of the arm
+    apart: bool = field(default=False, kw_only=True)  # it was asked for a way to any of the yaws once
     first_error: str = ""
 
     def __post_init__(self) -> None:
@@ -147,14 +151,17 @@ class Choice:
         candidates.sort(key=lambda ball: math.dist(ball.position[:2], origin[:2]))
         for ball in candidates:
             others = [(*b.position[:2], b.radius) for b in view.others(ball, self.radius)]
-            yaws = grasp_yaws(self.p.hand, ball.position, others, self.radius, self.container,
-                              yaws_of(ball, self.p.hand))
+            flat = yaws_of(ball, self.p.hand)
+            yaws = grasp_yaws(self.p.hand, ball.position, others, self.radius, self.container, flat)
             if full:
                 self.give_up(ball, FULL, view)
             elif not yaws:
                 self.give_up(ball, "no turn of the hand clears what stands beside it", view)
             else:
-                return Pick(target=ball, yaws=yaws, again=self._given_up_at(ball.position) is not None)
+                again = self._given_up_at(ball.position) is not None
+                clear = [] if flat is not None else grasp_yaws(
+                    self.p.hand, ball.position, others, self.radius, self.container, yaw_candidates(FINE))
+                return Pick(target=ball, yaws=yaws, ranges=yaw_ranges(clear), again=again)
         return None
 
     def once_more(self) -> bool:
@@ -276,6 +283,21 @@ def grasp_yaws(
         for yaw in (yaw_candidates(shape.yaw_count) if yaws is None else yaws)
         if finger_clearance(shape, center, yaw, near, radius, container) >= shape.min_clearance
     ]
+
+
+def yaw_ranges(clear: Sequence[float]) -> list[YawRange]:
+    """Ranges in a full turn of the hand that `clear` is about, of `yaw_candidates(FINE)`: those next to each other."""
+    if len(clear) == FINE:
+        return [(0.0, math.pi)]
+    step = math.pi / FINE
+    free = {round(yaw / step) % FINE for yaw in clear}
+    ranges: list[YawRange] = []
+    for first in sorted(number for number in free if (number - 1) % FINE not in free):
+        count = next(n for n in range(1, FINE + 1) if (first + n) % FINE not in free)
+        half = (count - 1) / 2
+        middle = (first + half) * step
+        ranges += [(math.remainder(middle + turn, 2 * math.pi), half * step) for turn in (0.0, math.pi)]
+    return ranges
 
 
 def yaws_of(target: Target, shape: HandShape) -> list[float] | None:

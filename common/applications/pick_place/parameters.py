@@ -65,6 +65,9 @@ class Config(TaskConfig):
     width_tolerance: Tunable[float] = Field(
         0.01, gt=0, le=0.05, description="what is grasped may be so much wider or narrower than it was seen [m]"
     )
+    joined: Tunable[bool] = Field(
+        True, description="one motion leads to an object and down to it, another up and across, where possible"
+    )
     hand: HandShape = HandShape()
 
     @model_validator(mode="after")

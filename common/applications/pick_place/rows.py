@@ -12,6 +12,8 @@ from common.config import GripperConfig
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down, transform
 from common.tasks.stages import Grip, Move, Place, Stage
 
+ANY_YAW = 3.1  # [rad] a tolerance of so much leaves the hand any yaw
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -25,15 +27,42 @@ class Rows:
         yaw = cycle.yaw = cycle.yaws.pop(0)
         x, y, z = cycle.target.position
         low = self.grasp_height(z)
-        grasp = m.PoseGoal(pose=matrix_to_pose(tool_down(x, y, low, yaw + self.turn)))
-        return [
-            Move("pre-grasp", "GRASPING", cycle, whole=True, fresh=True,
-                 goal=self._region((x, y, low + self.p.grasp.approach_clearance), yaw)),
+        grasp = self._at((x, y, low), yaw)
+        above = self._region((x, y, low + self.p.grasp.approach_clearance), yaw)
+        approach: list[Stage] = [
+            Move("pre-grasp", "GRASPING", cycle, whole=True, fresh=True, goal=above),
             Move("descend", "GRASPING", cycle, goal=grasp, straight=True, fresh=True),
-            self._close(cycle, yaw),
-            self._lift((x, y, low + self.p.grasp.lift_height), yaw, cycle),
-            *self._across(cycle, yaw),
         ]
+        lifted = self._region((x, y, low + self.p.grasp.lift_height), yaw)
+        carry: list[Stage] = [Move("lift", "GRASPING", cycle, goal=lifted, carries=True), self._across(cycle, yaw)]
+        if self.p.joined:
+            across = self._across(cycle, yaw)
+            across.goal = _through(lifted, across.goal, self.p.grasp.lift_height / 2)
+            across.otherwise, carry = carry, [across]
+        # A cup touches what it takes; what was not found once is looked for at each yaw by itself.
+        if self.p.joined and self.gripper.cup is None and (cycle.target.size is not None or not cycle.apart):
+            grasps = self._grasps(cycle, (x, y, low))
+            over: m.PoseGoal | m.GoalSet = above
+            if cycle.target.size is not None:  # the hand is turned as the box is before it goes down about it
+                over = m.GoalSet(goals=[each.model_copy(update={
+                    "pose": each.pose.model_copy(update={"position": above.pose.position}),
+                    "position_tolerance": above.position_tolerance}) for each in _each(grasps)])
+            goal = _through(over, grasps, self.p.grasp.approach_clearance / 2)
+            approach = [Move("pre-grasp", "GRASPING", cycle, whole=True, fresh=True, goal=goal, otherwise=approach)]
+        cycle.apart = True
+        return [*approach, self._close(cycle, yaw), *carry, self._release(cycle)]
+
+    def _grasps(self, cycle: Pick, at: Place) -> m.PoseGoal | m.GoalSet:
+        """The grasps of which any will do: of what is round those at which the hand is clear, else both ways round."""
+        ranges = [(cycle.yaw, 0.0), (cycle.yaw + math.pi, 0.0)]
+        if cycle.ranges and self.p.orient_yaw_tol_rad > ANY_YAW:
+            ranges = cycle.ranges
+        goals = [self._at(at, middle, half) for middle, half in ranges]
+        return goals[0] if len(goals) == 1 else m.GoalSet(goals=goals)
+
+    def _at(self, at: Place, yaw: float, either_way: float = 0.0) -> m.PoseGoal:
+        """The tool at a place, pointing down, turned by yaw or by up to so much more or less [rad]."""
+        return m.PoseGoal(pose=matrix_to_pose(tool_down(*at, yaw + self.turn)), yaw_tolerance=either_way)
 
     def _close(self, cycle: Pick, yaw: float) -> Grip:
         cup = self.gripper.cup is not None
@@ -45,19 +74,16 @@ class Rows:
         """What is left to do with a ball that is in the hand at `tcp`."""
         x, y, z = tcp
         height = self.grasp_height(self.p.world.table_height + self.p.world.ball_radius) + self.p.grasp.lift_height
-        lift = [self._lift((x, y, height), 0.0, cycle)] if z < height - 0.01 else []
-        return [*lift, *self._across(cycle, 0.0)]
+        lift = Move("lift", "GRASPING", cycle, goal=self._region((x, y, height), 0.0), carries=True)
+        return [*([lift] if z < height - 0.01 else []), self._across(cycle, 0.0), self._release(cycle)]
 
-    def _lift(self, to: Place, yaw: float, cycle: Pick) -> Stage:
-        return Move("lift", "GRASPING", cycle, goal=self._region(to, yaw), carries=True)
-
-    def _across(self, cycle: Pick, yaw: float) -> list[Stage]:
+    def _across(self, cycle: Pick, yaw: float) -> Move:
         box = self.p.world.container
         above = self._region((box.x, box.y, self.p.grasp.drop_z), yaw, self.p.place_pos_tol)
-        return [
-            Move("across", "PLACING", cycle, goal=above, carries=True),
-            Grip("release", "PLACING", cycle, width=self.gripper.max_width, carries=True, holds=False),
-        ]
+        return Move("across", "PLACING", cycle, goal=above, carries=True)
+
+    def _release(self, cycle: Pick) -> Grip:
+        return Grip("release", "PLACING", cycle, width=self.gripper.max_width, carries=True, holds=False)
 
     def open(self) -> Grip:
         """Fingers apart."""
@@ -99,3 +125,14 @@ class Rows:
             pose=matrix_to_pose(tool_down(*at, yaw + self.turn)), position_tolerance=m.Vector3(x=side, y=side, z=side),
             tilt_tolerance=self.p.orient_tol_rad, yaw_tolerance=self.p.orient_yaw_tol_rad,
         )
+
+
+def _each(goal: m.PoseGoal | m.GoalSet) -> list[m.PoseGoal]:
+    goals = goal.goals if isinstance(goal, m.GoalSet) else [goal]
+    return [each for each in goals if isinstance(each, m.PoseGoal)]
+
+
+def _through(first: m.PoseGoal | m.GoalSet, then: m.AnyGoal, radius: float) -> m.SequenceGoal:
+    """Both in one motion, which rounds the corner off within a radius [m]."""
+    assert isinstance(then, m.PoseGoal | m.GoalSet)
+    return m.SequenceGoal(items=[m.SequenceItem(goal=first, blend_radius=radius), m.SequenceItem(goal=then)])

@@ -16,6 +16,7 @@ from common.tasks.engine import Task
 from common.tasks.stages import MISSES, Cycle, Grip, Look, Move, Stage
 from common.tasks.watchdogs import Patience
 
+GONE = "the ball is no longer where it was seen"
 CONTAINED_FOR = 0.5  # [s] balls that are seen in the container for so long are there
 
 
@@ -155,12 +156,25 @@ class PickPlace(Task[PickPlaceView]):
         pick = _pick_of(stage)
         if not (isinstance(stage, Move) and stage.fresh) or pick is None:
             return True
-        place = pick.target.position[:2]
-        if any(math.dist(t[:2], place) <= self.p.moved for t in view.targets):
+        if self._is_there(pick, view):
             return True
         self.clear()
-        self.status.message = f"{stage.name}: the ball is no longer where it was seen"
+        self.status.message = f"{stage.name}: {GONE}"
         return False
+
+    def outdated(self, stage: Stage, view: PickPlaceView) -> str:
+        """On the way to a ball and down to it in one motion it is looked at as long as the hand is above."""
+        pick = _pick_of(stage)
+        if pick is None or not (isinstance(stage, Move) and stage.fresh and isinstance(stage.goal, m.SequenceGoal)):
+            return ""
+        above = self.p.grasp.approach_clearance + self.p.grasp_pos_tol
+        if math.dist(view.tool, pick.target.position) < above:
+            return ""
+        return self.unseen(view) or ("" if self._is_there(pick, view) else GONE)
+
+    def _is_there(self, pick: Pick, view: PickPlaceView) -> bool:
+        """Whether the newest picture shows a ball that may be taken where this one was."""
+        return any(math.dist(t[:2], pick.target.position[:2]) <= self.p.moved for t in view.targets)
 
     def request(self, move: Move, start: list[float], view: PickPlaceView) -> m.PlanRequest:
         """The ball is an obstacle, then may be touched, then moves with the hand."""

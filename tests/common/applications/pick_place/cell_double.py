@@ -87,8 +87,13 @@ class CellDouble:
         header = m.Header(stamp=int(self.now * 1e9))
         if isinstance(request, m.PlanRequest):
             error = self.unplannable(request)
-            if isinstance(request.goal, m.PoseGoal):
-                self._goals[request.id] = request.goal.pose
+            goal = request.goal
+            if isinstance(goal, m.SequenceGoal):
+                goal = goal.items[-1].goal
+            if isinstance(goal, m.GoalSet):
+                goal = goal.goals[0]
+            if isinstance(goal, m.PoseGoal):
+                self._goals[request.id] = goal.pose
             point = m.JointTrajectoryPoint(time_from_start=0, positions=[0.0], velocities=[0.0], accelerations=[0.0])
             trajectory = m.JointTrajectory(header=m.Header(frame_id=request.id), joint_names=["j"], points=[point])
             self.task.on_plan(m.PlanResponse(id=request.id, ok=not error, trajectory=None if error else trajectory,
