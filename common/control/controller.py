@@ -210,7 +210,7 @@ class TrajectoryController:
         return bool(self._fault) or self._limiter.at_rest
 
     def _as_of_now(self, status: MotionStatus) -> MotionStatus:
-        now: dict[str, object] = {
+        now: dict[str, object] = {  # of what `said` has too
             "held": bool(self._holds), "held_by": sorted(self._holds), "speed_scaling": self.speed_scaling,
             "inhibits": self.inhibits, "fault": self._fault,
         }
