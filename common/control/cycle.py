@@ -345,7 +345,7 @@ class ControlCycle:
             return {"mode": "fault" if fault else "running", "message": fault}
         own = self._own.state
         return {"mode": own.mode, "message": own.message, "speed": own.speed, "inputs": own.inputs,
-                "outputs": own.outputs}
+                "outputs": own.outputs, "controller": True}
 
     def order(self, request: RobotCommand) -> int:
         """A number to ask about what the arm's own controller was told to do.

@@ -195,6 +195,8 @@ class GripperState(Message):
 class RobotStatus(Message):
     """What the arm's own controller says: whether it could be moved, by whom, and how well time is kept."""
 
+    later: ClassVar[tuple[str, ...]] = ("controller",)
+
     header: Header = Header()
     mode: RobotMode
     message: Text = Field("", description="why it cannot be moved; empty while it can")
@@ -202,6 +204,7 @@ class RobotStatus(Message):
     late: Finite = Field(0.0, description="the latest cycle of its driver so far [s]")
     inputs: int = Field(0, ge=0, lt=2**32, description="digital inputs, a bit each")
     outputs: int = Field(0, ge=0, lt=2**32, description="digital outputs, a bit each")
+    controller: bool = Field(False, description="whether the arm has one of its own, which takes robot/command")
 
 
 class RobotCommand(Message):

@@ -171,7 +171,8 @@ class Console(Desk):
         super().__init__(doors)
         self._feeds = feeds
         self._newest = 0  # `since` of the stop that was said here
-        asked: list[Request[Any, Any]] = [topics.TASK_COMMAND, topics.MOTION_STOP, topics.WORLD_EDIT]
+        asked: list[Request[Any, Any]] = [
+            topics.TASK_COMMAND, topics.MOTION_STOP, topics.ROBOT_COMMAND, topics.WORLD_EDIT]
         self._clients: dict[str, Client[Any, Any]] = {request.key: bus.client(request) for request in [*asked, *more]}
         self._parameters = {name: bus.client(topics.parameters_of(name)) for name in members.services}
 

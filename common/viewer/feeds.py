@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=Message)
 
 ALWAYS: tuple[Topic[Any], ...] = (
-    topics.JOINT_STATES, topics.MOTION_STATUS, topics.GRIPPER_STATE, topics.SUPERVISOR_STATUS, topics.COUNTERS,
-    topics.LOG,
+    topics.JOINT_STATES, topics.MOTION_STATUS, topics.ROBOT_STATUS, topics.GRIPPER_STATE, topics.SUPERVISOR_STATUS,
+    topics.COUNTERS, topics.LOG,
 )
 LIVE, ANNOTATED = "live", "annotated"  # pictures
 _LOG_SIZE = 2000  # lines that may wait

@@ -25,6 +25,7 @@ from common.errors import ZencellError
 from common.messages import Rejections
 from common.reporting.summary import Rejected
 from common.topics import Topic
+from common.viewer.arm_panel import ArmPanel
 from common.viewer.console import Console
 from common.viewer.feeds import ANNOTATED, LIVE, Feeds, News, Periods, Topics
 from common.viewer.health import HealthPanel, LogPanel
@@ -93,6 +94,7 @@ class Page:
         gui.main_panel.set_width(layout.panel_width)
         self._task = TaskPanel(gui, console, self._words, self._home)
         console.tell = self._task.tell
+        self._arm = ArmPanel(gui, console)
         make = application.find("page", "Controls") if application is not None else None
         self._controls = make(gui, console) if make is not None else None
         self._news = News(self._controls, feeds.latest) if self._controls is not None else None
@@ -188,6 +190,7 @@ class Page:
             holding = self._feeds.latest(topics.GRIPPER_STATE)
             self._task.show(task, self._feeds.latest(topics.MOTION_STATUS), gripper(holding),
                             len(self._rejected.places))
+            self._arm.show(self._feeds.latest(topics.ROBOT_STATUS))
             self._log.show()
         if self._periods.due("health", now):
             self._health.show(self._feeds.latest(topics.SUPERVISOR_STATUS), alive)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from common.application import Application
 from common.errors import NoResponder, RemoteError, ZencellError
-from common.messages import GripperState, MotionStatus, PlanResponse, TaskStatus
+from common.messages import GripperState, MotionStatus, PlanResponse, RobotStatus, TaskStatus
 from common.viewer.markup import BAD, BUSY, GOOD, OFF
 
 STATES = {"IDLE": "Waiting", "HOMING": "Going home", "DONE": "Done", "ERROR": "Failed"}
@@ -27,6 +27,16 @@ SERVICE_STATES = {
     "failed": ("failed", BAD),
     "gone": ("not there", BAD),
 }
+ARM_MODES = {
+    "disconnected": ("Not connected", BAD),
+    "off": ("Without power", OFF),
+    "idle": ("Not ready", BUSY),
+    "running": ("Can be moved", GOOD),
+    "freedrive": ("Moved by hand", BUSY),
+    "protective_stop": ("Stopped for protection", BAD),
+    "emergency_stop": ("Emergency stop", BAD),
+    "fault": ("Does not work", BAD),
+}
 CLOSED = 0.001  # [m]
 GOAL_STATES = {
     "none": "at rest",
@@ -36,6 +46,11 @@ GOAL_STATES = {
     "aborted": "motion was given up",
     "cancelled": "motion was stopped",
 }
+
+
+def arm_mode(robot: RobotStatus) -> tuple[str, str]:
+    """How the arm's own controller says that it is, and how good that is."""
+    return ARM_MODES[robot.mode]
 
 
 def counters(status: TaskStatus, rejected: int) -> dict[str, object]:

@@ -90,6 +90,7 @@ class Played:
     commands: list[str] = field(default_factory=list)
     holder: str = ""
     stops: list[str] = field(default_factory=list)
+    orders: list[tuple[str, str]] = field(default_factory=list)
     sets: list[tuple[dict[str, object], str]] = field(default_factory=list)
     selects: list[OutlineSelect] = field(default_factory=list)
     area: float = 60.0
@@ -103,6 +104,12 @@ class Played:
     async def stop(self, request: m.StopRequest) -> m.MotionStatus:
         self.stops.append(request.reason)
         return m.MotionStatus()
+
+    async def order(self, request: m.RobotCommand) -> m.RobotStatus:
+        self.orders.append((request.act, request.owner))
+        if request.act == "enable":
+            raise Refused("robot", "enable: the emergency stop is pressed")
+        return m.RobotStatus(mode="running", controller=True)
 
     async def select(self, request: OutlineSelect) -> OutlineSelection:
         self.selects.append(request)
@@ -123,6 +130,7 @@ class Played:
     def serve(self) -> None:
         self.bus.serve(topics.TASK_COMMAND, self.command)
         self.bus.serve(topics.MOTION_STOP, self.stop)
+        self.bus.serve(topics.ROBOT_COMMAND, self.order)
         self.bus.serve(OUTLINE_SELECT, self.select)
         self.bus.serve(topics.parameters_of("vision_detector"), self.parameters)
 
@@ -198,6 +206,26 @@ async def test_who_stopped_the_robot_is_shown_though_no_task_says_so(panda: Play
     stop = m.Inhibit(kind="stopped", by="anna", reason="smoke", since=0)
     panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(inhibits=[stop]))
     await page.until(lambda: "stopped since 1970-01-01 00:00:00 UTC by anna (smoke)" in page.text)
+
+
+async def test_an_arm_with_a_controller_says_why_it_cannot_be_moved_and_recovers_when_it_is_asked(
+    panda: Played, page: BrowserDouble
+) -> None:
+    robot = panda.bus.writer(topics.ROBOT_STATUS)
+    robot.put(m.RobotStatus(mode="fault", message="the bus is off"))
+    panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(held=True))
+    await page.until(lambda: "held on its path" in page.text)
+    folder = page.label("Controller of the arm")
+    assert "the bus is off" not in page.text and not page.parts[folder]["visible"], "it has none"
+    robot.put(m.RobotStatus(mode="protective_stop", message="look <why>", speed=0.3, late=0.012, controller=True))
+    await page.until(lambda: "Stopped for protection" in page.text and page.parts[folder]["visible"])
+    for told in ("look &lt;why&gt;", "<b>30%</b>", "<b>12 ms</b>", 'data-mode="protective_stop"'):
+        assert told in page.text
+    await page.click("Recover")
+    await page.until(lambda: "Recover: can be moved" in page.text)
+    await page.click("Enable")
+    await page.until(lambda: "enable: the emergency stop is pressed" in page.text)
+    assert [act for act, _ in panda.orders] == ["recover", "enable"] and all(owner for _, owner in panda.orders)
 
 
 async def test_state_and_counters_are_shown_in_words(panda: Played, page: BrowserDouble) -> None:

@@ -9,7 +9,9 @@ import pytest
 from common import topics
 from common.application import all_topics
 from common.applications.pick_place.topics import SCENE_BALLS
+from common.config import load_cell
 from common.errors import ConfigError
+from common.process.wiring import wiring_of
 from common.security.access import Rights, access_control, rights_of, rights_of_recorder, rights_of_supervisor
 from common.security.checking import allowances, require_current
 from common.topics import Request, Topic
@@ -75,6 +77,15 @@ def test_who_only_listens_can_ask_for_states_and_for_no_request(name: str) -> No
     asks = allowances(access_control({"panda": {"recorder": rights_of_recorder()}}))[name]["asks"]
     keys = {key.partition("/")[2] for key in asks}
     assert keys == {topic.expression for topic in all_topics().values() if topic.kind == "state"}
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5"])
+async def test_the_arm_is_had_recover_by_operators_and_by_the_page_and_by_nobody_else(name: str) -> None:
+    loaded = load_cell(name)
+    rights = {entry.name: rights_of(entry.name, await wiring_of(loaded, entry)) for entry in loaded.services.values()}
+    may = allowances(access_control({name: {**rights, "recorder": rights_of_recorder()}}))
+    asking = {who for who, rights in may.items() if {f"{name}/robot/command", "*/**"} & rights.get("asks", set())}
+    assert asking == {f"{name}.viewer", "operator"}
 
 
 def test_rules_that_are_those_of_the_services_are_current() -> None:

@@ -10,6 +10,9 @@ import viser
 
 from common.messages import Header, Image
 from common.perception.image import ImageError, array_to_image
+from common.viewer.arm_panel import ArmPanel
+from common.viewer.console import Desk
+from common.viewer.doors import Doors, Visitor
 from common.viewer.guard import close_server, make_server
 from common.viewer.pictures import rgb_picture
 from common.viewer.plots import SAMPLE, SECONDS, Limits, PlotPanel
@@ -71,3 +74,16 @@ def test_picture_is_red_where_it_was_and_no_wider_than_is_shown() -> None:
 def test_what_is_no_picture_is_refused(encoding: str, data: bytes) -> None:
     with pytest.raises(ImageError):
         rgb_picture(Image(header=Header(), height=4, width=4, encoding=encoding, data=data))
+
+
+async def test_who_only_looks_has_the_arm_do_nothing(gui: viser.GuiApi) -> None:
+    doors, noted = Doors(), []
+    doors.guarded = True
+    desk = Desk(doors)
+    desk.put = noted.append  # type: ignore[method-assign]
+    before = set(gui._gui_input_handle_from_uuid)
+    ArmPanel(gui, desk)  # type: ignore[arg-type]  # asks nobody here
+    (buttons,) = set(gui._gui_input_handle_from_uuid) - before
+    roles = {role: doors.admit(Visitor(n, "10.0.0.5", frozenset({"look", role})), buttons)
+             for n, role in enumerate(("look", "tune", "operate"))}
+    assert roles == {"look": False, "tune": False, "operate": True}
