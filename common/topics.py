@@ -89,6 +89,9 @@ TF = Topic("tf", m.TFMessage, "stream", "poses of the robot's links")
 TF_STATIC = Topic("tf_static", m.TFMessage, "state", "poses that never change: base, camera")
 GRIPPER_STATE = Topic("gripper/state", m.GripperState, "state", "width, whether it holds something, newest command")
 MOTION_STATUS = Topic("motion/status", m.MotionStatus, "state", "newest goal: state, progress, error, source")
+MOTION_OWNER = Topic("motion/owner", m.MotionOwner, "state", "whose the motion is: nobody else's begins")
+MOTION_JOG = Topic("motion/jog", m.JogCommand, "stream",
+                   "velocities of joints or tool: the arm moves while they come, at least every 0.1 s; anybody's key")
 ROBOT_STATUS = Topic("robot/status", m.RobotStatus, "state",
                      "what the arm's own controller says: mode, why it cannot be moved, speed slider")
 DISPLAY_TRAJECTORY = Topic("display_trajectory", m.JointTrajectory, "state", "newest plan")
@@ -113,6 +116,7 @@ MOTION_EXECUTE = Request("motion/execute", m.ExecuteRequest, m.MotionStatus,
 MOTION_FOLLOWED = Request("motion/followed", m.FollowedRequest, m.ExecuteRequest, "what the goal is that is followed")
 MOTION_STOP = Request("motion/stop", m.StopRequest, m.MotionStatus, "bring the robot to rest")
 MOTION_HOLD = Request("motion/hold", m.HoldRequest, m.MotionStatus, "pause the robot on its path, or let it go on")
+MOTION_OWN = Request("motion/own", m.OwnRequest, m.MotionOwner, "take the motion of the robot, or give it back")
 GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState,
                           "move the fingers; the result appears on gripper/state")
 ROBOT_COMMAND = Request("robot/command", m.RobotCommand, m.RobotStatus,

@@ -122,7 +122,7 @@ def writers() -> dict[str, str]:
         for key, (_, services) in owned_in(wirings).items():
             found.setdefault(key, {}).update(dict.fromkeys(services))
     return {**{key: ", ".join(services) for key, services in found.items()}, **shared,
-            topics.SUPERVISOR_STATUS.key: "supervisor"}
+            topics.SUPERVISOR_STATUS.key: "supervisor", topics.MOTION_JOG.key: "who jogs"}
 
 
 def topic_table() -> str:

@@ -22,6 +22,7 @@ from common.control.controller import PERIOD
 from common.control.cycle import ControlCycle
 from common.control.decisions import Decisions
 from common.control.inhibits import SOMEBODY, Inhibits, Speed, speed_of
+from common.control.jogging import DEADMAN
 from common.control.record_file import record_file
 from common.control.requester import Alone, WhenAlone, objection
 from common.control.sole_use import sole_use
@@ -35,7 +36,9 @@ from common.messages import (
     GripperState,
     Header,
     HoldRequest,
+    MotionOwner,
     MotionStatus,
+    OwnRequest,
     RobotCommand,
     RobotStatus,
     StopRequest,
@@ -52,6 +55,7 @@ from common.transport.bus import Bus
 
 T = TypeVar("T")
 
+MOST_TOLD = 16  # who jogs in vain, told of once
 MOST_CYCLES = 250.0  # per second of wall time
 REACH_MARGIN = 0.008  # [m] random places keep from the ends of the reach: what is seen is a few millimetres off
 
@@ -141,7 +145,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     """Control the arm until cancelled; what is ours alone meanwhile is let go of afterwards."""
     simulated = is_simulated(config.robot)
     joints, motion = bus.writer(topics.JOINT_STATES), bus.writer(topics.MOTION_STATUS)
-    robot = bus.writer(topics.ROBOT_STATUS)
+    robot, owner = bus.writer(topics.ROBOT_STATUS), bus.writer(topics.MOTION_OWNER)
+    jogged = bus.reader(topics.MOTION_JOG)
     gripper = bus.writer(topics.GRIPPER_STATE) if config.robot.gripper else None
     updates = bus.writer(topics.SCENE_OBJECT_UPDATES) if simulated else None
     objects = bus.writer(topics.SCENE_OBJECTS) if simulated else None
@@ -207,6 +212,31 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         late = too_late(request.header) if request.header.stamp else None
         return cycle.command(request, bus.clock.now(), late).model_copy(update={"header": bus.header()})
 
+    async def own(request: OwnRequest) -> MotionOwner:
+        before = cycle.owner
+        now = cycle.own(request, bus.clock.now())
+        if now.owner != before.owner and {before.kind, now.kind} != {"none", "task"}:
+            bus.log.info("%s: the motion was %s, it is %s now", request.owner, before.told, now.told)
+        if problem := await decisions.keep():
+            bus.log.error("%s", problem)
+        return now.model_copy(update={"header": bus.header()})
+
+    async def jog() -> None:
+        """Take what somebody who jogs asks for; why it does not count is logged once."""
+        told: dict[str, str] = {}
+        async for asked in jogged:
+            try:
+                cycle.jog(asked, objection(
+                    bus.clock.age_ms(asked.header.stamp) * 1e-3, DEADMAN + config.clock_tolerance,
+                    config.clock_tolerance))
+                told.pop(asked.owner, None)
+            except Refused as refusal:
+                if refusal.code not in (told.get(asked.owner), "let_go"):
+                    bus.log.warning("%s does not jog the arm: %s [%s]", asked.owner, refusal, refusal.code)
+                told[asked.owner] = refusal.code
+                while len(told) > MOST_TOLD:
+                    told.pop(next(iter(told)))
+
     async def order(request: RobotCommand) -> RobotStatus:
         who = request.owner or SOMEBODY
         bus.log.info("%s asks the arm: %s", who, request.act + (f" {request.value:g}" if request.value else ""))
@@ -249,6 +279,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     bus.serve(topics.MOTION_FOLLOWED, followed)
     bus.serve(topics.MOTION_STOP, stop)
     bus.serve(topics.MOTION_HOLD, hold)
+    bus.serve(topics.MOTION_OWN, own)
     bus.serve(topics.ROBOT_COMMAND, order)
     if gripper is not None:
         bus.serve(topics.GRIPPER_COMMAND, command)
@@ -306,6 +337,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
                 asked.set_result(outcome)
         if report.robot is not None:
             robot.put(report.robot)
+        if report.owner is not None:
+            owner.put(report.owner)
         if report.gripper is not None and gripper is not None:
             gripper.put(report.gripper)
         if report.objects is not None and objects is not None:
@@ -317,11 +350,17 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
                 updates.put(update)
         due = max(due + period, loop.time())  # after an overrun from now on: no burst
 
+    there, jogs = False, asyncio.create_task(jog(), name="jog")
     try:
         await bus.ready()
         while True:
-            cycle.wait(alone.look(task in bus.alive, cycle.goal, config.when_alone), f"{task} is gone")
+            was, there = there, task in bus.alive
+            if was and not there:
+                cycle.disown()
+            cycle.wait(alone.look(there, cycle.goal, config.when_alone), f"{task} is gone")
             turn()
+            if jogs.done():
+                jogs.result()
             await asyncio.sleep(due - loop.time())
     except asyncio.CancelledError:  # whatever ends it: the arm comes to rest on its path first
         cycle.wait(True, f"{bus.service} ends")
@@ -330,6 +369,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
             turn()
         raise
     finally:
+        jogs.cancel()
         if moving is not None:
             moving.cancel()
         if keeping is not None:

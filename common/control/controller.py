@@ -171,7 +171,8 @@ class TrajectoryController:
         self._memory: GoalMemory[MotionStatus] = GoalMemory(remember)
         self._fault = ""
         self._found: Vector | None = None  # where the arm was read once, which says that it moves
-        self._coasting = False  # from where the arm was found in motion to rest, on no path
+        self._coasting = False  # from where the arm was found in motion, or jogged to, to rest, on no path
+        self._jog: Vector | None = None  # velocities at which the arm is jogged (dof,) [rad/s]
         self._missed = self._let_go = False  # a goal ended with the arm off: where it rests is held; it was tried
         self._amiss = 0.0 * start  # of what is measured of an arm that stays off wherever it is held [rad]
         self._reseated = -math.inf  # cell time at which the arm was found moved from outside [s]
@@ -203,6 +204,11 @@ class TrajectoryController:
     def goal(self) -> str:
         """Id of the goal that moves the robot; empty when there is none."""
         return self._goal.id if self._goal else ""
+
+    @property
+    def set_point(self) -> Vector:
+        """The newest set-point (dof,) [rad]."""
+        return self._limiter.position
 
     @property
     def at_rest(self) -> bool:
@@ -250,7 +256,7 @@ class TrajectoryController:
             if self._last is None:
                 self._seat(measured)
             elif self._coasting or self._found is not None or not self._limiter.at_rest:
-                raise Refused("busy", "the arm is still coming to rest")
+                raise Refused("busy", "the arm is still coming to rest" if self._jog is None else "the arm is jogged")
             if self._missed or np.any(np.abs(self._amiss) > self._tolerances.start):
                 self._require_followed(measured)
             begin = self._begin(measured)
@@ -345,6 +351,13 @@ class TrajectoryController:
             return self._report("active", message=self._holding(self._goal))
         return self.status
 
+    def jog(self, velocity: Vector | None) -> None:
+        """Go at joint velocities (dof,) [rad/s] until told others; None: come to rest. A goal is not disturbed."""
+        if self._goal is not None or self._holds or self._fault or self._last is None or self._found is not None:
+            velocity = None
+        self._coasting = self._coasting or (velocity is None and self._jog is not None)
+        self._jog = velocity
+
     def knows(self, goal: str) -> bool:
         """Whether a goal was heard of."""
         return self._memory.get(goal) is not None
@@ -420,6 +433,7 @@ class TrajectoryController:
         """Have set-points begin where the arm is (dof,) [rad]; at the velocity it has [rad/s], if it moves."""
         self._hold, self._amiss = measured.copy(), 0.0 * measured
         self._sent.clear()  # what was sent before is not followed any more
+        self._jog = None
         self._coasting = velocity is not None and bool(np.any(np.abs(velocity) > self._tolerances.stopped_velocity))
         self._limiter.rest(measured, velocity if self._coasting else None)
 
@@ -449,6 +463,15 @@ class TrajectoryController:
         Raises:
             HardwareFault: the arm does not stay where it is held.
         """
+        if self._jog is not None:
+            off = np.abs(measured - self._due(now, measured)[1])
+            if np.all(off <= self._tolerances.path):
+                self._coasting = False
+                set_point = self._limiter.go_at(self._jog, step)
+                self._hold = set_point[0]
+                return set_point
+            self._jog, self._coasting = None, True
+            self._missed, self._let_go = True, False
         if self._coasting:
             set_point = self._limiter.brake(step)
             self._coasting, self._hold = not self._limiter.at_rest, set_point[0]

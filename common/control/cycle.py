@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from common.config import GripperConfig
 from common.control.checks import Tolerances
 from common.control.controller import PERIOD, Judged, TrajectoryController
 from common.control.faults import Fault, asked
 from common.control.gripper_controller import GripperController
-from common.control.inhibits import Inhibits
+from common.control.inhibits import SOMEBODY, Inhibits
+from common.control.jogging import Jogging, ToolKinematics
+from common.control.ownership import Ownership
 from common.errors import ConfigError, Refused
 from common.hardware.interface import ControlledArm, Hardware, HardwareFault, Limits, SimulatedGripper, Vector
 from common.messages import (
@@ -25,8 +26,11 @@ from common.messages import (
     Header,
     HoldRequest,
     Inhibit,
+    JogCommand,
     JointState,
+    MotionOwner,
     MotionStatus,
+    OwnRequest,
     RobotCommand,
     RobotStatus,
     SceneUpdate,
@@ -38,16 +42,10 @@ from common.messages import (
 from common.robot.finger_joints import finger_positions, finger_velocities
 from common.sim.interface import SimulatedWorld, StandingObject
 from common.sim.standing import Standing
+from common.sources import monotonic
 
 PROGRESS_PERIOD = 0.1  # cell time between reports of progress [s]
 WORLD_PERIOD = 0.05  # cell time between reports of an object that moves [s]
-
-
-class Kinematics(Protocol):
-    """What is asked of the robot's model."""
-
-    def fk(self, q: Vector) -> NDArray[np.float64]:
-        """(4, 4) T_world_tcp at q (dof,) [rad]."""
 
 
 @dataclass
@@ -60,6 +58,7 @@ class Report:
     objects: WorldObjects | None = None
     updates: list[SceneUpdate] = field(default_factory=list)
     robot: RobotStatus | None = None
+    owner: MotionOwner | None = None
     notes: list[str] = field(default_factory=list)  # for the log
 
 
@@ -75,14 +74,14 @@ class ControlCycle:
         tolerances: Tolerances | None = None,
         gripper: GripperConfig | None = None,
         controller: str = "controller",
-        kinematics: Kinematics | None = None,
+        kinematics: ToolKinematics | None = None,
         world: SimulatedWorld | None = None,
         inhibits: Inhibits | None = None,
         period: float = PERIOD,
     ) -> None:
         """Control this hardware every `period` [s], unless `inhibits` keep it.
 
-        `world` and `kinematics` come with simulated hardware only.
+        `world` comes with simulated hardware only, and then `kinematics` must; without them the tool is not jogged.
 
         Raises:
             ConfigError: the backend's gripper cannot feel the simulated world, or it has none.
@@ -122,6 +121,10 @@ class ControlCycle:
         self._kept: object = None
         self._stood: tuple[int, dict[str, StandingObject]] | None = None  # the objects, as of a version of the world
         self._waits = False  # held by ourselves
+        self._jogging = Jogging(limits, kinematics)
+        self._owners = Ownership()
+        self._jogged = False  # until the arm rests
+        self._told_owner: tuple[MotionOwner, bool] | None = None
         self._followed: ExecuteRequest | None = None  # the newest goal that was accepted
         self._held_goal = ""  # that the scene monitor holds
         self._inhibits = inhibits or Inhibits()
@@ -139,12 +142,15 @@ class ControlCycle:
             except HardwareFault as fault:
                 self._arm_fault.failed(str(fault), now)
                 self._arm.fault(str(fault))
+                self._jogging.interrupt(monotonic())
         if self._own is not None:
             self._inhibits.arm_stopped = self._own.stopped
         report.robot = self._news_of_robot(header)
         report.notes = [*filter(None, (self._arm_fault.news(), self._hand_fault.news(), self._arm.news()))]
         if self._held_goal and self._held_goal != self._arm.goal:  # nothing is in the way of what is over
             self.hold(HoldRequest(hold=False, by="scene_monitor"))
+        self._owners.look(bool(self._arm.goal) or not self._arm.at_rest or self._fingers_move, monotonic())
+        report.owner = self._news_of_owner(header)
         report.motion = self._news_of_motion(header, now)
         report.gripper = self._news_of_gripper(header, now)
         if self._world is not None and not self.apart:
@@ -178,7 +184,9 @@ class ControlCycle:
             self._arm.speed_scaling = self._cap * own.speed
             if own.mode != "running":  # there is no need to leave it alone: it says how it is
                 self._arm.fault(own.message or own.mode)
+                self._jogging.interrupt(monotonic())
                 return self._joint_state(header, dq)
+        self._arm.jog(self._jogging.velocity(self._arm.set_point, monotonic(), self._arm.speed_scaling))
         set_points = self._arm.update(now, self._q, dq)
         if set_points is not None:
             asked("sending set-points", self._hardware.write, *set_points, now)
@@ -228,16 +236,73 @@ class ControlCycle:
     ) -> MotionStatus:
         """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
         inhibited = self._inhibits.objection(request.id, request.owner, request.heard)
-        fault = self._hand_fault.objection
-        if fault is None and not self._found and not self._arm_fault.reason:
-            fault = Refused("hardware_fault", "nobody knows yet where the arm is")
         status = self._arm.accept(
-            request.id, request.trajectory, now, self._q, inhibited or objection or fault, judged, request.plan,
+            request.id, request.trajectory, now, self._q,
+            inhibited or objection or self._owners.objection(request.owner) or self._unfit, judged, request.plan,
             request.scene_stamp,
         )
         if request.id == self._arm.goal and (self._followed is None or self._followed.id != request.id):
             self._followed = request
+            self._owners.use(request.owner, monotonic())
         return status
+
+    @property
+    def _unfit(self) -> Refused | None:
+        """Why nothing can be moved."""
+        if self._hand_fault.objection is None and not self._found and not self._arm_fault.reason:
+            return Refused("hardware_fault", "nobody knows yet where the arm is")
+        return self._hand_fault.objection
+
+    def jog(self, request: JogCommand, late: Refused | None = None) -> None:
+        """Move the arm while that comes again and again, unless it comes too `late`.
+
+        Raises:
+            Refused: with the reason. It counts again after a pause.
+        """
+        objection = late or self._inhibits.objection("", request.owner, request.heard) or self._unfit
+        if objection is None and self._arm.status.fault:
+            objection = Refused("hardware_fault", self._arm.status.fault)
+        if objection is None and self._arm.status.held:
+            objection = Refused("held", self._arm.status.message or "the robot is held")
+        objection = objection or self._owners.objection(request.owner)
+        if objection is None and self._arm.goal:
+            objection = Refused("busy", f"goal {self._arm.goal!r} is still being followed")
+        self._jogging.ask(request, monotonic(), objection)
+        self._owners.use(request.owner, monotonic())
+
+    def own(self, request: OwnRequest, now: float) -> MotionOwner:
+        """Whose the motion is, after it was asked for or given back.
+
+        What is taken over is brought to rest. A task that lost it waits for a person to start it again, as after a
+        stop, so that no restart of anything has it go on.
+
+        Raises:
+            Refused: it is somebody else's.
+        """
+        if request.act == "give":
+            self._owners.give(request.owner)
+            return self.owner
+        before = self._owners.take(request, monotonic())
+        if before is not None:
+            reason = f"{request.owner} took the motion over, which was {before.told}"
+            if before.task:
+                self._inhibits.stop(StopRequest(reason=reason, owner=request.owner))
+            self._jogging.interrupt(monotonic())
+            if goal := self._arm.goal:
+                self._inhibits.never([goal])
+                self._arm.cancel(goal, reason, now)
+            self.tell_inhibits()
+        return self.owner
+
+    def disown(self) -> None:
+        """Have the motion be nobody's: the task that had it is gone."""
+        if self._owners.now.kind == "task":
+            self._owners.end()
+
+    @property
+    def owner(self) -> MotionOwner:
+        """Whose the motion is."""
+        return self._owners.now.model_copy(update={"jogging": self._jogged})
 
     def followed(self, goal: str) -> ExecuteRequest:
         """What was asked for with the goal that is followed.
@@ -257,6 +322,8 @@ class ControlCycle:
         running, known = self._arm.goal, not request.id or self._arm.knows(request.id)
         if request.by == "person":
             self._inhibits.stop(request)
+            self._owners.end()
+            self._jogging.interrupt(monotonic())
             if running:
                 self._arm.cancel(running, request.reason, now)
         stopped = [goal for goal in (running if request.by == "person" or not request.id else "", request.id) if goal]
@@ -276,6 +343,12 @@ class ControlCycle:
         if request.by != "person" and request.hold and request.goal not in ("", self._arm.goal):
             return self._arm.status, []  # that one is over
         let_go = self._inhibits.hold(request)
+        if request.hold:
+            self._jogging.interrupt(monotonic())
+        elif request.into_stop or (
+            request.stops and (request.override or self._owners.now.owner == (request.owner or SOMEBODY))
+        ):
+            self._owners.end()  # handed over to whoever moves the robot now: the person, or the task that is started
         if request.by == "scene_monitor":
             self._held_goal = request.goal if request.hold else ""
         if request.by != "person":
@@ -287,6 +360,7 @@ class ControlCycle:
         """Bring the arm to rest on its path of our own accord, or let it go on."""
         if wait != self._waits:
             self._waits = wait
+            self._jogging.interrupt(monotonic())
             self._inhibits.hold_ourselves("controller", wait, reason)
             self._arm.hold(wait, reason, "controller")
             self.tell_inhibits()
@@ -301,6 +375,10 @@ class ControlCycle:
     def goal(self) -> str:
         """Id of the goal that is followed; empty when there is none."""
         return self._arm.goal
+
+    @property
+    def _fingers_move(self) -> bool:
+        return self._gripper is not None and self._gripper.state.moving
 
     @property
     def at_rest(self) -> bool:
@@ -325,9 +403,13 @@ class ControlCycle:
         """
         if self._gripper is None:
             raise Refused("no_gripper", "this robot has no gripper")
-        objection = self._inhibits.objection(request.id) or late or self._hand_fault.objection
+        objection = (self._inhibits.objection(request.id) or late or self._owners.objection(request.owner)
+                     or self._hand_fault.objection)
         try:
-            return self._gripper.command(request, now, objection)
+            state = self._gripper.command(request, now, objection)
+            if objection is None:
+                self._owners.use(request.owner, monotonic())
+            return state
         except HardwareFault as fault:
             self._hand_fault.failed(str(fault), now)
             self._gripper.fault(str(fault))
@@ -428,6 +510,14 @@ class ControlCycle:
             return None
         self._told_robot = robot
         return self.robot.model_copy(update={"header": header})
+
+    def _news_of_owner(self, header: Header) -> MotionOwner | None:
+        self._jogged = bool(self._jogging.owner) or (self._jogged and not self._arm.at_rest)
+        now = (self._owners.now, self._jogged)
+        if now == self._told_owner:
+            return None
+        self._told_owner = now
+        return self.owner.model_copy(update={"header": header})
 
     def _news_of_gripper(self, header: Header, now: float) -> GripperState | None:
         if self._gripper is None:

@@ -98,10 +98,27 @@ class Limiter:
         self._beyond = bool((self._lowest < self._lower).any() or (self._highest > self._upper).any())
 
     def brake(self, seconds: float) -> tuple[Vector, Vector]:
-        """The set-point after a step (dof,) [rad], [rad/s] on the shortest way to rest, wherever that is."""
-        given = self._given(self._braking)
+        """The set-point after a step (dof,) [rad], [rad/s] to rest, wherever that is: all joints together, soon."""
+        return self._toward(0.0 * self.position, self._braking, seconds, together=True)
+
+    def go_at(self, velocity: Vector, seconds: float) -> tuple[Vector, Vector]:
+        """The set-point after a step (dof,) [rad], [rad/s] towards velocities (dof,) [rad/s], all joints alike.
+
+        A joint that comes nearer to its end than it can be braked in brakes, whatever is asked for, and so do all.
+        """
+        left = np.where(self._way > 0, self._highest - self.position, self.position - self._lowest)
+        speed = np.abs(self._way)
+        ends = speed * (2 * seconds + speed / (2 * self._acceleration)) > left
+        if ends.any():
+            return self._toward(0.0 * velocity, self._acceleration, seconds, together=False)
+        return self._toward(velocity, self._acceleration, seconds, together=True)
+
+    def _toward(self, velocity: Vector, hardest: Vector, seconds: float, together: bool) -> tuple[Vector, Vector]:
+        given = self._given(hardest)
+        if together:  # the tool goes straight then
+            given.synchronization = ruckig.Synchronization.Phase
         given.control_interface = ruckig.ControlInterface.Velocity
-        given.target_velocity = [0.0] * len(self.position)
+        given.target_velocity = velocity.tolist()
         target, velocity, acceleration = _after(given, seconds)
         return self._go(target, velocity, acceleration, seconds)
 

@@ -7,7 +7,20 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from common.messages.basics import MOST_STAMP, SMALL, Finite, Fraction, Header, Label, Message, Name, Remark, Text
+from common.messages.basics import (
+    MOST_JOINTS,
+    MOST_STAMP,
+    SMALL,
+    Finite,
+    Fraction,
+    Header,
+    Label,
+    Message,
+    Name,
+    Remark,
+    Text,
+)
+from common.messages.geometry import Vector3
 from common.messages.robot import TRAJECTORY_BYTES, JointTrajectory
 
 GoalState = Literal["none", "rejected", "active", "succeeded", "aborted", "cancelled"]
@@ -16,6 +29,8 @@ RobotMode = Literal[
     "disconnected", "off", "idle", "running", "freedrive", "protective_stop", "emergency_stop", "fault"
 ]
 Holder = Literal["person", "watchdog", "controller", "scene_monitor"]
+OwnerKind = Literal["none", "task", "operator", "script"]
+JogFrame = Literal["base", "tool", "world"]
 Who = Label
 Since = Annotated[int, Field(ge=0, le=MOST_STAMP)]
 MOST_INHIBITS = 32  # that are told of
@@ -156,10 +171,11 @@ class GripperCommand(Message):
     """
 
     most_bytes: ClassVar[int] = SMALL
-    later: ClassVar[tuple[str, ...]] = ("expected_width", "width_tolerance")
+    later: ClassVar[tuple[str, ...]] = ("expected_width", "width_tolerance", "owner")
 
     header: Header = Header()
     id: Name
+    owner: Who = Field("", description="who asks for it; empty for a task")
     width: Annotated[float, Field(ge=0, le=0.2)]
     effort: Annotated[float, Field(ge=0, le=1e4, description="grip force [N]; 0: the gripper's own default")] = 0.0
     expected_width: Annotated[float, Field(ge=0, le=0.2)] | None = Field(
@@ -218,3 +234,55 @@ class RobotCommand(Message):
     )
     value: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 0.0
     owner: Who = Field("", description="name of the person")
+
+
+class JogCommand(Message):
+    """Move while this comes again and again: velocities of joints, or of the tool. One that comes late does nothing.
+
+    The arm brakes 0.1 s after the newest one, and stands 0.2 s after it. All left out: it comes to rest at once.
+    """
+
+    most_bytes: ClassVar[int] = SMALL
+
+    header: Header = Header()
+    owner: Who = Field("person", min_length=1, description="name of who jogs")
+    heard: Since | None = Field(None, description="`since` of the newest inhibit that this person had heard of")
+    joints: Annotated[dict[Name, Finite], Field(max_length=MOST_JOINTS)] = Field(
+        {}, description="velocities of joints by their names [rad/s, m/s]; the others rest")
+    linear: Vector3 = Field(Vector3(), description="velocity of the TCP [m/s]; not beside joints")
+    angular: Vector3 = Field(Vector3(), description="rotation of the tool about the TCP [rad/s]; not beside joints")
+    frame: JogFrame = Field("base", description="whose axes linear and angular are along")
+
+
+class OwnRequest(Message):
+    """Ask for the motion of the robot, or give it back. It has one owner at a time, and nobody else's motion begins."""
+
+    most_bytes: ClassVar[int] = SMALL
+
+    act: Literal["take", "give"]
+    owner: Name = Field(description="name of a person, a script or a task")
+    kind: Literal["task", "operator", "script"] = "operator"
+    over: bool = Field(False, description="take it from whoever has it: their motion is stopped; is logged")
+    lease: Annotated[float, Field(ge=0, le=86_400, allow_inf_nan=False)] = Field(
+        0.0, description="give it back after so long without a motion or another take [s, wall]; 0: never")
+
+
+class MotionOwner(Message):
+    """Whose motion it is: nobody else's begins. Stops and holds are everybody's."""
+
+    most_bytes: ClassVar[int] = SMALL
+
+    header: Header = Header()
+    owner: Who = ""
+    kind: OwnerKind = "none"
+    since: Since = Field(0, description="[ns since the Unix epoch]")
+    asked: bool = Field(False, description="taken until it is given back; else for one motion")
+    jogging: bool = False
+
+    @property
+    def told(self) -> str:
+        """In words, for a line."""
+        if self.kind == "none":
+            return "nobody's"
+        when = datetime.fromtimestamp(self.since * 1e-9, UTC)
+        return f"{self.owner or 'a task'}'s ({self.kind}) since {when:%Y-%m-%d %H:%M:%S} UTC"

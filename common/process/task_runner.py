@@ -9,7 +9,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from common import messages as m
 from common import topics
-from common.errors import Refused, RemoteError
+from common.errors import Refused, RemoteError, RequestFailed
 from common.process.persist import persist
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
@@ -33,6 +33,8 @@ REFUSED_AGAIN = 0.1  # [s] wall: what is told of the second refusal of a motion 
 LONGEST_REFUSED = 2.0  # [s] wall
 LONGEST_STEP = LOOK_PERIOD  # [s] wall: time passes too
 WAITS = "the arm waits: "
+ENDED = ("DONE", "ERROR")
+OWN_PERIOD = 0.2  # [s] wall between two times that the motion is asked for: what came of it is heard meanwhile
 SOMEBODY = ("", "person", "watchdog", "controller", "scene_monitor")  # whose holds are nobody's own
 
 LETS_GO = "lets go"  # of what a person said
@@ -127,7 +129,9 @@ class TaskRunner(Generic[V]):
         self._task, self._look, self._status, self._bus = task, look, status, bus
         self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
         self._stop, self._grip = bus.client(topics.MOTION_STOP), bus.client(topics.GRIPPER_COMMAND)
-        self._hold = bus.client(topics.MOTION_HOLD)
+        self._hold, self._own = bus.client(topics.MOTION_HOLD), bus.client(topics.MOTION_OWN)
+        self._owner = bus.reader(topics.MOTION_OWNER)
+        self._owning: asyncio.Task[None] | None = None
         self._planning_time, self._watchdog = planning_time, watchdog
         self._woken = asyncio.Event()
         self._told: list[Command] = []
@@ -155,6 +159,24 @@ class TaskRunner(Generic[V]):
                 for command in [*told, *holds, *self._task.step(view)]:
                     self._begin(group, command)
                 self._tell()
+                self._have_motion(group)
+
+    def _have_motion(self, group: asyncio.TaskGroup) -> None:
+        """Have the motion of the robot from a start to the end or a stop, if it is nobody else's."""
+        now, status = self._owner.latest, self._task.status
+        if now is None or (self._owning is not None and not self._owning.done()):
+            return
+        wanted = status.started and status.state not in ENDED
+        ours = now.kind == "task" and now.owner in ("", self._bus.service)
+        if wanted == (ours and now.asked) or not (ours or now.kind == "none"):
+            return
+        asked = m.OwnRequest(act="take" if wanted else "give", owner=self._bus.service, kind="task")
+        self._owning = group.create_task(self._ask_for(asked), name="own")
+
+    async def _ask_for(self, request: m.OwnRequest) -> None:
+        with contextlib.suppress(RequestFailed):  # of who has it then the motions that are refused tell
+            await self._own.call(request, GOAL_TIMEOUT)
+        await asyncio.sleep(OWN_PERIOD)
 
     def _mind(self, view: V) -> list[m.HoldRequest]:
         """The holds to ask for, because something is missing or is back again; the view has what is missing."""
@@ -168,7 +190,7 @@ class TaskRunner(Generic[V]):
     async def _obey(self, command: m.TaskCommand) -> m.TaskStatus:
         self._bus.log.info("told to %s%s", command.command, f" by {command.by}" if command.by else "")
         view = self._look()
-        _require_allowed(command, view.motion if view else None)
+        _require_allowed(command, view.motion if view else None, self._owner.latest)
         asked = self._task.command(command.command, view)
         for request in asked:
             if isinstance(request, m.HoldRequest | m.StopRequest) and request.by == "person":
@@ -207,7 +229,7 @@ class TaskRunner(Generic[V]):
         """Publish the status when more of it has changed than the time."""
         now, before = self._task.status, self._before
         trouble = self._watchdog.trouble if self._watchdog else ""
-        if trouble and now.state not in ("DONE", "ERROR"):
+        if trouble and now.state not in ENDED:
             now.message = f"{WAITS}{trouble}"
         elif now.message.startswith(WAITS):
             now.message = ""
@@ -324,13 +346,17 @@ def _voided(command: Command) -> tuple[str, ...]:
     return _kind(command), *((LETS_GO,) if command.by == "person" else ())
 
 
-def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None) -> None:
+def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owner: m.MotionOwner | None) -> None:
     """Return when a person may say that.
 
     Raises:
-        Refused: another person holds the robot, or it was stopped and can only be started.
+        Refused: another person holds the robot or has the motion, or it was stopped and can only be started.
     """
-    if motion is None or command.override or command.command not in ("start", "resume"):
+    if command.override or command.command not in ("start", "resume"):
+        return
+    if owner is not None and owner.asked and owner.kind != "task" and owner.owner not in (SOMEBODY[1], command.by):
+        raise Refused("not_owner", f"the motion is {owner.told}: only they hand it over, unless you override that")
+    if motion is None:
         return
     others = [inhibit.told for inhibit in motion.inhibits
               if inhibit.kind == "held" and inhibit.by not in (*SOMEBODY, command.by)]

@@ -13,6 +13,7 @@ from common.config import RobotConfig
 from common.errors import ConfigError, UnknownName
 from common.robot.description import find_description, package_folders
 from common.robot.merging import WORLD, merged_urdf
+from common.robot.transforms import rpy_to_matrix
 
 Array = NDArray[np.float64]
 
@@ -146,6 +147,16 @@ class RobotModel:
         pin.forwardKinematics(self.model, self.data, self._checked(q), self._checked(dq))
         twist = pin.getFrameVelocity(self.model, self.data, self.tcp_frame, pin.ReferenceFrame.LOCAL)
         return float(np.linalg.norm(twist.linear))
+
+    def jacobian(self, q: ArrayLike) -> Array:
+        """(6, dof): what joint velocities move the TCP by, linear [m/s] then angular [rad/s], along world's axes."""
+        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        return np.array(pin.computeFrameJacobian(self.model, self.data, self._checked(q), self.tcp_frame, axes))
+
+    @property
+    def base_axes(self) -> Array:
+        """(3, 3) axes of the base in world."""
+        return rpy_to_matrix(*self.config.base_rpy)
 
     def link_poses(self, q: ArrayLike, others: Mapping[str, float] | None = None) -> dict[str, Array]:
         """(4, 4) T_world_link of every link at q (dof,) [rad].

@@ -11,7 +11,17 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from common.application import all_topics
-from common.topics import COUNTERS, LOG, SUPERVISOR_STATUS, Request, Topic, general_key, of_service, parameters_of
+from common.topics import (
+    COUNTERS,
+    LOG,
+    MOTION_JOG,
+    SUPERVISOR_STATUS,
+    Request,
+    Topic,
+    general_key,
+    of_service,
+    parameters_of,
+)
 from common.transport.copies import plain_key
 from common.transport.credentials import OBSERVER, OPERATOR, RECORDER, ROUTER_NAME, SUPERVISOR, common_name
 from common.transport.keys import alive_key, owns_key, serves_key
@@ -80,7 +90,7 @@ def rights_of_recorder(services: Iterable[Rights] = ()) -> Rights:
 def rights_of_tools(services: Iterable[Rights] = ()) -> dict[str, Rights]:
     """What people's tools may do, in all cells behind a router, which have these services."""
     return {
-        OPERATOR: Rights(read={"**"}, get={"**"}, call={"**"}),
+        OPERATOR: Rights(write={MOTION_JOG.key}, read={"**"}, get={"**"}, call={"**"}),
         OBSERVER: Rights(read={"**"}, get=_states(services)),
     }
 

@@ -17,7 +17,8 @@ from common import messages as m
 from common.tasks.deciding import Deciding, V
 from common.tasks.stages import MISSES, Command, Execution, Grip, Look, Move, Report, Stage
 
-ANEW = ("busy", "stale_request", "clock_ahead", "stopped")  # refusals that have nothing to do with the motion
+# Refusals that have nothing to do with the motion.
+ANEW = ("busy", "stale_request", "clock_ahead", "stopped", "not_owner")
 START = ": start to go on"
 BLOCKED_BY = "scene_monitor"  # holds the arm while something is in the way
 NO_ARM = "the arm cannot be moved: "

@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 
 from common.errors import ConfigError
 from common.sources import new_id, wall_ns
-from common.topics import general_key
+from common.topics import MOTION_JOG, general_key
 from common.transport.handoff import Doorbell
 from common.transport.keys import owns_key
 from common.transport.session import Declared, Session
 from common.transport.tokens import tokens_now
 
-# What the supervisors of linked hosts say under one key; the readers tell them apart.
-SHARED = ("log/supervisor", "counters/supervisor", "supervisor/status")
+# What the supervisors of linked hosts say under one key, and whoever jogs; the readers tell them apart.
+SHARED = ("log/supervisor", "counters/supervisor", "supervisor/status", MOTION_JOG.key)
 GIVE_UP = 3.0  # [s] longer than a link that was cut stands: the one before may be gone and its tokens not yet
 LOOK_PERIOD = 0.2  # [s]
 LOOK = 3.0  # [s] for an answer: longer than a link holds anything up before it is cut, so that no answer means nobody

@@ -12,14 +12,15 @@ from common.virtual.network import FAIR, Weather
 
 Kind = Literal[
     "crash", "restart", "cut", "router lost", "stalled", "late goal", "person", "clock step", "ended", "slowed",
-    "supervisor lost", "second instance", "hostile", "stopped again", "gave up",
+    "supervisor lost", "second instance", "hostile", "stopped again", "gave up", "taken over",
 ]
 Amid = Literal["", "asker", "asked"]
 
 # At least, and soon: in short runs as well.
 FIRST: tuple[Kind, ...] = ("crash", "crash", "crash", "cut", "stalled", "late goal", "late goal")
 LATER: tuple[Kind, ...] = ("crash", "crash", "restart", "cut", "stalled", "late goal", "person")
-LAST: tuple[Kind, ...] = ("slowed", "supervisor lost", "second instance", "hostile", "stopped again", "gave up")
+LAST: tuple[Kind, ...] = (
+    "slowed", "supervisor lost", "second instance", "hostile", "stopped again", "gave up", "taken over")
 FIRST_GAPS = 0.0, 1.5  # [s] of cell time between those
 LATER_GAP = 12.0  # [s] of cell time on average to each further fault
 LONGEST = 60.0  # [s] of cell time from the cell being ready; what comes after is left to it to finish
@@ -42,7 +43,8 @@ ENDED_LATEST = 15.0  # [s] of cell time from the cell being ready
 SLOWED_SHARE = 0.25  # of the runs: somebody sets the speed
 SUPERVISOR_SHARE = 0.25  # of the runs: the supervisor dies, and the cell is brought up again
 SECOND_SHARE = 0.5  # of the runs: somebody starts a service that is up
-TOO_LATE_SHARE = 0.25  # of the runs: a start comes later than a stop; and of the runs: a goal later than its end
+TOO_LATE_SHARE = 0.25  # of the runs: a start comes later than a stop; and of the runs: a goal later than its end; and
+# of the runs: somebody takes the motion over
 MOST_HOSTILE = 3  # of a run
 MEANWHILE = 10.0  # [s] of cell time from the cell being ready, in which these happen
 PERSON_SHARE = 0.5  # of the runs: somebody stops the task early on
@@ -62,7 +64,8 @@ class Fault:
             which task or executor or both crash, and who starts it later or leaves it so; a person who sets the speed;
             the supervisor ends without `finally`, and somebody brings the cell up again; somebody starts a service
             that is up; payloads that nobody can read under all keys; a person who starts the task, and another who
-            stops the robot while that is on its way; a person who asks for a motion and gives up before that is heard.
+            stops the robot while that is on its way; a person who asks for a motion and gives up before that is heard;
+            a person who takes the motion over from whoever has it, jogs the arm, and starts the task.
         target: name of the process; empty for the router, for a person, the supervisor and the system clock.
         amid: it hits who next asks for a plan or a goal of arm or fingers, or who is asked for it, instead of the
             target; of a late goal it is the request, or the answer.
@@ -157,7 +160,7 @@ def _strange(seed: int, services: Sequence[str], sooner: float) -> list[Fault]:
             target, seconds = str(random.choice(list(services))), float(random.uniform(*SECOND_SECONDS))
         faults.append(Fault(at, kind, target, seconds=seconds))
     late = np.random.default_rng([seed, 13])
-    too_late: tuple[Kind, ...] = ("stopped again", "gave up")
+    too_late: tuple[Kind, ...] = ("stopped again", "gave up", "taken over")
     for kind in too_late:
         happens, at = late.random() < TOO_LATE_SHARE, sooner * float(late.uniform(0.0, MEANWHILE))
         faults += [Fault(at, kind)] if happens else []

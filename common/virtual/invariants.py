@@ -24,7 +24,9 @@ from common.messages import (
     Image,
     LogLine,
     Message,
+    MotionOwner,
     MotionStatus,
+    OwnRequest,
     ParameterRequest,
     PlanRequest,
     PointCloud2,
@@ -122,6 +124,7 @@ class Invariants:
         self._log = f"/{topics.LOG.expression.partition('/')[0]}/"
         self._motion = f"{cell.name}/{topics.MOTION_STATUS.key}"
         self._gripper = f"{cell.name}/{topics.GRIPPER_STATE.key}"
+        self._owner, self._jogged = f"{cell.name}/{topics.MOTION_OWNER.key}", False  # whether the arm moves by hand
         self._goals: dict[str, _Goals] = {}
         self._over: dict[tuple[str, str], str] = {}  # by key and goal
         self._ids: list[str] = []  # what there is
@@ -194,6 +197,8 @@ class Invariants:
         elif sample.key == self._gripper:
             gripper = decode(GripperState, sample.payload)
             self._on_goal(sample.key, life, gripper.id, gripper.state)
+        elif sample.key == self._owner:
+            self._jogged = decode(MotionOwner, sample.payload).jogging
         elif sample.key == self._objects:
             self._on_truth(msgpack.unpackb(sample.payload)["objects"])
 
@@ -289,7 +294,7 @@ class Invariants:
         if way.max() <= STILL or passed > 2 * self._cycle:
             return
         goals = self._goals.get(self._motion)
-        self._stray = 0 if goals is not None and goals.active else self._stray + 1
+        self._stray = 0 if self._jogged or (goals is not None and goals.active) else self._stray + 1
         if self._broke(self._stray <= UNTOLD, GOAL):
             self._tell(GOAL, f"{way.max():.4f} rad without one")
         resting = self._held_since is not None and now - self._held_since >= AT_REST
@@ -301,7 +306,8 @@ class Invariants:
             if self._broke(not too_fast.any(), SLOW):
                 self._tell(SLOW, f"dq {np.round(dq, 3).tolist()} at {self._cap:.0%}")
         brakes = current_life() is self._ended_by and self._ended_at is not None and now - self._ended_at < AT_REST
-        unasked = self._ended and not brakes and (goals is None or goals.active not in self._by_persons)
+        asked = self._jogged or (goals is not None and goals.active in self._by_persons)
+        unasked = self._ended and not brakes and not asked
         self._unasked = self._unasked + 1 if unasked else 0
         if self._broke(self._unasked <= UNTOLD, ASKED):
             self._tell(ASKED, f"it moves {way.max():.4f} rad for {goals.active if goals else 'nobody'}")
@@ -321,6 +327,8 @@ class Invariants:
             self._cap = max([self._cap, *_speeds(request)])
         elif isinstance(request, StopRequest) and request.owner:  # of the task's own it has none
             self._last_word = "stop"
+        elif isinstance(request, OwnRequest) and request.over:
+            self._last_word = "stop"  # of a task
         elif isinstance(request, HoldRequest) and request.hold and service == PERSON:
             self._last_word = "hold"
         if self._last_word not in ENDS:

@@ -48,6 +48,8 @@ SURE = 2.5  # [s] after which a person looks again: what was read may have been 
 PERSON_SLOW = 0.3  # [s] that a message takes to or from a person on average, at most
 START_LATE = 0.3, 1.0  # [s] by which a start comes late when somebody stops the robot meanwhile
 GOAL_LATE = 0.5, 1.8  # [s] by which the goal comes late that a person gives up: less than what is refused as too old
+JOGS, MOST_JOG = 4, 40  # of a person, and messages in each
+JOG_PERIOD, JOG_GAP = 0.02, 0.5  # [s] between those, and at most between two of them
 PERSON_LATE = 1.0  # [s] at most between a person's stop and what is done next, in two places at once
 
 
@@ -83,7 +85,8 @@ class Misfortune:
         began, persons = loop.time(), list[asyncio.Task[None]]()
         begins = {"person": self._begin_person, "ended": self._begin_ending, "slowed": self._begin_slowing,
                   "second instance": self._begin_second, "hostile": self._begin_strange,
-                  "stopped again": self._begin_stopping_again, "gave up": self._begin_giving_up}
+                  "stopped again": self._begin_stopping_again, "gave up": self._begin_giving_up,
+                  "taken over": self._begin_taking_over}
         try:
             for fault in self._plan.faults:
                 await asyncio.sleep(max(0.0, began + fault.at / speed - loop.time()))
@@ -332,6 +335,33 @@ class Misfortune:
                 async with asyncio.timeout(seconds * float(random.uniform(0.5, 1.0))):
                     await motion.move(m.JointGoal(named="home"))
             await asyncio.sleep(GOAL_LATE[1])
+            await self._start(bus, heard_of)
+        finally:
+            await bus.close()
+            self._network.detach(session)
+
+    def _begin_taking_over(self, _fault: Fault) -> asyncio.Task[None]:
+        self._tell("FAULT taken over: a person takes the motion over, jogs the arm, and starts the task")
+        context = context_of(Life(PERSON))
+        session = self._network.attach(context, PERSON, 5000 + self.made["taken over"])
+        return context.run(lambda: asyncio.create_task(self._take_over(session)))
+
+    async def _take_over(self, session: VirtualSession) -> None:
+        """Take the motion over, jog a joint to and fro, and start the task, which hands it over."""
+        host, random = self._host, self._late
+        bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
+        heard_of, jogs = bus.reader(topics.MOTION_STATUS), bus.writer(topics.MOTION_JOG)
+        joints = host.cell.robot.joints
+        try:
+            await persist(bus.client(topics.MOTION_OWN), m.OwnRequest(act="take", owner=PERSON, over=True),
+                          PERSON_TIMEOUT, lambda error: m.MotionOwner(), lambda problem: None)
+            for _ in range(JOGS):
+                velocities = {str(random.choice(joints)): float(random.uniform(-1.0, 1.0))}
+                for _ in range(int(random.integers(1, MOST_JOG))):
+                    heard = heard_of.latest.newest if heard_of.latest else 0
+                    jogs.put(m.JogCommand(header=bus.header(), owner=PERSON, heard=heard, joints=velocities))
+                    await asyncio.sleep(JOG_PERIOD)
+                await asyncio.sleep(float(random.uniform(0.0, JOG_GAP)))
             await self._start(bus, heard_of)
         finally:
             await bus.close()

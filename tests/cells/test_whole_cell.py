@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -19,7 +20,7 @@ import pytest
 from common import topics
 from common.config import load_cell
 from common.messages import SupervisorStatus
-from tests.harness import RunningCell, until
+from tests.harness import RunningCell, command_line, environment, until
 
 pytestmark = pytest.mark.cell
 
@@ -87,6 +88,40 @@ def test_the_camera_sends_no_more_than_about_ten_pictures_each_second(up: Runnin
     assert answer.returncode == 0, answer.stderr
     last = json.loads(answer.stdout.splitlines()[-1])
     assert 1 < last["hz"] < 13  # fewer on a machine that is busy
+
+
+async def test_it_is_jogged_from_a_terminal_until_that_dies_and_is_nobodys_then(up: RunningCell) -> None:
+    jogging = await asyncio.to_thread(
+        subprocess.Popen, command_line("robot", "jog", "--linear", "0,0,0.05", "--seconds", "60", "--domain",
+                                       str(up.domain)), env=environment(up.folder), stdout=subprocess.DEVNULL)
+    async with up.listen() as bus:
+        owner, joints = bus.reader(topics.MOTION_OWNER), bus.reader(topics.JOINT_STATES)
+        now = await until(owner, lambda o: o.jogging)
+        assert now.kind == "operator" and now.owner
+        first = await joints.next()
+        await until(joints, lambda j: max(abs(a - b) for a, b in zip(j.position, first.position, strict=True)) > 0.05)
+        jogging.kill()
+        await until(owner, lambda o: o.kind == "none" and not o.jogging)
+        rests = await joints.next()
+        later = await until(joints, lambda j: j.header.stamp > rests.header.stamp + 1_000_000_000)
+        assert later.position == rests.position and not any(later.velocity)
+    jogging.wait()
+    assert (await asyncio.to_thread(up.tell, "robot", "owner")).stdout == "the motion is nobody's\n"
+
+
+@pytest.mark.parametrize(("arguments", "wanted"), [
+    (["take"], "the motion is .* \\(operator\\) since .* UTC\n"), (["give"], "the motion is nobody's\n"),
+    (["give"], "the motion is nobody's\n"),
+    (["jog"], "zencell: jog: needs --joint NAME=V, --linear X,Y,Z or --angular X,Y,Z\n"),
+    (["jog", "--linear", "1,2"], "zencell: --linear: '1,2' must be three numbers X,Y,Z\n"),
+    (["jog", "--joint", "nose=1"], "zencell: unknown joint 'nose'; choices: panda_finger_joint1, .*\n"),
+    (["jog", "--linear", "0,0,1", "--frame", "moon"], "zencell: jog.frame: 'moon' must be .*\n"),
+    (["jog", "--linear", "0,0,1", "--seconds", "99"],
+     "zencell: --seconds: '99' must be more than 0 and at most 60 s\n"),
+])
+def test_who_takes_gives_and_jogs_is_told_in_one_line(up: RunningCell, arguments: list[str], wanted: str) -> None:
+    said = up.tell("robot", *arguments)
+    assert re.fullmatch(wanted, said.stdout + said.stderr)
 
 
 def test_interrupted_while_waiting_it_is_gone_and_says_so(up: RunningCell) -> None:

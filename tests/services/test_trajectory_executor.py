@@ -121,13 +121,14 @@ def move(robot: RobotModel, start, end, scaling=0.5) -> JointTrajectory:
     return JointTrajectory(joint_names=robot.joint_names, points=points)
 
 
-async def test_it_reads_nothing_and_serves_motion_gripper_and_world() -> None:
+async def test_it_reads_who_jogs_and_serves_motion_gripper_and_world() -> None:
     found = await wiring(trajectory_executor.run, config())
-    assert found.reads == set() and found.calls == set()
-    assert found.writes == {topics.JOINT_STATES, topics.MOTION_STATUS, topics.ROBOT_STATUS, topics.GRIPPER_STATE,
+    assert found.reads == {topics.MOTION_JOG} and found.calls == set()
+    assert found.writes == {topics.JOINT_STATES, topics.MOTION_STATUS, topics.MOTION_OWNER, topics.ROBOT_STATUS,
+                            topics.GRIPPER_STATE,
                             SCENE_BALLS, topics.SCENE_OBJECTS, topics.SCENE_OBJECT_UPDATES}
     assert found.serves == {topics.MOTION_EXECUTE, topics.MOTION_FOLLOWED, topics.MOTION_STOP, topics.MOTION_HOLD,
-                            topics.ROBOT_COMMAND,
+                            topics.MOTION_OWN, topics.ROBOT_COMMAND,
                             topics.GRIPPER_COMMAND, topics.WORLD_EDIT}
 
 

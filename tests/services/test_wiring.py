@@ -47,7 +47,7 @@ async def test_the_camera_knows_the_truth_from_the_topic_alone(camera: str) -> N
 
 async def test_every_topic_that_is_known_has_an_owner_in_a_cell_and_only_such_are_owned() -> None:
     owned = {topic for cell, name in SERVICES for topic in (await wired(cell, name)).owns}
-    of_no_service = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.PARAMETERS}
+    of_no_service = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.PARAMETERS, topics.MOTION_JOG}
     assert owned == set(all_topics().values()) - of_no_service
 
 
@@ -66,7 +66,7 @@ async def test_every_topic_that_is_read_or_asked_is_written_or_served_by_one_ser
     all_wired = [await wired(cell, name) for name in CELLS[cell].services]
     written = [topic for found in all_wired for topic in found.writes]
     served = [topic for found in all_wired for topic in found.serves]
-    by_others = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS}  # and by everybody
+    by_others = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.MOTION_JOG}  # and by everybody
     parameters = {topics.parameters_of(name) for name in CELLS[cell].services}  # which nobody serves by itself
     assert len(written) == len(set(written)) and len(served) == len(set(served))
     for name, found in zip(CELLS[cell].services, all_wired, strict=True):

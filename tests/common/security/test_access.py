@@ -109,3 +109,8 @@ def test_a_service_that_is_missing_or_different_is_named(
     with pytest.raises(ConfigError, match=reason) as caught:
         require_current(PLACE, access_control({"panda": cell(**before)}), "panda", cell(**now), RENEW)
     assert RENEW in str(caught.value)
+
+
+def test_operators_jog_and_observers_do_not() -> None:
+    both = allowed(task=TASK)
+    assert both["operator"]["writes"] == {"*/motion/jog"} and "writes" not in both["observer"]

@@ -1,0 +1,384 @@
+"""An arm that is jogged, at every cycle: how it goes, how soon it stands, and who may."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from common.config import load_cell
+from common.control.cycle import ControlCycle
+from common.errors import Refused
+from common.hardware.interface import Limits
+from common.hardware.mock import MockHardware
+from common.messages import (
+    ExecuteRequest,
+    Header,
+    HoldRequest,
+    JogCommand,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    OwnRequest,
+    StopRequest,
+    Vector3,
+)
+from common.robot.model import RobotModel
+from common.sources import Machine, drawn_from
+
+PERIOD = 0.01
+UR5_WORKS = np.array([0.0, -1.9, 1.9, -1.6, -1.57, 0.0])  # at home it stands upright: a singular place
+ROBOTS = {cell: RobotModel.load(load_cell(cell).robot) for cell in ("panda", "ur5")}
+
+
+@dataclass
+class Moved:
+    """A cell's arm, with a clock that passes when it is told to."""
+
+    robot: RobotModel
+    stamp: int = int(1.7e18)
+    sent: list = field(default_factory=list)
+    reports: list = field(default_factory=list)
+    refused: list = field(default_factory=list)
+
+    def __post_init__(self):
+        robot, home = self.robot, self.robot.named("home") if self.robot.dof == 7 else UR5_WORKS
+        self.limits = Limits(
+            tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration,
+            np.array(robot.config.deceleration_limits) if robot.config.deceleration_limits else None, robot.jerk)
+        self.cycle = ControlCycle(MockHardware(home, None), self.limits, home, kinematics=robot)
+        self.sources = Machine()
+        self.sources.monotonic_ns = self.sources.wall_ns = lambda: self.stamp
+        self.step()
+
+    def step(self, seconds=PERIOD):
+        self.stamp += int(seconds * 1e9)
+        with drawn_from(self.sources):
+            self.reports.append(self.cycle.step(Header(stamp=self.stamp)))
+        self.sent.append((self.stamp * 1e-9, self.cycle._arm.set_point.copy()))
+
+    def run(self, seconds):
+        for _ in range(round(seconds / PERIOD)):
+            self.step()
+
+    def jog(self, seconds, **asked):
+        """Ask every 20 ms for so long; what was refused is kept by its code."""
+        for k in range(round(seconds / PERIOD)):
+            if k % 2 == 0:
+                try:
+                    with drawn_from(self.sources):
+                        self.cycle.jog(JogCommand(**{"owner": "ann", **asked}))
+                except Refused as refusal:
+                    self.refused.append(refusal.code)
+            self.step()
+
+    def tool(self, seconds, linear=(0, 0, 0), angular=(0, 0, 0), **asked):
+        vectors = (Vector3(x=x, y=y, z=z) for x, y, z in (linear, angular))
+        self.jog(seconds, **dict(zip(("linear", "angular"), vectors, strict=True)), **asked)
+
+    def asked(self, call, *args):
+        with drawn_from(self.sources):
+            return call(*args)
+
+    def own(self, act="take", owner="ann", **more):
+        return self.asked(self.cycle.own, OwnRequest(act=act, owner=owner, **more), self.stamp * 1e-9)
+
+    def execute(self, goal, owner="", **more):
+        begin = self.q
+        points = [JointTrajectoryPoint(time_from_start=t, positions=list(begin + way), velocities=[0.0] * len(begin),
+                                       accelerations=[0.0] * len(begin)) for t, way in ((0.0, 0.0), (2.0, 0.2))]
+        request = ExecuteRequest(id=goal, owner=owner, trajectory=JointTrajectory(
+            joint_names=self.robot.joint_names, points=points), **more)
+        return self.asked(self.cycle.execute, request, self.stamp * 1e-9)
+
+    @property
+    def q(self):
+        return self.sent[-1][1]
+
+    @property
+    def owner(self):
+        return self.cycle.owner.owner, self.cycle.owner.kind
+
+    def rests(self, seconds=0.3):
+        before = self.q
+        self.run(seconds)
+        return np.array_equal(before, self.q)
+
+    def judge(self):
+        """The largest shares of velocity, acceleration and jerk limits between set-points."""
+        q = np.array([q for _, q in self.sent])
+        v, limits = np.diff(q, axis=0) / PERIOD, self.limits
+        a = np.diff(v, axis=0) / PERIOD
+        j = np.diff(a, axis=0) / PERIOD
+        return (float((np.abs(v) / limits.velocity).max()), float((np.abs(a) / limits.braking).max()),
+                float((np.abs(j) / limits.jerks).max()))
+
+
+@pytest.fixture(params=ROBOTS)
+def arm(request):
+    return Moved(ROBOTS[request.param])
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_joint_goes_as_fast_as_is_asked_and_the_others_rest(arm, sign):
+    joint = arm.robot.joint_names[3]
+    arm.jog(0.5, joints={joint: sign * 0.2})
+    before = arm.q
+    arm.jog(0.5, joints={joint: sign * 0.2})
+    way = arm.q - before
+    assert way[3] == pytest.approx(sign * 0.1, abs=1e-6) and not np.delete(way, 3).any()
+
+
+def test_the_arm_stands_a_fifth_of_a_second_after_the_newest_command(arm):
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        dq = rng.uniform(-3, 3, arm.robot.dof)
+        arm.jog(rng.uniform(0.02, 0.6), joints=dict(zip(arm.robot.joint_names, dq, strict=True)))
+        arm.run(0.19)  # with the cycle of the newest command
+        assert arm.rests()
+    velocity, acceleration, jerk = arm.judge()
+    assert velocity <= 1.0 and acceleration <= 1.001 and jerk <= 1.001
+
+
+def test_whatever_is_asked_for_set_points_keep_the_limits(arm):
+    rng = np.random.default_rng(2)
+    lower, upper = arm.robot.lower, arm.robot.upper
+    for _ in range(120):
+        kind = rng.integers(3)
+        if kind == 0:
+            arm.jog(0.02 * rng.integers(1, 20), joints=dict(zip(
+                arm.robot.joint_names, rng.uniform(-9, 9, arm.robot.dof), strict=True)))
+        elif kind == 1:
+            arm.tool(0.02 * rng.integers(1, 20), rng.uniform(-1, 1, 3), rng.uniform(-2, 2, 3),
+                     frame=str(rng.choice(["base", "tool", "world"])))
+        else:
+            arm.run(0.01 * rng.integers(1, 20))
+    velocity, acceleration, jerk = arm.judge()
+    assert not arm.refused and velocity <= 1.0 and acceleration <= 1.001 and jerk <= 1.001
+    q = np.array([q for _, q in arm.sent])
+    assert (lower - q).max() < 1e-6 and (q - upper).max() < 1e-6 and np.ptp(q, axis=0).min() > 0.05
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_each_joint_comes_to_rest_before_its_end(arm, sign):
+    for k, joint in enumerate(arm.robot.joint_names):
+        arm.jog(0.2, joints={joint: sign * 9.0})
+        arm.cycle._jogging._kinematics = None  # without the tool's own limit, faster
+        arm.jog(12.0, joints={joint: sign * 9.0})
+        end = arm.robot.upper[k] if sign > 0 else arm.robot.lower[k]
+        assert 0 <= sign * (end - arm.q[k]) < 0.01
+        arm.cycle._jogging._kinematics = arm.robot
+    assert max(arm.judge()) <= 1.001
+
+
+@pytest.mark.parametrize("frame", ["base", "tool", "world"])
+@pytest.mark.parametrize("axis", range(3))
+def test_the_tool_goes_straight_along_the_axis_of_the_frame(arm, frame, axis):
+    arm.jog(0.2, joints={arm.robot.joint_names[0]: 0.5})  # turned away from the axes
+    arm.run(0.5)
+    begin = arm.robot.fk(arm.q)
+    asked = np.eye(3)[axis] * 0.1
+    arm.tool(0.6, asked, frame=frame)
+    arm.run(0.2)
+    end = arm.robot.fk(arm.q)
+    way = {"tool": begin[:3, :3], "base": arm.robot.base_axes, "world": np.eye(3)}[frame] @ asked
+    moved = end[:3, 3] - begin[:3, 3]
+    assert moved @ way / np.linalg.norm(moved) / 0.1 > 0.9999 and 0.05 < np.linalg.norm(moved) < 0.08
+    assert np.allclose(end[:3, :3], begin[:3, :3], atol=2e-3)
+
+
+def test_the_tool_turns_about_itself(arm):
+    begin = arm.robot.fk(arm.q)
+    arm.tool(0.5, angular=(0, 0, 0.4), frame="tool")
+    arm.run(0.2)
+    turned = begin[:3, :3].T @ arm.robot.fk(arm.q)[:3, :3]
+    assert np.linalg.norm(arm.robot.fk(arm.q)[:3, 3] - begin[:3, 3]) < 2e-3
+    assert 0.1 < np.arctan2(turned[1, 0], turned[0, 0]) < 0.3
+
+
+def test_the_tool_is_never_faster_than_by_hand(arm):
+    arm.tool(1.0, (3.0, 0.0, 0.0))
+    arm.jog(1.0, joints={arm.robot.joint_names[0]: 9.0})
+    places = np.array([arm.robot.fk(q)[:3, 3] for _, q in arm.sent])
+    assert 0.2 < np.linalg.norm(np.diff(places, axis=0), axis=1).max() / PERIOD <= 0.251
+
+
+def test_where_the_tool_can_go_no_farther_it_comes_to_rest(arm):
+    arm.tool(30.0, (0.2, 0.0, 0.0))
+    arm.tool(0.5, (0.2, 0.0, 0.0))
+    before = arm.robot.fk(arm.q)[:3, 3]
+    arm.tool(0.5, (0.2, 0.0, 0.0))
+    assert np.linalg.norm(arm.robot.fk(arm.q)[:3, 3] - before) < 5e-3 and max(arm.judge()) <= 1.001
+
+
+def test_a_command_for_nothing_brings_it_to_rest_at_once(arm):
+    arm.tool(0.5, (0.1, 0.0, 0.0))
+    arm.tool(0.12)
+    assert arm.rests()
+
+
+@pytest.mark.parametrize(("asked", "code", "told"), [
+    ({"joints": {"nose": 1.0}}, "unknown_joint", "'nose' is no joint of the arm; choices: "),
+    ({"joints": {}, "linear": Vector3(x=1.0)}, None, ""),
+])
+def test_what_cannot_be_jogged_is_refused_with_the_choices(arm, asked, code, told):
+    if code is None:
+        arm.asked(arm.cycle.jog, JogCommand(**asked))
+        return
+    with pytest.raises(Refused, match=told) as refusal:
+        arm.asked(arm.cycle.jog, JogCommand(**asked))
+    assert refusal.value.code == code
+
+
+def test_joints_and_tool_together_are_a_contradiction(arm):
+    with pytest.raises(Refused, match="do not go together"):
+        arm.asked(arm.cycle.jog, JogCommand(joints={arm.robot.joint_names[0]: 1.0}, linear=Vector3(x=1.0)))
+
+
+def test_no_goal_begins_while_the_arm_is_jogged_and_none_is_disturbed(arm):
+    arm.jog(0.3, joints={arm.robot.joint_names[0]: 0.2})
+    assert arm.execute("one", "ann").error == "busy"
+    arm.run(0.5)
+    assert arm.execute("two", "ann").state == "active"
+    arm.jog(2.2, joints={arm.robot.joint_names[0]: -0.2})
+    last = [report.motion for report in arm.reports if report.motion][-1]
+    assert (last.id, last.state) == ("two", "succeeded") and set(arm.refused) == {"busy", "let_go"}
+
+
+@pytest.mark.parametrize("end", ["stop", "hold"])
+def test_after_a_stop_or_a_hold_who_keeps_asking_moves_nothing_until_they_let_go(arm, end):
+    joint = {arm.robot.joint_names[0]: 0.2}
+    arm.jog(0.3, joints=joint)
+    if end == "stop":
+        arm.asked(arm.cycle.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
+    else:
+        arm.asked(arm.cycle.hold, HoldRequest(hold=True, owner="bob"))
+    arm.jog(0.2, joints=joint)
+    before = arm.q
+    arm.jog(1.0, joints=joint)
+    arm.asked(arm.cycle.hold, HoldRequest(hold=False, owner="bob", stops=True))
+    arm.jog(1.0, joints=joint)
+    assert np.array_equal(arm.q, before)
+    arm.run(0.35)
+    arm.jog(0.3, joints=joint)
+    assert not np.array_equal(arm.q, before)
+
+
+def test_who_stopped_the_arm_jogs_it_and_nobody_else(arm):
+    joint = {arm.robot.joint_names[0]: 0.2}
+    heard = arm.asked(arm.cycle.stop, StopRequest(owner="ann"), arm.stamp * 1e-9).newest
+    arm.jog(0.3, joints=joint, owner="bob", heard=heard)
+    arm.jog(0.3, joints=joint)
+    assert arm.rests() and set(arm.refused) == {"stopped", "let_go"}
+    arm.run(0.3)
+    arm.jog(0.3, joints=joint, heard=heard)
+    assert not arm.rests()
+
+
+def test_of_two_that_jog_the_first_does(arm):
+    arm.jog(0.2, joints={arm.robot.joint_names[0]: 0.2})
+    with pytest.raises(Refused, match=r"the motion is ann's \(operator\)"):
+        arm.asked(arm.cycle.jog, JogCommand(owner="bob", joints={arm.robot.joint_names[0]: -0.2}))
+
+
+def test_a_stall_of_the_executor_while_it_jogs_makes_no_step(arm):
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        arm.jog(0.3, joints=dict(zip(arm.robot.joint_names, rng.uniform(-1, 1, arm.robot.dof), strict=True)))
+        at = arm.q
+        arm.step(rng.uniform(0.02, 0.5))
+        assert np.all(np.abs(arm.q - at) <= PERIOD * arm.limits.velocity * 0.2)
+
+
+# --- whose the motion is -------------------------------------------------------------------------------------------
+
+
+def test_who_begins_a_motion_has_it_until_it_ends(arm):
+    assert arm.owner == ("", "none")
+    assert arm.execute("one", "ann").state == "active" and arm.owner == ("ann", "operator")
+    assert arm.execute("two").error == "not_owner"
+    arm.run(3.0)
+    assert arm.owner == ("", "none") and arm.execute("three").state == "active" and arm.owner == ("", "task")
+
+
+def test_what_was_asked_for_stays_until_it_is_given_back(arm):
+    arm.own(kind="script")
+    arm.run(10.0)
+    assert arm.owner == ("ann", "script") and arm.execute("one", "bob").error == "not_owner"
+    arm.own("give", "bob")
+    assert arm.owner == ("ann", "script")
+    arm.own("give")
+    assert arm.owner == ("", "none") and arm.execute("two", "bob").state == "active"
+
+
+def test_a_lease_ends_when_its_owner_says_nothing_more_but_not_in_a_motion(arm):
+    arm.own(kind="script", lease=1.0)
+    arm.run(0.8)
+    arm.own(kind="script", lease=1.0)
+    arm.run(0.8)
+    assert arm.execute("one", "ann").state == "active"
+    arm.run(2.0)
+    assert arm.owner == ("ann", "script")
+    arm.run(2.0)
+    assert arm.owner == ("", "none")
+
+
+def test_it_is_not_taken_from_another_unless_that_is_said(arm):
+    arm.own()
+    with pytest.raises(Refused, match=r"the motion is ann's \(operator\) since .*: take it over, if it must be"):
+        arm.own(owner="bob")
+    arm.own(owner="bob", over=True)
+    assert arm.owner == ("bob", "operator")
+    assert arm.execute("one", "ann").error == "not_owner"
+
+
+def test_who_takes_over_from_a_task_stops_it_for_good(arm):
+    arm.own(owner="sorting", kind="task")
+    arm.execute("one")
+    arm.run(0.5)
+    arm.own(over=True)
+    arm.run(0.5)
+    assert arm.rests() and arm.cycle.goal == ""
+    assert arm.execute("two").error == "stopped"  # latched: it outlives the executor
+    assert arm.cycle._inhibits.record.inhibits[0].by == "ann"
+    assert arm.execute("three", "ann", heard=arm.stamp + 1).state == "active"
+    arm.run(3.0)
+    arm.asked(arm.cycle.hold, HoldRequest(hold=False, owner="ann", stops=True))  # she starts the task
+    assert arm.owner == ("", "none") and arm.own(owner="sorting", kind="task").owner == "sorting"
+    assert arm.execute("four").state == "active"
+
+
+def test_a_start_by_another_does_not_take_it_from_who_has_it(arm):
+    arm.own()
+    arm.asked(arm.cycle.hold, HoldRequest(hold=False, owner="bob", stops=True))
+    assert arm.owner == ("ann", "operator") and arm.execute("one").error == "not_owner"
+    arm.asked(arm.cycle.hold, HoldRequest(hold=False, owner="bob", stops=True, override=True))
+    assert arm.owner == ("", "none")
+
+
+def test_a_stop_and_a_hold_need_no_ownership_and_a_stop_ends_it(arm):
+    arm.own()
+    arm.execute("one", "ann")
+    arm.run(0.5)
+    assert arm.asked(arm.cycle.hold, HoldRequest(hold=True, owner="bob"))[0].held
+    arm.run(0.5)
+    assert arm.rests()
+    arm.asked(arm.cycle.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
+    assert arm.owner == ("", "none")
+
+
+def test_a_task_that_is_gone_has_the_motion_no_more(arm):
+    arm.own(owner="sorting", kind="task")
+    arm.cycle.disown()
+    assert arm.owner == ("", "none")
+    arm.own()
+    arm.cycle.disown()
+    assert arm.owner == ("ann", "operator")
+
+
+def test_each_change_of_it_is_told_once(arm):
+    arm.reports.clear()
+    arm.own()
+    arm.run(0.2)
+    arm.jog(0.2, joints={arm.robot.joint_names[0]: 0.2})
+    arm.run(0.5)
+    told = [report.owner for report in arm.reports if report.owner]
+    assert [(one.owner, one.jogging) for one in told] == [("ann", False), ("ann", True), ("ann", False)]
