@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.messages import PlanAttempt
-from common.planning.goal_sampling import least_time, sample_goals
+from common.planning.goal_sampling import sample_goals
 from common.planning.ik import why_no_ik
 from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result
+from common.planning.resolving import quicker_goals
 from common.sources import monotonic
 
 Array = NDArray[np.float64]
@@ -22,7 +23,7 @@ _TOLD = 4  # goals of a set of which a message says why they fail
 
 
 def joint_goals(problem: Problem, cancel: Cancel, *, wanted: int, tries: int = 40) -> list[Array] | Result:
-    """Free goal positions (dof,) [rad], nearest to the start first; or why there is none.
+    """Free goal positions (dof,) [rad], those that take least time first; or why there is none.
 
     Args:
         problem: with a joint goal, a region, or several of these to choose from; other goals, and straight lines of the
@@ -47,7 +48,7 @@ def joint_goals(problem: Problem, cancel: Cancel, *, wanted: int, tries: int = 4
         if not samples.goals:
             failures[number] = samples.failure(cancel.reason(problem))
     if found:
-        return sorted(found, key=lambda goal: least_time(problem.start, goal, problem.velocity))
+        return quicker_goals(problem, found)
     if (stop := cancel.reason(problem)) and len(choices) > 1:  # the others may not be looked at yet
         return Result(error=stop, message=f"planning was ended while {len(choices)} goals were sampled")
     for number in list(failures)[:_TOLD]:

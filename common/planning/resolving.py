@@ -95,6 +95,20 @@ def chains(problem: Problem, parts: Sequence[Part], cancel: Cancel) -> list[Chai
     return sorted(better, key=lambda chain: chain.seconds)
 
 
+def quicker_goals(problem: Problem, goals: Sequence[Array]) -> list[Array]:
+    """Free positions (dof,) [rad] of a goal, the quickest to turn to first; the best of them moved to less time."""
+    assert isinstance(problem.goal, Region | GoalChoice)
+    parts = [Part(problem.goal)]
+    until = monotonic() + _SHARE * max(0.0, problem.seconds_left)
+    timed = (_timed(problem, parts, np.array([problem.start, goal])) for goal in goals)
+    ranked = sorted((chain for chain in timed if chain is not None), key=lambda chain: chain.seconds)
+    for chain in ranked[:STARTS]:
+        if (checked := _checked(problem, chain)).free:
+            moved = _moved(problem, parts, [_choices(parts[0])], checked, until)
+            return [moved.positions[-1], *(chain.positions[-1] for chain in ranked)]
+    return [chain.positions[-1] for chain in ranked]
+
+
 def _choices(part: Part) -> Choices:
     assert not isinstance(part.goal, Arc)
     return part.goal.goals if isinstance(part.goal, GoalChoice) else (part.goal,)
@@ -157,6 +171,10 @@ def _timed(problem: Problem, parts: Sequence[Part], positions: Array) -> Chain |
 
 
 def _seconds(problem: Problem, positions: Array, cuts: Array) -> float | None:
+    if len(positions) == 2:  # the slowest joint sets the pace of the straight edge
+        edge = np.abs(positions[1] - positions[0])
+        slowest, hardest = float((edge / problem.velocity).max()), float((edge / problem.acceleration).max())
+        return slowest + hardest / slowest if hardest < slowest**2 else 2 * math.sqrt(hardest)
     try:
         return sum(parametrise(path, problem.velocity, problem.acceleration, step=_COARSE).duration
                    for path in blended_path(positions, cuts))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from common.messages import GoalSet, JointGoal, PlanningScene, PlanRequest, PoseGoal
+from common.messages import GoalSet, JointGoal, PlanningScene, PlanRequest, PoseGoal, Vector3
 from common.planning import joint_goals, pipeline
 from common.planning.pipeline import PlanningPipeline
 from common.planning.problem import Cancel
@@ -146,3 +146,24 @@ def test_what_was_not_looked_at_in_time_is_not_said_to_be_out_of_reach(monkeypat
     response = PIPELINE.plan(to_any([UNREACHABLE, NEAR], planner="rrt_connect"), TABLE, cancel=flag)
     assert (response.ok, response.error) == (False, "cancelled")
     assert "planning was ended while 2 goals were sampled" in response.message
+
+
+@pytest.mark.parametrize("planner", SAMPLING)
+def test_place_yaw_and_posture_in_a_region_are_chosen_by_the_time_that_the_way_takes(planner, monkeypatch):
+    goal = PoseGoal(pose=matrix_to_pose(tool_down(0.5, 0.1, 0.35)), position_tolerance=Vector3(x=0.06, y=0.06, z=0.06),
+                    tilt_tolerance=0.25, yaw_tolerance=3.1)
+    starts = [HOME, above(0.4, -0.3, 0.3), above(0.6, -0.1, 0.4, 1.0)]
+
+    def seconds() -> float:
+        total = 0.0
+        for start in starts:
+            request = PlanRequest(id="1", start=start.tolist(), goal=goal, seed=1, planner=planner)
+            response = PIPELINE.plan(request, TABLE)
+            assert response.ok, response.message
+            total += response.trajectory.points[-1].time_from_start
+        return total
+
+    chosen = seconds()
+    monkeypatch.setattr(joint_goals, "quicker_goals", lambda problem, goals: sorted(
+        goals, key=lambda q: float((np.abs(q - problem.start) / problem.velocity).max())))
+    assert chosen < 0.9 * seconds()
