@@ -1,0 +1,96 @@
+"""Whole cells that move an arm by its maker's protocol: the controller is a double, the client library is not."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from common import topics
+from common.messages import MotionStatus, RobotCommand, RobotStatus
+from tests.doubles.ur_host import UrHost
+from tests.harness import RunningCell, until
+
+pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.timeout(300)]
+if os.environ.get("CI") != "true":
+    pytest.importorskip("rtde_control", reason="make setup EXTRAS=ur")
+
+HOME = "0,-2.36,1.57,-1.57,-1.57,0"
+SOON, WHOLE = 30.0, 150.0  # [s] for what a link or a controller does; for a whole outline
+PULLED = float(os.environ.get("ZENCELL_TEST_PULLED", "10"))  # [s] that the cable is out: 60 was tried by hand
+
+
+def outliner(folder: Path, host: UrHost) -> RunningCell:
+    """The cell of the UR5, with that arm."""
+    return RunningCell(
+        folder, "run", "ur5", "--set", "robot.hardware.backend=ur",
+        "--set", f"robot.hardware.options.host={host.host}", "--set", "robot.hardware.options.model=ur5e",
+        "--set", "robot.hardware.options.world=simulated", "--set", "robot.hardware.options.ahead=0.2",
+    )
+
+
+def check_traced(cell: RunningCell, host: UrHost, stops: int = 0) -> None:
+    """Nothing was lost, and the arm had no other reason to stop for protection than the test."""
+    summary = cell.summary
+    assert summary["state"] == "DONE" and summary["failures"] == 0, cell.text
+    assert summary["outline"]["fraction"] > 0.99, summary["outline"]
+    assert host.tell()["stops"] == stops, cell.tail()
+
+
+async def test_an_outline_is_traced_through_a_protective_stop_and_a_pulled_cable(tmp_path: Path) -> None:
+    with UrHost("127.0.0.51", q=HOME) as host, outliner(tmp_path, host) as cell:
+        async with cell.listen() as bus:
+            robot, motion = bus.reader(topics.ROBOT_STATUS), bus.reader(topics.MOTION_STATUS)
+            await until(motion, lambda status: status.progress > 0.2, WHOLE)
+            host.tell("protect")
+            told: RobotStatus = await until(robot, lambda status: status.mode == "protective_stop", SOON)
+            assert "recover" in told.message
+            failed: MotionStatus = await until(motion, lambda status: bool(status.fault), SOON)
+            assert failed.state == "aborted" and failed.error == "hardware_fault"
+            before = host.tell("normal")  # the pendant alone lets nothing go
+            await until(robot, lambda status: "was stopped" in status.message, SOON)
+            now = host.tell()
+            assert now["commands"] == before["commands"] and not any(now["qd"])
+            await bus.client(topics.ROBOT_COMMAND).call(RobotCommand(act="recover", owner="tester"), SOON)
+            await until(motion, lambda status: status.state == "active" and status.progress > 0.2, WHOLE)
+            host.tell("pull 1")
+            await until(robot, lambda status: status.mode == "disconnected", SOON)
+            await until(robot, lambda status: status.mode == "running", SOON)
+            assert await cell.ended(WHOLE) == 0, cell.tail()
+        check_traced(cell, host, stops=1)
+    assert "tester asks the arm: recover" in cell.text
+
+
+async def test_an_outline_is_traced_through_a_cable_that_is_out_for_long_and_a_controller_that_is_rebooted(
+    tmp_path: Path,
+) -> None:
+    with UrHost("127.0.0.52", q=HOME) as host, outliner(tmp_path, host) as cell:
+        async with cell.listen() as bus:
+            robot, motion = bus.reader(topics.ROBOT_STATUS), bus.reader(topics.MOTION_STATUS)
+            await until(motion, lambda status: status.progress > 0.2, WHOLE)
+            host.tell(f"pull {PULLED}")
+            await until(robot, lambda status: status.mode == "disconnected", SOON)
+            await until(robot, lambda status: status.mode == "running", PULLED + SOON)
+            await until(motion, lambda status: status.state == "active" and status.progress > 0.2, WHOLE)
+            host.tell("reboot 2")
+            await until(robot, lambda status: status.mode == "off", SOON)
+            before = host.tell()
+            await until(motion, lambda status: "without power" in status.fault, SOON)
+            now = host.tell()
+            assert (now["commands"], now["q"]) == (before["commands"], before["q"]) and now["mode"] == "POWER_OFF"
+            await bus.client(topics.ROBOT_COMMAND).call(RobotCommand(act="enable", owner="tester"), SOON)
+            assert await cell.ended(WHOLE) == 0, cell.tail()
+        check_traced(cell, host)
+
+
+async def test_an_outline_is_traced_at_thirty_percent_of_the_slider(tmp_path: Path) -> None:
+    with UrHost("127.0.0.53", q=HOME) as host, outliner(tmp_path, host) as cell:
+        host.tell("slider 0.3")
+        async with cell.listen() as bus:
+            motion = bus.reader(topics.MOTION_STATUS)
+            await until(motion, lambda status: status.state == "active" and status.progress > 0.2, WHOLE)
+            assert motion.latest is not None and motion.latest.speed_scaling == pytest.approx(0.3)
+            assert await cell.ended(WHOLE + SOON) == 0, cell.tail()
+        check_traced(cell, host)
+        assert host.tell()["fastest"] <= 0.3 * 3.14159 * 1.05
