@@ -9,15 +9,20 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
 from common.control.checks import Tolerances, checked_trajectory
-from common.control.goals import REMEMBERED, GoalMemory
-from common.control.limiter import SLACK, Limiter
-from common.control.trajectory import Trajectory
+from common.control.goals import (
+    MOST_SAMPLES,
+    REMEMBERED,
+    Goal,
+    GoalMemory,
+    Judged,
+    blend_time,
+    possible_share,
+)
+from common.control.limiter import Limiter
 from common.errors import Refused
 from common.hardware.interface import HardwareFault, Limits, Vector
 from common.hardware.pace import Pace
@@ -29,124 +34,10 @@ STALLED = 2  # usual cycles: after one that comes later motion goes on from rest
 USUAL = 0.2  # of what is usual is how it was the last time
 LATER = 0.1  # cell time that an arm behind its set-points may be later than that: hosts and networks are no clocks [s]
 RESEATED = 1.0  # cell time between two takings of an arm that was moved from outside: oftener it is not held [s]
-BLEND_TIME = 0.3  # the difference between the robot's and the trajectory's start fades in this time [s]
-BLEND_SHARE = 0.5  # of the limits is for that difference at most; else it takes longer
 RAMP_SHARE = 0.95  # of the accelerations is for going on: the rest is for what differences see of a bend
 BEHIND = 1e-3  # [rad] between path and set-point, at which the goal's time stands still
 ARRIVED = 1e-6  # [rad] nearer, the set-point is on the path
-SLOWEST = 0.01  # of its speed, at which a trajectory is refused instead of being followed so slowly
 LONG = 3000  # points and samples of a trajectory, which cost a few milliseconds
-MOST_SAMPLES = 20_000  # of a trajectory, when it is looked for how fast it can be followed
-
-
-V = TypeVar("V", float, Vector)
-
-
-@dataclass
-class _Goal:
-    """The goal that moves the robot. `time` is on the trajectory's own time axis [s], which passes at the pace's rate.
-
-    The difference `offset` to where the robot was fades in the time `blend` [s]. `share` is the speed at which the
-    limits can be kept, 1 for a trajectory that is as it should be.
-    """
-
-    id: str
-    trajectory: Trajectory
-    offset: Vector
-    blend: float
-    last: float  # cell time of the newest set-point
-    pace: Pace
-    share: float = 1.0
-    time: float = 0.0
-    behind: float = 0.0  # the newest set-point, of the path [rad]
-    stopping: bool = False
-    reason: str = ""
-    error: str = ""  # why it is stopped, where nobody asked for it
-    source: str = ""
-    plan: str = ""  # id of the plan request that it answers
-    scene_stamp: int = 0  # of the planning scene that it was planned on
-    ended: float | None = None  # cell time at which the set-points came to rest
-    _newest: tuple[float, tuple[Vector, Vector]] | None = None  # time and answer: most are asked for three times
-
-    @property
-    def duration(self) -> float:
-        """Time at which the trajectory is over, and the robot on it [s]."""
-        return max(self.trajectory.duration, self.blend)
-
-    def at(self, time: float) -> tuple[Vector, Vector]:
-        """Positions [rad] and their change per second of the trajectory (dof,), blended from where the robot was."""
-        if self._newest is None or self._newest[0] != time:
-            self._newest = time, self._blended(time)
-        return self._newest[1]
-
-    def _blended(self, time: float) -> tuple[Vector, Vector]:
-        q, dq = self.trajectory.at(time)
-        if time >= self.blend:
-            return q, dq
-        u = time / self.blend
-        slope = -30 * u**2 * (1 - u) ** 2 / self.blend
-        return q + _left(u) * self.offset, dq + slope * self.offset
-
-    def positions_at(self, times: Vector) -> Vector:
-        """Positions (N, dof) at times (N,), blended as well."""
-        u = np.clip(times / self.blend, 0.0, 1.0) if self.blend > 0 else np.ones_like(times)
-        return self.trajectory.positions_at(times) + _left(u)[:, None] * self.offset
-
-    @property
-    def progress(self) -> float:
-        """The share of the trajectory that is behind it."""
-        return min(self.time / self.duration, 1.0)
-
-
-def _left(u: V) -> V:
-    return 1 - u**3 * (10 - 15 * u + 6 * u**2)
-
-
-def blend_time(offset: Vector, duration: float, limits: Limits) -> float:
-    """Time [s] in which an offset (dof,) [rad] from a trajectory of this duration [s] fades; 0 when there is none."""
-    off = np.abs(offset)
-    if not off.any():
-        return 0.0
-    least = max(  # peaks of 1 - 10 u^3 + 15 u^4 - 6 u^5
-        float((1.875 * off / (BLEND_SHARE * limits.velocity)).max()),
-        float(np.sqrt(5.774 * off / (BLEND_SHARE * limits.acceleration)).max()),
-        float(np.cbrt(60 * off / (BLEND_SHARE * limits.jerks)).max()),
-    )
-    return max(min(BLEND_TIME, duration), least)
-
-
-def possible_share(goal: _Goal, limits: Limits, period: float) -> float:
-    """The share of its speed, at most 1, at which set-points of a goal every `period` [s] keep the limits.
-
-    Raises:
-        Refused: there is none that is worth the name.
-    """
-    share, most = 1.0, 1 + SLACK
-    while share >= SLOWEST:
-        step = share * period / 2  # of trajectory's time: differences over two, from every second one on
-        count = min(int(goal.duration / step) + 1, MOST_SAMPLES)
-        q = goal.positions_at(np.arange(-6.0, count + 6) * step)
-        v = (q[2:] - q[:-2]) / period
-        a = (v[2:] - v[:-2]) / period
-        j = (a[2:] - a[:-2]) / period
-        over = max(float((np.abs(v) / limits.velocity).max()) / most,
-                   math.sqrt(float((np.abs(a) / limits.acceleration).max()) / most),
-                   float(np.cbrt((np.abs(j) / limits.jerks).max() / most)))
-        if over <= 1.0:
-            return share
-        share /= 1.01 * over
-    raise Refused("contradiction", "its points are too far apart for their times: it could only be followed at less "
-                                   f"than {SLOWEST:.0%} of its speed")
-
-
-@dataclass(frozen=True)
-class Judged:
-    """What was found out about a trajectory, for an arm that begins at `begin` (dof,) [rad]: how it can be followed."""
-
-    begin: Vector
-    trajectory: Trajectory | None = None
-    share: float = 1.0
-    refusal: Refused | None = None
 
 
 class TrajectoryController:
@@ -167,7 +58,7 @@ class TrajectoryController:
         self._limiter = Limiter(limits, start, period)
         self._period = self._usual = period
         self._last: float | None = None  # cell time of the newest set-point
-        self._goal: _Goal | None = None
+        self._goal: Goal | None = None
         self._memory: GoalMemory[MotionStatus] = GoalMemory(remember)
         self._fault = ""
         self._found: Vector | None = None  # where the arm was read once, which says that it moves
@@ -296,7 +187,7 @@ class TrajectoryController:
             checked = checked_trajectory(trajectory, self._limits, measured, self._tolerances)
             offset = begin - checked.positions[0]
             blend = blend_time(offset, checked.duration, self._limits)
-            like = _Goal("", checked, offset, blend, 0.0, Pace(0.0, 0.0 * begin))
+            like = Goal("", checked, offset, blend, 0.0, Pace(0.0, 0.0 * begin))
             return Judged(begin, checked, possible_share(like, self._limits, self._period))
         except Refused as refusal:
             return Judged(begin, refusal=refusal)
@@ -314,14 +205,14 @@ class TrajectoryController:
             raise Refused("not_followed", f"{self._limits.names[j]} is {off[j]:.4f} rad off where it is held")
         self._amiss = 0.0 * self._amiss
 
-    def _taken(self, goal: str, judged: Judged, begin: Vector, now: float) -> _Goal:
+    def _taken(self, goal: str, judged: Judged, begin: Vector, now: float) -> Goal:
         assert judged.trajectory is not None
         offset = begin - judged.trajectory.positions[0]
         blend = blend_time(offset, judged.trajectory.duration, self._limits)
         pace = Pace(0.0, 0.0 * begin)
         if not self._holds:
             pace.rate = self.speed_scaling * judged.share
-        return _Goal(goal, judged.trajectory, offset, blend, now, pace, judged.share)
+        return Goal(goal, judged.trajectory, offset, blend, now, pace, judged.share)
 
     def cancel(self, goal: str, reason: str, now: float) -> MotionStatus:
         """Begin to bring the robot to rest along its path. An empty id means whatever runs.
@@ -362,7 +253,7 @@ class TrajectoryController:
         """Whether a goal was heard of."""
         return self._memory.get(goal) is not None
 
-    def _holding(self, goal: _Goal) -> str:
+    def _holding(self, goal: Goal) -> str:
         """What there is to say of a goal about being held."""
         if not self._holds:
             return ""
@@ -531,7 +422,7 @@ class TrajectoryController:
         due = [q for sent, q in self._sent if sent <= now - self.delay + 1e-6] or [self._sent[0][1]]
         return due[-1], min(due, key=lambda q: float(np.abs(measured - q).max()))
 
-    def _judge(self, goal: _Goal, now: float, measured: Vector, velocity: Vector) -> None:
+    def _judge(self, goal: Goal, now: float, measured: Vector, velocity: Vector) -> None:
         """End the goal when it is reached, or the robot is too far from the newest set-point."""
         allowed = self._tolerances
         due, nearest = self._due(now, measured)

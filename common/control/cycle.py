@@ -11,8 +11,9 @@ import numpy as np
 
 from common.config import GripperConfig
 from common.control.checks import Tolerances
-from common.control.controller import PERIOD, Judged, TrajectoryController
+from common.control.controller import PERIOD, TrajectoryController
 from common.control.faults import Fault, asked
+from common.control.goals import Judged
 from common.control.gripper_controller import GripperController
 from common.control.inhibits import SOMEBODY, Inhibits
 from common.control.jogging import Jogging, ToolKinematics
