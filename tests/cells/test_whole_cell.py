@@ -150,7 +150,7 @@ def test_a_run_ends_with_everything_in_the_box_and_all_figures(tmp_path: Path) -
     assert 0 < seconds["ready"] < seconds["first_motion"]
     assert 0 < seconds["moving"] <= seconds["task"]
     assert seconds["planning"] > 0
-    assert len(summary["plans"]) >= 4 * 2
+    assert len(summary["plans"]) >= 2 * 2  # to the ball and away with it
     for plan in summary["plans"]:
         assert set(plan) == {"planner", "seconds", "fraction", "attempts"}
         assert 0 < plan["fraction"] <= 1
