@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from typing import Any
 
@@ -52,6 +52,8 @@ JOGS, MOST_JOG = 4, 40  # of a person, and messages in each
 JOG_PERIOD, JOG_GAP = 0.02, 0.5  # [s] between those, and at most between two of them
 PERSON_LATE = 1.0  # [s] at most between a person's stop and what is done next, in two places at once
 
+Act = Callable[[VirtualSession, Fault], Coroutine[Any, Any, None]]
+
 
 class Misfortune:
     """Lets go wrong in one run what its plan says; `made` counts."""
@@ -78,15 +80,21 @@ class Misfortune:
         self._random = np.random.default_rng([seed, 6])
         self._ends = np.random.default_rng([seed, 8])
         self._late = np.random.default_rng([seed, 12])
+        self._persons: dict[str, tuple[int, str, Act]] = {  # number of the first session, what is told, what they do
+            "person": (0, "stops the task, moves the arm home, and starts the task again", self._be_person),
+            "ended": (1000, "", self._end_and_start),
+            "slowed": (2000, "", self._slow_down),
+            "stopped again": (3000, "a person stops the robot while a start is on its way", self._stop_again),
+            "gave up": (4000, "a person asks for a motion and gives up before that is heard", self._give_up),
+            "taken over": (5000, "a person takes the motion over, jogs the arm, and starts the task", self._take_over),
+        }
 
     async def run(self) -> None:
         """Return when all has happened; cancelled, nothing more does."""
         loop, speed = self._host.loop, self._plan.speed
         began, persons = loop.time(), list[asyncio.Task[None]]()
-        begins = {"person": self._begin_person, "ended": self._begin_ending, "slowed": self._begin_slowing,
-                  "second instance": self._begin_second, "hostile": self._begin_strange,
-                  "stopped again": self._begin_stopping_again, "gave up": self._begin_giving_up,
-                  "taken over": self._begin_taking_over}
+        begins = {"second instance": self._begin_second, "hostile": self._begin_strange,
+                  **dict.fromkeys(self._persons, self._begin_person)}
         try:
             for fault in self._plan.faults:
                 await asyncio.sleep(max(0.0, began + fault.at / speed - loop.time()))
@@ -262,30 +270,15 @@ class Misfortune:
 
     # --- a person -----------------------------------------------------------------------------------------------------
 
-    def _begin_person(self, _fault: Fault) -> asyncio.Task[None]:
-        self._tell("FAULT person: stops the task, moves the arm home, and starts the task again")
+    def _begin_person(self, fault: Fault) -> asyncio.Task[None]:
+        number, told, act = self._persons[fault.kind]
+        if told:
+            self._tell(f"FAULT {fault.kind}: {told}")
         context = context_of(Life(PERSON))
-        session = self._network.attach(context, PERSON, self.made[PERSON])
-        session.slow = float(self._random.uniform(0.0, PERSON_SLOW))
-        return context.run(lambda: asyncio.create_task(self._be_person(session)))
+        session = self._network.attach(context, PERSON, number + self.made[fault.kind])
+        return context.run(lambda: asyncio.create_task(act(session, fault)))
 
-    def _begin_ending(self, _fault: Fault) -> asyncio.Task[None]:
-        context = context_of(Life(PERSON))
-        session = self._network.attach(context, PERSON, 1000 + self.made["ended"])
-        return context.run(lambda: asyncio.create_task(self._end_and_start(session)))
-
-    def _begin_slowing(self, fault: Fault) -> asyncio.Task[None]:
-        context = context_of(Life(PERSON))
-        session = self._network.attach(context, PERSON, 2000 + self.made["slowed"])
-        return context.run(lambda: asyncio.create_task(self._slow_down(session, fault.seconds)))
-
-    def _begin_stopping_again(self, _fault: Fault) -> asyncio.Task[None]:
-        self._tell("FAULT stopped again: a person stops the robot while a start is on its way")
-        context = context_of(Life(PERSON))
-        session = self._network.attach(context, PERSON, 3000 + self.made["stopped again"])
-        return context.run(lambda: asyncio.create_task(self._stop_again(session)))
-
-    async def _stop_again(self, session: VirtualSession) -> None:
+    async def _stop_again(self, session: VirtualSession, _fault: Fault) -> None:
         """Start the task; stop the robot while that is on its way; start it again some time later."""
         host, random = self._host, self._late
         bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
@@ -313,13 +306,7 @@ class Misfortune:
             await bus.close()
             self._network.detach(session)
 
-    def _begin_giving_up(self, _fault: Fault) -> asyncio.Task[None]:
-        self._tell("FAULT gave up: a person asks for a motion and gives up before that is heard")
-        context = context_of(Life(PERSON))
-        session = self._network.attach(context, PERSON, 4000 + self.made["gave up"])
-        return context.run(lambda: asyncio.create_task(self._give_up(session)))
-
-    async def _give_up(self, session: VirtualSession) -> None:
+    async def _give_up(self, session: VirtualSession, _fault: Fault) -> None:
         """Stop the task; send the arm home, which comes late; give that up; start the task."""
         host, random = self._host, self._late
         bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
@@ -340,13 +327,7 @@ class Misfortune:
             await bus.close()
             self._network.detach(session)
 
-    def _begin_taking_over(self, _fault: Fault) -> asyncio.Task[None]:
-        self._tell("FAULT taken over: a person takes the motion over, jogs the arm, and starts the task")
-        context = context_of(Life(PERSON))
-        session = self._network.attach(context, PERSON, 5000 + self.made["taken over"])
-        return context.run(lambda: asyncio.create_task(self._take_over(session)))
-
-    async def _take_over(self, session: VirtualSession) -> None:
+    async def _take_over(self, session: VirtualSession, _fault: Fault) -> None:
         """Take the motion over, jog a joint to and fro, and start the task, which hands it over."""
         host, random = self._host, self._late
         bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
@@ -367,25 +348,25 @@ class Misfortune:
             await bus.close()
             self._network.detach(session)
 
-    async def _slow_down(self, session: VirtualSession, seconds: float) -> None:
+    async def _slow_down(self, session: VirtualSession, fault: Fault) -> None:
         """Set the speed, and set it back some time later."""
         host = self._host
         bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
         executor = next(entry.name for entry in host.cell.services.values() if entry.kind == EXECUTOR)
         client = bus.client(topics.parameters_of(executor))
         share = float(self._strange.uniform(SLOWEST, SLOW))
-        self._tell(f"FAULT slowed: to {share:.0%} for {seconds:.1f} s")
+        self._tell(f"FAULT slowed: to {share:.0%} for {fault.seconds:.1f} s")
         try:
             for speed in (share, 1.0):
                 asked = m.ParameterRequest(set={SPEED.replace(EXECUTOR, executor): speed})
                 await persist(client, asked, PERSON_TIMEOUT,
                               lambda error: m.ParameterReply(service=executor, parameters=[]), lambda problem: None)
-                await asyncio.sleep(seconds)
+                await asyncio.sleep(fault.seconds)
         finally:
             await bus.close()
             self._network.detach(session)
 
-    async def _end_and_start(self, session: VirtualSession) -> None:
+    async def _end_and_start(self, session: VirtualSession, _fault: Fault) -> None:
         """Stop or pause the robot; let those crash who could start it again; start it some time later."""
         host, random = self._host, self._ends
         bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
@@ -437,8 +418,9 @@ class Misfortune:
             if _started(status.latest, motion.latest):
                 return
 
-    async def _be_person(self, session: VirtualSession) -> None:
+    async def _be_person(self, session: VirtualSession, _fault: Fault) -> None:
         """Stop the task; then send the arm home and start the task, from two places that know nothing of each other."""
+        session.slow = float(self._random.uniform(0.0, PERSON_SLOW))
         host = self._host
         bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
         command, heard_of = bus.client(topics.TASK_COMMAND), bus.reader(topics.MOTION_STATUS)
