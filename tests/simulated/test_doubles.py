@@ -56,8 +56,13 @@ def test_every_plan_has_hostile_payloads_and_some_have_each_other_fault():
 @pytest.mark.slow
 def test_run_that_a_person_stops_for_good_ends_with_the_robot_at_rest():
     outcomes = (outcome_of("panda", seed) for seed in range(1, 101))  # about every tenth
-    outcome = next(outcome for outcome in outcomes if outcome.faults["left so"])
-    assert (outcome.state, outcome.ok) == ("LEFT", True)
+    left = []
+    for outcome in (outcome for outcome in outcomes if outcome.faults["left so"]):
+        assert outcome.ok
+        left.append(outcome.state)
+        if left[-1] == "LEFT":
+            break
+    assert left[-1] == "LEFT" and set(left[:-1]) <= {"DONE"}  # which another person had started again
 
 
 def test_newest_stop_is_heard_of_before_a_start_is_asked_for():
