@@ -168,7 +168,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         status = cycle.execute(request, bus.clock.now(), late, judged)
         if status.state == "rejected":
             bus.log.warning("goal %s rejected: %s [%s]", request.id, status.message, status.error)
-        return status.model_copy(update={"header": bus.header()})
+        return await kept_answer(status)
 
     async def stop(request: StopRequest) -> MotionStatus:
         if request.by == "person":

@@ -17,7 +17,7 @@ from common.control.goals import Judged
 from common.control.gripper_controller import GripperController
 from common.control.inhibits import SOMEBODY, Inhibits
 from common.control.jogging import Jogging, ToolKinematics
-from common.control.ownership import Ownership
+from common.control.ownership import NOT_OWNER, Ownership
 from common.errors import ConfigError, Refused
 from common.hardware.interface import ControlledArm, Hardware, HardwareFault, Limits, SimulatedGripper, Vector
 from common.messages import (
@@ -237,11 +237,15 @@ class ControlCycle:
     ) -> MotionStatus:
         """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
         inhibited = self._inhibits.objection(request.id, request.owner, request.heard)
+        others = self._owners.objection(request.owner)
         status = self._arm.accept(
-            request.id, request.trajectory, now, self._q,
-            inhibited or objection or self._owners.objection(request.owner) or self._unfit, judged, request.plan,
-            request.scene_stamp,
+            request.id, request.trajectory, now, self._q, inhibited or objection or others or self._unfit, judged,
+            request.plan, request.scene_stamp,
         )
+        if status.error == NOT_OWNER and not request.owner and self._owners.now.asked:
+            # A task that was kept from going on does not do so by itself once the motion is given back.
+            self._inhibits.stop(StopRequest(reason=str(others), owner=self._owners.now.owner))
+            self.tell_inhibits()
         if request.id == self._arm.goal and (self._followed is None or self._followed.id != request.id):
             self._followed = request
             self._owners.use(request.owner, monotonic())
@@ -284,10 +288,10 @@ class ControlCycle:
             self._owners.give(request.owner)
             return self.owner
         before = self._owners.take(request, monotonic())
-        if before is not None:
-            reason = f"{request.owner} took the motion over, which was {before.told}"
-            if before.task:
-                self._inhibits.stop(StopRequest(reason=reason, owner=request.owner))
+        reason = f"{request.owner} took the motion over{before and f', which was {before}'}"
+        if request.over and request.kind != "task":
+            self._inhibits.stop(StopRequest(reason=reason, owner=request.owner))  # also of who is just being restarted
+        if before or request.over:
             self._jogging.interrupt(monotonic())
             if goal := self._arm.goal:
                 self._inhibits.never([goal])
@@ -296,9 +300,9 @@ class ControlCycle:
         return self.owner
 
     def disown(self) -> None:
-        """Have the motion be nobody's: the task that had it is gone."""
+        """Have the motion be nobody's once what moves has ended: the task that had it is gone."""
         if self._owners.now.kind == "task":
-            self._owners.end()
+            self._owners.let_end()
 
     @property
     def owner(self) -> MotionOwner:

@@ -25,7 +25,9 @@ ROOM = 0.5  # share of the acceleration that is reckoned with before the end of 
 SETTLE = 0.15  # [s] which is come to the slower the nearer it is, in this time
 DAMPING = 0.05  # of the least squares, where the tool loses a direction
 NEAR = 0.02  # [m, rad per rad] least singular value of the Jacobian below which it is damped
-MOST_REFUSED = 16  # who is remembered for it
+MOST_REFUSED = 16  # who is remembered for it; with more at once nobody new is heard
+TURNED = 0.3  # share of what is asked for by which the tool may leave its direction, where it goes slowest:
+SLOWEST = 0.2  # share of the speed with which it still goes on there, and gets out again
 
 
 class ToolKinematics(Protocol):
@@ -66,6 +68,7 @@ class Jogging:
         self._fastest = np.minimum(limits.velocity, braked_within(STANDS, limits))
         self._asked: JogCommand | None = None
         self._at = 0.0  # [s] wall: when that came
+        self._began: float | None = None  # [s] wall: what comes soon after may be a stream of before
         self._refused: OrderedDict[str, float] = OrderedDict()  # whose commands do not count, and when the last came
 
     @property
@@ -81,7 +84,9 @@ class Jogging:
         """
         before = self._refused.get(request.owner)
         try:
-            if before is not None and now - before < PAUSE:
+            early = self._began is None or now - self._began < PAUSE
+            crowded = len(self._refused) >= MOST_REFUSED and request.owner != self.owner
+            if early or crowded or (before is not None and now - before < PAUSE):
                 raise Refused("let_go", f"jogging was ended: nothing for {PAUSE:g} s, then it counts again")
             if objection is not None:
                 raise objection
@@ -108,21 +113,30 @@ class Jogging:
             now: wall time [s].
             share: of the joints' velocities that is to be had, 0 to 1.
         """
+        self._began = now if self._began is None else self._began
+        while self._refused and now - next(iter(self._refused.values())) >= PAUSE:
+            self._refused.popitem(last=False)
         asked = self._asked
         if asked is None:
             return None
         if now - self._at > DEADMAN:
             self._asked = None
             return None
-        names = self._limits.names
-        dq = np.array([asked.joints.get(name, 0.0) for name in names]) if asked.joints else self._by_tool(asked, q)
+        limits = self._limits
+        lowest, highest = -room_velocity(q - limits.lower, limits), room_velocity(limits.upper - q, limits)
+        if asked.joints:
+            dq = np.clip([asked.joints.get(name, 0.0) for name in limits.names], lowest, highest)
+        else:
+            dq = self._by_tool(asked, q)
+            with np.errstate(divide="ignore", invalid="ignore"):  # the tool keeps its way: the slowest joint counts
+                room = np.where(dq < 0, lowest, highest) / dq
+            dq = dq * min(float(np.min(room, where=dq != 0, initial=1.0)), 1.0)
         if not dq.any():
             return None
-        dq = dq / max(float((np.abs(dq) / np.minimum(self._fastest, share * self._limits.velocity)).max()), 1.0)
+        dq = dq / max(float((np.abs(dq) / np.minimum(self._fastest, share * limits.velocity)).max()), 1.0)
         if self._kinematics is not None:
             dq = dq / max(float(np.linalg.norm(self._kinematics.jacobian(q)[:3] @ dq)) / TOOL_SPEED, 1.0)
-        return np.clip(dq, -room_velocity(q - self._limits.lower, self._limits),
-                       room_velocity(self._limits.upper - q, self._limits))
+        return np.asarray(dq)
 
     def _by_tool(self, asked: JogCommand, q: Vector) -> Vector:
         assert self._kinematics is not None
@@ -133,7 +147,15 @@ class Jogging:
         least = float(np.linalg.svd(jacobian, compute_uv=False)[-1])
         damping = DAMPING * max(1 - least / NEAR, 0.0)
         square = jacobian @ jacobian.T + damping**2 * np.eye(6)
-        return np.asarray(jacobian.T @ np.linalg.lstsq(square, np.concatenate([turn @ linear, turn @ angular]))[0])
+        twist = np.concatenate([turn @ linear, turn @ angular])
+        dq = np.asarray(jacobian.T @ np.linalg.lstsq(square, twist)[0])
+        part = slice(0, 3) if any(linear) else slice(3, 6)
+        goes, wanted = (jacobian @ dq)[part], twist[part]
+        size = float(np.linalg.norm(wanted))
+        if size == 0.0:
+            return dq
+        aside = goes - (goes @ wanted) / size**2 * wanted
+        return np.asarray(dq * max(1 - float(np.linalg.norm(aside)) / size / TURNED, SLOWEST))
 
     def _require_known(self, request: JogCommand) -> None:
         names = self._limits.names
@@ -147,7 +169,6 @@ class Jogging:
             raise Refused("no_kinematics", "this arm is jogged by its joints only")
 
     def _bar(self, owner: str, now: float) -> None:
-        self._refused.pop(owner, None)
-        self._refused[owner] = now
-        if len(self._refused) > MOST_REFUSED:
-            self._refused.popitem(last=False)
+        if owner in self._refused or len(self._refused) < MOST_REFUSED:
+            self._refused.pop(owner, None)
+            self._refused[owner] = now

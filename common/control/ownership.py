@@ -6,21 +6,11 @@ holds are everybody's: they are none of this, and a person's stop ends whatever 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from common.errors import Refused
 from common.messages import MotionOwner, OwnRequest
 from common.sources import wall_ns
 
 NOT_OWNER = "not_owner"
-
-
-@dataclass(frozen=True)
-class Ended:
-    """Who had the motion until somebody took it over, and whether it was a task's."""
-
-    told: str
-    task: bool
 
 
 class Ownership:
@@ -43,17 +33,17 @@ class Ownership:
         if self.now.kind == "none":
             self._put(owner, "operator" if owner else "task", asked=False)
 
-    def take(self, request: OwnRequest, now: float) -> Ended | None:
-        """Who had it before, if it was taken over from somebody; wall time [s].
+    def take(self, request: OwnRequest, now: float) -> str:
+        """Whose it was, if it was taken over from somebody, in words; wall time [s].
 
         Raises:
             Refused: somebody else has it, and it is not to be taken over.
         """
-        before = None
+        before = ""
         if self.now.kind != "none" and not self._is(request):
             if not request.over:
                 raise Refused(NOT_OWNER, f"the motion is {self.now.told}: take it over, if it must be")
-            before = Ended(self.now.told, self.now.kind == "task")
+            before = self.now.told
         if before or not self.now.asked:
             self._put(request.owner, request.kind, asked=True)
         self._lease, self._used = request.lease, now
@@ -67,6 +57,10 @@ class Ownership:
         """Have it be nobody's from now on; whether it was somebody's."""
         had, self.now = self.now.kind != "none", MotionOwner()
         return had
+
+    def let_end(self) -> None:
+        """Have it be nobody's as soon as nothing moves."""
+        self.now = self.now.model_copy(update={"asked": False})
 
     def look(self, moving: bool, now: float) -> None:
         """End what was taken for one motion when nothing moves, and what nobody uses for longer than was asked for."""

@@ -159,14 +159,14 @@ class TaskRunner(Generic[V]):
                 for command in [*told, *holds, *self._task.step(view)]:
                     self._begin(group, command)
                 self._tell()
-                self._have_motion(group)
+                self._have_motion(group, view.motion)
 
-    def _have_motion(self, group: asyncio.TaskGroup) -> None:
+    def _have_motion(self, group: asyncio.TaskGroup, motion: m.MotionStatus | None) -> None:
         """Have the motion of the robot from a start to the end or a stop, if it is nobody else's."""
         now, status = self._owner.latest, self._task.status
         if now is None or (self._owning is not None and not self._owning.done()):
             return
-        wanted = status.started and status.state not in ENDED
+        wanted = status.started and status.state not in ENDED and not (motion and motion.stopped)
         ours = now.kind == "task" and now.owner in ("", self._bus.service)
         if wanted == (ours and now.asked) or not (ours or now.kind == "none"):
             return
@@ -352,6 +352,8 @@ def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owne
     Raises:
         Refused: another person holds the robot or has the motion, or it was stopped and can only be started.
     """
+    if command.command == "resume" and motion is not None and motion.stopped:
+        raise Refused("stopped", f"the robot is {motion.stopped}: start the task to go on")
     if command.override or command.command not in ("start", "resume"):
         return
     if owner is not None and owner.asked and owner.kind != "task" and owner.owner not in (SOMEBODY[1], command.by):
@@ -362,5 +364,3 @@ def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owne
               if inhibit.kind == "held" and inhibit.by not in (*SOMEBODY, command.by)]
     if others:
         raise Refused("held", f"the robot is {'; '.join(others)}: only they let go of it, unless you override that")
-    if command.command == "resume" and motion.stopped:
-        raise Refused("stopped", f"the robot is {motion.stopped}: start the task to go on")
