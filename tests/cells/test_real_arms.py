@@ -12,7 +12,7 @@ from common.messages import MotionStatus, RobotCommand, RobotStatus
 from tests.doubles.ur_host import UrHost
 from tests.harness import RunningCell, until
 
-pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(300)]
 if os.environ.get("CI") != "true":
     pytest.importorskip("rtde_control", reason="make setup EXTRAS=ur")
 

@@ -18,7 +18,7 @@ from common.hardware.ur import Options, create
 from tests.common.hardware.test_backends import robot
 from tests.doubles.ur_host import UrHost
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(120)]
 if os.environ.get("CI") != "true":
     pytest.importorskip("rtde_control", reason="make setup EXTRAS=ur")
 
