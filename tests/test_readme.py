@@ -104,7 +104,8 @@ def test_command_of_the_readme_answers_beside_a_running_cell(line: str, cell: di
             process.kill()
     wanted = {"hz": "Hz", "status": '"state"', "targets": '"poses"', "list": "panda/", "zenoh": "panda/",
               "add": '"ids"', "pause": '"paused": true', " top ": "panda at speed", " tf ": "position",
-              "param set": "400.0 -> 350.0", "param dump": "# Parameters of panda", "record": ""}
+              "param set": "400.0 -> 350.0", "param dump": "# Parameters of panda",
+              "owner": "the motion is", "record": ""}
     assert next(text for word, text in wanted.items() if word in line) in first
 
 
