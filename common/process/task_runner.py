@@ -159,7 +159,7 @@ class TaskRunner(Generic[V]):
                 for command in [*told, *holds, *self._task.step(view)]:
                     self._begin(group, command)
                 self._tell()
-                self._have_motion(group, view.motion)
+                self._have_motion(group, view.motion if view else None)
 
     def _have_motion(self, group: asyncio.TaskGroup, motion: m.MotionStatus | None) -> None:
         """Have the motion of the robot from a start to the end or a stop, if it is nobody else's."""
