@@ -4,11 +4,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup run up test test-all containers check audit bench bench-check chaos fuzz soak docs deploy clean
+.PHONY: setup franka-sim run up test test-all containers check audit bench bench-check chaos fuzz soak docs deploy clean
 
 setup: $(STAMP)
 
-# Drivers of real arms and the like, as `make setup EXTRAS=ur`; what was asked for once stays.
+# Drivers of real arms and the like, as `make setup EXTRAS=ur,franka`; what was asked for once stays.
 EXTRAS := $(if $(EXTRAS),$(EXTRAS),$(shell cat $(VENV)/.extras 2>/dev/null))
 COMMA := ,
 $(shell mkdir -p $(VENV); [ "$$(cat $(VENV)/.extras 2>/dev/null)" = "$(EXTRAS)" ] || echo "$(EXTRAS)" > $(VENV)/.extras)
@@ -20,6 +20,13 @@ $(STAMP): pyproject.toml constraints.txt $(KERNEL) $(wildcard $(VENV)/.extras)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "zencell needs Python 3.11 or newer: make PYTHON=python3.11 ...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev$(addprefix $(COMMA),$(EXTRAS))]'
+	@touch $@
+
+# A test host of tests/common/hardware/test_franka.py; its numpy is not ours. Nothing else needs it.
+franka-sim: .venv-franka-sim/.up-to-date
+.venv-franka-sim/.up-to-date:
+	$(PYTHON) -m venv .venv-franka-sim
+	.venv-franka-sim/bin/python -m pip install --quiet --disable-pip-version-check franka-sim==1.1.7
 	@touch $@
 
 run: setup  ## clear the table into the box, print a summary

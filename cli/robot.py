@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,7 +15,7 @@ from common.errors import ConfigError, ZencellError
 from common.terminal import echo
 
 if TYPE_CHECKING:
-    from common.messages import JogCommand
+    from common.messages import JogCommand, RobotStatus
     from common.transport.bus import Bus
 
 app = typer.Typer(help="Prepare a robot, ask its controller, jog it.", no_args_is_help=True)
@@ -90,34 +90,40 @@ def collisions(
                f"({', '.join(f'{found[reason]} {reason.lower()}' for reason in sorted(found))})")
 
 
-@app.command()
-def status(
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
-) -> None:
-    """Print what the arm's own controller says: mode, why it cannot be moved, speed slider."""
+def _status(cell: str | None, domain: str | None, connect: str | None) -> RobotStatus:
     from cli.inspection import inspect
     from common import topics
-    from common.messages import RobotStatus
 
     async def visit(bus: Bus) -> RobotStatus:
         async with asyncio.timeout(FIRST_WORD):
             return await bus.reader(topics.ROBOT_STATUS).next()
 
     try:
-        told = inspect(visit, cell=cell, domain=domain, connect=connect)
+        return inspect(visit, cell=cell, domain=domain, connect=connect)
     except TimeoutError:
         raise NothingSaid() from None
+
+
+@app.command()
+def status(
+    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
+) -> None:
+    """Print what the arm's own controller says: mode, why it cannot be moved, speed slider."""
+    told = _status(cell, domain, connect)
     echo(f"{told.mode}{f': {told.message}' if told.message else ''}")
     echo(f"speed slider {told.speed:.0%}, latest cycle {told.late * 1e3:.1f} ms late, "
          f"inputs {told.inputs:#b}, outputs {told.outputs:#b}")
 
 
-def _order(act: str, value: float, cell: str | None, domain: str | None, connect: str | None) -> None:
+def _order(
+    act: str, value: float, cell: str | None, domain: str | None, connect: str | None, **more: Any
+) -> None:
     from cli.inspection import inspect
     from common import topics
-    from common.messages import RobotCommand, RobotStatus
+    from common.config import check
+    from common.messages import RobotCommand
 
-    asked = RobotCommand.model_validate({"act": act, "value": value, "owner": options.person()})
+    asked = check(RobotCommand, {"act": act, "value": value, "owner": options.person(), **more}, act)
 
     async def visit(bus: Bus) -> RobotStatus:
         return await bus.client(topics.ROBOT_COMMAND).call(asked, TIMEOUT)
@@ -156,10 +162,33 @@ def freedrive(
 @app.command()
 def payload(
     mass: Annotated[str, typer.Argument(metavar="KG", help="mass of what the tool carries, with its fingers")],
+    com: Annotated[
+        str, typer.Option("--com", metavar="X,Y,Z", help="its centre of mass, from the flange [m]")] = "0,0,0",
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Tell the arm's controller what the tool carries."""
-    _order("payload", options.number("KG", mass), cell, domain, connect)
+    _order("payload", options.number("KG", mass), cell, domain, connect, com=_vector("--com", com))
+
+
+@app.command()
+def io(
+    output: Annotated[str | None, typer.Argument(metavar="[OUTPUT", help="number of a digital output")] = None,
+    state: Annotated[str | None, typer.Argument(metavar="on|off]", help="what it becomes")] = None,
+    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+) -> None:
+    """Print the digital inputs and outputs of the arm's controller, or set an output."""
+    if output is None:
+        told = _status(cell, domain, connect)
+        echo(f"inputs on: {_numbers(told.inputs)}\noutputs on: {_numbers(told.outputs)}")
+        return
+    if state not in ("on", "off"):
+        raise ConfigError("io", state or "", "must be on or off")
+    _order("output", float(state == "on"), cell, domain, connect, output=options.whole("OUTPUT", output, 0))
+
+
+def _numbers(bits: int) -> str:
+    """The numbers of the bits that are set."""
+    return ", ".join(str(n) for n in range(32) if bits >> n & 1) or "none"
 
 
 # --- whose the motion is -------------------------------------------------------------------------------------------

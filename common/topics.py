@@ -120,7 +120,7 @@ MOTION_OWN = Request("motion/own", m.OwnRequest, m.MotionOwner, "take the motion
 GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState,
                           "move the fingers; the result appears on gripper/state")
 ROBOT_COMMAND = Request("robot/command", m.RobotCommand, m.RobotStatus,
-                        "enable, recover, freedrive, payload: what the arm's own controller does beside motion")
+                        "enable, recover, freedrive, payload, output: what the arm's own controller does beside motion")
 WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "add, move, remove, reset; simulated hardware only")
 TASK_COMMAND = Request("task/command", m.TaskCommand, m.TaskStatus, "start, pause, resume or stop the task")
 PARAMETERS = Request("param/<service>", m.ParameterRequest, m.ParameterReply,

@@ -31,6 +31,7 @@ from common.planning.points import PointObstacle
 from common.planning.problem import Cancel
 from common.planning.seeing import Camera, JointHistory, PointsOptions, Seeing, Seen
 from common.planning.watching import NotWatched, SceneMonitor
+from common.process.pace import come_last
 from common.process.service import main
 from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
@@ -234,6 +235,7 @@ async def _plan(
     cancel = Cancel()
 
     def plan() -> PlanResponse:
+        come_last()
         points = [] if see is None else see()
         return pipeline.plan(request, scene, current, cancel, points, width)
 

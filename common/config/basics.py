@@ -28,7 +28,7 @@ Tunable = Annotated[T, AtRunTime()]  # as in `min_area: Tunable[float] = Field(.
 class Section(BaseModel):
     """A part of the cell that several services may need."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)  # see common/messages/basics.py
 
 
 class Parameters(BaseModel):
@@ -38,4 +38,4 @@ class Parameters(BaseModel):
     them; so is a section that has such fields. Nothing else ever changes.
     """
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", defer_build=True)

@@ -36,6 +36,21 @@ class SuctionCup(Section):
     give: Length = Field(0.005, description="by which the lip follows what it touches [m]")
 
 
+class PayloadConfig(Section):
+    """What the arm carries where its controller wants to know; centres of mass [m] are from the flange, z out of it."""
+
+    mass: float = Field(ge=0, le=1000, description="of the gripper [kg]")
+    com: Point = Field((0.0, 0.0, 0.0), description="its centre of mass [m]")
+    held: Point | None = Field(None, description="that of what it holds [m]; else that of the gripper")
+
+    def with_held(self, mass: float) -> tuple[float, float, float, float]:
+        """Mass [kg], and centre of mass x, y, z [m], with something so heavy [kg] in the gripper."""
+        total, held = self.mass + mass, self.held or self.com
+        x, y, z = ((self.mass * own + mass * other) / total if total else 0.0
+                   for own, other in zip(self.com, held, strict=True))
+        return total, x, y, z
+
+
 class GripperConfig(Section):
     """A parallel gripper: `width` is the distance between the inner faces of the fingers [m].
 
@@ -45,6 +60,7 @@ class GripperConfig(Section):
 
     closing_axis: Literal["x", "y"] = Field("y", description="axis of the tool centre point along which fingers close")
     fingers: FingerShape = FingerShape()
+    payload: PayloadConfig | None = Field(None, description="what the arm's controller is told; else nothing")
     cup: SuctionCup | None = Field(None, description="grips what its lip touches, in the place of fingers")
     group: str = Field("gripper", description="name of the fingers as a group")
     joints: list[str] = Field([], description="finger joints, the driven one first")
@@ -141,6 +157,9 @@ class RobotConfig(Section):
         {}, description="joints outside the group and where planning holds them; fingers while their width is not known"
     )
     named_poses: dict[str, list[Number]] = Field(description="joint positions [rad]; must have home")
+    position_limits: list[tuple[Number, Number]] = Field(
+        [], description="lowest and highest of each joint [rad]; else the URDF's"
+    )
     velocity_limits: list[Annotated[float, Field(gt=0, le=100)]] = Field([], description="[rad/s]; else the URDF's")
     acceleration_limits: list[Annotated[float, Field(gt=0, le=1000)]] = Field(description="[rad/s^2]")
     deceleration_limits: list[Annotated[float, Field(gt=0, le=1000)]] = Field(
@@ -164,8 +183,9 @@ class RobotConfig(Section):
             raise ValueError("tcp_link must be given, or tcp")
         if self.tcp is not None and self.tcp.link != self.tcp_link:
             raise ValueError(f"tcp_link is {self.tcp_link}, but tcp defines {self.tcp.link}")
-        for field in ("velocity_limits", "acceleration_limits", "deceleration_limits", "jerk_limits"):
-            if field in ("velocity_limits", "deceleration_limits") and not getattr(self, field):
+        optional = ("position_limits", "velocity_limits", "deceleration_limits")
+        for field in (*optional, "acceleration_limits", "jerk_limits"):
+            if field in optional and not getattr(self, field):
                 continue
             if len(getattr(self, field)) != len(self.joints):
                 raise ValueError(f"{field} has {len(getattr(self, field))} values for {len(self.joints)} joints")

@@ -30,6 +30,9 @@ class KnownShort(Section):
     grip_efforts: dict[str, Annotated[float, Field(gt=0, le=1e4)]] = Field(
         {}, description="by kind of object, as detectors call it: force to grip it with [N]; else the gripper's effort"
     )
+    masses: dict[str, Annotated[float, Field(gt=0, le=1000)]] = Field(
+        {}, description="by kind of object, as detectors call it [kg]: the arm's controller is told what it carries"
+    )
 
     @model_validator(mode="before")
     @classmethod

@@ -109,6 +109,8 @@ class ControlCycle:
             self._arm.delay, self._arm.bridges = self._own.delay, self._own.ahead
         self._cap = 1.0  # of the speed, as persons and programs say
         self._told_robot: dict[str, Any] | None = None
+        self._carried: float | None = None  # [kg] that the arm's controller was told is held
+        self._payload = 0  # number of that order
         self._arm_fault, self._hand_fault = Fault("the arm"), Fault("the gripper")
         self._width_rate = 0.0
         self._told_motion: MotionStatus | None = None
@@ -147,7 +149,8 @@ class ControlCycle:
         if self._own is not None:
             self._inhibits.arm_stopped = self._own.stopped
         report.robot = self._news_of_robot(header)
-        report.notes = [*filter(None, (self._arm_fault.news(), self._hand_fault.news(), self._arm.news()))]
+        report.notes = [*filter(None, (self._arm_fault.news(), self._hand_fault.news(), self._arm.news(),
+                                       self._news_of_payload()))]
         if self._held_goal and self._held_goal != self._arm.goal:  # nothing is in the way of what is over
             self.hold(HoldRequest(hold=False, by="scene_monitor"))
         self._owners.look(bool(self._arm.goal) or not self._arm.at_rest or self._fingers_move, monotonic())
@@ -183,6 +186,7 @@ class ControlCycle:
         if self._own is not None:
             own, self._arm.delay = self._own.state, self._own.delay
             self._arm.speed_scaling = self._cap * own.speed
+            self._tell_payload(own.mode == "running")
             if own.mode != "running":  # there is no need to leave it alone: it says how it is
                 self._arm.fault(own.message or own.mode)
                 self._jogging.interrupt(monotonic())
@@ -193,6 +197,22 @@ class ControlCycle:
             asked("sending set-points", self._hardware.write, *set_points, now)
             self._arm_fault.works(now)
         return self._joint_state(header, dq)
+
+    def _tell_payload(self, ready: bool) -> None:
+        """Have the arm's controller know what it carries: when that changes, and when it is ready anew."""
+        if not ready:
+            self._carried = None
+        elif self._own is not None and self._gripper is not None and self._fingers and self._fingers.payload:
+            held = self._gripper.held_mass
+            if held != self._carried and not self._payload:
+                self._carried = held
+                self._payload = self._own.order("payload", *self._fingers.payload.with_held(held))
+
+    def _news_of_payload(self) -> str:
+        if self._own is None or not self._payload or (outcome := self._own.outcome(self._payload)) is None:
+            return ""
+        self._payload = 0
+        return outcome and f"the arm was not told what it carries: {outcome}"
 
     def standing(self) -> Standing | None:
         """What simulated hardware would be found like after a restart, if it has changed since the last call."""
@@ -444,7 +464,7 @@ class ControlCycle:
             raise Refused("no_controller", "this arm has no controller of its own that could do that")
         if request.act == "freedrive" and request.value and self._arm.goal:
             raise Refused("busy", f"goal {self._arm.goal!r} is still being followed: stop it first")
-        return self._own.order(request.act, request.value)
+        return self._own.order(request.act, *request.values)
 
     def outcome(self, number: int) -> str | None:
         """None while it is being done; empty once it was; else why not."""

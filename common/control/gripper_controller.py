@@ -87,6 +87,11 @@ class GripperController:
         """What the fingers were told last to press with [N]."""
         return self._effort
 
+    @property
+    def held_mass(self) -> float:
+        """Of what was grasped, as the command said [kg]; 0 where nothing is held, or nobody said."""
+        return self._asked.mass if self._asked is not None and self.state.outcome == "grasped" else 0.0
+
     def resume(self, width: float, now: float, effort: float = 0.0) -> None:
         """Go on moving to the width [m] or pressing with the effort [N] that was told before this process began."""
         self._tell(width, now, effort)

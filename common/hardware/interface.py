@@ -151,8 +151,12 @@ class ControlledArm(Hardware, Protocol):
     def state(self) -> ArmState:
         """What the arm said last, or that it says nothing."""
 
-    def order(self, act: str, value: float) -> int:
-        """Have it `enable`, `recover`, `freedrive` (1 or 0) or take a `payload` (kg): a number to ask about."""
+    def order(self, act: str, *values: float) -> int:
+        """Have it do something beside motion: a number to ask about.
+
+        `enable`, `recover`, `freedrive` (1 or 0), `payload` ([kg], and its centre of mass from the flange, x, y, z
+        [m]), `output` (1 or 0, and which one).
+        """
 
     def outcome(self, number: int) -> str | None:
-        """None while it is being done; empty once it was; else why not."""
+        """None while it is being done; empty once it was; else why not: asked once more, nothing is known of it."""

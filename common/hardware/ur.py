@@ -15,9 +15,10 @@ from pydantic import Field
 
 from common.config import Parameters, RobotConfig
 from common.errors import ConfigError
+from common.hardware.driven_gripper import DrivenGripper
 from common.hardware.driver import DrivenArm
 from common.hardware.fingers import Fingers
-from common.hardware.interface import ArmState, Limits, Vector
+from common.hardware.interface import ArmState, Gripper, Limits, Vector
 from common.messages import RobotMode
 
 MODELS = r"^ur((3|5|10)e?|16e|15|20|30)$"
@@ -57,6 +58,9 @@ class Options(Parameters):
         "real", description="simulated: cameras and fingers are those of the simulated world, about a real arm or a "
                             "test host that stands for one"
     )
+    gripper: Literal["", "2f85", "2f140"] = Field(
+        "", description="Robotiq's gripper at the arm, where the robot file has a gripper section"
+    )
 
 
 def simulated(options: Options) -> bool:
@@ -70,7 +74,13 @@ def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) 
         import rtde_control  # noqa: F401
     except ImportError:
         raise ConfigError("robot.hardware.backend", "ur", "needs the extra `ur`: pip install 'zencell[ur]'") from None
-    gripper = Fingers(robot.gripper, robot.gripper.max_width) if robot.gripper and simulated(options) else None
+    gripper: Gripper | None = None
+    if robot.gripper is not None and simulated(options):
+        gripper = Fingers(robot.gripper, robot.gripper.max_width)
+    elif robot.gripper is not None and options.gripper:
+        gripper = DrivenGripper(
+            "common.hardware.robotiq", {"host": options.host, "model": options.gripper}, robot.gripper,
+            name=f"{options.gripper} at {options.host}")
     return DrivenArm("common.hardware.ur", options.model_dump(), limits, gripper=gripper, name=f"{options.model} at "
                      f"{options.host}", ahead=options.ahead, delay=options.ahead + options.lookahead)
 
@@ -82,6 +92,8 @@ def connect(options: dict[str, Any], limits: Limits) -> UrArm:
 
 class UrArm:
     """The three connections to a controller: what it says, the program that moves it, and its dashboard."""
+
+    paces, hurries = False, True
 
     def __init__(self, options: Options, limits: Limits) -> None:
         """Connect; an arm that is ready gets its program, and rests."""
@@ -155,15 +167,19 @@ class UrArm:
         self._ending = threading.Thread(target=control.disconnect, daemon=True)  # it waits for threads of its own
         self._ending.start()
 
-    def servo(self, q: Vector) -> None:
-        """Go to q (6,) [rad] within one period.
+    def due(self) -> list[float]:
+        """One, now: who is late slows down."""
+        return [time.monotonic()]
+
+    def servo(self, points: list[Vector]) -> None:
+        """Go to the last of the set-points (6,) [rad] within one period.
 
         Raises:
             ConnectionError: the program in the arm does not run any more.
         """
         with self._using:
             taken = self._control is not None and self._control.servoJ(
-                q.tolist(), 0.0, 0.0, 1 / self.rate, self._options.lookahead, self._options.gain)
+                points[-1].tolist(), 0.0, 0.0, 1 / self.rate, self._options.lookahead, self._options.gain)
             self._taken = self._taken if self._servoing else time.monotonic()
             self._servoing = True
         now = time.monotonic()
@@ -183,8 +199,8 @@ class UrArm:
             self._control.servoStop(self._deceleration)
             self._servoing = False
 
-    def do(self, act: str, value: float) -> None:
-        """Power and brakes, recovery, freedrive, payload, digital outputs."""
+    def do(self, act: str, value: float = 0.0, *more: float) -> None:
+        """Power and brakes, recovery, freedrive, payload."""
         if act in ("enable", "recover"):
             self._enable()
             return
@@ -198,9 +214,9 @@ class UrArm:
                 done = self._control.teachMode() if value else self._control.endTeachMode()
                 self._freedrive = bool(value) and done
             elif act == "payload":
-                done = self._control.setPayload(value, [0.0, 0.0, 0.0])
+                done = self._control.setPayload(value, list(more) or [0.0, 0.0, 0.0])
             else:
-                raise ValueError(f"no act {act!r}: enable, recover, freedrive, payload")
+                raise ValueError(f"it cannot {act}: enable, recover, freedrive, payload")
         if not done:
             raise ValueError("the arm refused it")
 

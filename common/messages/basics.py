@@ -134,7 +134,9 @@ class Message(BaseModel):  # noqa: PLW1641 - it can change, and so has no hash
     they are finite and within 64 bits, lists have an end; the first entry of a list that does not fit ends it.
     """
 
-    model_config = ConfigDict(extra="forbid")
+    # Each process uses a few of them: to build the rules of all takes as long as importing all else. Who is about to
+    # read or write one builds its rules first (common/transport/bus.py).
+    model_config = ConfigDict(extra="forbid", defer_build=True)
 
     most_bytes: ClassVar[int] = 1024 * 1024  # of an encoded message; readers and the router take no more
     most_parts: ClassVar[int] = 32 * 1024  # lists and maps in it, all levels together: they cost most time to read

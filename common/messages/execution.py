@@ -171,7 +171,7 @@ class GripperCommand(Message):
     """
 
     most_bytes: ClassVar[int] = SMALL
-    later: ClassVar[tuple[str, ...]] = ("expected_width", "width_tolerance", "owner")
+    later: ClassVar[tuple[str, ...]] = ("expected_width", "width_tolerance", "owner", "mass")
 
     header: Header = Header()
     id: Name
@@ -182,6 +182,7 @@ class GripperCommand(Message):
         None, description="of what is to be between the fingers, such as it was seen [m]"
     )
     width_tolerance: Annotated[float, Field(gt=0, le=0.2, description="of expected_width [m]")] = 0.005
+    mass: Annotated[float, Field(ge=0, le=1000)] = Field(0.0, description="of what is to be held [kg]; 0: not known")
 
 
 class GripperState(Message):
@@ -228,12 +229,23 @@ class RobotCommand(Message):
 
     most_bytes: ClassVar[int] = SMALL
 
-    act: Literal["enable", "recover", "freedrive", "payload"] = Field(
+    later: ClassVar[tuple[str, ...]] = ("output", "com")
+
+    act: Literal["enable", "recover", "freedrive", "payload", "output"] = Field(
         description="enable: power and brakes; recover: from a protective stop; freedrive: moved by hand, value 1 or "
-                    "0; payload: what the tool carries, value in kg"
+                    "0; payload: what the tool carries, value in kg; output: a digital output, value 1 or 0"
     )
     value: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 0.0
+    output: int = Field(0, ge=0, lt=32, description="which one")
+    com: Vector3 = Field(Vector3(), description="centre of mass of the payload, from the flange [m]")
     owner: Who = Field("", description="name of the person")
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """What the arm's driver is told beside the act."""
+        if self.act == "payload":
+            return self.value, self.com.x, self.com.y, self.com.z
+        return (self.value, float(self.output)) if self.act == "output" else (self.value,)
 
 
 class JogCommand(Message):

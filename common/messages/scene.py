@@ -19,7 +19,7 @@ class CollisionObject(Message):
     prism has the convex hull of `outline` [m] as its cross-section and, as all shapes, its pose at half its length.
     """
 
-    later: ClassVar[tuple[str, ...]] = ("grip_effort",)
+    later: ClassVar[tuple[str, ...]] = ("grip_effort", "mass")
 
     id: Name
     role: Literal["fixture", "container", "target", "contained", "attached"]
@@ -31,6 +31,7 @@ class CollisionObject(Message):
     grip_effort: Annotated[float, Field(ge=0, le=1e4)] = Field(
         0.0, description="force that it is to be gripped with [N]; 0: the gripper's own default"
     )
+    mass: Annotated[float, Field(ge=0, le=1000)] = Field(0.0, description="[kg]; 0: not known")
 
     @model_validator(mode="after")
     def _dimensions_fit_shape(self) -> CollisionObject:

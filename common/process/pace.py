@@ -1,12 +1,25 @@
-"""Turns of a loop at a steady rate that may change while it waits."""
+"""Turns of a loop at a steady rate that may change while it waits; and who comes after all others."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
+import os
+import sys
+import threading
 from collections.abc import Callable
 
 from common.transport.bus import Bus
+
+NICENESS = 5  # of a thread that computes for long
+
+
+def come_last() -> None:
+    """Have this thread, beside the main one, compute while no other has anything to do: pictures do not wait for it."""
+    if sys.platform == "linux" and threading.current_thread() is not threading.main_thread():
+        with contextlib.suppress(OSError):  # elsewhere, only whole processes have a priority
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
 
 
 class Pace:

@@ -28,7 +28,7 @@ class RobotModel:
         config: the robot file.
         urdf: text of the URDF with everything that is attached, rooted in a link `world`; srdf: path, or None.
         joint_names: joints of the group, in the order of every (dof,) array.
-        lower, upper: position limits (dof,) [rad], from the URDF.
+        lower, upper: position limits (dof,) [rad], from the robot file, else the URDF.
         velocity: limits (dof,) [rad/s], from the robot file, else the URDF.
         acceleration, jerk: limits (dof,) [rad/s^2], [rad/s^3], from the robot file.
         link_parents: link -> the link it hangs on, for every link but the root.
@@ -52,6 +52,9 @@ class RobotModel:
         if self.model.nq != len(self.joint_names):
             raise ConfigError("robot.joints", config.joints, "must have one position each; continuous joints have two")
         self.dof: int = self.model.nq
+        if config.position_limits:
+            lowest, highest = np.array(config.position_limits, dtype=float).T
+            self.model.lowerPositionLimit, self.model.upperPositionLimit = lowest, highest
         self.lower: Array = np.array(self.model.lowerPositionLimit)
         self.upper: Array = np.array(self.model.upperPositionLimit)
         self.velocity: Array = np.array(config.velocity_limits or self.model.velocityLimit, dtype=float)
@@ -59,7 +62,8 @@ class RobotModel:
         self.jerk: Array = np.array(config.jerk_limits, dtype=float)
         for name, low, high, speed in zip(self.joint_names, self.lower, self.upper, self.velocity, strict=True):
             if not (np.isfinite(low) and np.isfinite(high) and low < high and 0 < speed < np.inf):
-                raise ConfigError("robot.urdf", config.urdf, f"has no usable limits for joint {name}")
+                said = ("position_limits", [low, high]) if config.position_limits else ("urdf", config.urdf)
+                raise ConfigError(f"robot.{said[0]}", said[1], f"has no usable limits for joint {name}")
         self._links = _link_frames(self.model)
         self._full_links = _link_frames(full_model)
         names = list(full_model.names)[1:]

@@ -299,7 +299,7 @@ class Task(Deciding[V]):
                 id=self.mint(), trajectory=stage.trajectory, plan=stage.plan, scene_stamp=stage.scene_stamp)
         else:
             assert isinstance(stage, Grip)
-            command = m.GripperCommand(id=self.mint(), width=stage.width, effort=stage.effort)
+            command = m.GripperCommand(id=self.mint(), width=stage.width, effort=stage.effort, mass=stage.mass)
             if stage.expected_width is not None:
                 command.expected_width, command.width_tolerance = stage.expected_width, stage.width_tolerance
         if stage.cycle is not None:

@@ -78,6 +78,7 @@ class Grip(Stage):
     expected_width: float | None = field(default=None, kw_only=True)  # [m]
     width_tolerance: float = field(default=0.01, kw_only=True)  # of expected_width [m]
     effort: float = field(default=0.0, kw_only=True)  # [N]; 0: the gripper's own default
+    mass: float = field(default=0.0, kw_only=True)  # of what is held then [kg]; 0: not known
     problem: str = field(default="the fingers closed on nothing", init=False)
 
     def width_after(self, before: float) -> float:

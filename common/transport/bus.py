@@ -165,7 +165,9 @@ class Bus:
         )
 
     def _in_cell(self, topic: T) -> T:
-        """The topic or request under its key in the cell."""
+        """The topic or request under its key in the cell, with its messages ready to be read."""
+        for message in (topic.message, *((topic.answer,) if isinstance(topic, Request) else ())):
+            message.model_rebuild()
         key = self._remapping.key(topic.key)
         return topic if key == topic.key else replace(topic, key=key)
 

@@ -24,6 +24,8 @@ class StoppingArm(MockHardware):
         """Not stopped."""
         super().__init__(start, gripper)
         self.stopped = False
+        self.orders: list[tuple[object, ...]] = []
+        self.refuses = ""
 
     @property
     def state(self) -> ArmState:
@@ -37,14 +39,15 @@ class StoppingArm(MockHardware):
             raise HardwareFault("stopped for safety")
         super().write(positions, velocities, now)
 
-    def order(self, act: str, value: float) -> int:
-        """Recover, whatever was asked for."""
-        self.stopped = False
-        return 1
+    def order(self, act: str, *values: float) -> int:
+        """Recover, or take note."""
+        self.orders.append((act, *values))
+        self.stopped = self.stopped and act != "recover"
+        return len(self.orders)
 
     def outcome(self, number: int) -> str:
-        """It is done."""
-        return ""
+        """It is done, unless it is refused."""
+        return self.refuses
 
 
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> StoppingArm:

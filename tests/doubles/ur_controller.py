@@ -24,6 +24,8 @@ import numpy as np
 
 RTDE, DASHBOARD, SCRIPTS, ORDERS = 30004, 29999, (30001, 30002, 30003), 29919
 RATE = 500.0  # [Hz]
+OUTPUT_MASKS = {f"{kind}_digital_output_mask": 8 * n for n, kind in enumerate(("standard", "configurable", "tool"))}
+COMMAND = "input_int_register_0"  # to the program
 POWER_OFF, IDLE, RUNNING = 3, 5, 7  # robot modes
 NORMAL, PROTECTIVE_STOP, EMERGENCY_STOP = 1, 3, 7  # safety modes
 MODES = {POWER_OFF: "POWER_OFF", IDLE: "IDLE", RUNNING: "RUNNING"}
@@ -243,7 +245,7 @@ class Controller:
         self.host, self.arm = host, arm
         self._servers: list[asyncio.Server] = []
         self._writers: set[asyncio.StreamWriter] = set()
-        self._inputs: asyncio.StreamWriter | None = None  # who may set input registers
+        self._inputs: dict[str, asyncio.StreamWriter] = {}  # who sets each of them
         self.pulled_until = 0.0  # monotonic [s]: the cable carries nothing until then
 
     async def listen(self) -> None:
@@ -331,9 +333,9 @@ class Controller:
                         answer(kind, struct.pack(">B", number) + ",".join(kinds).encode())
                     case "I":
                         names, kinds = variables(payload)
-                        if self._inputs not in (None, writer):  # one client at a time may set them
-                            kinds = ["IN_USE"] * len(names)
-                        self._inputs = self._inputs or writer
+                        for n, name in enumerate(names):  # one client at a time may set each
+                            if self._inputs.setdefault(name, writer) is not writer:
+                                kinds[n] = "IN_USE"
                         recipes[len(recipes) + 1] = names
                         answer(kind, struct.pack(">B", len(recipes)) + ",".join(kinds).encode())
                     case "S":
@@ -345,22 +347,22 @@ class Controller:
                         if sender is not None:
                             sender.cancel()
                             sender = None
-                    case "U" if self._inputs is writer:
-                        self.arm.heard()
-                        self._take(recipes[payload[0]], payload[1:])
                     case "U":
-                        pass
+                        names = recipes[payload[0]]
+                        if self._inputs.get(COMMAND) is writer:  # the program in the arm watches who commands it
+                            self.arm.heard()
+                        if all(self._inputs.get(name) is writer for name in names):
+                            self._take(names, payload[1:])
                     case other:
                         raise NotImplementedError(f"packet {other}")
                 await writer.drain()
         finally:
-            if self._inputs is writer:
-                self._inputs = None
+            self._inputs = {name: owner for name, owner in self._inputs.items() if owner is not writer}
             if sender is not None:
                 sender.cancel()
 
     def _take(self, names: list[str], payload: bytes) -> None:
-        offset = 0
+        offset, changed = 0, 0
         for name in names:
             shape = ">" + FORMATS[kind_of(name)]
             value = struct.unpack_from(shape, payload, offset)[0]
@@ -372,6 +374,11 @@ class Controller:
                 self.arm.doubles_in[int(number)] = value
             elif name == "speed_slider_fraction":
                 self.arm.slider = value
+            elif name in OUTPUT_MASKS:
+                changed = value << OUTPUT_MASKS[name]
+            elif f"{name}_mask" in OUTPUT_MASKS:
+                levels = value << OUTPUT_MASKS[f"{name}_mask"]
+                self.arm.outputs = self.arm.outputs & ~changed | levels & changed
 
     async def _dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(b"Connected: Universal Robots Dashboard Server\n")
@@ -417,6 +424,7 @@ class Controller:
                 "q": arm.q.tolist(), "qd": arm.qd.tolist(), "mode": MODES[arm.mode], "safety": SAFETY[arm.safety],
                 "program": arm.program, "stops": arm.stops, "reason": arm.reason, "commands": arm.commands,
                 "fastest": arm.fastest, "hardest": arm.hardest, "payload": arm.payload, "slider": arm.slider,
+                "outputs": arm.outputs,
                 "freedrive": arm.freedrive,
             }).encode() + b"\n")
             await writer.drain()

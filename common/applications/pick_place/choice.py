@@ -29,8 +29,8 @@ SETTLING = 1.5  # [s] from letting go until the ball lies in the container and w
 class Target:
     """An object that was seen: its place [m] in world, and its track id in the planning scene.
 
-    `size` (x, y) [m] and `yaw` [rad] are those of a box seen from above; what is round has none. `grip_effort` [N] is
-    that of the planning scene, 0 where it says none.
+    `size` (x, y) [m] and `yaw` [rad] are those of a box seen from above; what is round has none. `grip_effort` [N]
+    and `mass` [kg] are those of the planning scene, 0 where it says none.
     """
 
     id: str
@@ -39,16 +39,17 @@ class Target:
     size: tuple[float, float] | None = None
     yaw: float = 0.0
     grip_effort: float = 0.0
+    mass: float = 0.0
 
     @classmethod
     def of(cls, thing: m.CollisionObject) -> Target:
         """An object of the planning scene."""
         d = thing.dimensions
         if thing.shape != "box":
-            return cls(thing.id, place_of(thing.pose), d[0], grip_effort=thing.grip_effort)
+            return cls(thing.id, place_of(thing.pose), d[0], grip_effort=thing.grip_effort, mass=thing.mass)
         yaw = matrix_to_rpy(pose_to_matrix(thing.pose)[:3, :3])[2]
         radius = math.hypot(d[0], d[1]) / 2
-        return cls(thing.id, place_of(thing.pose), radius, (d[0], d[1]), yaw, thing.grip_effort)
+        return cls(thing.id, place_of(thing.pose), radius, (d[0], d[1]), yaw, thing.grip_effort, thing.mass)
 
     def width(self, yaw: float) -> float | None:
         """Between fingers that are turned by `yaw` [rad] [m]; None where its size is not known."""

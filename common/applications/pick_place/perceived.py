@@ -145,6 +145,7 @@ class PerceivedScene:
         return m.CollisionObject.model_validate({
             "id": name, "role": role, "shape": thing.shape, "dimensions": thing.dimensions, "pose": pose,
             "color": thing.color, "grip_effort": self.around.grip_efforts.get(thing.kind, 0.0),
+            "mass": self.around.masses.get(thing.kind, 0.0),
         })
 
 

@@ -68,7 +68,7 @@ class Rows:
         cup = self.gripper.cup is not None
         return Grip("close", "GRASPING", cycle, width=0.0, holds=True, effort=cycle.target.grip_effort,
                     expected_width=self.gripper.held_width if cup else cycle.target.width(yaw),
-                    width_tolerance=self.p.width_tolerance)
+                    width_tolerance=self.p.width_tolerance, mass=cycle.target.mass)
 
     def place_held(self, cycle: Pick, tcp: Place) -> list[Stage]:
         """What is left to do with a ball that is in the hand at `tcp`."""

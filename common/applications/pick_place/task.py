@@ -100,10 +100,12 @@ class PickPlace(Task[PickPlaceView]):
         status = self.status
         status.skipped = self._choice.rejections()
         # What lies in the container was put there before a restart of this task, or by somebody else. The scene may
-        # tell of it only later, when it was started again as well.
+        # tell of it only later, when it was started again as well. A ball that is let go counts when it is: until then
+        # it may hang over others, and a picture of it shows one more.
         contained = len(view.objects("contained"))
-        seen_for = self._contained.lasts(contained, view.scene_stamp)
-        if seen_for >= min(CONTAINED_FOR, self.p.empty) and status.stage != "release":  # which counts its ball itself
+        if status.stage == "release":
+            self._contained.reset()
+        elif self._contained.lasts(contained, view.scene_stamp) >= min(CONTAINED_FOR, self.p.empty):
             status.done = max(status.done, contained)
         if status.stage not in ("close", "lift", "across", "release"):
             status.total = status.done + len(view.targets)

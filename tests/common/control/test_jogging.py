@@ -158,6 +158,7 @@ def test_whatever_is_asked_for_set_points_keep_the_limits(arm):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.slow
 def test_each_joint_comes_to_rest_before_its_end(arm, sign):
     for k, joint in enumerate(arm.robot.joint_names):
         arm.jog(0.2, joints={joint: sign * 9.0})
@@ -201,6 +202,7 @@ def test_the_tool_is_never_faster_than_by_hand(arm):
     assert 0.2 < np.linalg.norm(np.diff(places, axis=0), axis=1).max() / PERIOD <= 0.251
 
 
+@pytest.mark.slow
 def test_where_the_tool_can_go_no_farther_it_hardly_moves(arm):
     arm.tool(30.0, (0.2, 0.0, 0.0))
     arm.tool(0.5, (0.2, 0.0, 0.0))
@@ -412,6 +414,7 @@ def test_the_tool_is_never_faster_than_by_hand_beside_the_ends_of_joints(arm, se
     assert (np.linalg.norm(np.diff(places, axis=0), axis=1) / PERIOD).max() <= 0.27
 
 
+@pytest.mark.slow
 def test_where_the_tool_was_led_to_the_end_of_its_reach_it_comes_back(arm):
     arm.tool(20.0, (0.2, 0.0, 0.0))
     far = arm.robot.fk(arm.q)[0, 3]

@@ -32,12 +32,12 @@ def test_every_backend_starts_at_the_start_at_rest_and_goes_where_it_is_sent(lim
 
 
 def test_backends_are_found_by_name() -> None:
-    assert backend_names() == ["lag", "mock", "ur"]
+    assert backend_names() == ["franka", "lag", "mock", "ur"]
     assert all(is_simulated(robot(name)) for name in ("lag", "mock"))
 
 
 def test_unknown_backend_names_the_choices() -> None:
-    with pytest.raises(UnknownName, match=r"'mok' \(did you mean 'mock'\?\); choices: lag, mock, ur"):
+    with pytest.raises(UnknownName, match=r"'mok' \(did you mean 'mock'\?\); choices: franka, lag, mock, ur"):
         find_backend(robot("mok"))
 
 

@@ -12,9 +12,10 @@ import pytest
 
 from common.errors import ConfigError
 from common.hardware.driver import DrivenArm
-from common.hardware.interface import HardwareFault, Limits
+from common.hardware.interface import Limits
 from common.hardware.loading import is_simulated
 from common.hardware.ur import Options, create
+from tests.common.hardware.driven_rig import PERIOD, TIMEOUT, Rig
 from tests.common.hardware.test_backends import robot
 from tests.doubles.ur_host import UrHost
 
@@ -24,65 +25,6 @@ if os.environ.get("CI") != "true":
 
 SIX = np.ones(6)
 LIMITS = Limits(tuple("abcdef"), -6 * SIX, 6 * SIX, 3 * SIX, 5 * SIX, 10 * SIX, 500 * SIX)
-PERIOD, TIMEOUT = 0.01, 30.0
-
-
-class Rig:
-    """The backend, and cycles of 10 ms as the controller has them."""
-
-    def __init__(self, arm: DrivenArm) -> None:
-        self.arm, self.told, self.measured = arm, [""], 0 * SIX
-
-    def cycle(self, q: np.ndarray | None, dq: np.ndarray) -> str:
-        """One cycle: empty when the set-points were taken, else why not."""
-        now = time.monotonic()
-        try:
-            measured, _ = self.arm.read(now)
-            self.measured = measured
-            self.arm.write(measured if q is None else q, dq, now)
-            problem = ""
-        except HardwareFault as fault:
-            problem = str(fault)
-        if problem != self.told[-1]:
-            self.told.append(problem)
-        time.sleep(PERIOD)
-        return problem
-
-    def until(self, wanted: str) -> str:
-        """Rest until a cycle ends with what is wanted: empty for set-points that are taken."""
-        end = time.monotonic() + TIMEOUT
-        q = None
-        while True:
-            problem = self.cycle(q, 0 * SIX)
-            q = None if problem else self.measured if q is None else q
-            if problem == wanted or (wanted and wanted in problem):
-                return problem
-            assert time.monotonic() < end, f"{wanted!r} did not come: {self.told}"
-
-    def wave(self, seconds: float) -> str:
-        """Swing every joint by 0.2 rad: empty at the end, or why it ended before."""
-        q0, _ = self.arm.read(0.0)
-        began = time.monotonic()
-        while (t := time.monotonic() - began) < seconds:
-            if problem := self.cycle(q0 + 0.1 * (1 - np.cos(2 * t)) * SIX, 0.2 * np.sin(2 * t) * SIX):
-                return problem
-        return ""
-
-    def until_it_moves(self) -> None:
-        """Try until a motion is not cut short: a link that was lost may be lost once more before it is there again."""
-        end = time.monotonic() + TIMEOUT
-        self.until("")
-        while self.wave(0.3):
-            assert time.monotonic() < end, self.told[-6:]
-            self.until("")
-
-    def done(self, number: int) -> str:
-        """What became of an order."""
-        end = time.monotonic() + TIMEOUT
-        while (outcome := self.arm.outcome(number)) is None:
-            assert time.monotonic() < end
-            time.sleep(PERIOD)
-        return outcome
 
 
 def made(host: str, **options: object) -> DrivenArm:
@@ -98,7 +40,7 @@ def host() -> Iterator[UrHost]:
 
 @pytest.fixture(scope="module")
 def rig(host: UrHost) -> Iterator[Rig]:
-    rig = Rig(made(host.host))
+    rig = Rig(made(host.host), 0 * SIX)
     yield rig
     rig.arm.close()
 
@@ -149,7 +91,7 @@ def test_set_points_are_for_when_they_were_made_however_late_they_are_sent(
 ) -> None:
     rig.until("")
     sent: list[tuple[object, ...]] = []
-    monkeypatch.setattr(rig.arm, "_send", lambda message: sent.append(message) or True)
+    monkeypatch.setattr(rig.arm._process, "send", lambda message: sent.append(message) or True)
     q, now = rig.measured, time.monotonic()
     for n in range(5):
         time.sleep(0.01 + 0.004 * (n % 2))
@@ -277,7 +219,7 @@ def test_what_the_tool_carries_and_the_slider_are_told(host: UrHost, rig: Rig) -
 
 
 def test_nobody_at_the_address_is_told_without_end() -> None:
-    rig = Rig(made("127.0.0.42"))
+    rig = Rig(made("127.0.0.42"), 0 * SIX)
     try:
         problem = rig.until("Timeout connecting")
         assert "ur5e at 127.0.0.42" in problem and rig.arm.state.mode == "disconnected"
@@ -288,7 +230,7 @@ def test_nobody_at_the_address_is_told_without_end() -> None:
 
 def test_a_controller_of_the_older_series_is_served_at_its_rate() -> None:
     with UrHost("127.0.0.43", "--cb3") as host:
-        rig = Rig(made(host.host, model="ur5"))
+        rig = Rig(made(host.host, model="ur5"), 0 * SIX)
         try:
             rig.until("")
             assert not any("was connected" in told for told in rig.told), "that is no fault"

@@ -153,6 +153,7 @@ async def test_router_killed_in_the_middle_loses_the_request_and_then_nobody_is_
         await client.call(START)
 
 
+@pytest.mark.slow
 async def test_router_frozen_in_the_middle_loses_the_request(stage: Stage, bus: Bus) -> None:
     toy = stage.toy()
     client = await available(bus)
@@ -221,7 +222,10 @@ async def reach(stage: Stage, state: str) -> list[subprocess.Popen[bytes]]:
 STATES = ["connecting", "gated", "running", "busy", "stubborn", "router dead", "router frozen"]
 
 
-@pytest.mark.parametrize("state", STATES)
+@pytest.mark.parametrize("state", [
+    state if state in ("running", "connecting", "stubborn") else pytest.param(state, marks=pytest.mark.slow)
+    for state in STATES
+])
 async def test_gone_with_exit_code_0_after_sigint_or_sigterm(stage: Stage, state: str) -> None:
     interrupted, terminated = await reach(stage, state)
     interrupted.send_signal(signal.SIGINT)
@@ -254,6 +258,7 @@ async def test_token_vanishes_at_once_when_a_service_is_terminated(stage: Stage,
     assert "stopped: SIGTERM" in stage.output(toy)
 
 
+@pytest.mark.slow
 async def test_router_ends_on_signals_and_with_its_supervisor(processes, domain: int) -> None:
     for end in (signal.SIGINT, signal.SIGTERM, None):
         router = processes.start("services.router", "--domain", str(domain), "--gate")

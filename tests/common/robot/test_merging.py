@@ -87,6 +87,9 @@ def test_attachment_hangs_on_its_link_and_tcp_on_the_attachment(make, tmp_path):
         ({"tcp": {"link": "tip", "parent": "arm"}}, "tcp_link is arm, but tcp defines tip"),
         ({"tcp_link": ""}, "tcp_link must be given, or tcp"),
         ({"velocity_limits": [1, 1]}, "velocity_limits has 2 values for 1 joints"),
+        ({"position_limits": [[0, 1], [0, 1]]}, "position_limits has 2 values for 1 joints"),
+        ({"position_limits": [[1, 0]]}, "robot.position_limits.*has no usable limits for joint"),
+        ({"position_limits": [[0.5, 1]]}, "robot.named_poses.home.*must be within 0.5 to 1"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused_with_field_and_choice(make, changes, message):

@@ -1,0 +1,147 @@
+"""Grippers behind a process of their own: Robotiq's by its lines of text, and what every driver may do wrong."""
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from common.config import GripperConfig, load_cell
+from common.control.gripper_controller import GripperController
+from common.errors import ConfigError
+from common.hardware.driven_gripper import DrivenGripper
+from common.hardware.interface import HardwareFault, Limits
+from common.hardware.loading import load_hardware
+from common.hardware.robotiq import MODELS, Robotiq
+from common.messages import GripperCommand, GripperState
+from tests.doubles.robotiq import RobotiqHost
+
+TIMEOUT = 20.0
+SIX = np.ones(6)
+LIMITS = Limits(tuple("abcdef"), -6 * SIX, 6 * SIX, 3 * SIX, 5 * SIX, 10 * SIX, 500 * SIX)
+CONFIG: GripperConfig = load_cell("ur5", ["robot.gripper.speed=0.15"]).robot.gripper  # a 2F-85
+TOUCH = 110  # counts at which the fingers meet what is between them,
+WIDE = 0.085 * (228 - TOUCH) / 225  # [m] apart then
+
+
+@pytest.fixture
+def host() -> Iterator[RobotiqHost]:
+    with RobotiqHost() as host:
+        yield host
+
+
+def options(host: RobotiqHost) -> dict:
+    return {"host": "127.0.0.1", "port": host.port, "model": "2f85"}
+
+
+class Driven:
+    """The gripper behind its controller, cycle by cycle."""
+
+    def __init__(self, gripper: DrivenGripper) -> None:
+        self.gripper, self.controller = gripper, GripperController(gripper, CONFIG)
+        self.problem = ""
+
+    def cycle(self) -> GripperState:
+        now = time.monotonic()
+        try:
+            self.controller.update(self.gripper.read(now), now)
+            self.problem = ""
+        except HardwareFault as fault:
+            self.problem = str(fault)
+            self.controller.fault(self.problem)
+        time.sleep(0.01)
+        return self.controller.state
+
+    def until(self, condition) -> GripperState:
+        end = time.monotonic() + TIMEOUT
+        while not condition(state := self.cycle()):
+            assert time.monotonic() < end, (state, self.problem)
+        return state
+
+    def told(self, name: str, width: float, **more: object) -> GripperState:
+        """What becomes of a command."""
+        self.until(lambda _: not self.problem)
+        self.controller.command(GripperCommand(id=name, width=width, **more), time.monotonic())
+        return self.until(lambda state: state.state != "active")
+
+
+@pytest.fixture
+def driven(host: RobotiqHost) -> Iterator[Driven]:
+    gripper = DrivenGripper("common.hardware.robotiq", options(host), CONFIG, name="a 2f85")
+    yield Driven(gripper)
+    gripper.close()
+
+
+@pytest.mark.parametrize("answers", [b"ack", b"ack\n"])
+def test_fingers_open_and_close_to_a_width(host: RobotiqHost, driven: Driven, answers: bytes) -> None:
+    host.gripper.answers = answers
+    for n, width in enumerate((0.03, 0.085, 0.0)):
+        state = driven.told(f"g{n}", width)
+        assert (state.state, state.holding) == ("succeeded", False)
+        assert state.width == pytest.approx(width, abs=3e-4)  # a count
+
+
+def test_what_is_between_them_is_held_with_the_effort_that_was_asked_for_and_let_go(
+    host: RobotiqHost, driven: Driven,
+) -> None:
+    host.gripper.thing = TOUCH
+    state = driven.told("close", 0.0, effort=100.0, expected_width=WIDE)
+    assert (state.state, state.outcome, state.holding) == ("succeeded", "grasped", True)
+    assert state.width == pytest.approx(WIDE, abs=3e-4) and state.effort == pytest.approx(100.0, abs=1.0)
+    assert driven.told("again", 0.0, expected_width=0.02).outcome == "too_wide"
+    host.gripper.thing = None
+    state = driven.told("open", 0.08)
+    assert (state.state, state.holding) == ("succeeded", False)
+
+
+def test_gripper_that_is_not_activated_or_has_a_fault_is_never_moved_and_says_so(host: RobotiqHost) -> None:
+    host.gripper.registers["STA"] = 0
+    driven = Driven(DrivenGripper("common.hardware.robotiq", options(host), CONFIG, name="a 2f85"))
+    driven.until(lambda _: "a 2f85: the gripper is not activated (state 0)" in driven.problem)
+    with pytest.raises(HardwareFault, match="not activated"):
+        driven.gripper.command(0.0, time.monotonic(), 20.0)
+    host.gripper.registers["STA"] = 3
+    driven.until(lambda _: not driven.problem)
+    host.gripper.registers["FLT"] = 14
+    driven.until(lambda _: "has fault 14" in driven.problem)
+    driven.gripper.close()
+    assert host.gripper.registers["GTO"] == 0
+
+
+@pytest.mark.slow
+def test_gripper_that_goes_away_is_a_fault_and_is_found_again() -> None:
+    with RobotiqHost() as host:
+        driven = Driven(DrivenGripper("common.hardware.robotiq", options(host), CONFIG, name="a 2f85"))
+        assert driven.told("first", 0.02).state == "succeeded"
+    driven.until(lambda _: "the gripper's program is gone" in driven.problem)
+    driven.until(lambda _: "refused" in driven.problem)
+    with RobotiqHost(host.port) as again:
+        driven.until(lambda _: not driven.problem)
+        assert again.gripper.registers["GTO"] == 0  # nobody has asked
+        driven.gripper.close()
+
+
+@pytest.mark.parametrize("answer", [b"POS\n", b"POS x\n", b"?\n", b"y" * 300])
+def test_answers_that_are_none_end_the_driver_with_a_line(
+    host: RobotiqHost, answer: bytes, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gripper = Robotiq("127.0.0.1", MODELS["2f85"], 0.1, host.port)
+    monkeypatch.setattr(host.gripper, "answer", lambda line: answer)
+    try:
+        with pytest.raises((RuntimeError, ConnectionError), match="the gripper"):
+            gripper.read()
+    finally:
+        gripper.close()
+
+
+def test_arm_takes_its_gripper_by_an_option() -> None:
+    pytest.importorskip("rtde_control", reason="make setup EXTRAS=ur")
+    robot = load_cell("ur5", ["robot.hardware.backend=ur", "robot.hardware.options.host=127.0.0.9",
+                              "robot.hardware.options.model=ur5e", "robot.hardware.options.gripper=2f85"]).robot
+    arm = load_hardware(robot, LIMITS, LIMITS.lower)
+    assert isinstance(arm.gripper, DrivenGripper)
+    arm.gripper.close()
+    arm.close()
+    with pytest.raises(ConfigError, match=r"robot\.hardware\.options\.gripper: '3f'"):
+        load_hardware(robot.model_copy(update={"hardware": robot.hardware.model_copy(
+            update={"options": {**robot.hardware.options, "gripper": "3f"}})}), LIMITS, LIMITS.lower)
