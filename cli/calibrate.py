@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import sys
 import time
@@ -12,18 +13,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import options
-from common.errors import ConfigError, UnknownName
+from common.errors import ConfigError, UnknownName, ZencellError
 from common.terminal import echo
 
 if TYPE_CHECKING:
+    from common.messages import Image
     from common.perception.calibration import IntrinsicCalibration, ViewResidual
     from common.perception.calibration_board import Board, Picture, Sighting
     from common.perception.calibration_file import CameraFile
     from common.perception.calibration_pose import PoseCalibration
+    from common.transport.bus import Bus
+    from common.transport.reader import Reader
 
 app = typer.Typer(help="Calibrate a real camera with a ChArUco board.", no_args_is_help=True)
 
 BOARD_FORMATS = (".png", ".pdf")
+FIRST_PICTURE = 5.0  # [s] of wall time in which one comes
 _MOST_LISTED = 12  # views of which the residuals are shown
 SOURCE_HELP = "device number or path, video file, or folder of images"
 
@@ -33,6 +38,12 @@ Marker = Annotated[str, typer.Option("--marker", metavar="M", help="length of a 
 Dictionary = Annotated[str, typer.Option("--dictionary", metavar="NAME", help="of markers: 4x4_50, 5x5_50, ...")]
 Size = Annotated[str, typer.Option("--size", metavar="WxH", help="size that a device is asked for [px]")]
 Seconds = Annotated[str, typer.Option("--seconds", metavar="S", help="how long a device is looked at")]
+
+
+class NoPicture(ZencellError):
+    """Nobody sends pictures."""
+
+    exit_code = 1
 
 
 @app.callback()
@@ -165,6 +176,126 @@ def pose(
     camera.save(file)
     echo(_pose_told(result))
     echo(f"{file} holds intrinsics and pose; a cell takes both with --set world.camera={file}")
+
+
+@app.command(name="hand-eye")
+def hand_eye(
+    folder: Annotated[str, typer.Argument(metavar="FOLDER", help="views of `zencell calibrate collect`")],
+    intrinsics_file: Annotated[
+        str, typer.Option("--intrinsics", metavar="FILE", help="YAML file of `zencell calibrate intrinsics`")
+    ],
+    mount: Annotated[str, typer.Option("--camera", metavar="hand|beside", help="where the camera is")],
+    output: Annotated[
+        str, typer.Option("-o", "--output", metavar="FILE", help="YAML file to write; left out: that of --intrinsics")
+    ] = "",
+    squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
+) -> None:
+    """Find where a camera is that sits on the hand, or beside an arm that holds the board."""
+    from typing import get_args
+
+    from common.perception.calibration import CalibrationFailed
+    from common.perception.calibration_file import CameraFile
+    from common.perception.calibration_hand_eye import LEAST_VIEWS, Mount, calibrate_hand_eye
+    from common.perception.hand_eye_views import load_views
+
+    if mount not in get_args(Mount):
+        raise UnknownName("--camera", mount, get_args(Mount))
+    camera, board = CameraFile.load(intrinsics_file), board_of(squares, square, marker, dictionary)
+    views, why, said = load_views(Path(folder).expanduser(), board, camera)
+    if len(views) < LEAST_VIEWS and why:
+        raise CalibrationFailed(f"{len(views)} views of the board, {LEAST_VIEWS} are needed; {why[0]}")
+    result = calibrate_hand_eye(views, camera, "hand" if mount == "hand" else "beside")
+    record = {
+        "date": _today(), "source": folder, "robot": said.robot, "camera": mount, "views": len(result.pictures),
+        "rms_px": result.rms, "rms_mm": 1e3 * result.rms_at_board, "verdict": result.verdict,
+        "position_std_mm": [1e3 * value for value in result.position_std],
+        "rotation_std_deg": math.degrees(result.rotation_std)}
+    place = {"position": result.position, "rpy": result.rpy}
+    if mount == "hand":
+        found = camera.model_copy(update={"calibration": {**camera.calibration, "hand_eye": {
+            **record, **{name: list(value) for name, value in place.items()}, "in": "the tool centre point"}}})
+    else:
+        found = camera.model_copy(update={**place, "calibration": {**camera.calibration, "hand_eye": record}})
+    found.save(output or intrinsics_file)
+    position, rpy = result.position, result.rpy
+    echo(f"{len(result.pictures)} views, residual {result.rms:.3f} px rms, {1e3 * result.rms_at_board:.2f} mm at the "
+         f"board; {_per_view(result.pictures)}")
+    echo(f"position {position[0]:.5f}, {position[1]:.5f}, {position[2]:.5f} m in "
+         f"{'the tool centre point' if mount == 'hand' else 'world'} +- {1e3 * max(result.position_std):.2f} mm")
+    echo(f"rpy      {rpy[0]:.5f}, {rpy[1]:.5f}, {rpy[2]:.5f} rad +- {math.degrees(result.rotation_std):.3f} degrees")
+    if result.dropped:
+        echo(f"dropped, since they do not fit: {_per_view(result.dropped)}")
+    echo(result.verdict)
+
+
+@app.command()
+def collect(
+    folder: Annotated[str, typer.Argument(metavar="FOLDER", help="where views are kept, with the joints of each")],
+    robot: Annotated[str, typer.Option("--robot", metavar="NAME", help="robot file of the arm that is up")],
+    key: Annotated[str, typer.Option("--key", metavar="KEY", help="of the camera's pictures")] = "camera/image_raw",
+    views: Annotated[str, typer.Option("--views", metavar="N", help="that are wanted")] = "15",
+    squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
+    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+) -> None:
+    """Keep pictures of the board, with the joints, of a cell that is up: whenever the arm rests in a new pose.
+
+    Bring it there by hand, by jogging or by a script of yours; nothing is moved from here.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    from cli.inspection import inspect
+    from common import topics
+    from common.config import RobotConfig, check, find_file, read_robot
+    from common.perception.hand_eye_views import ViewCollector
+    from common.perception.image import image_to_array
+    from common.robot.model import RobotModel
+
+    model = RobotModel.load(check(RobotConfig, read_robot(find_file("robots", robot)), "robot"))
+    board, wanted = board_of(squares, square, marker, dictionary), options.whole("--views", views, 1) or 1
+    collector = ViewCollector(Path(folder).expanduser(), model, robot, board)
+
+    async def visit(bus: Bus) -> None:
+        pictures, joints = bus.reader(replace(topics.CAMERA_IMAGE, key=key)), bus.reader(topics.JOINT_STATES)
+
+        async def take_note() -> None:
+            async for state in joints:
+                q = dict(zip(state.name, state.position, strict=True))
+                collector.joints(state.header.stamp * 1e-9, np.array([q[name] for name in model.joint_names]))
+
+        noting, said = asyncio.create_task(take_note()), ""
+        try:
+            while collector.count < wanted:
+                image = await next_of(pictures, noting)
+                why = await asyncio.to_thread(
+                    collector.picture, image.header.stamp * 1e-9, np.ascontiguousarray(image_to_array(image)))
+                line = why or f"view {collector.count} of {wanted}; {collector.hint}"
+                if line != said:
+                    echo(line)
+                said = line
+        finally:
+            noting.cancel()
+
+    inspect(visit, cell=cell, domain=domain, connect=connect)
+    echo(f"{folder} holds {collector.count} views; next: zencell calibrate hand-eye {folder} --intrinsics FILE "
+         "--camera hand|beside")
+
+
+async def next_of(pictures: Reader[Image], noting: asyncio.Task[None]) -> Image:
+    """The next picture.
+
+    Raises:
+        NoPicture: none comes.
+    """
+    coming = asyncio.ensure_future(pictures.next())
+    done, _ = await asyncio.wait({coming, noting}, timeout=FIRST_PICTURE, return_when=asyncio.FIRST_COMPLETED)
+    if coming in done:
+        return coming.result()
+    coming.cancel()
+    if noting in done:
+        noting.result()
+    raise NoPicture(f"no picture came for {FIRST_PICTURE:g} s: is a camera up, and its key right (--key)?")
 
 
 def board_of(squares: str, square: str, marker: str, dictionary: str) -> Board:
