@@ -199,6 +199,7 @@ def planners(summary: dict[str, object]) -> set[str]:
 
 
 @pytest.mark.parametrize("line", HERE)
+@pytest.mark.slow
 def test_cell_of_the_clone_runs_with_one_part_of_ours(line: str, folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "summary.json"
     with no_processes():
@@ -282,6 +283,7 @@ def test_task_of_one_file_moves_a_cube_as_processes(folder: Path, tmp_path: Path
     assert_cube_moved(file, ran.stdout, recording, folder, tmp_path / "elsewhere")
 
 
+@pytest.mark.slow
 def test_task_of_one_file_moves_a_cube_and_ends_the_run_with_a_status_and_figures_of_its_own(
     folder: Path, tmp_path: Path
 ) -> None:

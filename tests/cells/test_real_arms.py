@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from pathlib import Path
 
@@ -36,6 +37,17 @@ def check_traced(cell: RunningCell, host: UrHost, stops: int = 0) -> None:
     assert summary["state"] == "DONE" and summary["failures"] == 0, cell.text
     assert summary["outline"]["fraction"] > 0.99, summary["outline"]
     assert host.tell()["stops"] == stops, cell.tail()
+
+
+async def check_told(cell: RunningCell) -> None:
+    """What a person tells the arm's controller from a terminal, while it moves."""
+    for words, said in (
+        (("io",), "inputs on: none\noutputs on: none"),
+        (("io", "3", "up"), "zencell: io: 'up' must be on or off"),
+        (("io", "99", "on"), "zencell: output.output: 99 must be less than 32"),
+    ):
+        done = await asyncio.to_thread(cell.tell, "robot", *words)
+        assert (done.stdout + done.stderr).strip() == said
 
 
 async def test_an_outline_is_traced_through_a_protective_stop_and_a_pulled_cable(tmp_path: Path) -> None:
@@ -91,6 +103,7 @@ async def test_an_outline_is_traced_at_thirty_percent_of_the_slider(tmp_path: Pa
             motion = bus.reader(topics.MOTION_STATUS)
             await until(motion, lambda status: status.state == "active" and status.progress > 0.2, WHOLE)
             assert motion.latest is not None and motion.latest.speed_scaling == pytest.approx(0.3)
+            await check_told(cell)
             assert await cell.ended(WHOLE + SOON) == 0, cell.tail()
         check_traced(cell, host)
         assert host.tell()["fastest"] <= 0.3 * 3.14159 * 1.05

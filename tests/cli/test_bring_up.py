@@ -28,6 +28,7 @@ def test_services_are_let_through_in_order_and_stopped_in_reverse(zencell: Start
     assert not any("Traceback" in line for line in command.lines)
 
 
+@pytest.mark.slow
 def test_what_crashes_at_its_start_or_is_killed_later_is_started_again_and_shown(zencell: Start) -> None:
     command = zencell("up", "tiny.yaml", "--set", "services.middle.behave=crash once")
     command.until("RuntimeError: a bug")
@@ -44,6 +45,7 @@ def test_what_crashes_at_its_start_or_is_killed_later_is_started_again_and_shown
     assert not command.children()
 
 
+@pytest.mark.slow
 def test_wrong_configuration_of_one_service_ends_everything_with_one_line(zencell: Start) -> None:
     command = zencell("up", "tiny.yaml", "--set", "services.middle.plcaed=3")
     assert command.end() == 2

@@ -77,6 +77,7 @@ def test_it_tells_residuals_uncertainty_and_what_comes_next(calibrated, tmp_path
     assert "position" not in yaml.safe_load(Path(path).read_text())
 
 
+@pytest.mark.slow
 def test_a_video_serves_as_well_as_pictures(pictures, tmp_path):
     path = str(tmp_path / "views.avi")
     writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"FFV1"), 10, (640, 480))

@@ -128,7 +128,7 @@ def test_missing_description_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_robots_and_cells_that_come_with_us_are_well() -> None:
     assert [(finding.level, finding.what.split(":")[0]) for finding in configuration.robots()] == [
-        ("ok", "robot panda"), ("ok", "robot ur5")]
+        ("ok", "robot fr3"), ("ok", "robot panda"), ("ok", "robot ur5")]
     assert [(finding.level, finding.what.split(":")[0]) for finding in configuration.cells()] == [
         ("ok", "cell panda"), ("ok", "cell ur5")]
 

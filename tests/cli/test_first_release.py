@@ -93,6 +93,7 @@ def test_report_tells_how_it_went(old: Old, tmp_path: Path) -> None:
     assert "Not understood" not in page
 
 
+@pytest.mark.slow
 def test_export_leaves_nothing_out(old: Old, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert app.execute(["export", str(old.path), "--csv", str(tmp_path / "csv"), "--images", str(tmp_path / "png"),
                         "--foxglove", str(tmp_path / "foxglove.mcap")]) == 0

@@ -149,6 +149,7 @@ def test_metadata_that_cannot_be_is_one_line(
     {"overrides": ["application=secret.module"]}, {"overrides": ["services.x.module=secret.module"]},
     {"overrides": ["world={{a: &a [1], b: *a}}"]}, {"about": {"cell": "secret.yaml"}},
 ], ids=str)
+@pytest.mark.slow
 def test_no_file_is_read_that_a_recording_names(
     names: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

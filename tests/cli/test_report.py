@@ -198,6 +198,7 @@ def test_a_recording_that_ran_faster_tells_latency_in_wall_time(tmp_path):
     assert "3 frames: median 20.0 ms" in Page((tmp_path / "fast.html").read_text()).sections["latency"]
 
 
+@pytest.mark.slow
 def test_an_outline_is_compared_with_what_was_traced(tmp_path):
     path = tmp_path / "outline.mcap"
     tape = Tape(path, "ur5", world="w2")
@@ -253,6 +254,7 @@ def test_an_application_of_ones_own_is_told_of_in_its_own_words(tmp_path, monkey
     assert "RUBBING" in page.sections["timeline"]
 
 
+@pytest.mark.slow
 def test_the_recording_of_a_cell_that_is_not_here_has_no_limits_and_says_so(tmp_path):
     path = tmp_path / "away.mcap"
     tape = Tape(path, "elsewhere")

@@ -21,7 +21,7 @@ SMALL = ["panda", "--set", "world.count=1"]
 
 
 def test_campaign_with_faults_tells_what_was_made_and_checked(capfd):
-    code = app.execute(["simulate", *SMALL, "--seeds", "1-2", "--faults", "--jobs", "2"])
+    code = app.execute(["simulate", *SMALL, "--seeds", "1-2", "--faults", "--doubles", "--jobs", "2"])
     told = capfd.readouterr().out
     assert code == 0, told
     assert "2 of 2 (100.0%)" in told
@@ -39,6 +39,7 @@ def test_campaign_that_does_not_end_names_each_seed_and_fails(capfd):
     assert "seed 4" in told and "seed 5" in told and "NOT ENDED" in told
 
 
+@pytest.mark.slow
 def test_one_seed_is_told_in_full_and_leaves_a_recording_that_opens(tmp_path: Path, capfd):
     file = tmp_path / "seed.mcap"
     assert app.execute(["simulate", *SMALL, "--seed", "7", "--faults", "--trace", str(file)]) == 0
@@ -71,6 +72,7 @@ def test_bad_input_gets_one_line(arguments, told, capfd):
     assert told in said and "\n" not in said
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_it_with_what_there_is_and_leaves_no_process_behind():
     running = subprocess.Popen(
         [sys.executable, "-m", "cli.main", "simulate", *SMALL, "--seeds", "1-500", "--jobs", "2", "--limit", "5"],

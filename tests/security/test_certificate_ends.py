@@ -168,6 +168,7 @@ def test_what_cannot_be_used_leaves_in_force_what_was_there(
     assert is_let_in(endpoint, credentials_of("operator", folder))
 
 
+@pytest.mark.slow
 def test_a_certificate_that_ends_opens_nothing_new_and_ends_nothing_that_runs(folder: Path, endpoint: str) -> None:
     lasts = 3.0  # [s]
     Authority.load(folder / "ca.pem", folder / "ca.key").issue(

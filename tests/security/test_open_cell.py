@@ -60,6 +60,7 @@ def test_an_open_cell_is_reached_from_its_own_machine_only_and_scouts_for_nobody
         assert warnings_in(cell) == []
 
 
+@pytest.mark.slow
 def test_an_open_cell_that_listens_wider_warns_and_names_what_closes_it(tmp_path: Path) -> None:
     endpoint = f"tcp/0.0.0.0:{free_port()}"
     with RunningCell(tmp_path, "up", "panda", "--only", "robot_state_publisher,vision_detector", "--listen",

@@ -59,6 +59,7 @@ def cell(tmp_path_factory):
     return str(root / "cell.yaml")
 
 
+@pytest.mark.slow
 async def test_balls_are_found_where_they_are_within_two_millimetres(cell):
     loaded, net = load_cell(cell), LocalNetwork()
     bus = net.bus()

@@ -206,6 +206,7 @@ RARE: dict[str, Callable[..., Any]] = {
 
 
 @pytest.mark.parametrize("service", TUNABLE)
+@pytest.mark.slow
 async def test_every_tunable_parameter_is_read_anew_for_the_next_thing_that_a_service_does(
     service: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -504,7 +504,7 @@ async def test_wrong_message_is_refused_and_the_next_one_served(robot: RobotMode
 
 
 async def test_unknown_backend_stops_it_with_the_choices() -> None:
-    with pytest.raises(UnknownName, match="choices: lag, mock"):
+    with pytest.raises(UnknownName, match="choices: franka, lag, mock, ur"):
         async with executor("robot.hardware.backend=gazebo"):
             pass
 

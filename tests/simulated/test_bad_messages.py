@@ -24,6 +24,7 @@ async def keys_in(cell: Cell) -> list[str]:
     return list(owned_in({entry.name: await wiring_of(cell, entry) for entry in cell.services.values()}))
 
 
+@pytest.mark.slow
 def test_bad_messages_stop_no_service_and_a_ball_that_slips_is_taken_again() -> None:
     happened: set[tuple[str, str]] = set()
     keys: list[str] = []

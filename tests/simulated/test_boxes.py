@@ -61,6 +61,7 @@ class Heard:
             self.truth = decode(WorldObjects, raw.payload)
 
 
+@pytest.mark.slow
 def test_boxes_are_taken_by_their_narrow_sides_and_lie_in_the_container(cell: Cell) -> None:
     heard = Heard()
     outcome = Simulation(cell, 2, trace=cast(Trace, heard)).run()

@@ -27,6 +27,7 @@ def halfway(status: MotionStatus) -> bool:
     return status.state == "active" and status.progress > 0.3
 
 
+@pytest.mark.slow
 def test_task_and_scene_manager_are_killed_with_a_ball_in_the_hand() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         gripper = bus.reader(topics.GRIPPER_STATE)
@@ -55,6 +56,7 @@ def test_the_router_is_lost_in_the_middle_of_a_motion_which_goes_on_to_its_end()
     assert (summary["state"], summary["restarts"]) == ("DONE", {})
 
 
+@pytest.mark.slow
 def test_balls_that_are_moved_added_and_taken_away_end_up_where_they_should() -> None:
     def placing(status: PickPlaceStatus) -> bool:
         return status.state == "PLACING"

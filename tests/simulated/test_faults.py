@@ -38,11 +38,13 @@ def test_cell_ends_well_whatever_goes_wrong(cell, seed):
     assert all(count > 0 for count in outcome.checked.values()) and len(outcome.checked) >= 9
 
 
+@pytest.mark.slow
 def test_same_seed_is_the_same_run_with_faults_too():
     first, second = outcome_of("panda", 1), Simulation(PANDA, 1, faults=True, digest=True).run()
     assert first.digest == second.digest and first.faults == second.faults
 
 
+@pytest.mark.slow
 def test_run_of_a_campaign_is_repeated_by_its_seed():
     [among_others] = run_seeds(PANDA, [1], True, 1, LIMIT)
     alone = outcome_of("panda", 1)

@@ -86,6 +86,7 @@ def test_stopped_robot_stays_where_it_is_whoever_starts_again_until_a_person_sta
     assert summary["truth"]["in_box"] == 1 and summary["failures"] == 0
 
 
+@pytest.mark.slow
 def test_hold_of_a_person_and_the_speed_outlive_executor_and_task_and_nobody_else_lets_go() -> None:
     path = "services.trajectory_executor.speed_scaling"
 

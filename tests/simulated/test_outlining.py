@@ -28,6 +28,7 @@ def test_the_cube_is_outlined_and_every_figure_is_told() -> None:
     assert 0 < summary["seconds"]["moving"] <= summary["seconds"]["task"]
 
 
+@pytest.mark.slow
 def test_the_object_that_was_chosen_is_outlined() -> None:
     chosen: list[str] = []
 

@@ -64,6 +64,7 @@ async def pause_in_motion(cell: SimulatedCell, bus: Bus, stage: str) -> Any:
     return await until(status, lambda s: s.state in ("DONE", "ERROR"), 120)
 
 
+@pytest.mark.slow
 def test_panda_paused_on_its_way_goes_on_and_puts_every_ball_in_the_box() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         await pause_in_motion(cell, bus, "across")
@@ -107,6 +108,7 @@ def test_task_service_that_dies_while_paused_leaves_the_robot_held_until_somebod
     assert summary["truth"]["in_box"] == 1 and summary["restarts"] == {"smart_pick_place": 1}
 
 
+@pytest.mark.slow
 def test_stopped_robot_is_brought_home_by_a_person_and_the_task_starts_again() -> None:
     async def visit(cell: SimulatedCell, bus: Bus) -> None:
         joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)

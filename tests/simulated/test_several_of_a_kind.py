@@ -24,6 +24,7 @@ from services import camera_simulator
 CELL = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")
 
 
+@pytest.mark.slow
 def test_two_cameras_two_detectors_and_one_scene_clear_a_table_that_neither_camera_sees_wholly(tmp_path: Path) -> None:
     cell = load_cell(CELL)
     trace = Trace(tmp_path / "run.mcap", {"cell": cell.name}, Own.of(cell))
@@ -91,6 +92,7 @@ CUP = "robot.gripper={cup: {}, links: [panda_hand, panda_leftfinger, panda_right
 
 
 @pytest.mark.parametrize("gripper", [CUP, "robot.gripper.closing_axis=x"])
+@pytest.mark.slow
 def test_task_goes_by_what_the_robot_file_says_of_the_gripper(gripper: str) -> None:
     outcome = Simulation(load_cell("panda", ["world.count=1", gripper]), 1).run()
     assert (outcome.state, outcome.done, outcome.broken) == ("DONE", 1, []), outcome

@@ -11,7 +11,8 @@ SINGLE = (
     "common/transport/requests.py", "common/transport/tokens.py", "common/transport/trace.py",
     "common/supervision/supervisor.py", "common/supervision/operation.py",
 )
-REAL = ("common/hardware/driver.py", "common/hardware/ur.py")  # of real arms, which no simulation has
+REAL = tuple(f"common/hardware/{name}.py" for name in (  # of real arms, which no simulation has
+    "driver", "driver_process", "driven_gripper", "franka", "ur"))
 OF_THE_MACHINE = {"time", "uuid", "secrets", "random", "datetime"}
 
 

@@ -40,6 +40,7 @@ def test_panda_clears_the_table_without_any_time_passing():
 @pytest.mark.parametrize(("cell", "overrides"), [
     ("panda", ["world.count=1"]), pytest.param("ur5", [], marks=pytest.mark.slow),
 ])
+@pytest.mark.slow
 def test_same_seed_is_the_same_run_to_the_byte_in_any_process_and_another_is_not(cell, overrides):
     here = Simulation(load_cell(cell, overrides), 3, digest=True).run()
     assert here.messages > 1000

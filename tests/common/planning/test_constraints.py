@@ -112,6 +112,7 @@ def test_goal_region_is_entered_where_the_tool_stands_upright():
 
 
 @pytest.mark.parametrize("planner", ["joint_move", "lerp", "ptp", "rrt_connect", "ompl", "chomp", "trajopt", "lin"])
+@pytest.mark.slow
 def test_no_planner_returns_a_trajectory_that_breaks_a_constraint(planner):
     kept = refused = 0
     pipeline = with_planner(planner)
@@ -245,6 +246,7 @@ def test_tool_is_never_faster_than_asked_and_as_fast_where_it_may(planner, goal,
 @pytest.mark.parametrize(
     "what", ["tilt 0.3", "tilt 0.1", pytest.param("tilt 0.1, corridor", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["panda", "ur5"])
+@pytest.mark.slow
 def test_glass_is_carried_upright_over_a_wall_each_time(name, what):
     robot, pipeline = arms()[name == "ur5"]
     wanted, around = constraints_of(what, name), walled(name)

@@ -32,6 +32,7 @@ def test_same_seed_gives_the_same_pairs():
 
 
 @pytest.mark.parametrize("robot", [ROBOT, PANDA], ids=["ur5", "panda"])
+@pytest.mark.slow
 def test_pairs_called_never_do_not_collide_at_other_samples(robot):
     never = named(disabled_pairs(robot), "Never")
     assert never

@@ -115,6 +115,7 @@ def test_ompl_finds_the_way_where_the_kernel_is_not_built(monkeypatch):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.slow
 def test_each_algorithm_of_ompl_finds_a_way_around_a_wall(algorithm):
     request = to_joints(LEFT, RIGHT, planning_attempts=1, planning_time=20)
     response = with_planner("ompl", algorithm=algorithm, improving_time=1.5).plan(request, wall())

@@ -69,6 +69,7 @@ def test_what_begins_a_handshake_is_passed_on_byte_for_byte(port: int) -> None:
 
 
 @pytest.mark.parametrize("said", [b"", b"GET / HTTP/1.1\r\n", b"\x16\x03\x01\x00\x20\x02", b"\x16\x03"])
+@pytest.mark.slow
 def test_what_does_not_is_ended(port: int, echo: Echo, said: bytes) -> None:
     with joined(port) as connection:
         connection.sendall(said)

@@ -47,6 +47,7 @@ def seconds_to_decode(model: type[Message], payload: bytes) -> float:
 
 
 @pytest.mark.parametrize("model", [model for model in MESSAGES if model.most_bytes <= 4 * SMALL])
+@pytest.mark.slow
 def test_nothing_that_is_small_takes_long_to_refuse(model: type[Message]) -> None:
     worst = 0.0
     for field in model.model_fields:

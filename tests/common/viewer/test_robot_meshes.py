@@ -54,6 +54,7 @@ def corners(geometry: Any) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
+@pytest.mark.slow
 def test_every_visual_of_the_description_is_where_its_link_is(cell: str) -> None:
     robot = robot_of(cell)
     model, data = robot.full_model, robot.full_model.createData()
@@ -87,6 +88,7 @@ def test_colours_are_those_of_the_files() -> None:
 
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
+@pytest.mark.slow
 def test_few_triangles_are_left_and_no_part_is_lost(cell: str) -> None:
     robot = robot_of(cell)
     whole = visual_pieces(robot, 10**9)

@@ -111,6 +111,7 @@ def test_every_ball_of_random_layouts_is_found_within_a_millimetre(noise, bright
     # Without rims nothing in the picture shows the ball in the middle of seven.
     [(name, *p) for name in CLUSTERS for p in PICTURES if p[2] or name != "seven close together"],
 )
+@pytest.mark.slow
 def test_balls_that_touch_are_told_apart(name, noise, brightness, rim):
     rng = np.random.default_rng(2)
     for _ in range(5):

@@ -387,6 +387,24 @@ def test_what_is_seen_in_the_container_for_a_moment_only_does_not_count() -> Non
     assert (cell.contained, cell.task.status.placed) == (1, 1)
 
 
+def test_ball_that_hangs_over_the_container_while_it_is_let_go_counts_once() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.until("across")
+    asked: list[m.GripperCommand] = []
+    cell._grip = lambda request, header: asked.append(request)
+    cell.until("release")
+    cell.contained = 2  # one above the other, as a picture shows it while the fingers open
+    for _ in range(20):
+        cell.step()
+    del cell._grip
+    cell._grip(asked[-1], m.Header(stamp=int(cell.now * 1e9)))
+    cell.contained = 2  # as the picture before still says
+    cell.step()
+    cell.contained = 1
+    cell.until("DONE")
+    assert (cell.task.status.placed, cell.task.status.targets) == (1, 1)
+
+
 def test_restart_waits_for_what_the_task_before_it_had_begun() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.motion = m.MotionStatus(id="other-1", state="active")
