@@ -111,6 +111,7 @@ class ControlCycle:
         self._told_robot: dict[str, Any] | None = None
         self._carried: float | None = None  # [kg] that the arm's controller was told is held
         self._payload = 0  # number of that order
+        self._untold = False  # whether it came to nothing: it is given again when the arm has moved
         self._arm_fault, self._hand_fault = Fault("the arm"), Fault("the gripper")
         self._width_rate = 0.0
         self._told_motion: MotionStatus | None = None
@@ -199,10 +200,10 @@ class ControlCycle:
         return self._joint_state(header, dq)
 
     def _tell_payload(self, ready: bool) -> None:
-        """Have the arm's controller know what it carries: when that changes, and when it is ready anew."""
-        if not ready:
-            self._carried = None
-        elif self._own is not None and self._gripper is not None and self._fingers and self._fingers.payload:
+        """Have the arm's controller know what it carries: when that changes, and when it is ready anew; at rest only."""
+        if not ready or (self._untold and not self._arm.at_rest):
+            self._carried, self._untold = None, False
+        elif self._arm.at_rest and self._own is not None and self._gripper is not None and self._fingers and self._fingers.payload:
             held = self._gripper.held_mass
             if held != self._carried and not self._payload:
                 self._carried = held
@@ -211,7 +212,7 @@ class ControlCycle:
     def _news_of_payload(self) -> str:
         if self._own is None or not self._payload or (outcome := self._own.outcome(self._payload)) is None:
             return ""
-        self._payload = 0
+        self._payload, self._untold = 0, bool(outcome)
         return outcome and f"the arm was not told what it carries: {outcome}"
 
     def standing(self) -> Standing | None:

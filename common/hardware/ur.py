@@ -25,6 +25,8 @@ MODELS = r"^ur((3|5|10)e?|16e|15|20|30)$"
 CB3 = re.compile(r"^ur(3|5|10)$")
 LATEST = 0.15  # [s] without a new state of the arm, after which it counts as gone
 WATCHDOG = 10.0  # [Hz] less often, the arm's program ends by itself
+MOVES = 0.02  # [rad/s] faster than this, a joint does not rest
+SETTLES = 0.5  # [s] in which the arm rests once its set-points do
 PROGRAM_RUNS = 2  # of the robot's status bits
 POWER = 30.0  # [s] in which joints are powered, and brakes released
 VARIABLES = ["timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "safety_status_bits", "runtime_state",
@@ -206,6 +208,12 @@ class UrArm:
             return
         if act == "freedrive" and value:
             self._freedrive = True  # from now on nothing is servoed
+        elif act == "payload":
+            end = time.monotonic() + SETTLES
+            while max(map(abs, self._receive.getActualQd())) > MOVES:
+                if time.monotonic() > end:
+                    raise ValueError("cannot be told while the arm moves")
+                time.sleep(1 / self.rate)
         with self._using:
             if self._control is None:
                 raise ValueError(f"cannot {act}: {self._mode()[1] or 'the arm is not ready'}")
@@ -214,6 +222,7 @@ class UrArm:
                 done = self._control.teachMode() if value else self._control.endTeachMode()
                 self._freedrive = bool(value) and done
             elif act == "payload":
+                self._rest()  # its program takes no other order while it servoes
                 done = self._control.setPayload(value, list(more) or [0.0, 0.0, 0.0])
             else:
                 raise ValueError(f"it cannot {act}: enable, recover, freedrive, payload")

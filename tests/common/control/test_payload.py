@@ -7,12 +7,12 @@ from common.config import GripperConfig
 from common.control.cycle import ControlCycle
 from common.hardware.fingers import Fingers
 from common.hardware.interface import Limits
-from common.messages import GripperCommand, Header
+from common.messages import ExecuteRequest, GripperCommand, Header, JointTrajectory
 from tests.doubles.stopping_arm import StoppingArm
 
 PAYLOAD = {"mass": 0.9, "com": [0, 0, 0.06], "held": [0, 0, 0.16]}
 TWO = np.ones(2)
-LIMITS = Limits(("a", "b"), -TWO, TWO, TWO, TWO)
+LIMITS = Limits(("shoulder", "elbow"), -3 * TWO, 3 * TWO, 2 * TWO, 10 * TWO)
 
 
 class Rig:
@@ -30,6 +30,10 @@ class Rig:
             self.now += 0.01
             self.notes += self.cycle.step(Header(stamp=round(self.now * 1e9))).notes
         return self.arm.orders[before:]
+
+    def move(self, trajectory: JointTrajectory) -> None:
+        answer = self.cycle.execute(ExecuteRequest(id=f"{self.now:.2f}", trajectory=trajectory), self.now)
+        assert answer.state == "active", answer
 
     def told(self, width: float, **more: float) -> list[tuple[object, ...]]:
         self.cycle.command(GripperCommand(id=f"{self.now:.2f}", width=width, **more), self.now)
@@ -71,3 +75,25 @@ def test_nothing_is_told_where_the_robot_file_says_nothing_and_a_refusal_is_said
     rig.arm.stopped = False
     rig.run(3.0)
     assert [note for note in rig.notes if "carries" in note] == ["the arm was not told what it carries: too heavy"]
+
+
+def test_what_came_to_nothing_is_told_again_after_a_motion(rest_to_rest):
+    rig = Rig(payload=PAYLOAD)
+    rig.fingers.obstruct(0.05)
+    rig.arm.refuses = "cannot be told while the arm moves"
+    first = rig.told(0.0, expected_width=0.05, mass=0.3)
+    rig.arm.refuses = ""
+    assert len(first) == 1 and rig.run() == []
+    rig.move(rest_to_rest([0, 0], [0, 0.2]))
+    moving = rig.run(0.1)
+    assert not moving and rig.run(3.0) == first
+
+
+def test_what_changes_while_the_arm_moves_is_told_when_it_rests(rest_to_rest):
+    rig = Rig(payload=PAYLOAD)
+    rig.fingers.obstruct(0.05)
+    rig.told(0.0, expected_width=0.05, mass=0.3)
+    rig.move(rest_to_rest([0, 0], [0, 0.2]))
+    rig.run(0.1)
+    rig.cycle.command(GripperCommand(id="let go", width=0.08), rig.now)
+    assert rig.run(0.1) == [] and rig.run(3.0) == [("payload", 0.9, 0.0, 0.0, 0.06)]

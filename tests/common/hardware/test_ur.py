@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from common.errors import ConfigError
-from common.hardware.driver import DrivenArm
+from common.hardware.driver import DrivenArm, Reading
 from common.hardware.interface import Limits
 from common.hardware.loading import is_simulated
 from common.hardware.ur import Options, create
@@ -109,15 +109,22 @@ def test_a_program_that_ended_is_told_at_once_and_begun_again(host: UrHost, rig:
     assert multiprocessing.active_children() == driver, "by the same process"
 
 
-def test_an_arm_that_comes_to_rest_by_itself_says_so_before_it_rests(host: UrHost, rig: Rig) -> None:
+def test_an_arm_that_comes_to_rest_by_itself_says_so_before_it_rests(
+    host: UrHost, rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rig.until_it_moves()
     rig.until("")
     assert rig.wave(0.7) == ""
-    time.sleep(rig.arm.ahead + 0.05)  # nobody sends anything
-    assert "ceased to come" in rig.cycle(rig.measured, 0 * SIX) and max(map(abs, host.tell()["qd"])) > 0.01
+    heard, hear = list[Reading](), rig.arm._process._hear
+    monkeypatch.setattr(rig.arm._process, "_hear", lambda told: (heard.append(told), hear(told)))
+    end = time.monotonic() + TIMEOUT
+    while not heard or not heard[-1].ceased:  # nobody sends anything
+        assert time.monotonic() < end
+        time.sleep(0.001)
+    assert max(map(abs, next(each for each in heard if each.ceased).state.dq)) > 0.05, "while it moves"
     while problem := rig.cycle(None, 0 * SIX):
         assert "ceased to come" in problem, "nor does it say anything else until it rests"
-    assert max(map(abs, host.tell()["qd"])) < 0.05, "but for what servoJ smooths"
+    assert max(map(abs, host.tell()["qd"])) < 0.1, "half of what it was, for servoJ smooths: its set-points rest"
 
 
 def test_a_protective_stop_says_so_and_is_left_only_when_somebody_asks(host: UrHost, rig: Rig) -> None:
@@ -215,7 +222,26 @@ def test_what_the_tool_carries_and_the_slider_are_told(host: UrHost, rig: Rig) -
         rig.cycle(None, 0 * SIX)
         assert time.monotonic() < end
     host.tell("slider 1")
-    assert "no act 'dance'" in rig.done(rig.arm.order("dance"))
+    assert "cannot dance" in rig.done(rig.arm.order("dance"))
+
+
+def test_what_it_carries_is_told_between_motions_only(host: UrHost, rig: Rig) -> None:
+    rig.until_it_moves()
+    rig.until("")
+    q0, began, orders = rig.measured, time.monotonic(), list[int]()
+    while (t := time.monotonic() - began) < np.pi:
+        assert rig.cycle(q0 + 0.1 * (1 - np.cos(2 * t)), 0.2 * np.sin(2 * t) * (1 + 0 * SIX)) == ""
+        if t > 0.7 and not orders:
+            orders.append(rig.arm.order("payload", 0.5))
+    before = host.tell()["payload"][0]
+    assert "while the arm moves" in rig.done(orders[0]) and before != 0.5
+    rig.until("")
+    number = rig.arm.order("payload", 0.5, 0.0, 0.0, 0.1)
+    q, end = rig.measured, time.monotonic() + TIMEOUT
+    while (outcome := rig.arm.outcome(number)) is None:
+        assert rig.cycle(q, 0 * SIX) == "" and time.monotonic() < end
+    assert outcome == "" and host.tell()["payload"] == [0.5, 0.0, 0.0, 0.1]
+    assert rig.wave(0.7) == "", "and goes on"
 
 
 def test_nobody_at_the_address_is_told_without_end() -> None:
