@@ -200,10 +200,12 @@ class ControlCycle:
         return self._joint_state(header, dq)
 
     def _tell_payload(self, ready: bool) -> None:
-        """Have the arm's controller know what it carries: when that changes, and when it is ready anew; at rest only."""
+        """Have the arm's controller know what it carries, at rest: when that changes, and when it is ready anew."""
         if not ready or (self._untold and not self._arm.at_rest):
             self._carried, self._untold = None, False
-        elif self._arm.at_rest and self._own is not None and self._gripper is not None and self._fingers and self._fingers.payload:
+        elif not self._arm.at_rest or self._own is None:
+            return
+        elif self._gripper is not None and self._fingers is not None and self._fingers.payload is not None:
             held = self._gripper.held_mass
             if held != self._carried and not self._payload:
                 self._carried = held
