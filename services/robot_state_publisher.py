@@ -1,4 +1,4 @@
-"""Publishes where the robot's links are: tf from the joint states, tf_static for what never moves."""
+"""Publishes what the robot is, and where its links are: tf from the joint states, tf_static for what never moves."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import Field
 
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
-from common.messages import JointState, TFMessage, TransformStamped
+from common.messages import JointState, RobotDescription, TFMessage, TransformStamped
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_fields, rpy_to_matrix, transform
@@ -80,12 +80,24 @@ class LinkFrames:
         ]
 
 
+def description(robot: RobotModel, stamp: int) -> RobotDescription:
+    """What the arm is, for who moves it from outside."""
+    config, gripper = robot.config, robot.config.gripper
+    return RobotDescription.model_validate({
+        "header": {"stamp": stamp}, "joints": robot.joint_names, "lower": robot.lower.tolist(),
+        "upper": robot.upper.tolist(), "velocity": robot.velocity.tolist(), "tcp": config.tcp_link,
+        "named_poses": {name: list(robot.named(name)) for name in config.named_poses},
+        "gripper": gripper is not None, "fingers": gripper.links if gripper else [],
+        "gripper_width": gripper.max_width if gripper else 0.0})
+
+
 async def run(bus: Bus, config: Config) -> None:
     """Publish until cancelled."""
     joints = bus.reader(topics.JOINT_STATES)
     tf, tf_static = bus.writer(topics.TF), bus.writer(topics.TF_STATIC)
-    frames = LinkFrames(RobotModel.load(config.robot))
-    stamp = bus.header().stamp
+    robot, told_once = RobotModel.load(config.robot), bus.writer(topics.ROBOT_DESCRIPTION)
+    frames, stamp = LinkFrames(robot), bus.header().stamp
+    told_once.put(description(robot, stamp))
     base = stamped(WORLD, frames.root, frames.T_world_root, stamp)
     cameras = [
         stamped(WORLD, camera.frame, transform(rpy_to_matrix(*camera.rpy), camera.position), stamp)

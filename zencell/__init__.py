@@ -1,14 +1,69 @@
-"""Robot work cells as a mesh of processes over Zenoh; after `import zencell` the project's modules can be imported.
+"""Robot work cells as a mesh of processes over Zenoh, and the client for programs: `from zencell import Cell`.
 
-In a clone `common`, `services`, `cli` and `config` lie beside this package. In a wheel they lie below it, in a folder
-whose name is no Python name, so that no module has a second name there: docs/architecture.md, "Where modules live".
+After `import zencell` the project's modules can be imported, too. In a clone `common`, `services`, `cli` and `config`
+lie beside this package. In a wheel they lie below it, in a folder whose name is no Python name, so that no module has a
+second name there: docs/architecture.md, "Where modules live".
 """
 
+from __future__ import annotations
+
+import importlib
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 _WHEEL = Path(__file__).resolve().parent / "top-level"
 _FOLDER = str(_WHEEL if _WHEEL.is_dir() else _WHEEL.parent.parent)
 
 if _FOLDER not in sys.path:
     sys.path.insert(0, _FOLDER)
+
+if TYPE_CHECKING:
+    from common.client.arm import NotJogged
+    from common.client.cell import Cell
+    from common.client.goals import Plan, any_of, pose, region, through
+    from common.client.hearing import NothingHeard
+    from common.client.joining import NothingUp
+    from common.client.starting import NotStarted
+    from common.errors import (
+        ConfigError,
+        NoResponder,
+        RemoteError,
+        RequestFailed,
+        RequestLost,
+        RequestTimeout,
+        UnknownName,
+        ZencellError,
+    )
+    from common.messages import Pose
+    from common.process.operator_motion import MotionFailed
+
+_FROM = {  # imported when they are asked for: the command line starts without them
+    "common.client.arm": ("NotJogged",),
+    "common.client.cell": ("Cell",),
+    "common.client.goals": ("Plan", "any_of", "pose", "region", "through"),
+    "common.client.hearing": ("NothingHeard",),
+    "common.client.joining": ("NothingUp",),
+    "common.client.starting": ("NotStarted",),
+    "common.errors": ("ConfigError", "NoResponder", "RemoteError", "RequestFailed", "RequestLost", "RequestTimeout",
+                      "UnknownName", "ZencellError"),
+    "common.messages": ("Pose",),
+    "common.process.operator_motion": ("MotionFailed",),
+}
+_WHERE = {name: module for module, names in _FROM.items() for name in names}
+
+__all__ = [
+    "Cell", "ConfigError", "MotionFailed", "NoResponder", "NotJogged", "NotStarted", "NothingHeard", "NothingUp",
+    "Plan", "Pose", "RemoteError", "RequestFailed", "RequestLost", "RequestTimeout", "UnknownName", "ZencellError", "any_of",
+    "pose", "region", "through",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _WHERE:
+        raise AttributeError(f"module 'zencell' has no attribute {name!r}")
+    return getattr(importlib.import_module(_WHERE[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

@@ -102,6 +102,8 @@ def load_cell(
             _override(tree, parts, camera)
         elif len(parts) > 1 or parts[0] not in WHOLE:
             _override(tree, parts, value)
+    if "run" in tree:
+        raise ConfigError("run", tree["run"], "is no section of a cell: autostart and seed stand at its top")
     run = {"cell": tree.pop("cell", path.stem), "autostart": tree.pop("autostart", True), "seed": tree.pop("seed", 0)}
     if seed is not None:
         run["seed"] = seed

@@ -54,7 +54,7 @@ from common.messages.processes import (
     ServiceStatus,
     SupervisorStatus,
 )
-from common.messages.robot import JointState, JointTrajectory, JointTrajectoryPoint
+from common.messages.robot import JointState, JointTrajectory, JointTrajectoryPoint, RobotDescription
 from common.messages.scene import AttachedObject, CollisionObject, PlanningScene
 from common.messages.task import PlanFigure, TaskCommand, TaskStatus
 from common.messages.world import SceneUpdate, WorldEdit, WorldEditReply, WorldObject, WorldObjects

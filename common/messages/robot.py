@@ -35,6 +35,30 @@ class JointState(Message):
         return self
 
 
+class RobotDescription(Message):
+    """What an arm is, for who moves it from outside: `joints` are those of goals and plans, in their order."""
+
+    most_bytes: ClassVar[int] = 4 * SMALL
+
+    header: Header = Header()
+    joints: list[Name] = Field(max_length=MOST_JOINTS)
+    lower: Joints = Field(description="least positions [rad or m]")
+    upper: Joints = Field(description="greatest positions [rad or m]")
+    velocity: Joints = Field(description="speed limits [rad/s or m/s]")
+    tcp: Name = Field(description="frame of the tool centre point, which pose goals are for")
+    named_poses: dict[Name, Joints] = Field({}, max_length=200)
+    gripper: bool = False
+    fingers: list[Name] = Field([], max_length=100, description="links that touch what is grasped")
+    gripper_width: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="greatest width between the fingers [m]")
+
+    @model_validator(mode="after")
+    def _same_length(self) -> RobotDescription:
+        for field in ("lower", "upper", "velocity"):
+            if len(getattr(self, field)) != len(self.joints):
+                raise ValueError(f"{field} has {len(getattr(self, field))} values for {len(self.joints)} joints")
+        return self
+
+
 class JointTrajectoryPoint(Message):
     """State of all joints at a time [s] after the start."""
 

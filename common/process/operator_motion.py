@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from common import messages as m
 from common import topics
 from common.application import applications
+from common.config import check
 from common.errors import RequestFailed, ZencellError
 from common.sources import new_id
 from common.transport.bus import Bus
@@ -23,7 +24,7 @@ from common.transport.reader import Reader
 log = logging.getLogger(__name__)
 
 PLANNING_TIME = 5.0  # [s] wall
-PLAN_TIMEOUT = PLANNING_TIME + 15.0  # [s] wall: what is planned for somebody else comes first
+SLOWER = 15.0  # [s] wall for the answer besides: what is planned for somebody else comes first
 REQUEST_TIMEOUT = 2.0  # [s] wall
 PATIENCE = 10.0  # [s] wall without progress, unless the robot is held
 FIRST_WORD = 0.5  # [s] wall in which a state that there is has arrived
@@ -69,52 +70,50 @@ class OperatorMotion:
             tasks = [bus.reader(found.status) for found in applications()]
         self._tasks = tasks
 
-    async def plan(self, goal: Goal, *, planner: str = "", straight: bool = False) -> m.PlanResponse:
+    async def plan(self, goal: Goal, **more: Any) -> m.PlanResponse:
         """A trajectory from where the robot is, or what is in its way; nothing moves.
 
         Args:
             goal: where to.
-            planner: name of the only one to use; else those of the pipeline.
-            straight: only a straight line of the tool will do.
+            more: other fields of a `PlanRequest`, such as planner and straight.
 
         Raises:
+            ConfigError: a field that is not one, or cannot be used.
             RequestFailed: the planner does not answer, or does not know the scene or the robot's state yet.
         """
-        request = m.PlanRequest(
-            id=_mint(), stage="operator", goal=goal, planner=planner, straight=straight, planning_time=PLANNING_TIME,
-        )
-        return await self._plan.call(request, PLAN_TIMEOUT)
+        fields = {"id": _mint(), "stage": "operator", "goal": goal, "planning_time": PLANNING_TIME, **more}
+        request = check(m.PlanRequest, fields, "plan")
+        return await self._plan.call(request, (request.planning_time or PLANNING_TIME) + SLOWER)
 
-    async def move(
-        self, goal: Goal, *, planner: str = "", straight: bool = False, timeout: float = PATIENCE
-    ) -> m.MotionStatus:
+    async def move(self, goal: Goal, *, timeout: float = PATIENCE, **more: Any) -> m.MotionStatus:
         """The last status of a motion to the goal, once it has succeeded. When cancelled, the robot is stopped.
 
         Args:
             goal: where to.
-            planner: name of the only one to use; else those of the pipeline.
-            straight: only a straight line of the tool will do.
+            more: as `plan` takes it.
             timeout: give up and stop after so long without progress, but for the time that the robot is held [s, wall].
 
         Raises:
             MotionFailed: a task has the robot, there is no way, or the motion ended otherwise.
             RequestFailed: planner or executor do not answer.
         """
-        before = await self._require_free()
-        response = await self.plan(goal, planner=planner, straight=straight)
+        before = await self.require_free()
+        response = await self.plan(goal, **more)
         if not response.ok or response.trajectory is None:
             raise MotionFailed(response.error, response.message)
         return await self._follow(response.trajectory, timeout, before.newest, response)
 
-    async def follow(self, trajectory: m.JointTrajectory, *, timeout: float = PATIENCE) -> m.MotionStatus:
-        """The last status of following a trajectory that was planned before; as `move` otherwise."""
-        return await self._follow(trajectory, timeout, (await self._require_free()).newest)
+    async def follow(
+        self, trajectory: m.JointTrajectory, *, timeout: float = PATIENCE, plan: m.PlanResponse | None = None
+    ) -> m.MotionStatus:
+        """The last status of following a trajectory that was planned before, by that plan; as `move` otherwise."""
+        return await self._follow(trajectory, timeout, (await self.require_free()).newest, plan)
 
     async def _follow(
         self, trajectory: m.JointTrajectory, timeout: float, heard: int, plan: m.PlanResponse | None = None
     ) -> m.MotionStatus:
         """As `follow`; what was said later than `heard`, when the motion was asked for, keeps the robot."""
-        if (await self._require_free()).held:  # with nothing under way, letting go moves nothing, nor does it later
+        if (await self.require_free()).held:  # with nothing under way, letting go moves nothing, nor does it later
             await self._hold.call(m.HoldRequest(hold=False, reason="a person moves the robot", owner=self._owner(),
                                                 into_stop=True, heard=heard), REQUEST_TIMEOUT)
         request = m.ExecuteRequest(
@@ -130,8 +129,12 @@ class OperatorMotion:
             await self._bring_to_rest(request.id)
             raise
 
-    async def _require_free(self) -> m.MotionStatus:
-        """The motion status, when nothing and nobody moves the robot."""
+    async def require_free(self) -> m.MotionStatus:
+        """The motion status, when nothing and nobody moves the robot.
+
+        Raises:
+            MotionFailed: a task or another person has it, or nobody says how it is.
+        """
         status = await self._known()
         self._require_no_task()
         for inhibit in status.inhibits:

@@ -1,0 +1,309 @@
+"""A work cell for a program: `async with Cell("panda") as cell: await cell.arm.move("home")`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections.abc import AsyncIterator, Mapping, Sequence
+from typing import Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from common import topics
+from common.application import find_topic
+from common.client.arm import Arm, Hand
+from common.client.hearing import Camera, Carried, Ear, Frames, NothingHeard, cameras, messages, the_camera, topic_in
+from common.client.joining import cell_clock, joined, person
+from common.client.parameters import Parameters
+from common.client.starting import Started
+from common.client.task import TaskControl
+from common.config import check
+from common.errors import ConfigError, UnknownName, ZencellError
+from common.messages import CollisionObject, Header, Message, PlanningScene, SupervisorStatus, WorldEdit, WorldObject
+from common.topics import Request, Topic
+from common.transport.bus import Bus
+from common.transport.credentials import OPERATOR
+
+TIMEOUT = 5.0  # [s] wall for an answer
+NOT_JOINED = "is not joined: use it inside `async with Cell(...) as cell`"
+
+
+def seen(scene: PlanningScene) -> list[CollisionObject]:
+    """What was perceived of a planning scene."""
+    return [each for each in scene.objects if each.role in ("target", "contained")]
+
+
+class World:
+    """The simulated world; a real one is not changed by saying so."""
+
+    def __init__(self, bus: Bus, ear: Ear) -> None:
+        """The world of a cell."""
+        self._bus, self._ear = bus, ear
+
+    async def edit(self, op: str, **fields: Any) -> list[str]:
+        """Ids of all there is after an edit: the fields are those of a `WorldEdit`."""
+        asked = check(WorldEdit, {"op": op, **fields}, "world")
+        return (await self._bus.client(topics.WORLD_EDIT).call(asked, TIMEOUT)).ids
+
+    async def add(self, x: float, y: float, **more: Any) -> list[str]:
+        """Put one more object at a place [m]: like the first of the world, but for what else is said."""
+        return await self.edit("add", position={"x": x, "y": y}, **more)
+
+    async def move(self, name: str, x: float, y: float, **more: Any) -> list[str]:
+        """Put an object elsewhere [m]."""
+        return await self.edit("move", id=name, position={"x": x, "y": y}, **more)
+
+    async def remove(self, name: str) -> list[str]:
+        """Take an object away."""
+        return await self.edit("remove", id=name)
+
+    async def reset(self) -> list[str]:
+        """Bring the first layout back."""
+        return await self.edit("reset")
+
+    async def objects(self) -> list[WorldObject]:
+        """The truth: where everything is. What perceives must not use it."""
+        return (await self._ear.newest(topics.SCENE_OBJECTS)).objects
+
+
+class Cell:
+    """One work cell. Inside `async with` it is joined; many programs may be in one cell at the same time.
+
+    Attributes:
+        arm: where it is, plans, motions, jogging.
+        gripper: the fingers or cup.
+        task: start, pause, resume, stop, and how far it is.
+        param: parameters of the services by path.
+        world: the simulated world.
+        bus: what all of this stands on.
+    """
+
+    arm: Arm
+    gripper: Hand
+    task: TaskControl
+    param: Parameters
+    world: World
+
+    def __init__(
+        self, name: str | None = None, *, domain: int | str | None = None, connect: str | None = None,
+        secure: str | None = None, owner: str | None = None, application: str = "",
+        remapped: Mapping[str, str] | None = None,
+    ) -> None:
+        """A cell that is up; nothing is done before `async with`.
+
+        Args:
+            name: of the cell; not needed while only one is up.
+            domain: 0 to 232, as given to `--domain`; else ZENCELL_DOMAIN, or 42.
+            connect: endpoint of its router, as tcp/192.168.1.10:7489; else ZENCELL_CONNECT.
+            secure: folder of certificates, in which there is the operator's; else ZENCELL_SECURE.
+            owner: in whose name it is moved; user and host if not given.
+            application: dotted module of the cell's application, if it is one of your own.
+            remapped: keys of the cell by the platform's words, where a cell has several arms: as `topics:` of a
+                service in a cell file.
+        """
+        self._where: dict[str, Any] = {"domain": domain, "connect": connect, "secure": secure, "remapped": remapped}
+        self._name, self._application = name, application
+        self.owner = owner or person()
+        self._joined = contextlib.AsyncExitStack()
+        self._started: Started | None = None
+        self._bus: Bus | None = None
+        self._frames: Frames | None = None
+
+    @classmethod
+    def start(
+        cls, cell: str, *, speed: float = 1.0, world: str | None = None, seed: int | None = None,
+        overrides: Sequence[str] = (), autostart: bool = False, viewer: bool = False, domain: int | str | None = None,
+        owner: str | None = None, application: str = "",
+    ) -> Cell:
+        """A cell that is brought up when it is entered with `async with`, and ended when that is left.
+
+        Args:
+            cell: a name of `zencell cells`, or the path of a YAML file.
+            speed: cell time per wall time, 0.1 to 10; 1 with a real arm.
+            world: another one, by name or path.
+            seed: of everything random.
+            overrides: values of the cell, as of `--set`.
+            autostart: whether its task begins by itself; else nothing moves until it is asked to.
+            viewer: whether it has the operator's page.
+            domain: 0 to 232; one that is free if not given.
+            owner: in whose name it is moved; user and host if not given.
+            application: dotted module of the cell's application, if it is one of your own.
+        """
+        made = cls(owner=owner, application=application)
+        values = [*overrides, f"autostart={str(autostart).lower()}"]
+        made._started = Started(cell, speed=speed, world=world, seed=seed, overrides=values, viewer=viewer,
+                                domain=domain)
+        return made
+
+    @classmethod
+    def on(cls, bus: Bus, *, owner: str | None = None, application: str = "") -> Cell:
+        """A cell that a bus is in already, which is not closed from here."""
+        made = cls(bus.cell, owner=owner, application=application)
+        made._take(bus)
+        return made
+
+    def _take(self, bus: Bus) -> None:
+        self._bus, self._ear = bus, Ear(bus)
+        self.arm = Arm(self._ear, self.owner, self.tf)
+        self.gripper = Hand(self._ear, self.owner, self.arm)
+        self.task = TaskControl(self._ear, self.owner, self._application)
+        self.param = Parameters(bus)
+        self.world = World(bus, self._ear)
+
+    async def __aenter__(self) -> Cell:
+        async with contextlib.AsyncExitStack() as stack:
+            if self._started is not None:
+                up = await stack.enter_async_context(self._started)
+                self._name, self._where = up.name, {**self._where, "domain": up.domain}
+            if self._bus is None:
+                bus = await stack.enter_async_context(joined(self._name, identity=OPERATOR, **self._where))
+                bus.clock = await cell_clock(bus)
+                self._take(bus)
+                stack.callback(setattr, self, "_bus", None)
+            self._joined = stack.pop_all()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._frames = None
+        await self._joined.aclose()
+
+    def __getattr__(self, name: str) -> Any:
+        """Say why an attribute is not there yet.
+
+        Raises:
+            ZencellError: the cell is not joined.
+            AttributeError: there is no such attribute at all.
+        """
+        if name in Cell.__annotations__:
+            raise ZencellError(f"cell.{name}: the cell {NOT_JOINED}")
+        raise AttributeError(f"a Cell has no {name!r}")
+
+    @property
+    def bus(self) -> Bus:
+        """The program's place in the cell, for what is not here.
+
+        Raises:
+            ZencellError: it is not joined.
+        """
+        if self._bus is None:
+            raise ZencellError(f"the cell {NOT_JOINED}")
+        return self._bus
+
+    @property
+    def name(self) -> str:
+        """Of the cell, the first part of all its keys."""
+        return self.bus.cell
+
+    async def services(self) -> SupervisorStatus:
+        """All processes of the cell, its speed and seed, as its supervisor has them."""
+        return await self._ear.newest(topics.SUPERVISOR_STATUS)
+
+    # --- what is seen ---------------------------------------------------------------------------------------------
+
+    async def cameras(self) -> list[str]:
+        """Names of its cameras."""
+        return await cameras(self.bus)
+
+    async def camera(self, name: str = "") -> Camera:
+        """A camera; its name may be left out where there is one.
+
+        Raises:
+            UnknownName: with the choices.
+        """
+        return Camera(await the_camera(self.bus, name), self._ear, self.tf)
+
+    async def planning_scene(self) -> PlanningScene:
+        """What planners avoid: fixtures, and what was perceived."""
+        return await self._ear.newest(topics.PLANNING_SCENE)
+
+    async def objects(self, least: int = 0, *, timeout: float = TIMEOUT) -> list[CollisionObject]:
+        """What was perceived: ids, shapes, dimensions [m], colours, and poses in world.
+
+        Args:
+            least: wait until so many are seen: just after a start nobody has looked yet.
+            timeout: for so long [s, wall].
+
+        Raises:
+            NothingHeard: there are fewer.
+        """
+        reader, found = self._ear.reader(topics.PLANNING_SCENE), seen(await self.planning_scene())
+        try:
+            async with asyncio.timeout(timeout):
+                while len(found) < least:
+                    found = seen(await reader.next())
+        except TimeoutError:
+            raise NothingHeard(f"{self.name}/planning_scene of {least} objects, but of {len(found)}", timeout) from None
+        return found
+
+    async def tf(self, target: str, source: str) -> NDArray[np.float64]:
+        """The pose (4, 4) of one frame in another, now: "world", "tcp", and those of `zencell tf frames`.
+
+        Raises:
+            UnknownName: a frame that nobody tells of; with the choices.
+            NothingHeard: nobody tells of any.
+        """
+        target, source = [await self._frame(name) for name in (target, source)]
+        known = self._frames
+        if known is None:
+            known = self._frames = await self._joined.enter_async_context(Frames(self.bus))
+            await known.until_known(target, source)
+        else:
+            await known.until_known(target, source)
+            await known.until_moved()
+        return known.tree.pose(target, source)
+
+    async def _frame(self, name: str) -> str:
+        return (await self.arm.description()).tcp if name == "tcp" else name
+
+    # --- any key --------------------------------------------------------------------------------------------------
+
+    async def _carried(self, key: str | Carried) -> Carried | None:
+        return key if isinstance(key, Topic | Request) else find_topic(key) or await topic_in(self.bus, key)
+
+    async def call(
+        self, key: str | Request[Any, Any], message: Message | Mapping[str, Any] | None = None, *,
+        timeout: float = TIMEOUT, **fields: Any,
+    ) -> Any:
+        """The answer to a request.
+
+        Args:
+            key: such as "motion/stop", or the `Request`.
+            message: what is asked, or its fields.
+            timeout: [s, wall].
+            fields: of the message, when it is not given.
+
+        Raises:
+            UnknownName: there is no such request; with the choices.
+            ConfigError: a field that does not fit.
+            NoResponder, RemoteError, RequestLost, RequestTimeout: the four ways to no answer.
+        """
+        request = await self._carried(key)
+        if not isinstance(request, Request):
+            from common.application import all_topics
+
+            raise UnknownName("request", str(key), [n for n, each in all_topics().items() if isinstance(each, Request)])
+        if not math.isfinite(timeout) or timeout <= 0:
+            raise ConfigError("timeout", timeout, "must be more than 0")
+        asked = message if isinstance(message, Message) else check(
+            request.message, {**(message or {}), **fields}, request.key)
+        if isinstance(header := getattr(asked, "header", None), Header) and not header.stamp:
+            asked = asked.model_copy(update={"header": self.bus.header(header.frame_id)})  # decided now
+        return await self.bus.client(request).call(asked, timeout)
+
+    async def listen(self, key: str | Topic[Any]) -> AsyncIterator[Any]:
+        """Messages of a key from now on: of a stream or state the newest, of an event all.
+
+        What is not known here comes as it was packed: dictionaries, lists, numbers.
+        """
+        topic = await self._carried(key)
+        if isinstance(topic, Request):
+            raise ConfigError("key", topic.key, f"is a request: await cell.call({topic.key!r}, ...)")
+        if topic is not None:
+            async for message in messages(self.bus, topic):
+                yield message
+            return
+        async for sample in self.bus.raw_reader(f"{self.name}/{key}"):
+            yield msgpack.unpackb(sample.payload)

@@ -1,0 +1,245 @@
+"""What a program hears of a cell: the newest of a topic, frames, cameras."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable, Coroutine
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common import topics
+from common.application import find_topic
+from common.errors import RequestFailed, UnknownName, ZencellError
+from common.messages import CameraInfo, Image, Message
+from common.perception.image import image_to_array
+from common.robot.transform_tree import TransformTree
+from common.topics import Request, Topic
+from common.transport.bus import Bus
+from common.transport.ownership import Owner
+from common.transport.reader import Reader
+
+M = TypeVar("M", bound=Message)
+Array = NDArray[np.float64]
+Carried = Topic[Any] | Request[Any, Any]
+
+PATIENCE = 2.0  # [s] wall until what nothing was heard of counts as not there
+GATHER = 0.5  # [s] in which every moving frame surely comes once
+PICTURE, DEPTH, INFO = "image_raw", "depth/image_raw", "camera_info"  # last parts of keys of a camera
+
+
+class NothingHeard(RequestFailed):
+    """Nobody says what was asked for."""
+
+    def __init__(self, keys: str, seconds: float = PATIENCE) -> None:
+        super().__init__(f"nothing came on {keys} within {seconds:g} s")
+
+
+def topic_of_owner(owner: Owner) -> Carried | None:
+    """What an owner's key carries, known by the owner's own word for it."""
+    topic = find_topic(owner.own)
+    return replace(topic, key=owner.key) if topic else None
+
+
+async def topic_in(bus: Bus, key: str) -> Carried | None:
+    """What a key carries in the cell that is up, where only its owner knows."""
+    return next((topic_of_owner(owner) for owner in await bus.owners() if owner.key == key), None)
+
+
+class Ear:
+    """The newest messages of a cell: subscribed when first asked for, and from then on."""
+
+    def __init__(self, bus: Bus) -> None:
+        """Hear nothing yet."""
+        self.bus = bus
+        self._readers: dict[str, Reader[Any]] = {}
+
+    def reader(self, topic: Topic[M]) -> Reader[M]:
+        """The one reader of a topic; of an event topic take your own, all of which are for you."""
+        if topic.key not in self._readers:
+            self._readers[topic.key] = self.bus.reader(topic)
+        return self._readers[topic.key]
+
+    async def newest(self, topic: Topic[M], seconds: float = PATIENCE) -> M:
+        """The value of a state, the newest message of a stream; waits for the first.
+
+        Raises:
+            NothingHeard: none came.
+        """
+        reader = self.reader(topic)
+        return reader.latest or await self._next(reader, None, seconds)
+
+    async def fresh(self, topic: Topic[M], seconds: float = PATIENCE) -> M:
+        """The first message of a stream that comes from now on.
+
+        Raises:
+            NothingHeard: none came.
+        """
+        reader = self.reader(topic)
+        return await self._next(reader, reader.latest, seconds)
+
+    async def _next(self, reader: Reader[M], known: M | None, seconds: float) -> M:
+        try:
+            async with asyncio.timeout(seconds):
+                while True:
+                    found = await reader.next()
+                    if found is not known:
+                        return found
+        except TimeoutError:
+            raise NothingHeard(f"{self.bus.cell}/{reader.topic.key}", seconds) from None
+
+
+class Frames:
+    """The tree that tf and tf_static make, kept up to date inside an `async with`."""
+
+    def __init__(self, bus: Bus) -> None:
+        """Subscribe to both."""
+        self.tree = TransformTree()
+        self.moving: set[str] = set()
+        self._cell = bus.cell
+        self._changed = asyncio.Event()
+        self._moving, self._fixed = bus.reader(topics.TF), bus.reader(topics.TF_STATIC)
+        self._following: list[asyncio.Task[None]] = []
+
+    async def __aenter__(self) -> Frames:
+        followed: list[Coroutine[Any, Any, None]] = [self._follow_moving(), self._follow_fixed()]
+        self._following = [asyncio.create_task(each) for each in followed]
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        for task in self._following:
+            task.cancel()
+        await asyncio.gather(*self._following, return_exceptions=True)
+
+    async def _follow_moving(self) -> None:
+        async for message in self._moving:
+            self.tree.update(message)
+            self.moving.update(each.child_frame_id for each in message.transforms)
+            self._changed.set()
+
+    async def _follow_fixed(self) -> None:
+        async for message in self._fixed:
+            self.tree.update(message)
+            self._changed.set()
+
+    async def until_known(self, target: str, source: str) -> None:
+        """Return when the pose of source in target is known.
+
+        Raises:
+            NothingHeard: nothing came at all.
+            UnknownName, NotConnected: it still is not after a while.
+        """
+        try:
+            async with asyncio.timeout(PATIENCE):
+                while not self._known(target, source):
+                    self._changed.clear()
+                    await self._changed.wait()
+        except TimeoutError:
+            self._require_some()
+            self.tree.path(target, source)
+
+    async def until_moved(self) -> None:
+        """Return when the next transforms have come; at once where nothing moves."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(PATIENCE if self.moving else 0.0):
+                self._changed.clear()
+                await self._changed.wait()
+
+    def _known(self, target: str, source: str) -> bool:
+        try:
+            self.tree.path(target, source)
+        except ZencellError:
+            return False
+        return True
+
+    def _require_some(self) -> None:
+        if not self.tree.frames:
+            raise NothingHeard(f"{self._cell}/tf and {self._cell}/tf_static")
+
+    async def gather(self) -> None:
+        """Return when every frame that comes regularly is in the tree.
+
+        Raises:
+            NothingHeard: nothing came at all.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(PATIENCE):
+                while not self.tree.frames:
+                    self._changed.clear()
+                    await self._changed.wait()
+        self._require_some()
+        await asyncio.sleep(GATHER)
+
+
+class Camera:
+    """One camera of a cell. Lengths are in metres, pictures are arrays of (height, width) and channels."""
+
+    def __init__(self, name: str, ear: Ear, tf: Callable[[str, str], Coroutine[Any, Any, Array]]) -> None:
+        """A camera by the first part of its keys."""
+        self.name = name
+        self._ear, self._tf = ear, tf
+
+    async def image(self) -> NDArray[np.uint8]:
+        """The next picture, (height, width, 3) blue green red, or as its encoding says."""
+        return image_to_array(await self.message())
+
+    async def message(self) -> Image:
+        """The next picture as it travels, with its stamp and frame."""
+        return await self._ear.fresh(replace(topics.CAMERA_IMAGE, key=f"{self.name}/{PICTURE}"))
+
+    async def depth(self) -> NDArray[np.float32]:
+        """The next depth picture (height, width): metres along the optical axis, NaN where there is none.
+
+        Raises:
+            NothingHeard: the camera has no depth.
+        """
+        return image_to_array(await self._ear.fresh(replace(topics.DEPTH_CAMERA_DEPTH, key=f"{self.name}/{DEPTH}")))
+
+    async def info(self) -> CameraInfo:
+        """Size, frame, intrinsics and distortion."""
+        return await self._ear.newest(replace(topics.CAMERA_INFO, key=f"{self.name}/{INFO}"))
+
+    async def intrinsics(self) -> Array:
+        """The matrix (3, 3) [px]."""
+        return np.array((await self.info()).k).reshape(3, 3)
+
+    async def pose(self, frame: str = "world") -> Array:
+        """Where its optical frame is (4, 4): z looks out, x to the right and y down in the picture."""
+        return await self._tf(frame, (await self.info()).header.frame_id)
+
+
+async def cameras(bus: Bus) -> list[str]:
+    """Names of the cameras that are there now, sorted."""
+    found = set()
+    for owner in await bus.owners():
+        topic = topic_of_owner(owner)
+        if topic is not None and owner.own in (topics.CAMERA_INFO.key, topics.DEPTH_CAMERA_INFO.key):
+            found.add(owner.key.removesuffix(f"/{INFO}"))
+    return sorted(found)
+
+
+async def the_camera(bus: Bus, name: str) -> str:
+    """The name of a camera that is there; of the only one where none is given.
+
+    Raises:
+        UnknownName: there is no such camera, or there are several; with the choices.
+    """
+    there = await cameras(bus)
+    if not name and len(there) == 1:
+        return there[0]
+    if name not in there:
+        raise UnknownName("camera", name, there)
+    return name
+
+
+async def messages(bus: Bus, topic: Topic[M]) -> AsyncIterator[M]:
+    """Messages of a topic from now on: of a stream the newest, of an event all."""
+    reader = bus.reader(topic)
+    try:
+        async for message in reader:
+            yield message
+    finally:
+        bus.listen(reader, False)

@@ -1,0 +1,122 @@
+"""Taking part in a cell that is up, from a tool or a script: finding it, its clock, and who is there."""
+
+from __future__ import annotations
+
+import contextlib
+import getpass
+import os
+import socket
+from collections.abc import AsyncIterator, Mapping
+
+from common import topics
+from common.clock import Clock
+from common.errors import DecodeError, NoRouter, RequestFailed, UnknownName
+from common.messages import MotionStatus, SupervisorStatus
+from common.transport.bus import Bus
+from common.transport.codec import decode
+from common.transport.connect import connect as connect_to
+from common.transport.credentials import OPERATOR, SECURE_VARIABLE
+from common.transport.endpoint import endpoint_of
+
+TOOL = "zencell"
+CONNECT_TIMEOUT = 2.0  # [s] to reach the router
+LOOK_TIMEOUT = 1.0  # [s] to hear who is there
+ASK_TIMEOUT = 1.0  # [s]
+
+
+class NothingUp(RequestFailed):
+    """There is no cell to look at."""
+
+    def __init__(self, endpoint: str, what: str) -> None:
+        super().__init__(f"{what} at {endpoint}; is a cell up (`zencell up CELL`), and on this --domain or --connect?")
+        self.endpoint = endpoint
+
+
+@contextlib.asynccontextmanager
+async def joined(
+    cell: str | None = None, *, domain: str | int | None = None, connect: str | None = None, any_cell: bool = False,
+    identity: str = OPERATOR, remapped: Mapping[str, str] | None = None, secure: str | None = None,
+) -> AsyncIterator[Bus]:
+    """A bus in a cell that is up.
+
+    Args:
+        cell: its name; when not given, the one cell that is up.
+        domain: where, as given to `--domain`.
+        connect: where, as given to `--connect`.
+        any_cell: the visit is to the network, no cell needs to be up.
+        identity: whose certificate is shown in a secured cell.
+        remapped: keys of the cell by the platform's words for them, as `topics:` of a service in a cell file.
+        secure: folder of certificates; that of the environment when not given.
+
+    Raises:
+        NothingUp: there is no router, or no cell.
+        UnknownName: several cells are up and none was named.
+    """
+    environ = {**os.environ, SECURE_VARIABLE: secure} if secure else os.environ
+    endpoint = endpoint_of(domain, connect, environ)
+    try:
+        async with contextlib.AsyncExitStack() as stack:
+            if cell is None and not any_cell:
+                async with connect_to(
+                    cell="_", service=TOOL, endpoint=endpoint, timeout=CONNECT_TIMEOUT, identity=identity,
+                    secure=secure,
+                ) as bus:
+                    cell = _only({name for name, _ in await alive(bus)}, endpoint)
+            bus = await stack.enter_async_context(connect_to(
+                cell=cell or "_", service=TOOL, endpoint=endpoint, clock=Clock.from_environment(),
+                timeout=CONNECT_TIMEOUT, identity=identity, remapped=remapped,
+                secure=secure))
+            yield bus
+    except NoRouter:
+        raise NothingUp(endpoint, "no router") from None
+
+
+def _only(cells: set[str], endpoint: str) -> str:
+    if not cells:
+        raise NothingUp(endpoint, "there is a router and no service")
+    if len(cells) > 1:
+        raise UnknownName("cell (name one with --cell)", "", cells)
+    return cells.pop()
+
+
+async def alive(bus: Bus) -> list[tuple[str, str]]:
+    """Cell and name of every service on the network that is ready."""
+    tokens = [token.split("/") for token in await bus.raw_tokens("*/alive/*", LOOK_TIMEOUT)]
+    return [(token[0], token[2]) for token in tokens]
+
+
+async def supervisor_status(bus: Bus, cell: str = "") -> SupervisorStatus | None:
+    """What the supervisor of a cell, or of this one, says now; None without one, as in containers."""
+    for sample in await bus.raw_get(f"{cell or bus.cell}/{topics.SUPERVISOR_STATUS.key}", ASK_TIMEOUT):
+        try:
+            return decode(SupervisorStatus, sample.payload)
+        except DecodeError as error:
+            bus.log.warning("%s: %s", sample.key, error)
+    return None
+
+
+async def cell_clock(bus: Bus) -> Clock:
+    """The clock that the cell runs by; the environment's where no supervisor tells."""
+    status = await supervisor_status(bus)
+    if status is None or not status.epoch:
+        return bus.clock
+    here = status.host == socket.gethostname()  # another host has a clock of its own
+    return Clock(status.speed, status.epoch, status.booted if here and status.booted else None)
+
+
+async def newest_heard(bus: Bus) -> int:
+    """`since` of the newest stop or hold that can be known now: a start lets go of nothing later, 0 of nothing."""
+    newest = 0
+    for sample in await bus.raw_get(f"{bus.cell}/{topics.MOTION_STATUS.key}", ASK_TIMEOUT):
+        with contextlib.suppress(DecodeError):
+            newest = max(newest, decode(MotionStatus, sample.payload).newest)
+    return newest
+
+
+def person() -> str:
+    """Who gives a command here: what a cell remembers of who stopped or holds a robot."""
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a user without a name, as in a container
+        user = str(os.getuid()) if hasattr(os, "getuid") else "somebody"
+    return "".join(filter(str.isprintable, f"{user}@{socket.gethostname()}"))[:120]

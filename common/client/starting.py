@@ -1,0 +1,139 @@
+"""Bringing a cell up for a program, in processes of its own, and ending it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from common.client.joining import joined, supervisor_status
+from common.config import load_cell
+from common.errors import RequestFailed, ZencellError
+from common.supervision.launch import python_module, python_path, require_free_port
+from common.transport.endpoint import MAX_DOMAIN, endpoint_of, parse_domain
+from common.transport.router import PortInUse
+
+READY = 60.0  # [s] wall in which it is up
+LOOK = 0.1  # [s] between looks whether it is
+ENDS = 15.0  # [s] in which it ends when it is told to
+LAST_LINES = 5  # that are told of a start that failed
+
+
+class NotStarted(ZencellError):
+    """The cell did not come up."""
+
+    exit_code = 1
+
+    def __init__(self, cell: str, why: str) -> None:
+        super().__init__(f"{cell} did not come up: {why}")
+
+
+class Started:
+    """A cell that is up inside `async with`: `name` and `domain` say where."""
+
+    def __init__(
+        self, cell: str, *, speed: float, world: str | None, seed: int | None, overrides: Sequence[str], viewer: bool,
+        domain: int | str | None,
+    ) -> None:
+        """Take note of what is to be started; see `Cell.start`."""
+        self._cell, self._domain = cell, domain
+        self.name, self.domain = "", -1
+        self._arguments = ["up", cell, "--speed", f"{speed:g}"]
+        self._arguments += [] if viewer else ["--no-viewer"]
+        self._arguments += [] if world is None else ["--world", world]
+        self._arguments += [] if seed is None else ["--seed", str(seed)]
+        self._arguments += [part for value in overrides for part in ("--set", value)]
+        self._loaded = (cell, tuple(overrides), world, seed)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._log = Path()
+
+    async def __aenter__(self) -> Started:
+        cell, overrides, world, seed = self._loaded
+        loaded = await asyncio.to_thread(load_cell, cell, overrides, world=world, seed=seed)  # says what is wrong
+        self.name, self.domain = loaded.name, free_domain() if self._domain is None else parse_domain(self._domain)
+        self._folder = tempfile.TemporaryDirectory(prefix="zencell-")
+        self._log = Path(self._folder.name, "log")
+        self._process = await asyncio.to_thread(self._begin)
+        try:
+            async with asyncio.timeout(READY):
+                await self._until_up()
+        except BaseException as error:
+            said = self._last_lines()
+            await self._end()
+            if isinstance(error, TimeoutError):
+                raise NotStarted(self.name, f"not within {READY:g} s; {said}") from None
+            raise
+        return self
+
+    def _begin(self) -> subprocess.Popen[bytes]:
+        with self._log.open("wb") as out:
+            return subprocess.Popen(
+                [*python_module("zencell"), *self._arguments, "--domain", str(self.domain)],
+                stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, start_new_session=True,
+                env={**os.environ, "PYTHONPATH": python_path()})
+
+    async def _until_up(self) -> None:
+        """Return when all services are ready.
+
+        Raises:
+            NotStarted: it has ended instead.
+        """
+        while not await self._is_up():
+            assert self._process is not None
+            if self._process.poll() is not None:
+                raise NotStarted(self.name, self._last_lines())
+            await asyncio.sleep(LOOK)
+
+    async def _is_up(self) -> bool:
+        try:
+            async with joined(self.name, domain=self.domain) as bus:
+                status = await supervisor_status(bus)
+        except RequestFailed:
+            return False
+        return status is not None and all(service.state == "ready" for service in status.services)
+
+    def _last_lines(self) -> str:
+        lines = [line for line in self._log.read_text(errors="replace").splitlines() if line.strip()]
+        return " | ".join(lines[-LAST_LINES:]) or "it said nothing"
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._end()
+
+    async def _end(self) -> None:
+        process, folder = self._process, self._folder
+        self._process = self._folder = None
+        if process is not None:
+            await asyncio.shield(asyncio.to_thread(_end, process))
+        if folder is not None:
+            folder.cleanup()
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+    try:
+        process.wait(ENDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def free_domain() -> int:
+    """A domain at whose port nobody listens.
+
+    Raises:
+        NotStarted: all are taken.
+    """
+    for domain in random.SystemRandom().sample(range(MAX_DOMAIN + 1), MAX_DOMAIN + 1):
+        try:
+            require_free_port(endpoint_of(domain))
+        except PortInUse:
+            continue
+        return domain
+    raise NotStarted("the cell", "all domains are taken")

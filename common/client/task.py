@@ -1,0 +1,114 @@
+"""The task of a cell, for a program: start, pause, resume, stop, and how far it is."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+
+from common import topics
+from common.application import find_application
+from common.client.hearing import Ear, topic_of_owner
+from common.client.joining import newest_heard
+from common.errors import RequestFailed, UnknownName, ZencellError
+from common.messages import MotionStatus, StopRequest, TaskCommand, TaskStatus
+from common.topics import Topic
+
+TIMEOUT = 5.0  # [s] wall for an answer
+ENDED = ("DONE", "ERROR")
+
+
+class ArmOnly(ZencellError):
+    """The arm was stopped, though the task could not be told."""
+
+    exit_code = 1
+
+    def __init__(self, error: ZencellError) -> None:
+        super().__init__(f"the arm is stopped and stays so until a start; the task did not hear of it: {error}")
+
+
+class TaskControl:
+    """What a person may tell the task. `async for status in cell.task` hears of every change, until it is left."""
+
+    def __init__(self, ear: Ear, owner: str, application: str = "") -> None:
+        """The task of a cell; of an application of one's own, its dotted module is needed to hear of it."""
+        self._ear, self._bus, self._owner, self._application = ear, ear.bus, owner, application
+        self.unkept = ""  # what a stop would not outlive, in words
+
+    async def start(self, *, override: bool = False) -> TaskStatus:
+        """Start it, or start it again; a robot that you hold is let go, with `override` also one that others hold.
+
+        Raises:
+            RemoteError: somebody else stopped it or has the motion.
+        """
+        return await self._tell("start", override)
+
+    async def pause(self) -> TaskStatus:
+        """Bring the robot to rest on its path at once and hold it there."""
+        return await self._tell("pause")
+
+    async def resume(self, *, override: bool = False) -> TaskStatus:
+        """Let the robot go on along its path after a pause of yours."""
+        return await self._tell("resume", override)
+
+    async def stop(self) -> TaskStatus:
+        """Stop the robot, give up its motion, and wait for a start, also if the task does not answer.
+
+        Raises:
+            ArmOnly: the arm is stopped, but the task did not hear of it.
+            RequestFailed: neither heard of it.
+        """
+        stop = StopRequest(owner=self._owner)
+        arm = asyncio.create_task(self._bus.client(topics.MOTION_STOP).call(stop, TIMEOUT))
+        try:
+            told = await self._tell("stop")
+        except RequestFailed as error:
+            with contextlib.suppress(RequestFailed):
+                self._note(await arm)
+                raise ArmOnly(error) from None
+            raise
+        with contextlib.suppress(RequestFailed):
+            self._note(await arm)
+        return told
+
+    def _note(self, answer: MotionStatus) -> None:
+        self.unkept = answer.not_kept
+
+    async def _tell(self, command: str, override: bool = False) -> TaskStatus:
+        heard = await newest_heard(self._bus) if command in ("start", "resume") else None
+        asked = TaskCommand.model_validate({
+            "command": command, "by": self._owner, "override": override, "heard": heard})
+        return await self._bus.client(topics.TASK_COMMAND).call(asked, TIMEOUT)
+
+    async def topic(self) -> Topic[TaskStatus]:
+        """Where the task says how far it is.
+
+        Raises:
+            UnknownName: no task is there, or none that is known here.
+        """
+        if self._application:
+            return find_application(self._application).status
+        for owner in await self._bus.owners():
+            topic = topic_of_owner(owner)
+            if isinstance(topic, Topic) and issubclass(topic.message, TaskStatus):
+                return topic
+        raise UnknownName("task (application=MODULE names one of your own)", self._bus.cell, ())
+
+    async def status(self) -> TaskStatus:
+        """How far it is: its newest status."""
+        return await self._ear.newest(await self.topic())
+
+    async def __aiter__(self) -> AsyncIterator[TaskStatus]:
+        reader = self._bus.reader(await self.topic())
+        try:
+            async for status in reader:
+                yield status
+        finally:
+            self._bus.listen(reader, False)
+
+    async def ended(self) -> TaskStatus:
+        """Its last status, once it is DONE or in ERROR."""
+        async for status in self:
+            if status.state in ENDED:
+                return status
+        raise AssertionError  # it is heard of until the connection ends

@@ -1,0 +1,350 @@
+"""What a program does in a whole cell, on the virtual clock: `Cell` on the bus of a visitor."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from common import topics
+from common.client.cell import Cell
+from common.client.goals import any_of, pose, region, through
+from common.client.hearing import Camera, NothingHeard
+from common.config import load_cell
+from common.errors import ConfigError, NoResponder, RemoteError, UnknownName, ZencellError
+from common.messages import HoldRequest, JointGoal, StopRequest
+from common.process.operator_motion import MotionFailed
+from common.transport.bus import Bus
+from common.virtual.simulation import Simulation
+
+pytestmark = pytest.mark.timeout(600)
+
+Program = Callable[[Cell], Awaitable[None]]
+
+
+class Over(Exception):
+    """The program has come to its end."""
+
+
+def run(program: Program, cell: str = "panda", *overrides: str, autostart: bool = False) -> None:
+    """Run a program in a cell to its end."""
+    loaded = load_cell(cell, [f"autostart={str(autostart).lower()}", *overrides])
+
+    raised: list[BaseException] = []
+
+    async def visit(bus: Bus) -> None:
+        try:
+            async with Cell.on(bus, owner="program") as joined:
+                await program(joined)
+        except BaseException as error:
+            raised.append(error)
+        raise Over  # the rest of the run is nobody's business here
+
+    simulation = Simulation(loaded, 1, visit=visit)
+    with pytest.raises(Over):
+        simulation.run()
+    if raised:
+        raise raised[0]
+    assert not simulation.outcome.broken and not simulation.outcome.crashes, simulation.outcome
+
+
+async def until_moving(cell: Cell) -> None:
+    async with asyncio.timeout(5.0):
+        while np.abs(await cell.arm.velocities()).max() < 0.02:
+            pass
+
+
+def test_arm_is_read_planned_for_and_moved_in_numbers() -> None:
+    async def program(cell: Cell) -> None:
+        told = await cell.arm.description()
+        assert len(told.joints) == 7 and "home" in told.named_poses
+        q = await cell.arm.joints()
+        assert np.allclose(q, told.named_poses["home"], atol=1e-3)
+        T = await cell.arm.pose()
+        assert np.allclose(T, await cell.tf("world", "tcp")) and np.allclose(T[2, :3], [0, 0, -1], atol=1e-3)
+
+        plan = await cell.arm.plan(pose(0.45, 0.1, 0.4), speed=0.5)
+        assert plan.joints == tuple(told.joints) and np.allclose(plan.positions[0], q, atol=1e-3)
+        assert plan.times[0] == 0 and plan.duration > 0.2
+        assert np.allclose(await cell.arm.joints(), q, atol=1e-3), "planning moves nothing"
+        assert (await cell.arm.execute(plan)).state == "succeeded"
+        T = await cell.arm.pose()
+        assert np.allclose(T[:3, 3], [0.45, 0.1, 0.4], atol=2e-3)
+        assert np.allclose(T[:3, 2], [0, 0, -1], atol=5e-3)
+
+        await cell.arm.move(pose(0.45, -0.1, 0.4), straight=True)
+        await cell.arm.move(pose(0.45, 0.1, 0.4), via=(0.5, 0.0, 0.4))
+        assert np.allclose((await cell.arm.pose())[:3, 3], [0.45, 0.1, 0.4], atol=2e-3)
+        await cell.arm.move(pose(0.45, -0.1, 0.4), around=(0.4, 0.0, 0.4))
+        await cell.arm.move(through(pose(0.4, 0.0, 0.4), pose(0.4, 0.1, 0.4), tool_speed=0.1))
+        await cell.arm.move(region(pose(0.5, 0.0, 0.4), size=(0.02, 0.02, 0.02), yaw=3.0))
+        await cell.arm.move(any_of("home", JointGoal(positions=q.tolist())))
+        assert np.allclose(await cell.arm.joints(), q, atol=2e-3)
+        assert (await cell.arm.owner_now()).owner in ("", "program")
+
+    run(program)
+
+
+def test_what_cannot_be_reached_or_asked_for_is_said_in_one_line_and_moves_nothing() -> None:
+    async def program(cell: Cell) -> None:
+        before = await cell.arm.joints()
+        for to, how, error, words in (
+            ("hoem", {}, MotionFailed, "home"),
+            (pose(3.0, 0.0, 0.4), {}, MotionFailed, "operator"),
+            ([0.1, 0.2], {}, MotionFailed, "operator"),
+            ([], {}, ConfigError, "name of a pose"),
+            ({"x": 1}, {}, ConfigError, "name of a pose"),
+            ([0.0, np.nan], {}, ConfigError, "finite"),
+            (2 * np.eye(4), {}, ConfigError, "rotation"),
+            ("home", {"speed": 2.0}, ConfigError, "velocity_scaling"),
+            ("home", {"sped": 2.0}, ConfigError, "choices"),
+            ("home", {"via": (1, 2)}, ConfigError, "pose"),
+            ("home", {"planner": "nobody"}, (MotionFailed, RemoteError), "nobody"),
+        ):
+            with pytest.raises(error, match=words):
+                await cell.arm.move(to, **how)  # type: ignore[arg-type]
+        assert np.allclose(await cell.arm.joints(), before, atol=1e-6)
+
+    run(program)
+
+
+def test_a_motion_that_is_cancelled_comes_to_rest_and_the_next_one_goes() -> None:
+    async def program(cell: Cell) -> None:
+        moving = asyncio.create_task(cell.arm.move(pose(0.4, 0.4, 0.3), speed=0.1))
+        await until_moving(cell)
+        moving.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await moving
+        await asyncio.sleep(1.0)
+        assert np.abs(await cell.arm.velocities()).max() < 1e-3 and (await cell.arm.status()).state == "cancelled"
+        await cell.arm.move("home")
+
+    run(program)
+
+
+def test_stop_of_ones_own_is_ended_by_the_next_motion_and_that_of_others_is_not() -> None:
+    async def program(cell: Cell) -> None:
+        await cell.arm.stop("lunch")
+        assert "lunch" in (await cell.arm.status()).stopped
+        await cell.arm.move("home")
+        stop = cell.bus.client(topics.MOTION_STOP)
+        await stop.call(StopRequest(owner="another", reason="in the way"))
+        with pytest.raises(MotionFailed, match="another") as refused:
+            await cell.arm.move("home")
+        assert refused.value.code == "stopped"
+        with pytest.raises(MotionFailed, match="another"):
+            await cell.gripper.open()
+
+    run(program)
+
+
+def test_hold_keeps_a_motion_on_its_path_until_it_is_released() -> None:
+    async def program(cell: Cell) -> None:
+        moving = asyncio.create_task(cell.arm.move(pose(0.4, 0.4, 0.3), speed=0.2))
+        await until_moving(cell)
+        await cell.arm.hold("somebody comes")
+        await asyncio.sleep(1.0)
+        where = await cell.arm.joints()
+        await asyncio.sleep(0.5)
+        assert np.allclose(await cell.arm.joints(), where, atol=1e-6) and not moving.done()
+        await cell.arm.release()
+        assert (await moving).state == "succeeded"
+
+    run(program)
+
+
+def test_motion_that_is_owned_is_nobody_elses_until_the_block_ends() -> None:
+    async def program(cell: Cell) -> None:
+        other = Cell.on(cell.bus, owner="other")
+        async with cell.arm.owned() as owner:
+            assert (owner.owner, owner.kind) == ("program", "script")
+            with pytest.raises(MotionFailed) as refused:
+                await other.arm.move(pose(0.4, 0.1, 0.4))
+            assert refused.value.code == "not_owner"
+            with pytest.raises(RemoteError):
+                await other.arm.own("take")
+            await cell.arm.move("home")
+        async with asyncio.timeout(2.0):
+            while (await cell.arm.owner_now()).kind != "none":
+                await asyncio.sleep(0.01)
+        await other.arm.move("home")
+
+    run(program)
+
+
+def test_jogging_moves_as_long_as_it_is_asked_for_and_no_longer() -> None:
+    async def program(cell: Cell) -> None:
+        before = await cell.arm.pose()
+        await cell.arm.jog(linear=(0.0, 0.1, 0.0), seconds=1.0)
+        await asyncio.sleep(0.5)
+        after = await cell.arm.pose()
+        moved = after[:3, 3] - before[:3, 3]
+        assert 0.03 < moved[1] < 0.11 and abs(moved[0]) < 5e-3 and abs(moved[2]) < 5e-3
+        assert np.abs(await cell.arm.velocities()).max() < 1e-3
+        with pytest.raises(UnknownName, match="elbow"):
+            await cell.arm.jog(joints={"elbow": 0.1})
+        with pytest.raises(ConfigError, match="60 s"):
+            await cell.arm.jog(linear=(0.1, 0, 0), seconds=1e9)
+
+    run(program)
+
+
+def test_fingers_open_close_and_say_what_they_hold() -> None:
+    async def program(cell: Cell) -> None:
+        opened = await cell.gripper.open()
+        assert opened.state == "succeeded" and opened.width == pytest.approx(0.08, abs=2e-3)
+        closed = await cell.gripper.move(0.02, 20.0)
+        assert closed.width == pytest.approx(0.02, abs=2e-3) and not closed.holding
+        empty = await cell.gripper.close(expected=0.04)
+        assert (empty.state, empty.outcome) == ("aborted", "empty")
+        assert (await cell.gripper.state()).width < 2e-3
+        with pytest.raises(ConfigError, match="width"):
+            await cell.gripper.move(5.0)
+
+    run(program)
+
+
+def test_a_pick_takes_ten_lines() -> None:
+    async def program(cell: Cell) -> None:
+        await cell.gripper.open()
+        ball, *_ = await cell.objects(least=1)
+        x, y, z = ball.pose.position.x, ball.pose.position.y, ball.pose.position.z
+        await cell.arm.move(pose(x, y, z + 0.15))
+        await cell.arm.move(pose(x, y, z), straight=True, touch=[ball.id])
+        assert (await cell.gripper.close()).holding
+        await cell.arm.move(pose(x, y, z + 0.15), straight=True)
+        (held,) = [each.id for each in await cell.world.objects() if each.state == "held"]
+        assert (await cell.gripper.state()).holding and held
+
+    run(program, "panda", "world.count=1")
+
+
+def test_pictures_come_as_arrays_with_the_camera_that_took_them() -> None:
+    async def program(cell: Cell) -> None:
+        (name,) = await cell.cameras()
+        camera = await cell.camera()
+        assert camera.name == name
+        info, image = await camera.info(), await camera.image()
+        assert image.shape == (info.height, info.width, 3) and image.dtype == np.uint8 and image.std() > 1
+        assert (await camera.intrinsics())[0, 0] == info.k[0]
+        T = await camera.pose()
+        assert T.shape == (4, 4) and T[2, 3] > 0.2, "above the table"
+        first, second = await camera.message(), await camera.message()
+        assert second.header.stamp > first.header.stamp
+        with pytest.raises(UnknownName, match=name):
+            await cell.camera("left")
+
+    run(program)
+
+
+def test_depth_is_in_metres() -> None:
+    async def program(cell: Cell) -> None:
+        depth = await (await cell.camera()).depth()
+        assert depth.dtype == np.float32 and 0.2 < np.nanmedian(depth) < 3.0
+
+    run(program, "ur5")
+
+
+def test_objects_are_those_that_were_seen_and_the_world_is_edited_by_name() -> None:
+    async def program(cell: Cell) -> None:
+        seen, truth = await cell.objects(least=2), await cell.world.objects()
+        assert len(seen) == len(truth) == 2 and all(each.role == "target" for each in seen)
+        for each in truth:
+            nearest = min(seen, key=lambda found: np.hypot(
+                found.pose.position.x - each.pose.position.x, found.pose.position.y - each.pose.position.y))
+            assert nearest.pose.position.x == pytest.approx(each.pose.position.x, abs=0.01)
+        with pytest.raises(NothingHeard, match="of 3 objects, but of 2"):
+            await cell.objects(least=3, timeout=1.0)
+        before = {each.id for each in truth}
+        ids = await cell.world.add(0.45, -0.1)
+        (new,) = set(ids) - before
+        assert len(await cell.objects(least=3)) == 3
+        assert new not in await cell.world.remove(new)
+        with pytest.raises(RemoteError, match="nothing"):
+            await cell.world.remove("nothing")
+        await cell.world.reset()
+
+    run(program, "panda", "world.count=2")
+
+
+def test_parameters_are_read_and_changed_by_path() -> None:
+    async def program(cell: Cell) -> None:
+        path = "vision_detector.min_contour_area_px"
+        before = await cell.param[path]
+        await cell.param.set(path, before + 5)
+        assert await cell.param[path] == before + 5 == (await cell.param.all())[f"services.{path}"]
+        with pytest.raises(UnknownName, match="did you mean"):
+            await cell.param["vision_detector.min_contour_area"]
+        with pytest.raises(ZencellError, match="min_contour_area_px"):
+            await cell.param.update({path: "large", "trajectory_executor.speed_scaling": 0.5})
+        assert await cell.param["trajectory_executor.speed_scaling"] == 1.0, "all of them or none"
+
+    run(program)
+
+
+def test_task_is_started_heard_of_and_stopped() -> None:
+    async def program(cell: Cell) -> None:
+        assert not (await cell.task.status()).started
+        await cell.task.start()
+        states = []
+        async for status in cell.task:
+            states.append(status.state)
+            with pytest.raises(MotionFailed, match="task"):
+                await cell.arm.move("home")
+            if status.done:
+                break
+        assert len(set(states)) > 2
+        await cell.task.pause()
+        await cell.task.resume()
+        assert not (await cell.task.stop()).started
+        await cell.arm.move("home")
+        await cell.task.start()
+        assert (await cell.task.ended()).state == "DONE"
+
+    run(program, "panda", "world.count=2")
+
+
+def test_any_key_is_called_and_listened_to() -> None:
+    async def program(cell: Cell) -> None:
+        async for state in cell.listen("joint_states"):
+            assert len(state.position) >= 7
+            break
+        answer = await cell.call("motion/hold", hold=True, owner="program")
+        again = await cell.call(topics.MOTION_HOLD, HoldRequest(hold=True, owner="program"))
+        assert answer.held and again.held and [each.by for each in again.inhibits] == ["program"]
+        await cell.arm.release()
+        for asked, error, words in (
+            (cell.call("motion/hodl"), UnknownName, "motion/hold"),
+            (cell.call("motion/hold", hodl=True), ConfigError, "hold"),
+            (cell.call("motion/hold", hold=True, timeout=-1), ConfigError, "timeout"),
+            (anext(cell.listen("motion/hold")), ConfigError, "is a request"),
+        ):
+            with pytest.raises(error, match=words):
+                await asked
+        assert any(service.name == "motion_planner" for service in (await cell.services()).services)
+
+    run(program)
+
+
+def test_what_nobody_answers_ends_in_the_exception_that_says_so() -> None:
+    async def program(cell: Cell) -> None:
+        with pytest.raises(NoResponder, match="param/nobody"):
+            await cell.call("param/nobody")
+        with pytest.raises(NothingHeard, match="nobody/camera_info"):
+            await Camera("nobody", cell._ear, cell.tf).info()
+        with pytest.raises(RemoteError, match="controller"):
+            await cell.arm.order("enable")
+
+    run(program, "ur5")
+
+
+async def test_a_cell_that_is_not_joined_says_how_to_join_it() -> None:
+    cell = Cell("panda")
+    for name in ("arm", "gripper", "task", "param", "world", "bus"):
+        with pytest.raises(ZencellError, match="async with"):
+            getattr(cell, name)
+    with pytest.raises(AttributeError, match="amr"):
+        _: Any = cell.amr
