@@ -2,40 +2,30 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import json
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from cli import completion, options
-from common.errors import ConfigError, UnknownName, ZencellError
+from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 
 if TYPE_CHECKING:
-    from common.messages import Message, TaskCommand, WorldEdit
+    from common.client.cell import Cell as Client
+    from common.client.task import TaskControl
+    from common.messages import Message, WorldEdit
     from common.topics import Request
-    from common.transport.bus import Bus
 
 task = typer.Typer(help="Tell the task what to do.", no_args_is_help=True)
 world = typer.Typer(help="Change the simulated world.", no_args_is_help=True)
 
 TIMEOUT = 5.0  # [s]
-FIRST_WORD = 1.0  # [s] in which a state that there is has arrived
 X = Annotated[str, typer.Argument(metavar="X", help="[m] in world")]
 Y = Annotated[str, typer.Argument(metavar="Y", help="[m] in world")]
 Id = Annotated[str, typer.Argument(metavar="ID", help="as in `zencell topic echo scene_objects`")]
 NEGATIVE_NUMBERS = {"ignore_unknown_options": True}  # -0.2 is a coordinate, not an option
-
-
-class ArmOnly(ZencellError):
-    """The arm was stopped, though the task could not be told."""
-
-    exit_code = 1
-
-    def __init__(self, error: ZencellError) -> None:
-        super().__init__(f"the arm is stopped and stays so until a start; the task did not hear of it: {error}")
 
 
 def call(
@@ -82,47 +72,36 @@ def send(
     connect: str | None,
 ) -> None:
     """Send a request to a cell that is up and print the answer as JSON."""
-    from cli.inspection import cell_clock, inspect
+    from cli.inspection import in_cell
     from cli.schema import to_json
-    from common.messages import Header, TaskCommand
+    from common.client.joining import newest_heard
+    from common.messages import TaskCommand
 
-    async def visit(bus: Bus) -> Message:
-        if isinstance(header := getattr(message, "header", None), Header) and not header.stamp:
-            header.stamp = (await cell_clock(bus)).now_ns()  # decided now
+    async def visit(joined: Client) -> Message:
         if isinstance(message, TaskCommand) and message.command in ("start", "resume") and message.heard is None:
-            message.heard = await newest_heard(bus)
-        answer: Message = await bus.client(request).call(message, timeout)
+            message.heard = await newest_heard(joined.bus)
+        answer: Message = await joined.call(request, message, timeout=timeout)
         return answer
 
-    echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
-
-
-async def newest_heard(bus: Bus) -> int:
-    """`since` of the newest stop or hold that can be known now: a start lets go of nothing later, 0 of nothing."""
-    from common import topics
-    from common.errors import DecodeError
-    from common.messages import MotionStatus
-    from common.transport.codec import decode
-
-    newest = 0
-    for sample in await bus.raw_get(f"{bus.cell}/{topics.MOTION_STATUS.key}", FIRST_WORD):
-        with contextlib.suppress(DecodeError):
-            newest = max(newest, decode(MotionStatus, sample.payload).newest)
-    return newest
+    echo(to_json(in_cell(visit, cell, domain, connect).model_dump()))
 
 
 # --- task -------------------------------------------------------------------------------------------------------
 
 
 def _task(
-    command: str, cell: str | None, domain: str | None, connect: str | None, override: bool = False
+    tell: Callable[[TaskControl], Awaitable[Message]], cell: str | None, domain: str | None, connect: str | None
 ) -> None:
-    from common import topics
-    from common.config import check
-    from common.messages import TaskCommand
+    from cli.inspection import in_cell
+    from cli.schema import to_json
 
-    message: TaskCommand = check(TaskCommand, {"command": command, "by": options.person(), "override": override})
-    send(topics.TASK_COMMAND, message, TIMEOUT, cell, domain, connect)
+    async def visit(joined: Client) -> Message:
+        answer = await tell(joined.task)
+        if joined.task.unkept:
+            echo(f"zencell: {joined.task.unkept}", err=True)
+        return answer
+
+    echo(to_json(in_cell(visit, cell, domain, connect).model_dump()))
 
 
 @task.command()
@@ -131,13 +110,13 @@ def start(
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Start the task of a cell that waits or was stopped, or start it again; a robot that you hold is let go."""
-    _task("start", cell, domain, connect, override)
+    _task(lambda task: task.start(override=override), cell, domain, connect)
 
 
 @task.command()
 def pause(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
     """Bring the robot to rest on its path at once and hold it there."""
-    _task("pause", cell, domain, connect)
+    _task(lambda task: task.pause(), cell, domain, connect)
 
 
 @task.command()
@@ -146,38 +125,13 @@ def resume(
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Let the robot go on along its path after a pause of yours."""
-    _task("resume", cell, domain, connect, override)
+    _task(lambda task: task.resume(override=override), cell, domain, connect)
 
 
 @task.command()
 def stop(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
     """Stop the robot, give up its motion, and wait for a start, also if the task does not answer."""
-    from cli.inspection import inspect
-    from cli.schema import to_json
-    from common import topics
-    from common.errors import RequestFailed
-    from common.messages import MotionStatus, StopRequest, TaskCommand
-
-    by = options.person()
-
-    async def visit(bus: Bus) -> Message:
-        arm = asyncio.create_task(bus.client(topics.MOTION_STOP).call(StopRequest(owner=by), TIMEOUT))
-        try:
-            told: Message = await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="stop", by=by), TIMEOUT)
-        except RequestFailed as error:
-            with contextlib.suppress(RequestFailed):
-                tell_unkept(await arm)
-                raise ArmOnly(error) from None
-            raise
-        with contextlib.suppress(RequestFailed):
-            tell_unkept(await arm)
-        return told
-
-    def tell_unkept(answer: MotionStatus) -> None:
-        if answer.not_kept:
-            echo(f"zencell: {answer.not_kept}", err=True)
-
-    echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
+    _task(lambda task: task.stop(), cell, domain, connect)
 
 
 @task.command()
@@ -188,18 +142,11 @@ def home(
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Plan a way home and go there, while no task has the robot; Ctrl-C stops the robot."""
-    from cli.inspection import inspect
+    from cli.inspection import in_cell
     from cli.schema import to_json
-    from common.messages import JointGoal
-    from common.process.operator_motion import OperatorMotion
 
-    async def visit(bus: Bus) -> Message:
-        from cli.inspection import cell_clock
-
-        bus.clock = await cell_clock(bus)  # requests to move say when they were decided
-        return await OperatorMotion(bus, owner=options.person()).move(JointGoal(named="home"), planner=planner)
-
-    echo(to_json(inspect(visit, cell=cell, domain=domain, connect=connect).model_dump()))
+    done = in_cell(lambda joined: joined.arm.move("home", planner=planner), cell, domain, connect)
+    echo(to_json(done.model_dump()))
 
 
 # --- world ------------------------------------------------------------------------------------------------------

@@ -31,8 +31,8 @@ async def delays(bus: Bus, key: str, foreign: bool) -> AsyncGenerator[tuple[Dela
         SilentKey: nothing came on a foreign key.
     """
     from cli.foreign import require_heard
-    from cli.inspection import cell_clock
     from cli.measuring import Hearing
+    from common.client.joining import cell_clock
 
     full = f"{bus.cell}/{key}"
     hearing = Hearing(await cell_clock(bus))

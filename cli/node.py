@@ -37,7 +37,8 @@ def list_(
     as_json: options.Json = False,
 ) -> None:
     """List the services that are ready now, of all cells unless one is named."""
-    from cli.inspection import alive, inspect
+    from cli.inspection import inspect
+    from common.client.joining import alive
     from common.errors import NoResponder
 
     found = inspect(alive, domain=domain, connect=connect)

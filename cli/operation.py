@@ -283,6 +283,7 @@ class Operation:
 
     async def _until_ended(self, bus: Bus) -> int:
         from common import topics
+        from common.client.joining import person
         from common.messages import TaskCommand
         from common.supervision.operation import beside
 
@@ -292,7 +293,7 @@ class Operation:
             self._tell_kept(kept)
         if (self._simulated and kept) or (not self.cell.run.autostart and not kept):  # who says `run` says start
             heard = max((inhibit.since for inhibit in kept), default=0)  # a stop that comes now stays
-            start = TaskCommand(command="start", by=options.person(), override=bool(kept), heard=heard)
+            start = TaskCommand(command="start", by=person(), override=bool(kept), heard=heard)
             await bus.client(topics.TASK_COMMAND).call(start, START_REQUEST_TIMEOUT)
             for inhibit in kept:
                 self._note(f"Let go: {self.cell.name} was {inhibit.told}")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import getpass
 import math
-import socket
 from typing import Annotated
 
 import typer
@@ -119,12 +117,3 @@ def rate(text: str) -> float:
     if not 0 < value <= MOST_PER_SECOND:
         raise ConfigError("--rate", text, f"must be more than 0 and at most {MOST_PER_SECOND:g} [Hz]")
     return value
-
-
-def person() -> str:
-    """Who gives a command here: what a cell remembers of who stopped or holds a robot."""
-    try:
-        user = getpass.getuser()
-    except (KeyError, OSError):  # a user without a name, as in a container
-        user = "somebody"
-    return "".join(filter(str.isprintable, f"{user}@{socket.gethostname()}"))[:120]

@@ -52,23 +52,10 @@ def known_keys(cell: str | None, domain: str | None, connect: str | None) -> dic
     return known
 
 
-def topic_of_owner(owner: Owner) -> Carried | None:
-    """What an owner's key carries, known by the owner's own word for it."""
-    from dataclasses import replace
-
-    from common.application import find_topic
-
-    topic = find_topic(owner.own)
-    return replace(topic, key=owner.key) if topic else None
-
-
-async def topic_in(bus: Bus, key: str) -> Carried | None:
-    """What a key carries in the cell that is up, where only its owner knows."""
-    return next((topic_of_owner(owner) for owner in await bus.owners() if owner.key == key), None)
-
-
 def _live(cell: str | None, domain: str | None, connect: str | None) -> list[Found]:
-    from cli.inspection import LOOK_TIMEOUT, inspect, somebody_listens
+    from cli.inspection import inspect, somebody_listens
+    from common.client.hearing import topic_of_owner
+    from common.client.joining import LOOK_TIMEOUT
     from common.transport.endpoint import endpoint_of
     from common.transport.keys import owns_key
     from common.transport.ownership import Owner

@@ -53,7 +53,7 @@ def pub(
     message = checked(topic, key, body)
 
     async def visit(bus: Bus) -> None:
-        from cli.inspection import cell_clock
+        from common.client.joining import cell_clock
         from common.topics import of_service
 
         bus.clock = await cell_clock(bus)

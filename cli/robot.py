@@ -2,47 +2,20 @@
 
 from __future__ import annotations
 
-import asyncio
-import time
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from cli import completion, options
-from common.errors import ConfigError, ZencellError
+from common.errors import ConfigError
 from common.terminal import echo
 
 if TYPE_CHECKING:
-    from common.messages import JogCommand, RobotStatus
-    from common.transport.bus import Bus
+    from common.messages import RobotStatus
 
 app = typer.Typer(help="Prepare a robot, ask its controller, jog it.", no_args_is_help=True)
-
-TIMEOUT = 60.0  # [s]: power and brakes take some
-FIRST_WORD = 3.0  # [s] in which a state that there is has arrived
-JOG_PERIOD = 0.02  # [s]
-LONGEST_JOG = 60.0  # [s]
-
-
-class NothingSaid(ZencellError):
-    """No executor told of its arm."""
-
-    exit_code = 1
-
-    def __init__(self) -> None:
-        super().__init__("nobody says how the arm is: the executor of this cell is not up, or is of before")
-
-
-class NotJogged(ZencellError):
-    """The arm did not go as it was asked to."""
-
-    exit_code = 1
-
-    def __init__(self, owner: str, why: str) -> None:
-        super().__init__(f"the arm is not jogged: the motion is {owner}{why and f'; {why}'}. The log of the executor "
-                         "says more: zencell topic echo log/trajectory_executor")
 
 
 @app.callback()
@@ -91,17 +64,9 @@ def collisions(
 
 
 def _status(cell: str | None, domain: str | None, connect: str | None) -> RobotStatus:
-    from cli.inspection import inspect
-    from common import topics
+    from cli.inspection import in_cell
 
-    async def visit(bus: Bus) -> RobotStatus:
-        async with asyncio.timeout(FIRST_WORD):
-            return await bus.reader(topics.ROBOT_STATUS).next()
-
-    try:
-        return inspect(visit, cell=cell, domain=domain, connect=connect)
-    except TimeoutError:
-        raise NothingSaid() from None
+    return in_cell(lambda joined: joined.arm.robot(), cell, domain, connect)
 
 
 @app.command()
@@ -118,17 +83,9 @@ def status(
 def _order(
     act: str, value: float, cell: str | None, domain: str | None, connect: str | None, **more: Any
 ) -> None:
-    from cli.inspection import inspect
-    from common import topics
-    from common.config import check
-    from common.messages import RobotCommand
+    from cli.inspection import in_cell
 
-    asked = check(RobotCommand, {"act": act, "value": value, "owner": options.person(), **more}, act)
-
-    async def visit(bus: Bus) -> RobotStatus:
-        return await bus.client(topics.ROBOT_COMMAND).call(asked, TIMEOUT)
-
-    told = inspect(visit, cell=cell, domain=domain, connect=connect)
+    told = in_cell(lambda joined: joined.arm.order(act, value, **more), cell, domain, connect)
     echo(f"{told.mode}{f': {told.message}' if told.message else ''}")
 
 
@@ -199,32 +156,19 @@ def owner(
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
 ) -> None:
     """Print whose the motion is: nobody else's begins. Stops and holds are everybody's."""
-    from cli.inspection import inspect
-    from common import topics
-    from common.messages import MotionOwner
+    from cli.inspection import in_cell
 
-    async def visit(bus: Bus) -> MotionOwner:
-        async with asyncio.timeout(FIRST_WORD):
-            return await bus.reader(topics.MOTION_OWNER).next()
-
-    try:
-        told = inspect(visit, cell=cell, domain=domain, connect=connect)
-    except TimeoutError:
-        raise NothingSaid() from None
+    told = in_cell(lambda joined: joined.arm.owner_now(), cell, domain, connect)
     echo(f"the motion is {told.told}{', who jogs the arm' if told.jogging else ''}")
 
 
-def _own(act: str, over: bool, cell: str | None, domain: str | None, connect: str | None) -> None:
-    from cli.inspection import inspect
-    from common import topics
-    from common.messages import MotionOwner, OwnRequest
+def _own(
+    act: Literal["take", "give"], over: bool, cell: str | None, domain: str | None, connect: str | None
+) -> None:
+    from cli.inspection import in_cell
 
-    asked = OwnRequest.model_validate({"act": act, "owner": options.person(), "over": over})
-
-    async def visit(bus: Bus) -> MotionOwner:
-        return await bus.client(topics.MOTION_OWN).call(asked, FIRST_WORD)
-
-    echo(f"the motion is {inspect(visit, cell=cell, domain=domain, connect=connect).told}")
+    told = in_cell(lambda joined: joined.arm.own(act, over=over, kind="operator"), cell, domain, connect)
+    echo(f"the motion is {told.told}")
 
 
 @app.command()
@@ -258,27 +202,19 @@ def jog(
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Move the arm by hand for a while: at most 0.25 m/s, and it stands 0.2 s after Ctrl-C or the end of this."""
-    from cli.inspection import inspect
-    from common.config import check
-    from common.messages import JogCommand
+    from cli.inspection import in_cell
 
-    duration = options.number("--seconds", seconds)
-    if not 0 < duration <= LONGEST_JOG:
-        raise ConfigError("--seconds", seconds, f"must be more than 0 and at most {LONGEST_JOG:g} s")
     if not (joint or linear or angular):
         raise ConfigError("jog", ..., "needs --joint NAME=V, --linear X,Y,Z or --angular X,Y,Z")
     joints = {}
     for each in joint or []:
         name, _, value = each.partition("=")
         joints[name] = options.number("--joint", value)
-    asked = check(JogCommand, {
-        "owner": options.person(), "joints": joints, "linear": _vector("--linear", linear),
-        "angular": _vector("--angular", angular), "frame": frame}, "jog")
-
-    async def visit(bus: Bus) -> None:
-        await _jog(bus, asked, duration)
-
-    inspect(visit, cell=cell, domain=domain, connect=connect)
+    asked: dict[str, Any] = {
+        "joints": joints, "linear": tuple(_vector("--linear", linear).values()),
+        "angular": tuple(_vector("--angular", angular).values()), "frame": frame,
+        "seconds": options.number("--seconds", seconds)}
+    in_cell(lambda joined: joined.arm.jog(**asked), cell, domain, connect)
 
 
 def _vector(option: str, text: str | None) -> dict[str, float]:
@@ -286,42 +222,3 @@ def _vector(option: str, text: str | None) -> dict[str, float]:
     if len(parts) != 3:
         raise ConfigError(option, text, "must be three numbers X,Y,Z")
     return dict(zip("xyz", (options.number(option, part) for part in parts), strict=True))
-
-
-async def _jog(bus: Bus, asked: JogCommand, seconds: float) -> None:
-    """Ask again and again for so long, while the motion is ours.
-
-    Raises:
-        NotJogged: it does not become ours, or is not any more.
-    """
-    from cli.inspection import cell_clock
-    from common import topics
-    from common.errors import UnknownName
-    from common.messages import JogCommand
-
-    motion, owners = bus.reader(topics.MOTION_STATUS), bus.reader(topics.MOTION_OWNER)
-    try:
-        async with asyncio.timeout(FIRST_WORD):
-            known = (await bus.reader(topics.JOINT_STATES).next()).name
-            heard = (await motion.next()).newest
-            await owners.next()
-    except TimeoutError:
-        raise NothingSaid() from None
-    for name in asked.joints:
-        if name not in known:
-            raise UnknownName("joint", name, known)
-    bus.clock = await cell_clock(bus)
-    writer = bus.writer(topics.MOTION_JOG)
-    began, ours = time.monotonic(), False
-    while (past := time.monotonic() - began) < seconds:
-        writer.put(asked.model_copy(update={"header": bus.header(), "heard": heard}))
-        await asyncio.sleep(JOG_PERIOD)
-        now, state = owners.latest, motion.latest
-        assert now is not None and state is not None
-        goes = now.jogging and now.owner == asked.owner
-        another = now.kind != "none" and now.owner != asked.owner
-        if not goes and (ours or another or past > min(FIRST_WORD, seconds - 2 * JOG_PERIOD)):
-            raise NotJogged(now.told, state.stopped or state.message)
-        ours = ours or goes
-    writer.put(JogCommand(header=bus.header(), owner=asked.owner, heard=heard))
-    await asyncio.sleep(JOG_PERIOD)

@@ -11,7 +11,6 @@ import typer
 
 from cli import options
 from common import terminal
-from common.errors import RequestFailed, ZencellError
 
 if TYPE_CHECKING:
     from common.robot.transform_tree import TransformTree
@@ -19,18 +18,8 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Frames: where one is in another, and the tree that they make.", no_args_is_help=True)
 
-PATIENCE = 2.0  # [s] until frames that nothing was heard of are taken for unknown
-GATHER = 0.5  # [s] in which every moving frame surely comes once
-
 Rate = Annotated[str, typer.Option("--rate", metavar="HZ", help="lines per second")]
 Once = Annotated[bool, typer.Option("--once", help="one line, then end")]
-
-
-class NoFrames(RequestFailed):
-    """Nobody says where anything is."""
-
-    def __init__(self, cell: str) -> None:
-        super().__init__(f"nothing came on {cell}/tf and {cell}/tf_static within {PATIENCE:g} s")
 
 
 @app.command()
@@ -47,6 +36,7 @@ def echo(
 ) -> None:
     """Show the pose of B in A: position, quaternion x y z w, and roll, pitch, yaw in degrees."""
     from cli.inspection import inspect
+    from common.client.hearing import Frames
 
     period = 1 / options.rate(rate)
     most = 1 if once else options.whole("--count", count, 1)
@@ -76,6 +66,7 @@ def frames(
 ) -> None:
     """Show the tree of frames, and which of them move."""
     from cli.inspection import inspect
+    from common.client.hearing import Frames
 
     async def visit(bus: Bus) -> None:
         found = Frames(bus)
@@ -90,82 +81,6 @@ def frames(
                 terminal.echo(f"{'  ' * depth}{name}{'  (moves)' if moves else ''}")
 
     inspect(visit, cell=cell, domain=domain, connect=connect)
-
-
-class Frames:
-    """The tree that tf and tf_static make, kept up to date inside an `async with`."""
-
-    def __init__(self, bus: Bus) -> None:
-        """Subscribe to both."""
-        from common import topics
-        from common.robot.transform_tree import TransformTree
-
-        self.tree: TransformTree = TransformTree()
-        self.moving: set[str] = set()
-        self._cell = bus.cell
-        self._changed = asyncio.Event()
-        self._moving = bus.reader(topics.TF)
-        self._fixed = bus.reader(topics.TF_STATIC)
-        self._following: list[asyncio.Task[None]] = []
-
-    async def __aenter__(self) -> Frames:
-        self._following = [asyncio.create_task(self._follow_moving()), asyncio.create_task(self._follow_fixed())]
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        for task in self._following:
-            task.cancel()
-        await asyncio.gather(*self._following, return_exceptions=True)
-
-    async def _follow_moving(self) -> None:
-        async for message in self._moving:
-            self.tree.update(message)
-            self.moving.update(each.child_frame_id for each in message.transforms)
-            self._changed.set()
-
-    async def _follow_fixed(self) -> None:
-        async for message in self._fixed:
-            self.tree.update(message)
-            self._changed.set()
-
-    async def until_known(self, target: str, source: str) -> None:
-        """Return when the pose of source in target is known.
-
-        Raises:
-            NoFrames: nothing came at all.
-            UnknownName, NotConnected: it still is not after a while.
-        """
-        try:
-            async with asyncio.timeout(PATIENCE):
-                while not self._known(target, source):
-                    self._changed.clear()
-                    await self._changed.wait()
-        except TimeoutError:
-            if not self.tree.frames:
-                raise NoFrames(self._cell) from None
-            self.tree.path(target, source)
-
-    def _known(self, target: str, source: str) -> bool:
-        try:
-            self.tree.path(target, source)
-        except ZencellError:
-            return False
-        return True
-
-    async def gather(self) -> None:
-        """Return when every frame that comes regularly is in the tree.
-
-        Raises:
-            NoFrames: nothing came at all.
-        """
-        try:
-            async with asyncio.timeout(PATIENCE):
-                while not self.tree.frames:
-                    self._changed.clear()
-                    await self._changed.wait()
-        except TimeoutError:
-            raise NoFrames(self._cell) from None
-        await asyncio.sleep(GATHER)
 
 
 def pose_figures(tree: TransformTree, target: str, source: str) -> dict[str, Any]:

@@ -42,8 +42,8 @@ def top(
     most = 1 if once else options.whole("--count", count, 1)
 
     async def visit(bus: Bus) -> None:
-        from cli.inspection import cell_clock
         from cli.watching import Watch
+        from common.client.joining import cell_clock
 
         async with Watch(bus, await cell_clock(bus)) as watch:
             await asyncio.sleep(FIRST)

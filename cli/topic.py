@@ -100,7 +100,7 @@ def echo(
     topic = published_or_foreign(key)
 
     async def visit(bus: Bus) -> None:
-        from cli.owners import topic_in
+        from common.client.hearing import topic_in
         from common.topics import Topic
 
         shown = 0
@@ -148,7 +148,8 @@ def visit_topic(
         NothingUp: no cell is up.
     """
     from cli.foreign import SilentKey
-    from cli.inspection import NothingUp, inspect
+    from cli.inspection import inspect
+    from common.client.joining import NothingUp
 
     try:
         inspect(visit, cell=cell, domain=domain, connect=connect)

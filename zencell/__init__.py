@@ -54,8 +54,8 @@ _WHERE = {name: module for module, names in _FROM.items() for name in names}
 
 __all__ = [
     "Cell", "ConfigError", "MotionFailed", "NoResponder", "NotJogged", "NotStarted", "NothingHeard", "NothingUp",
-    "Plan", "Pose", "RemoteError", "RequestFailed", "RequestLost", "RequestTimeout", "UnknownName", "ZencellError", "any_of",
-    "pose", "region", "through",
+    "Plan", "Pose", "RemoteError", "RequestFailed", "RequestLost", "RequestTimeout", "UnknownName", "ZencellError",
+    "any_of", "pose", "region", "through",
 ]
 
 

@@ -91,7 +91,7 @@ async def skews_of(bus: Bus, clock: Clock, services: set[str]) -> dict[str, Skew
 
 
 async def _all_skews(endpoint: str) -> dict[str, dict[str, Skew]]:
-    from cli.inspection import TOOL, alive, cell_clock
+    from common.client.joining import TOOL, alive, cell_clock
     from common.errors import NoRouter
     from common.transport.connect import connect
 

@@ -69,8 +69,8 @@ def versions(endpoint: str) -> Iterator[Finding]:
 
 async def schema_problems(endpoint: str) -> dict[str, str]:
     """By cell that is up: what is wrong with the version of its messages; empty when nothing is."""
-    from cli.inspection import TOOL, alive
     from common import topics
+    from common.client.joining import TOOL, alive
     from common.errors import DecodeError, NoRouter
     from common.messages import SupervisorStatus
     from common.transport.codec import decode, decode_attachment

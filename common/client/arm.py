@@ -232,10 +232,12 @@ class Arm:
 
     # --- whose the motion is --------------------------------------------------------------------------------------
 
-    async def own(self, act: Literal["take", "give"], *, over: bool = False, lease: float = 0.0) -> MotionOwner:
+    async def own(
+        self, act: Literal["take", "give"], *, over: bool = False, lease: float = 0.0,
+        kind: Literal["operator", "script"] = "script",
+    ) -> MotionOwner:
         """Take the motion until it is given back, or give it back: see `owned`."""
-        asked = check(OwnRequest, {
-            "act": act, "owner": self.owner, "kind": "script", "over": over, "lease": lease}, "own")
+        asked = check(OwnRequest, {"act": act, "owner": self.owner, "kind": kind, "over": over, "lease": lease}, "own")
         return await self._bus.client(topics.MOTION_OWN).call(asked, TIMEOUT)
 
     @contextlib.asynccontextmanager

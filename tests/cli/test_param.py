@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cli import param
 from cli.main import app
+from common.client import parameters
 from common.config import load_cell, service_config
 from common.errors import RequestTimeout
 from common.messages import Parameter, ParameterReply, ParameterRequest
@@ -257,13 +257,13 @@ async def test_a_service_that_does_not_answer_hides_nothing_of_the_others(monkey
     await bus.ready()
     # The token of what is served is named by who serves it; here one bus stands for two services.
     monkeypatch.setattr(param, "serving", lambda _: asyncio.sleep(0, ["frozen", "tuned"]))
-    found = await param.listing(bus, None)
+    found = await parameters.listing(bus, None)
     assert [p.path for p in found.parameters["tuned"]] == ["services.tuned.x"]
     with pytest.raises(RequestTimeout, match="param/frozen"):
         found.raise_first()
-    assert (await param.look_up(bus, ["tuned.x"]))["tuned.x"][1].value == 1
+    assert (await parameters.look_up(bus, ["tuned.x"]))["tuned.x"][1].value == 1
     with pytest.raises(RequestTimeout, match="param/frozen"):
-        await param.look_up(bus, ["motion.velocity_scaling"])  # may be one of that service
+        await parameters.look_up(bus, ["motion.velocity_scaling"])  # may be one of that service
     await bus.close()
 
 

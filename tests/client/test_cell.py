@@ -167,9 +167,9 @@ def test_motion_that_is_owned_is_nobody_elses_until_the_block_ends() -> None:
             with pytest.raises(RemoteError):
                 await other.arm.own("take")
             await cell.arm.move("home")
-        async with asyncio.timeout(2.0):
-            while (await cell.arm.owner_now()).kind != "none":
-                await asyncio.sleep(0.01)
+        async for owner in cell.listen("motion/owner"):
+            if owner.kind == "none":
+                break
         await other.arm.move("home")
 
     run(program)

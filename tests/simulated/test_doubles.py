@@ -4,8 +4,8 @@ from functools import cache
 
 import pytest
 
-from cli.commands import newest_heard
 from common import topics
+from common.client.joining import newest_heard
 from common.config import Cell, load_cell
 from common.errors import ConfigError
 from common.messages import StopRequest, TaskCommand
