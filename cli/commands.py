@@ -96,10 +96,11 @@ def _task(
     from cli.schema import to_json
 
     async def visit(joined: Client) -> Message:
-        answer = await tell(joined.task)
-        if joined.task.unkept:
-            echo(f"zencell: {joined.task.unkept}", err=True)
-        return answer
+        try:
+            return await tell(joined.task)
+        finally:
+            if joined.task.unkept:
+                echo(f"zencell: {joined.task.unkept}", err=True)
 
     echo(to_json(in_cell(visit, cell, domain, connect).model_dump()))
 

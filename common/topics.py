@@ -94,7 +94,8 @@ MOTION_JOG = Topic("motion/jog", m.JogCommand, "stream",
                    "velocities of joints or tool: the arm moves while they come, at least every 0.1 s; anybody's key")
 ROBOT_STATUS = Topic("robot/status", m.RobotStatus, "state",
                      "what the arm's own controller says: mode, why it cannot be moved, speed slider")
-ROBOT_DESCRIPTION = Topic("robot/description", m.RobotDescription, "state", "what the arm is: joints, limits, tool frame")
+ROBOT_DESCRIPTION = Topic("robot/description", m.RobotDescription, "state",
+                          "what the arm is: joints, limits, named poses, tool frame")
 DISPLAY_TRAJECTORY = Topic("display_trajectory", m.JointTrajectory, "state", "newest plan")
 SCENE_OBJECTS = Topic("scene_objects", m.WorldObjects, "state",
                       "the truth: where every object is; simulated hardware only")

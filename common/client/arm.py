@@ -100,11 +100,11 @@ class Arm:
 
     async def status(self) -> MotionStatus:
         """What it follows, how far that is, and who stopped or holds it."""
-        return await self._ear.newest(topics.MOTION_STATUS)
+        return await self._ear.now(topics.MOTION_STATUS)
 
     async def robot(self) -> RobotStatus:
         """What the arm's own controller says: mode, why it cannot be moved, speed slider, inputs and outputs."""
-        return await self._ear.newest(topics.ROBOT_STATUS)
+        return await self._ear.now(topics.ROBOT_STATUS)
 
     # --- motion ---------------------------------------------------------------------------------------------------
 
@@ -205,7 +205,7 @@ class Arm:
             if name not in known:
                 raise UnknownName("joint", name, known)
         motion, owners = self._ear.reader(topics.MOTION_STATUS), self._ear.reader(topics.MOTION_OWNER)
-        heard = (await self.status()).newest
+        heard = (await self._ear.newest(topics.MOTION_STATUS)).newest
         await self._ear.newest(topics.MOTION_OWNER)
         writer = self._bus.writer(topics.MOTION_JOG)
         clock = asyncio.get_running_loop().time
@@ -224,7 +224,8 @@ class Arm:
                     await asyncio.sleep(LET_GO)
                     began = clock()
                 elif not goes and not waits:
-                    raise NotJogged(now.told, state.stopped or state.message)
+                    kept = "; ".join(inhibit.told for inhibit in state.inhibits)
+                    raise NotJogged(now.told, kept or state.message)
                 ours = ours or goes
         finally:
             writer.put(JogCommand(header=self._bus.header(), owner=self.owner, heard=heard))
@@ -259,7 +260,7 @@ class Arm:
 
     async def owner_now(self) -> MotionOwner:
         """Whose the motion is."""
-        return await self._ear.newest(topics.MOTION_OWNER)
+        return await self._ear.now(topics.MOTION_OWNER)
 
     async def order(self, act: str, value: float = 0.0, **more: Any) -> RobotStatus:
         """Have the arm's own controller enable, recover, freedrive (1 or 0), payload [kg] or set an output."""
@@ -276,7 +277,7 @@ class Hand:
 
     async def state(self) -> GripperState:
         """Width [m], whether it holds something, and what became of the newest command."""
-        return await self._ear.newest(topics.GRIPPER_STATE)
+        return await self._ear.now(topics.GRIPPER_STATE)
 
     async def move(
         self, width: float, force: float = 0.0, *, expected: float | None = None, tolerance: float = 0.005,

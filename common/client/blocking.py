@@ -29,6 +29,7 @@ class Loop:
 
     def __init__(self) -> None:
         """Begin it."""
+        self.ended = False
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="zencell", daemon=True)
         self._thread.start()
@@ -58,7 +59,8 @@ class Loop:
 
     def end(self) -> None:
         """End it."""
-        if self._loop.is_running():
+        if not self.ended:
+            self.ended = True
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
             self._loop.close()
@@ -129,7 +131,7 @@ def iterated(loop: Loop, messages: Any) -> Iterator[Any]:
             except StopAsyncIteration:
                 return
     finally:
-        if (close := getattr(found, "aclose", None)) is not None:
+        if (close := getattr(found, "aclose", None)) is not None and not loop.ended:
             loop.wait(close)
 
 

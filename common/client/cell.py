@@ -1,4 +1,4 @@
-"""A work cell for a program: `async with Cell("panda") as cell: await cell.arm.move("home")`."""
+"""A work cell for a program: `async with Cell() as cell: await cell.arm.move("home")`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common import topics
-from common.application import find_topic
+from common.application import all_topics, find_topic
 from common.client.arm import Arm, Hand
 from common.client.hearing import Camera, Carried, Ear, Frames, NothingHeard, cameras, messages, the_camera, topic_in
 from common.client.joining import cell_clock, joined, person
@@ -282,8 +282,6 @@ class Cell:
         """
         request = await self._carried(key)
         if not isinstance(request, Request):
-            from common.application import all_topics
-
             raise UnknownName("request", str(key), [n for n, each in all_topics().items() if isinstance(each, Request)])
         if not math.isfinite(timeout) or timeout <= 0:
             raise ConfigError("timeout", timeout, "must be more than 0")
@@ -293,12 +291,20 @@ class Cell:
             asked = asked.model_copy(update={"header": self.bus.header(header.frame_id)})  # decided now
         return await self.bus.client(request).call(asked, timeout)
 
-    async def listen(self, key: str | Topic[Any]) -> AsyncIterator[Any]:
+    async def listen(self, key: str | Topic[Any], *, plain: bool = False) -> AsyncIterator[Any]:
         """Messages of a key from now on: of a stream or state the newest, of an event all.
 
-        What is not known here comes as it was packed: dictionaries, lists, numbers.
+        Args:
+            key: such as "joint_states", or the `Topic`.
+            plain: take any key, and what comes as it was packed: dictionaries, lists, numbers.
+
+        Raises:
+            UnknownName: no service of zencell writes it, and it is not asked for as `plain`; with the choices.
+            ConfigError: it is a request.
         """
-        topic = await self._carried(key)
+        topic = None if plain else await self._carried(key)
+        if topic is None and not plain:
+            raise UnknownName("key", str(key), [name for name, t in all_topics().items() if isinstance(t, Topic)])
         if isinstance(topic, Request):
             raise ConfigError("key", topic.key, f"is a request: await cell.call({topic.key!r}, ...)")
         if topic is not None:

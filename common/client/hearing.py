@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from common import topics
 from common.application import find_topic
-from common.errors import RequestFailed, UnknownName, ZencellError
-from common.messages import CameraInfo, Image, Message
+from common.errors import DecodeError, RequestFailed, UnknownName, ZencellError
+from common.messages import CameraInfo, Header, Image, Message
 from common.perception.image import image_to_array
 from common.robot.transform_tree import TransformTree
 from common.topics import Request, Topic
 from common.transport.bus import Bus
+from common.transport.codec import decode
 from common.transport.ownership import Owner
 from common.transport.reader import Reader
 
@@ -71,6 +72,21 @@ class Ear:
         """
         reader = self.reader(topic)
         return reader.latest or await self._next(reader, None, seconds)
+
+    async def now(self, topic: Topic[M]) -> M:
+        """The value of a state as its writer has it now, also just after it was changed.
+
+        Raises:
+            NothingHeard: nobody has one.
+        """
+        found: list[M] = []
+        key = f"{self.bus.cell}/{self.reader(topic).topic.key}"
+        for sample in await self.bus.raw_get(key, PATIENCE):
+            with contextlib.suppress(DecodeError):
+                found.append(decode(topic.message, sample.payload))
+        if not found:
+            raise NothingHeard(key)
+        return max(found, key=lambda each: getattr(each, "header", Header()).stamp)
 
     async def fresh(self, topic: Topic[M], seconds: float = PATIENCE) -> M:
         """The first message of a stream that comes from now on.

@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator, Mapping
 
 from common import topics
 from common.clock import Clock
+from common.config import names_of
 from common.errors import DecodeError, NoRouter, RequestFailed, UnknownName
 from common.messages import MotionStatus, SupervisorStatus
 from common.transport.bus import Bus
@@ -28,7 +29,9 @@ class NothingUp(RequestFailed):
     """There is no cell to look at."""
 
     def __init__(self, endpoint: str, what: str) -> None:
-        super().__init__(f"{what} at {endpoint}; is a cell up (`zencell up CELL`), and on this --domain or --connect?")
+        first = min(names_of("cells"), default="CELL")
+        super().__init__(
+            f"{what} at {endpoint}; is a cell up (`zencell up {first}`), and on this --domain or --connect?")
         self.endpoint = endpoint
 
 

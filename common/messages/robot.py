@@ -49,7 +49,7 @@ class RobotDescription(Message):
     named_poses: dict[Name, Joints] = Field({}, max_length=200)
     gripper: bool = False
     fingers: list[Name] = Field([], max_length=100, description="links that touch what is grasped")
-    gripper_width: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="greatest width between the fingers [m]")
+    gripper_width: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="between open fingers [m]")
 
     @model_validator(mode="after")
     def _same_length(self) -> RobotDescription:

@@ -242,7 +242,7 @@ def test_the_request_itself_can_be_called_and_looked_at(person: Person) -> None:
 
 
 async def test_a_service_that_does_not_answer_hides_nothing_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(param, "TIMEOUT", 0.05)
+    monkeypatch.setattr(parameters, "TIMEOUT", 0.05)
     bus = LocalNetwork().bus("tuned")
 
     async def answer(request: ParameterRequest) -> ParameterReply:
@@ -256,7 +256,7 @@ async def test_a_service_that_does_not_answer_hides_nothing_of_the_others(monkey
     bus.serve(parameters_of("tuned"), answer)
     await bus.ready()
     # The token of what is served is named by who serves it; here one bus stands for two services.
-    monkeypatch.setattr(param, "serving", lambda _: asyncio.sleep(0, ["frozen", "tuned"]))
+    monkeypatch.setattr(parameters, "serving", lambda _: asyncio.sleep(0, ["frozen", "tuned"]))
     found = await parameters.listing(bus, None)
     assert [p.path for p in found.parameters["tuned"]] == ["services.tuned.x"]
     with pytest.raises(RequestTimeout, match="param/frozen"):

@@ -321,9 +321,13 @@ def test_any_key_is_called_and_listened_to() -> None:
             (cell.call("motion/hold", hodl=True), ConfigError, "hold"),
             (cell.call("motion/hold", hold=True, timeout=-1), ConfigError, "timeout"),
             (anext(cell.listen("motion/hold")), ConfigError, "is a request"),
+            (anext(cell.listen("joint_state")), UnknownName, "did you mean 'joint_states'"),
         ):
             with pytest.raises(error, match=words):
                 await asked
+        async for packed in cell.listen("joint_states", plain=True):
+            assert len(packed["position"]) >= 7
+            break
         assert any(service.name == "motion_planner" for service in (await cell.services()).services)
 
     run(program)
