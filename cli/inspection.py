@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
@@ -15,7 +14,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-PROBE_TIMEOUT = 0.5  # [s] to see whether anything listens where a router would
 
 
 def inspect(
@@ -77,11 +75,10 @@ def look(domain: str | None, connect: str | None) -> dict[str, Presence]:
 
 
 async def _look(domain: str | None, connect: str | None) -> dict[str, Presence]:
-    from common.client.joining import NothingUp, alive, joined, supervisor_status
+    from common.client.joining import NothingUp, alive, joined, somebody_listens, supervisor_status
     from common.transport.endpoint import endpoint_of
 
-    endpoint = endpoint_of(domain, connect)
-    if not await asyncio.to_thread(somebody_listens, endpoint):  # Zenoh itself would try for longer
+    if not await asyncio.to_thread(somebody_listens, endpoint_of(domain, connect)):  # nobody is waited for
         return {}
     ready: dict[str, set[str]] = {}
     try:
@@ -92,16 +89,3 @@ async def _look(domain: str | None, connect: str | None) -> dict[str, Presence]:
                     for cell, names in ready.items()}
     except NothingUp:
         return {}
-
-
-def somebody_listens(endpoint: str) -> bool:
-    """Whether something takes connections at an endpoint; True where that cannot be told without Zenoh."""
-    protocol, _, address = endpoint.partition("/")
-    if protocol in ("udp", "quic"):
-        return True
-    host, _, port = address.split("?")[0].split("#")[0].rpartition(":")
-    try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout=PROBE_TIMEOUT):
-            return True
-    except OSError:
-        return False

@@ -53,9 +53,9 @@ def known_keys(cell: str | None, domain: str | None, connect: str | None) -> dic
 
 
 def _live(cell: str | None, domain: str | None, connect: str | None) -> list[Found]:
-    from cli.inspection import inspect, somebody_listens
+    from cli.inspection import inspect
     from common.client.hearing import topic_of_owner
-    from common.client.joining import LOOK_TIMEOUT
+    from common.client.joining import LOOK_TIMEOUT, somebody_listens
     from common.transport.endpoint import endpoint_of
     from common.transport.keys import owns_key
     from common.transport.ownership import Owner

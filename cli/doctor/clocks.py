@@ -30,7 +30,7 @@ class Skew:
 
 def clocks(endpoint: str) -> Iterator[Finding]:
     """Whether the clocks agree, for each cell that is up at an endpoint."""
-    from cli.inspection import somebody_listens
+    from common.client.joining import somebody_listens
 
     if not somebody_listens(endpoint):
         return

@@ -51,7 +51,7 @@ def page() -> Finding:
 
 def versions(endpoint: str) -> Iterator[Finding]:
     """Whether the cells that are up speak the same version of the messages, and are run by this Python."""
-    from cli.inspection import somebody_listens
+    from common.client.joining import somebody_listens
 
     if not somebody_listens(endpoint):
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import getpass
 import os
@@ -21,6 +22,7 @@ from common.transport.endpoint import endpoint_of
 
 TOOL = "zencell"
 CONNECT_TIMEOUT = 2.0  # [s] to reach the router
+PROBE_TIMEOUT, PROBE_PERIOD = 0.5, 0.1  # [s] to see whether anything listens where a router would; between two tries
 LOOK_TIMEOUT = 1.0  # [s] to hear who is there
 ASK_TIMEOUT = 1.0  # [s]
 
@@ -33,6 +35,33 @@ class NothingUp(RequestFailed):
         super().__init__(
             f"{what} at {endpoint}; is a cell up (`zencell up {first}`), and on this --domain or --connect?")
         self.endpoint = endpoint
+
+
+def somebody_listens(endpoint: str) -> bool:
+    """Whether something takes connections at an endpoint; True where that cannot be told without Zenoh."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol in ("udp", "quic"):
+        return True
+    host, _, port = address.split("?")[0].split("#")[0].rpartition(":")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=PROBE_TIMEOUT):
+            return True
+    except OSError:
+        return False
+
+
+async def until_somebody_listens(endpoint: str, seconds: float) -> None:
+    """Return when something takes connections there: what Zenoh tries meanwhile would go on after this program's end.
+
+    Raises:
+        NothingUp: nothing does.
+    """
+    try:
+        async with asyncio.timeout(seconds):
+            while not await asyncio.to_thread(somebody_listens, endpoint):  # noqa: ASYNC110 - nothing tells of it
+                await asyncio.sleep(PROBE_PERIOD)
+    except TimeoutError:
+        raise NothingUp(endpoint, "no router") from None
 
 
 @contextlib.asynccontextmanager
@@ -57,6 +86,7 @@ async def joined(
     """
     environ = {**os.environ, SECURE_VARIABLE: secure} if secure else os.environ
     endpoint = endpoint_of(domain, connect, environ)
+    await until_somebody_listens(endpoint, CONNECT_TIMEOUT)
     try:
         async with contextlib.AsyncExitStack() as stack:
             if cell is None and not any_cell:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import random
 import signal
@@ -11,7 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from common.client.joining import joined, supervisor_status
+from common.client.joining import joined, somebody_listens, supervisor_status
 from common.config import load_cell
 from common.errors import RequestFailed, ZencellError
 from common.supervision.launch import python_module, python_path, require_free_port
@@ -91,6 +92,8 @@ class Started:
             await asyncio.sleep(LOOK)
 
     async def _is_up(self) -> bool:
+        if not await asyncio.to_thread(somebody_listens, endpoint_of(self.domain)):
+            return False
         try:
             async with joined(self.name, domain=self.domain) as bus:
                 status = await supervisor_status(bus)
@@ -109,17 +112,20 @@ class Started:
         process, folder = self._process, self._folder
         self._process = self._folder = None
         if process is not None:
-            await asyncio.shield(asyncio.to_thread(_end, process))
+            await asyncio.shield(_ended(process))
         if folder is not None:
             folder.cleanup()
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+async def _ended(process: subprocess.Popen[bytes]) -> None:
+    """Have a process end, without a thread: there are no new ones any more when the program itself ends."""
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
-    try:
-        process.wait(ENDS)
-    except subprocess.TimeoutExpired:
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(ENDS):
+            while process.poll() is None:  # noqa: ASYNC110 - nothing tells of a child's end
+                await asyncio.sleep(LOOK / 2)
+    if process.poll() is None:
         process.kill()
         process.wait()
 

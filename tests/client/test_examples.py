@@ -50,7 +50,7 @@ def left(folder: Path) -> list[str]:
     found = []
     for process in psutil.process_iter():
         try:
-            if Path(process.cwd()) == folder:
+            if process.pid != os.getpid() and Path(process.cwd()) == folder:
                 found.append(" ".join(process.cmdline()))
         except psutil.Error:
             continue
@@ -75,7 +75,22 @@ def test_notebook_runs_from_top_to_bottom_inside_a_loop_that_runs(
     assert names["held"].outcome == "grasped" and not left(tmp_path)  # type: ignore[attr-defined]
 
 
+@pytest.mark.parametrize(("page", "says"), [("docs/client.md", "out_of_reach"), ("README.md", "grasped")])
+def test_what_a_page_says_works_from_top_to_bottom(
+    page: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", (EXAMPLES.parent / page).read_text(encoding="utf-8"), re.DOTALL)
+    assert blocks
+    names: dict[str, object] = {}
+    for block in blocks:
+        exec(block, names)
+    assert says in capsys.readouterr().out and not left(tmp_path)
+
+
 SLOWLY = """
+import time
+
 from zencell import pose
 from zencell.blocking import Cell
 
@@ -84,6 +99,7 @@ with Cell.start("panda") as cell:
     try:
         cell.arm.move(pose(0.3, 0.5, 0.3), speed=0.02)
     except KeyboardInterrupt:
+        time.sleep(0.5)  # in which it comes to rest
         status = cell.arm.status()
         print(status.state, abs(cell.arm.velocities()).max() < 0.01, flush=True)
         raise
@@ -101,6 +117,13 @@ def test_ctrl_c_stops_the_arm_and_ends_the_cell(tmp_path: Path) -> None:
     out, told = script.communicate(timeout=60)
     assert out == "cancelled True\n", (out, told)
     assert told.rstrip().endswith("KeyboardInterrupt") and script.returncode != 0 and not left(tmp_path)
+
+
+def test_a_script_that_forgets_its_cell_ends_it_all_the_same(tmp_path: Path) -> None:
+    script = "from zencell.blocking import Cell\ncell = Cell.start('panda').open()\nprint(cell.arm.joints().shape)"
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "(7,)\n", "") and not left(tmp_path)
 
 
 def test_a_cell_that_does_not_come_up_says_why(tmp_path: Path) -> None:
