@@ -24,7 +24,7 @@ BIN = Path(sys.executable).parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 LINES = [
     line.partition("#")[0].strip()
-    for block in re.findall(r"^```\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
+    for block in re.findall(r"^```\w*\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
     for line in block.splitlines()
     if line.startswith((".venv/bin/", "make "))
 ]
