@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from cli import hosts, options, securing, verbs, viewing
-from cli.operation import Operation
+from cli.operation import Operation, end_with_stdin
 
 Speed = Annotated[str, typer.Option("--speed", metavar="X", help="cell time per wall time, 0.1 to 10")]
 NoViewer = Annotated[bool, typer.Option("--no-viewer", help="without the operator's page")]
@@ -20,6 +20,9 @@ ChaosSeed = Annotated[
 ]
 ChaosRate = Annotated[
     str | None, typer.Option("--chaos-rate", metavar="N", help="faults per minute of wall time, on average [30]")
+]
+UntilStdinEnds = Annotated[
+    bool, typer.Option("--until-stdin-ends", help="end when standard input does: with the program that started this")
 ]
 
 
@@ -44,6 +47,7 @@ def _operation(
     record: Record = None,
     chaos: ChaosSeed = None,
     chaos_rate: ChaosRate = None,
+    until_stdin_ends: UntilStdinEnds = False,
     *,
     until_ended: bool,
 ) -> Operation:
@@ -51,6 +55,8 @@ def _operation(
     securing.choose(secure)
     operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json,
                           hosts.Share(listen, link, only, without))
+    if until_stdin_ends:
+        end_with_stdin()
     operation.serve_page(viewer_host, viewer_port)
     operation.record_to(record)
     operation.disturb(chaos, chaos_rate, until_ended=until_ended)

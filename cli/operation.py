@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
@@ -378,3 +379,15 @@ def zenoh_cli_line(endpoint: str, cell: str) -> str:
     """A command line to paste that shows all of a cell with zenoh-cli."""
     line = "{key} {value}"
     return f"zenoh --mode client --connect {endpoint} subscribe -k '{cell}/**' --decoder msgpack --line '{line}'"
+
+
+def end_with_stdin() -> None:
+    """Have this process take the end of its standard input for Ctrl-C, also should nobody be left to close it."""
+
+    def watch() -> None:
+        with contextlib.suppress(OSError):
+            while os.read(sys.stdin.fileno(), 4096):
+                pass
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=watch, name="stdin", daemon=True).start()

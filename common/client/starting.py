@@ -44,7 +44,7 @@ class Started:
         """Take note of what is to be started; see `Cell.start`."""
         self._cell, self._domain = cell, domain
         self.name, self.domain = "", -1
-        self._arguments = ["up", cell, "--speed", f"{speed:g}"]
+        self._arguments = ["up", cell, "--until-stdin-ends", "--speed", f"{speed:g}"]
         self._arguments += [] if viewer else ["--no-viewer"]
         self._arguments += [] if world is None else ["--world", world]
         self._arguments += [] if seed is None else ["--seed", str(seed)]
@@ -76,7 +76,7 @@ class Started:
         with self._log.open("wb") as out:
             return subprocess.Popen(
                 [*python_module("zencell"), *self._arguments, "--domain", str(self.domain)],
-                stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, start_new_session=True,
+                stdin=subprocess.PIPE, stdout=out, stderr=subprocess.STDOUT, start_new_session=True,
                 env={**os.environ, "PYTHONPATH": python_path()})
 
     async def _until_up(self) -> None:
@@ -121,6 +121,8 @@ async def _ended(process: subprocess.Popen[bytes]) -> None:
     """Have a process end, without a thread: there are no new ones any more when the program itself ends."""
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
+    if process.stdin is not None:
+        process.stdin.close()
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(ENDS):
             while process.poll() is None:  # noqa: ASYNC110 - nothing tells of a child's end

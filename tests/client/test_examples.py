@@ -45,13 +45,13 @@ def test_script_prints_what_it_found_and_leaves_nothing_behind(name: str, tmp_pa
     assert not left(tmp_path)
 
 
-def left(folder: Path) -> list[str]:
-    """Processes that were begun in a folder."""
+def left(folder: Path) -> list[psutil.Process]:
+    """Processes that were begun in a folder, but for this one."""
     found = []
     for process in psutil.process_iter():
         try:
             if process.pid != os.getpid() and Path(process.cwd()) == folder:
-                found.append(" ".join(process.cmdline()))
+                found.append(process)
         except psutil.Error:
             continue
     return found
@@ -117,6 +117,16 @@ def test_ctrl_c_stops_the_arm_and_ends_the_cell(tmp_path: Path) -> None:
     out, told = script.communicate(timeout=60)
     assert out == "cancelled True\n", (out, told)
     assert told.rstrip().endswith("KeyboardInterrupt") and script.returncode != 0 and not left(tmp_path)
+
+
+def test_a_script_that_is_killed_takes_its_cell_with_it(tmp_path: Path) -> None:
+    script = subprocess.Popen(
+        [sys.executable, "-c", SLOWLY], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    assert script.stdout is not None and script.stdout.readline() == "ready\n" and left(tmp_path)
+    script.kill()
+    script.wait()
+    _, alive = psutil.wait_procs(left(tmp_path), timeout=60)
+    assert not alive
 
 
 def test_a_script_that_forgets_its_cell_ends_it_all_the_same(tmp_path: Path) -> None:
