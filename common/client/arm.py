@@ -67,7 +67,7 @@ class Arm:
     def __init__(self, ear: Ear, owner: str, tf: Callable[[str, str], Coroutine[Any, Any, Array]]) -> None:
         """The arm of a cell, moved in the name of `owner`."""
         self.owner = owner
-        self.motion = OperatorMotion(ear.bus, owner=owner)
+        self._motion = OperatorMotion(ear.bus, owner=owner)
         self._ear, self._bus, self._tf = ear, ear.bus, tf
 
     # --- where it is ----------------------------------------------------------------------------------------------
@@ -138,7 +138,7 @@ class Arm:
             pairs = [(link, name) for link in (await self.description()).fingers for name in names]
             more["allowed_collisions"] = [*more.get("allowed_collisions", ()), *pairs]
         planner = planner or (ARCS if isinstance(goal, ArcGoal) else "")
-        response = await self.motion.plan(goal, **_asked(
+        response = await self._motion.plan(goal, **_asked(
             more, straight=straight, velocity_scaling=speed, planner=planner, constraints=constraints))
         if not response.ok or response.trajectory is None:
             raise MotionFailed(response.error, response.message)
@@ -155,12 +155,20 @@ class Arm:
             MotionFailed: somebody else has the robot, or the motion ended otherwise: `code` and the line say how.
             RequestFailed: the executor does not answer.
         """
-        return await self.motion.follow(plan.response.trajectory, timeout=timeout, plan=plan.response)  # type: ignore[arg-type]
+        return await self._motion.follow(plan.response.trajectory, timeout=timeout, plan=plan.response)  # type: ignore[arg-type]
 
     async def move(self, to: Where | Through, *, timeout: float = PATIENCE, **how: Any) -> MotionStatus:
         """Plan and execute: see there."""
-        await self.motion.require_free()
+        await self.require_free()
         return await self.execute(await self.plan(to, **how), timeout=timeout)
+
+    async def require_free(self) -> MotionStatus:
+        """The motion status, when nothing and nobody moves the robot.
+
+        Raises:
+            MotionFailed: a task or another person has it, or nobody says how it is.
+        """
+        return await self._motion.require_free()
 
     async def stop(self, reason: str = "a program asked for it") -> MotionStatus:
         """Bring it to rest, whoever moves it; a task waits for a start then, also after a restart of anything."""
@@ -300,7 +308,7 @@ class Hand:
         """
         if not (await self._arm.description()).gripper:
             raise MotionFailed("no_gripper", "the robot of this cell has no gripper")
-        await self._arm.motion.require_free()
+        await self._arm.require_free()
         asked = check(GripperCommand, {
             "header": self._bus.header(), "id": f"{self._owner}-{new_id()}"[-100:], "owner": self._owner,
             "width": width, "effort": force, "expected_width": expected, "width_tolerance": tolerance, "mass": mass,

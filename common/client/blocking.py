@@ -18,6 +18,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from typing import Any, TypeVar
 
 from common.client import arm, cell, hearing, parameters, task
+from common.errors import ZencellError
 
 T = TypeVar("T")
 
@@ -80,7 +81,12 @@ class Blocking:
         return dir(self._inner)
 
     def __getattr__(self, name: str) -> Any:
-        return given(self._loop, getattr(self._inner, name))
+        if name.startswith("__") or "_inner" not in self.__dict__:  # what copies and pickles ask for
+            raise AttributeError(name)
+        value = getattr(self._inner, name)
+        if self._loop is None:
+            raise ZencellError(f"cell.{name}: the cell {cell.NOT_JOINED}")
+        return given(self._loop, value)
 
     def __setattr__(self, name: str, value: object) -> None:
         setattr(self._inner, name, value)

@@ -28,7 +28,7 @@ from common.transport.bus import Bus
 from common.transport.credentials import OPERATOR
 
 TIMEOUT = 5.0  # [s] wall for an answer
-NOT_JOINED = "is not joined: use it inside `async with Cell(...) as cell`"
+NOT_JOINED = "is not joined: use it inside `async with Cell(...) as cell`, or `with` where nothing is awaited"
 
 
 def seen(scene: PlanningScene) -> list[CollisionObject]:

@@ -1,0 +1,107 @@
+"""The client without `await`: a loop in a thread of its own, and what Ctrl-C does to what is waited for."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import copy
+import signal
+import threading
+from collections.abc import AsyncIterator, Iterator
+
+import pytest
+
+from common.client.blocking import Blocking, Cell, Loop, called
+from common.errors import ZencellError
+
+pytestmark = pytest.mark.timeout(30)
+
+
+@pytest.fixture
+def loop() -> Iterator[Loop]:
+    made = Loop()
+    yield made
+    made.end()
+    assert made.ended and not any(thread.name == "zencell" for thread in threading.enumerate())
+
+
+class Thing:
+    """Says things."""
+
+    async def twice(self, value: int) -> int:
+        """Twice of it."""
+        return 2 * value
+
+    async def fails(self) -> None:
+        raise ZencellError("as it has to")
+
+    async def count(self, most: int) -> AsyncIterator[int]:
+        try:
+            for n in range(most):
+                yield n
+        finally:
+            self.left = True
+
+    @contextlib.asynccontextmanager
+    async def block(self) -> AsyncIterator[str]:
+        self.entered = True
+        try:
+            yield "inside"
+        finally:
+            self.entered = False
+
+    async def for_ever(self) -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.sleep(0.05)  # something is still to be done
+            self.ended = True
+
+
+def test_what_is_awaited_is_called_and_its_errors_are_raised_where_it_was(loop: Loop) -> None:
+    thing = Blocking(loop, Thing())
+    assert thing.twice(3) == 6 and thing.twice.__doc__ == "Twice of it." and thing.__doc__ == "Says things."
+    assert "twice" in dir(thing)
+    with pytest.raises(ZencellError, match="as it has to"):
+        thing.fails()
+    with pytest.raises(AttributeError):
+        thing.thrice()
+
+
+def test_async_for_is_for_and_is_closed_when_it_is_left(loop: Loop) -> None:
+    thing = Thing()
+    assert list(Blocking(loop, thing).count(3)) == [0, 1, 2]
+    thing.left = False
+    for _ in Blocking(loop, thing).count(100):
+        break
+    assert thing.left
+
+
+def test_async_with_is_with_also_when_it_ends_by_an_error(loop: Loop) -> None:
+    thing = Thing()
+    with Blocking(loop, thing).block() as value:
+        assert value == "inside" and thing.entered
+    assert not thing.entered
+    with pytest.raises(ValueError, match="inside"), Blocking(loop, thing).block():
+        raise ValueError("inside")
+    assert not thing.entered
+
+
+def test_ctrl_c_cancels_what_is_waited_for_and_waits_for_its_end(loop: Loop) -> None:
+    thing = Thing()
+    threading.Timer(0.2, lambda: signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        called(loop, thing.for_ever)
+    assert thing.ended
+    assert called(loop, thing.twice, 4) == 8, "and the loop goes on"
+
+
+def test_a_cell_that_is_not_open_says_so_and_can_be_looked_at() -> None:
+    cell = Cell("nowhere")
+    for name in ("arm", "cameras", "listen"):
+        with pytest.raises(ZencellError, match="is not joined"):
+            getattr(cell, name)
+    assert "arm" in repr(dir(cell)) or "camera" in dir(cell)
+    cell.close()
+    with pytest.raises(AttributeError):
+        copy.copy(cell).__wrapped__  # noqa: B018
