@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,18 +27,20 @@ def slot_positions(box: Container, radius: float, table_height: float) -> Array:
 
 
 def occupied_slots(
-    pixels: Iterable[tuple[float, float]], camera: Pinhole, slots: Array, radius: float
+    pixels: Iterable[tuple[float, float]], camera: Pinhole, slots: Array, radius: float, free: Collection[int] = ()
 ) -> set[int]:
     """Which slots hold a sphere, as indices.
 
     Each seen sphere belongs to the slot whose centre is imaged nearest to it, the nearest pairs first, one to one.
-    Below one that is seen stand those that carry it, though they are hidden.
+    Below one that is seen stand those that carry it, though they are hidden; but none in a slot that is known to be
+    free: above that it hangs or falls.
 
     Args:
         pixels: (u, v) of the spheres that are seen inside the container.
         camera: with its pose in world.
         slots: (n, 3) [m], world, as `slot_positions` has them, in its order.
         radius: of a sphere [m].
+        free: slots that hold a sphere only if it is seen.
     """
     images = camera.project(slots)
     seen = np.array(list(pixels)).reshape(-1, 2)
@@ -53,4 +55,5 @@ def occupied_slots(
             continue
         taken.add(slot)
         matched.add(number)
-    return taken | {slot - 4 * below for slot in taken for below in range(1, slot // 4 + 1)}
+    carriers = {slot - 4 * below for slot in taken for below in range(1, slot // 4 + 1)}
+    return taken | carriers.difference(free)

@@ -42,6 +42,7 @@ class PerceivedScene:
             for k, (x, y, z) in enumerate(self._slots.tolist(), 1)
         ]
         self._occupied: dict[int, tuple[int, set[int]]] = {}  # stamp and slots by view
+        self._free: set[int] = set()  # slots in which nothing was when the hand took something, nor was seen since
         self._beside_slots: dict[int, list[Sighting]] = {}  # what else lies in the container, by view
         self._held: m.AttachedObject | None = None
         self._changed_hands_at = 0
@@ -77,7 +78,8 @@ class PerceivedScene:
                 on_table.append(thing)
         self._beside_slots[view] = beside_slots
         self._tracks.update(on_table, stamp * 1e-9)
-        seen = occupied_slots(in_container, camera, self._slots, self.around.ball_radius)
+        seen = occupied_slots(in_container, camera, self._slots, self.around.ball_radius, self._free)
+        self._free -= seen
         self._occupied[view] = stamp, seen
 
     def feel(self, gripper: m.GripperState, T_world_tcp: Array | None) -> None:
@@ -88,6 +90,9 @@ class PerceivedScene:
         if not gripper.holding or T_world_tcp is None:
             self._held = None
             return
+        # What was let go may be seen while it still hangs or falls, as high as if it lay on another one. One ball more
+        # has come into the container then, not two. Before the first picture nothing is known to be free.
+        self._free = set(range(len(self._slots))) - self._occupied_slots() if self._occupied else set()
         x, y, z = (float(v) for v in T_world_tcp[:3, 3])
         track = self._tracks.take((x, y, z), self.p.match_radius, gripper.width if self.gripper.cup is None else 0.0)
         # The fingers have centred it between them; along them and along the tool it lies where it was seen.

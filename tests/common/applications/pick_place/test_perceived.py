@@ -82,6 +82,51 @@ def test_opened_hand_holds_nothing_and_the_ball_in_the_box_is_contained() -> Non
     assert "target" not in roles(s)
 
 
+LOW, HIGH = (0.517, 0.217, 0.035), (0.517, 0.217, 0.095)  # one above the other in the box
+OVER_BOX = tool_down(0.55, 0.25, 0.25)
+
+
+def test_ball_that_was_let_go_and_hangs_over_a_free_place_in_the_box_is_one_ball_until_it_lies_there() -> None:
+    s = scene()
+    s.see(frame(1.0, (0.4, 0.0, 0.03)), CAMERA, AWAY)
+    s.feel(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
+    s.see(frame(2.0), CAMERA, OVER_BOX)
+    s.feel(gripper(2.1, False), OVER_BOX)
+    for t in (2.2, 2.3, 4.0):
+        s.see(frame(t, HIGH), CAMERA, AWAY)
+        assert roles(s)["contained"] == ["slot_5"]
+    s.see(frame(4.1, LOW), CAMERA, AWAY)
+    assert roles(s)["contained"] == ["slot_1"]
+
+
+def test_ball_below_the_one_that_was_let_go_still_counts_though_the_hand_and_then_that_one_hide_it() -> None:
+    s = scene()
+    s.see(frame(1.0, (0.4, 0.0, 0.03), LOW), CAMERA, AWAY)
+    s.feel(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
+    s.see(frame(2.0), CAMERA, OVER_BOX)
+    s.feel(gripper(2.1, False), OVER_BOX)
+    s.see(frame(2.2, HIGH), CAMERA, AWAY)
+    assert roles(s)["contained"] == ["slot_1", "slot_5"]
+
+
+def test_ball_that_filled_a_free_place_carries_the_next_one() -> None:
+    s = scene()
+    s.see(frame(1.0, (0.4, 0.0, 0.03)), CAMERA, AWAY)
+    s.feel(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
+    s.feel(gripper(2.1, False), OVER_BOX)
+    s.see(frame(2.2, LOW), CAMERA, AWAY)
+    s.see(frame(2.3, HIGH), CAMERA, AWAY)  # put there by somebody
+    assert roles(s)["contained"] == ["slot_1", "slot_5"]
+
+
+@pytest.mark.parametrize("holding", [False, True])
+def test_after_a_restart_a_ball_that_is_hidden_in_the_box_is_taken_to_be_there(holding: bool) -> None:
+    s = scene()
+    s.feel(gripper(1.0, holding), OVER_BOX)
+    s.see(frame(1.1, HIGH), CAMERA, OVER_BOX)
+    assert roles(s)["contained"] == ["slot_1", "slot_5"]
+
+
 def test_perceived_place_is_where_the_ball_was_seen() -> None:
     s = scene()
     for t in (1.0, 1.1, 1.2):
