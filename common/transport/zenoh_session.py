@@ -300,7 +300,7 @@ async def open_zenoh(
 
     def deliver(session: ZenohSession) -> None:
         if opened.cancelled():
-            threading.Thread(target=session.close).start()
+            threading.Thread(target=session.close, daemon=True).start()
         else:
             opened.set_result(session)
 
@@ -322,7 +322,8 @@ async def open_zenoh(
             return
 
     # A thread of our own: asyncio would wait at its end for one of its executor's.
-    threading.Thread(target=work, name="connect").start()  # no daemon: cut off in Zenoh, it would end the program
+    # No daemon: cut off inside Zenoh at the end of a program it would bring that down.
+    threading.Thread(target=work, name="connect", daemon=False).start()
     try:
         return await opened
     finally:
