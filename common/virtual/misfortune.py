@@ -17,6 +17,7 @@ from common.application import find_application
 from common.chaos.agent import Chaos
 from common.chaos.plan import Fault as Bad
 from common.chaos.plan import Form
+from common.control.jogging import DEADMAN, STANDS
 from common.errors import RequestFailed
 from common.process.operator_motion import MotionFailed, OperatorMotion
 from common.process.persist import persist
@@ -26,6 +27,7 @@ from common.virtual.faults import Amid, Fault, Plan
 from common.virtual.loop import Life, context_of
 from common.virtual.network import VirtualSession
 from common.virtual.process import Host, VirtualBus, VirtualProcess
+from common.virtual.sight import Sight
 
 AGAIN = 0.1  # [s] between looks whether something has come about
 LATEST = 0.3  # [s] after which a process crashes that does not get to the turn at which it was to
@@ -50,6 +52,7 @@ START_LATE = 0.3, 1.0  # [s] by which a start comes late when somebody stops the
 GOAL_LATE = 0.5, 1.8  # [s] by which the goal comes late that a person gives up: less than what is refused as too old
 JOGS, MOST_JOG = 4, 40  # of a person, and messages in each
 JOG_PERIOD, JOG_GAP = 0.02, 0.5  # [s] between those, and at most between two of them
+JOG_LATE = 0.3  # [s] after which a jog command does nothing any more, nor a person who has not seen the arm for so long
 PERSON_LATE = 1.0  # [s] at most between a person's stop and what is done next, in two places at once
 
 Act = Callable[[VirtualSession, Fault], Coroutine[Any, Any, None]]
@@ -328,17 +331,30 @@ class Misfortune:
             self._network.detach(session)
 
     async def _take_over(self, session: VirtualSession, _fault: Fault) -> None:
-        """Take the motion over, jog a joint to and fro, and start the task, which hands it over."""
+        """Take the motion over, jog joints as far as nothing is in the way, and start the task, which hands it over."""
         host, random = self._host, self._late
         bus = VirtualBus(session, PERSON, host.cell.name, host.clock, host.requests)
         heard_of, jogs = bus.reader(topics.MOTION_STATUS), bus.writer(topics.MOTION_JOG)
-        joints = host.cell.robot.joints
+        states, scenes = bus.reader(topics.JOINT_STATES), bus.reader(topics.PLANNING_SCENE)
+        joints, sight, speed = host.cell.robot.joints, Sight(host.cell), host.clock.speed
+
+        def clear(velocities: dict[str, float]) -> bool:
+            """Whether the arm would come to rest before anything in its way, however late this command comes."""
+            state, scene = states.latest, scenes.latest
+            if state is None or scene is None:
+                return False
+            age = max(0.0, (bus.header().stamp - state.header.stamp) * 1e-9)
+            rests = (JOG_LATE + DEADMAN + STANDS) * speed
+            return age < JOG_LATE * speed and sight.clear(state, scene, velocities, age + rests)
+
         try:
             await persist(bus.client(topics.MOTION_OWN), m.OwnRequest(act="take", owner=PERSON, over=True),
                           PERSON_TIMEOUT, lambda error: m.MotionOwner(), lambda problem: None)
             for _ in range(JOGS):
                 velocities = {str(random.choice(joints)): float(random.uniform(-1.0, 1.0))}
                 for _ in range(int(random.integers(1, MOST_JOG))):
+                    if not clear(velocities):
+                        break
                     heard = heard_of.latest.newest if heard_of.latest else 0
                     jogs.put(m.JogCommand(header=bus.header(), owner=PERSON, heard=heard, joints=velocities))
                     await asyncio.sleep(JOG_PERIOD)

@@ -29,6 +29,7 @@ def outcome_of(name: str, seed: int) -> Outcome:
     pytest.param("panda", 2, marks=pytest.mark.slow),  # the answer to who is there comes late, to a second instance
     pytest.param("ur5", 2, marks=pytest.mark.slow),
     pytest.param("ur5", 22, marks=pytest.mark.slow),  # stopped where it cannot go up any further
+    pytest.param("ur5", 45, marks=pytest.mark.slow),  # jogged towards the pedestal of the object, in a fast cell
 ])
 def test_cell_ends_well_whatever_goes_wrong(cell, seed):
     outcome = outcome_of(cell, seed)
