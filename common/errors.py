@@ -19,7 +19,7 @@ class ConfigError(ZencellError):
     """
 
     def __init__(self, field: str, value: object, expected: str) -> None:
-        shown = repr(value)
+        shown = " ".join(repr(value).split())  # one line, also of a matrix
         if len(shown) > LONGEST_SHOWN:
             shown = shown[: LONGEST_SHOWN - 3] + "..."
         super().__init__(f"{field}: {expected}" if value is ... else f"{field}: {shown} {expected}")

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator, Mapping
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common import topics
-from common.client.goals import Plan, Point, Through, Where, goal_of
+from common.client.goals import Plan, Point, Through, Where, goal_of, numbers
 from common.client.hearing import Ear, NothingHeard
 from common.config import check
-from common.errors import ConfigError, UnknownName, ZencellError
+from common.errors import ConfigError, RequestLost, RequestTimeout, UnknownName, ZencellError
 from common.messages import (
     ArcGoal,
     GripperCommand,
@@ -41,6 +41,7 @@ POWER = 60.0  # [s] wall: power and brakes take some
 JOG_PERIOD = 0.02  # [s] wall
 LONGEST_JOG = 60.0  # [s] wall
 FIRST_WORD = 3.0  # [s] in which the motion has become ours
+RESTS, AT_REST = 1.0, 1e-3  # [s] wall in which a jogged arm rests, [rad/s, m/s]
 UNHEARD, LET_GO = 0.3, 0.4  # [s] of jogging in vain, and without it, after which it counts anew
 FINGERS = 10.0  # [s] wall in which fingers have come to their end
 ARCS = "circ"  # plans arcs, and need not be in the pipeline of a cell
@@ -69,6 +70,7 @@ class Arm:
         self.owner = owner
         self._motion = OperatorMotion(ear.bus, owner=owner)
         self._ear, self._bus, self._tf = ear, ear.bus, tf
+        self._moving: set[asyncio.Task[Any]] = set()  # what moves it in this program
 
     # --- where it is ----------------------------------------------------------------------------------------------
 
@@ -131,10 +133,12 @@ class Arm:
             MotionFailed: there is no way; `code` says which kind of no, the line what is in the way.
             RequestFailed: the planner does not answer.
         """
+        if straight and (via is not None or around is not None):
+            raise ConfigError("straight", straight, "does not go with via or around, which are arcs")
         if isinstance(to, Through):
             to = to.starting_at(await self.pose())
         goal = goal_of(to, via=via, around=around)
-        if names := list(touch):
+        if names := [touch] if isinstance(touch, str) else list(touch):
             pairs = [(link, name) for link in (await self.description()).fingers for name in names]
             more["allowed_collisions"] = [*more.get("allowed_collisions", ()), *pairs]
         planner = planner or (ARCS if isinstance(goal, ArcGoal) else "")
@@ -155,12 +159,34 @@ class Arm:
             MotionFailed: somebody else has the robot, or the motion ended otherwise: `code` and the line say how.
             RequestFailed: the executor does not answer.
         """
-        return await self._motion.follow(plan.response.trajectory, timeout=timeout, plan=plan.response)  # type: ignore[arg-type]
+        if not isinstance(plan, Plan) or plan.response.trajectory is None:
+            raise ConfigError("plan", plan, "must be a Plan, as `arm.plan(...)` returns it")
+        with self._noted():
+            return await self._motion.follow(plan.response.trajectory, timeout=timeout, plan=plan.response)
 
     async def move(self, to: Where | Through, *, timeout: float = PATIENCE, **how: Any) -> MotionStatus:
         """Plan and execute: see there."""
         await self.require_free()
         return await self.execute(await self.plan(to, **how), timeout=timeout)
+
+    @contextlib.contextmanager
+    def _noted(self) -> Iterator[None]:
+        """Have what is done inside be ended by `end`."""
+        task = asyncio.current_task()
+        assert task is not None
+        self._moving.add(task)
+        try:
+            yield
+        finally:
+            self._moving.discard(task)
+
+    async def end(self) -> None:
+        """Stop what this program moves: whoever waits for it is cancelled."""
+        moving = self._moving - {asyncio.current_task()}
+        for task in moving:
+            task.cancel()
+        if moving:
+            await asyncio.wait(moving)
 
     async def require_free(self) -> MotionStatus:
         """The motion status, when nothing and nobody moves the robot.
@@ -172,7 +198,8 @@ class Arm:
 
     async def stop(self, reason: str = "a program asked for it") -> MotionStatus:
         """Bring it to rest, whoever moves it; a task waits for a start then, also after a restart of anything."""
-        return await self._bus.client(topics.MOTION_STOP).call(StopRequest(reason=reason, owner=self.owner), TIMEOUT)
+        asked = check(StopRequest, {"reason": reason, "owner": self.owner}, "stop")
+        return await self._bus.client(topics.MOTION_STOP).call(asked, TIMEOUT)
 
     async def hold(self, reason: str = "") -> MotionStatus:
         """Bring it to rest on its path until `release`."""
@@ -183,7 +210,7 @@ class Arm:
         return await self._hold(False, "")
 
     async def _hold(self, hold: bool, reason: str) -> MotionStatus:
-        asked = HoldRequest(hold=hold, reason=reason, owner=self.owner)
+        asked = check(HoldRequest, {"hold": hold, "reason": reason, "owner": self.owner}, "hold")
         return await self._bus.client(topics.MOTION_HOLD).call(asked, TIMEOUT)
 
     async def jog(
@@ -205,9 +232,20 @@ class Arm:
             RequestFailed: nobody says how the robot is.
         """
         check_seconds(seconds)
+        with self._noted():
+            await self._jog(joints or {}, numbers("linear", linear), numbers("angular", angular), frame, seconds)
+        with contextlib.suppress(TimeoutError):  # who moves it next is refused while it comes to rest
+            async with asyncio.timeout(RESTS):
+                while np.abs(await self.velocities()).max() > AT_REST:
+                    pass
+
+    async def _jog(
+        self, joints: Mapping[str, float], linear: Array, angular: Array, frame: str, seconds: float
+    ) -> None:
         asked = check(JogCommand, {
-            "owner": self.owner, "joints": dict(joints or {}), "frame": frame,
-            "linear": dict(zip("xyz", linear, strict=True)), "angular": dict(zip("xyz", angular, strict=True))}, "jog")
+            "owner": self.owner, "joints": dict(joints), "frame": frame,
+            "linear": dict(zip("xyz", linear.tolist(), strict=True)),
+            "angular": dict(zip("xyz", angular.tolist(), strict=True))}, "jog")
         known = (await self._ear.newest(topics.JOINT_STATES)).name
         for name in asked.joints:
             if name not in known:
@@ -232,12 +270,14 @@ class Arm:
                     await asyncio.sleep(LET_GO)
                     began = clock()
                 elif not goes and not waits:
-                    kept = "; ".join(inhibit.told for inhibit in state.inhibits)
-                    raise NotJogged(now.told, kept or state.message)
+                    raise NotJogged(now.told, _kept(state))
                 ours = ours or goes
         finally:
             writer.put(JogCommand(header=self._bus.header(), owner=self.owner, heard=heard))
-        await asyncio.sleep(JOG_PERIOD)
+        if not ours:
+            now, state = owners.latest, motion.latest
+            assert now is not None and state is not None
+            raise NotJogged(now.told, _kept(state))
 
     # --- whose the motion is --------------------------------------------------------------------------------------
 
@@ -260,7 +300,11 @@ class Arm:
         Raises:
             RemoteError: it is somebody else's.
         """
-        owner = await self.own("take", over=over, lease=lease)
+        try:
+            owner = await self.own("take", over=over, lease=lease)
+        except (asyncio.CancelledError, RequestLost, RequestTimeout):  # it may have been carried out
+            await self.own("give")
+            raise
         try:
             yield owner
         finally:
@@ -308,8 +352,9 @@ class Hand:
         """
         if not (await self._arm.description()).gripper:
             raise MotionFailed("no_gripper", "the robot of this cell has no gripper")
-        await self._arm.require_free()
+        heard = (await self._arm.require_free()).newest
         asked = check(GripperCommand, {
+            "heard": heard,
             "header": self._bus.header(), "id": f"{self._owner}-{new_id()}"[-100:], "owner": self._owner,
             "width": width, "effort": force, "expected_width": expected, "width_tolerance": tolerance, "mass": mass,
         }, "gripper")
@@ -349,4 +394,11 @@ def check_seconds(seconds: float) -> None:
 
 
 def _asked(more: dict[str, Any], **given: Any) -> dict[str, Any]:
-    return {**{name: value for name, value in given.items() if value not in (None, "", False)}, **more}
+    for name in given.keys() & more.keys():
+        raise ConfigError(name, more[name], "is said twice")
+    return {**{name: value for name, value in given.items() if value is not None}, **more}
+
+
+def _kept(state: MotionStatus) -> str:
+    """Who keeps the arm from moving, in words."""
+    return "; ".join(inhibit.told for inhibit in state.inhibits) or state.message

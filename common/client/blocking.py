@@ -22,6 +22,7 @@ from common.errors import ZencellError
 
 T = TypeVar("T")
 
+ENDS = 5.0  # [s] in which what was begun has ended
 WRAPPED = (arm.Arm, arm.Hand, hearing.Camera, parameters.Parameters, task.TaskControl, cell.World)
 
 
@@ -37,20 +38,24 @@ class Loop:
 
     def wait(self, begin: Callable[[], Awaitable[T]]) -> T:
         """The result of what is begun on the loop. Ctrl-C cancels it, waits until it has ended, and is raised then."""
+        if self.ended:
+            raise ZencellError("the cell was closed")
         done: concurrent.futures.Future[T] = concurrent.futures.Future()
-        tasks: list[asyncio.Task[None]] = []
+        tasks: list[asyncio.Future[T]] = []
 
-        async def work() -> None:
-            try:
-                done.set_result(await begin())
-            except asyncio.CancelledError:
-                done.cancel()
-                done.set_running_or_notify_cancel()
-                raise
-            except BaseException as error:  # is raised where it was asked for
+        def settle(task: asyncio.Future[T]) -> None:
+            if task.cancelled():
+                done.set_exception(ZencellError("the cell was closed meanwhile"))
+            elif (error := task.exception()) is not None:
                 done.set_exception(error)
+            else:
+                done.set_result(task.result())
 
-        self._loop.call_soon_threadsafe(lambda: tasks.append(self._loop.create_task(work())))
+        def start() -> None:
+            tasks.append(task := asyncio.ensure_future(begin()))
+            task.add_done_callback(settle)
+
+        self._loop.call_soon_threadsafe(start)
         try:
             return done.result()
         except KeyboardInterrupt:
@@ -58,13 +63,31 @@ class Loop:
             concurrent.futures.wait([done])
             raise
 
+    @property
+    def is_here(self) -> bool:
+        """Whether this is the loop's own thread, which must not wait for it."""
+        return threading.current_thread() is self._thread
+
+    def soon(self, begin: Callable[[], Awaitable[object]]) -> None:
+        """Begin something that nobody waits for."""
+        self._loop.call_soon_threadsafe(lambda: asyncio.ensure_future(begin()))
+
     def end(self) -> None:
         """End it."""
         if not self.ended:
+            self.wait(self._cancelled)
             self.ended = True
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
             self._loop.close()
+
+    async def _cancelled(self) -> None:
+        """Whoever still waits is told that there is nothing to wait for."""
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        for other in others:
+            other.cancel()
+        if others:
+            await asyncio.wait(others, timeout=ENDS)
 
 
 class Blocking:
@@ -138,7 +161,7 @@ def iterated(loop: Loop, messages: Any) -> Iterator[Any]:
                 return
     finally:
         if (close := getattr(found, "aclose", None)) is not None and not loop.ended:
-            loop.wait(close)
+            (loop.soon if loop.is_here else loop.wait)(close)  # here, where it is collected as garbage
 
 
 @contextlib.contextmanager

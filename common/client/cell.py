@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
 from typing import Any
 
 import msgpack
@@ -66,7 +66,7 @@ class World:
 
     async def objects(self) -> list[WorldObject]:
         """The truth: where everything is. What perceives must not use it."""
-        return (await self._ear.newest(topics.SCENE_OBJECTS)).objects
+        return (await self._ear.now(topics.SCENE_OBJECTS)).objects
 
 
 class Cell:
@@ -110,6 +110,7 @@ class Cell:
         self._joined = contextlib.AsyncExitStack()
         self._started: Started | None = None
         self._bus: Bus | None = None
+        self._entered = False
         self._frames: Frames | None = None
 
     @classmethod
@@ -154,6 +155,8 @@ class Cell:
         self.world = World(bus, self._ear)
 
     async def __aenter__(self) -> Cell:
+        if self._entered:
+            raise ZencellError("the cell is joined already")
         async with contextlib.AsyncExitStack() as stack:
             if self._started is not None:
                 up = await stack.enter_async_context(self._started)
@@ -164,11 +167,15 @@ class Cell:
                 self._take(bus)
                 stack.callback(setattr, self, "_bus", None)
             self._joined = stack.pop_all()
+        self._entered = True
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        self._frames = None
-        await self._joined.aclose()
+        self._frames, self._entered = None, False
+        try:
+            await self.arm.end()
+        finally:
+            await self._joined.aclose()
 
     def __getattr__(self, name: str) -> Any:
         """Say why an attribute is not there yet.
@@ -217,7 +224,7 @@ class Cell:
 
     async def planning_scene(self) -> PlanningScene:
         """What planners avoid: fixtures, and what was perceived."""
-        return await self._ear.newest(topics.PLANNING_SCENE)
+        return await self._ear.now(topics.PLANNING_SCENE)
 
     async def objects(self, least: int = 0, *, timeout: float = TIMEOUT) -> list[CollisionObject]:
         """What was perceived: ids, shapes, dimensions [m], colours, and poses in world.
@@ -261,7 +268,11 @@ class Cell:
     # --- any key --------------------------------------------------------------------------------------------------
 
     async def _carried(self, key: str | Carried) -> Carried | None:
-        return key if isinstance(key, Topic | Request) else find_topic(key) or await topic_in(self.bus, key)
+        if isinstance(key, Topic | Request):
+            return key
+        if not isinstance(key, str):
+            raise ConfigError("key", key, "must be a key, or its Topic or Request")
+        return find_topic(key) or await topic_in(self.bus, key)
 
     async def call(
         self, key: str | Request[Any, Any], message: Message | Mapping[str, Any] | None = None, *,
@@ -285,31 +296,44 @@ class Cell:
             raise UnknownName("request", str(key), [n for n, each in all_topics().items() if isinstance(each, Request)])
         if not math.isfinite(timeout) or timeout <= 0:
             raise ConfigError("timeout", timeout, "must be more than 0")
+        if not isinstance(message, Message | Mapping | None):
+            raise ConfigError(request.key, message, f"must be a {request.message.__name__}, or its fields")
         asked = message if isinstance(message, Message) else check(
             request.message, {**(message or {}), **fields}, request.key)
         if isinstance(header := getattr(asked, "header", None), Header) and not header.stamp:
             asked = asked.model_copy(update={"header": self.bus.header(header.frame_id)})  # decided now
         return await self.bus.client(request).call(asked, timeout)
 
-    async def listen(self, key: str | Topic[Any], *, plain: bool = False) -> AsyncIterator[Any]:
+    async def listen(
+        self, key: str | Topic[Any], *, plain: bool = False, timeout: float | None = None
+    ) -> AsyncIterator[Any]:
         """Messages of a key from now on: of a stream or state the newest, of an event all.
 
         Args:
             key: such as "joint_states", or the `Topic`.
             plain: take any key, and what comes as it was packed: dictionaries, lists, numbers.
+            timeout: for each message [s, wall]; else they are waited for without end, also once the cell has ended.
 
         Raises:
             UnknownName: no service of zencell writes it, and it is not asked for as `plain`; with the choices.
             ConfigError: it is a request.
+            NothingHeard: nothing came in time.
         """
         topic = None if plain else await self._carried(key)
         if topic is None and not plain:
             raise UnknownName("key", str(key), [name for name, t in all_topics().items() if isinstance(t, Topic)])
         if isinstance(topic, Request):
             raise ConfigError("key", topic.key, f"is a request: await cell.call({topic.key!r}, ...)")
-        if topic is not None:
-            async for message in messages(self.bus, topic):
+        found = messages(self.bus, topic) if topic is not None else self._packed(f"{self.name}/{key}")
+        async with contextlib.aclosing(found):
+            while True:
+                try:
+                    async with asyncio.timeout(timeout):
+                        message = await anext(found)
+                except TimeoutError:
+                    raise NothingHeard(f"{self.name}/{topic.key if topic else key}", timeout or 0.0) from None
                 yield message
-            return
-        async for sample in self.bus.raw_reader(f"{self.name}/{key}"):
+
+    async def _packed(self, key: str) -> AsyncGenerator[Any]:
+        async for sample in self.bus.raw_reader(key):
             yield msgpack.unpackb(sample.payload)

@@ -23,7 +23,7 @@ from common.messages import (
     SequenceGoal,
     Vector3,
 )
-from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
+from common.robot.transforms import pose_fields, rpy_to_matrix, transform
 
 Array = NDArray[np.float64]
 Where = AnyGoal | Pose | str | Sequence[float] | Array
@@ -35,7 +35,8 @@ SAYS = ("must be the name of a pose, joint positions, a pose as a matrix (4, 4) 
 
 def pose(x: float, y: float, z: float, *, rpy: Sequence[float] = (np.pi, 0.0, 0.0)) -> Array:
     """A pose (4, 4) in world: position [m], and roll, pitch, yaw [rad] about fixed x, y, z. Left out: straight down."""
-    return transform(rpy_to_matrix(*rpy), (x, y, z))
+    roll, pitch, yaw = numbers("rpy", rpy)
+    return transform(rpy_to_matrix(roll, pitch, yaw), numbers("x, y, z", (x, y, z)))
 
 
 def region(
@@ -87,19 +88,19 @@ def goal_of(to: Where, *, via: Point | None = None, around: Point | None = None)
         ConfigError: it is no goal.
     """
     if via is not None or around is not None:
-        return ArcGoal(pose=_pose(to), via=None if via is None else _vector("via", via),
-                       center=None if around is None else _vector("around", around))
+        return check(ArcGoal, {"pose": _pose(to), "via": None if via is None else _vector("via", via),
+                               "center": None if around is None else _vector("around", around)}, "to")
     if isinstance(to, JointGoal | PoseGoal | PathGoal | ArcGoal | SequenceGoal | GoalSet):
         return to
     if isinstance(to, str):
-        return JointGoal(named=to)
+        return check(JointGoal, {"named": to}, "to")
     if isinstance(to, Pose):
         return PoseGoal(pose=to)
     values = _numbers("to", to)
     if values.shape == (4, 4):
         return PoseGoal(pose=_pose(values))
     if values.ndim == 1 and values.size:
-        return JointGoal(positions=values.tolist())
+        return check(JointGoal, {"positions": values.tolist()}, "to")
     raise ConfigError("to", to, SAYS)
 
 
@@ -121,14 +122,24 @@ def _pose(at: Any) -> Pose:
         raise ConfigError("to", at, "must be a pose here: a matrix (4, 4) or `Pose`")
     if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) or np.linalg.det(T[:3, :3]) < 0:
         raise ConfigError("to", at, "has no rotation in its first three rows and columns")
-    return matrix_to_pose(T)
+    return check(Pose, pose_fields(T), "to")
+
+
+def numbers(name: str, given: object) -> Array:
+    """Three finite numbers (3,).
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    values = _numbers(name, given)
+    if values.shape != (3,):
+        raise ConfigError(name, given, "must be three numbers")
+    return values
 
 
 def _vector(name: str, given: Point) -> Vector3:
-    values = _numbers(name, given)
-    if values.shape != (3,):
-        raise ConfigError(name, given, "must be three numbers x, y, z")
-    return Vector3(x=values[0], y=values[1], z=values[2])
+    x, y, z = numbers(name, given)
+    return check(Vector3, {"x": x, "y": y, "z": z}, name)
 
 
 @dataclass(frozen=True)

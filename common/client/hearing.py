@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncGenerator, Callable, Coroutine
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -251,7 +251,7 @@ async def the_camera(bus: Bus, name: str) -> str:
     return name
 
 
-async def messages(bus: Bus, topic: Topic[M]) -> AsyncIterator[M]:
+async def messages(bus: Bus, topic: Topic[M]) -> AsyncGenerator[M, None]:
     """Messages of a topic from now on: of a stream the newest, of an event all."""
     reader = bus.reader(topic)
     try:

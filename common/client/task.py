@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 
 from common import topics
 from common.application import find_application
@@ -39,7 +39,7 @@ class TaskControl:
         """Start it, or start it again; a robot that you hold is let go, with `override` also one that others hold.
 
         Raises:
-            RemoteError: somebody else stopped it or has the motion.
+            RemoteError: somebody else holds the robot or has its motion. Stops of others are ended by a start.
         """
         return await self._tell("start", override)
 
@@ -98,7 +98,7 @@ class TaskControl:
         """How far it is: its newest status."""
         return await self._ear.newest(await self.topic())
 
-    async def __aiter__(self) -> AsyncIterator[TaskStatus]:
+    async def __aiter__(self) -> AsyncGenerator[TaskStatus, None]:
         reader = self._bus.reader(await self.topic())
         try:
             async for status in reader:
@@ -106,9 +106,14 @@ class TaskControl:
         finally:
             self._bus.listen(reader, False)
 
-    async def ended(self) -> TaskStatus:
-        """Its last status, once it is DONE or in ERROR."""
-        async for status in self:
-            if status.state in ENDED:
-                return status
+    async def ended(self, timeout: float | None = None) -> TaskStatus:
+        """Its last status, once it is DONE or in ERROR.
+
+        Raises:
+            TimeoutError: it is not, after so long [s, wall]; without one that is waited for without end.
+        """
+        async with asyncio.timeout(timeout), contextlib.aclosing(aiter(self)) as statuses:
+            async for status in statuses:
+                if status.state in ENDED:
+                    return status
         raise AssertionError  # it is heard of until the connection ends

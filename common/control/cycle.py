@@ -431,8 +431,8 @@ class ControlCycle:
         """
         if self._gripper is None:
             raise Refused("no_gripper", "this robot has no gripper")
-        objection = (self._inhibits.objection(request.id) or late or self._owners.objection(request.owner)
-                     or self._hand_fault.objection)
+        objection = (self._inhibits.objection(request.id, request.owner, request.heard) or late
+                     or self._owners.objection(request.owner) or self._hand_fault.objection)
         try:
             state = self._gripper.command(request, now, objection)
             if objection is None:

@@ -171,11 +171,12 @@ class GripperCommand(Message):
     """
 
     most_bytes: ClassVar[int] = SMALL
-    later: ClassVar[tuple[str, ...]] = ("expected_width", "width_tolerance", "owner", "mass")
+    later: ClassVar[tuple[str, ...]] = ("expected_width", "width_tolerance", "owner", "mass", "heard")
 
     header: Header = Header()
     id: Name
     owner: Who = Field("", description="who asks for it; empty for a task")
+    heard: Since | None = Field(None, description="`since` of the newest inhibit that this person had heard of")
     width: Annotated[float, Field(ge=0, le=0.2)]
     effort: Annotated[float, Field(ge=0, le=1e4, description="grip force [N]; 0: the gripper's own default")] = 0.0
     expected_width: Annotated[float, Field(ge=0, le=0.2)] | None = Field(

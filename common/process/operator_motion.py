@@ -16,7 +16,7 @@ from common import messages as m
 from common import topics
 from common.application import applications
 from common.config import check
-from common.errors import RequestFailed, ZencellError
+from common.errors import RequestFailed, RequestLost, ZencellError
 from common.sources import new_id
 from common.transport.bus import Bus
 from common.transport.reader import Reader
@@ -182,7 +182,9 @@ class OperatorMotion:
                     status = await self._motion.next()
             except TimeoutError:
                 if status is None or not status.held:
-                    raise _Stalled("timeout", f"no progress for {patience:g} s: the motion is stopped") from None
+                    raise _Stalled("timeout", f"no progress for {patience:g} s: the motion is given up") from None
+                if not self._execute.available:  # whoever held it last may be gone, and the executor with them
+                    raise RequestLost(self._execute.topic.key) from None
         if status.state != "succeeded":
             raise MotionFailed(status.error or status.state, f"the motion was {status.state}: {status.message}")
         return status

@@ -7,6 +7,7 @@ import contextlib
 import copy
 import signal
 import threading
+import time
 from collections.abc import AsyncIterator, Iterator
 
 import pytest
@@ -94,6 +95,47 @@ def test_ctrl_c_cancels_what_is_waited_for_and_waits_for_its_end(loop: Loop) -> 
         called(loop, thing.for_ever)
     assert thing.ended
     assert called(loop, thing.twice, 4) == 8, "and the loop goes on"
+
+
+def test_ctrl_c_while_the_loop_is_busy_is_no_different(loop: Loop) -> None:
+    thing = Thing()
+    loop._loop.call_soon_threadsafe(time.sleep, 0.5)
+    threading.Timer(0.1, lambda: signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        called(loop, thing.for_ever)
+    assert called(loop, thing.twice, 4) == 8
+
+
+def test_who_waits_in_another_thread_is_told_when_the_cell_is_closed() -> None:
+    loop, told = Loop(), list[str]()
+
+    def wait() -> None:
+        try:
+            called(loop, Thing().for_ever)
+        except ZencellError as error:
+            told.append(str(error))
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    called(loop, asyncio.sleep, 0.05)
+    loop.end()
+    waiting.join(10.0)
+    assert told == ["the cell was closed meanwhile"]
+    with pytest.raises(ZencellError, match="was closed"):
+        called(loop, Thing().twice, 1)
+
+
+def test_an_iterator_that_is_collected_as_garbage_on_the_loops_own_thread_holds_nobody_up(loop: Loop) -> None:
+    thing = Thing()
+    kept = {"numbers": Blocking(loop, thing).count(100)}
+    next(kept["numbers"])
+
+    async def drop() -> None:
+        kept.clear()
+
+    called(loop, drop)
+    called(loop, asyncio.sleep, 0.01)
+    assert thing.left
 
 
 def test_a_cell_that_is_not_open_says_so_and_can_be_looked_at() -> None:

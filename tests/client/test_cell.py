@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from common import topics
+from common.client.arm import NotJogged
 from common.client.cell import Cell
 from common.client.goals import any_of, pose, region, through
 from common.client.hearing import Camera, NothingHeard
@@ -100,12 +101,25 @@ def test_what_cannot_be_reached_or_asked_for_is_said_in_one_line_and_moves_nothi
             ([0.0, np.nan], {}, ConfigError, "finite"),
             (2 * np.eye(4), {}, ConfigError, "rotation"),
             ("home", {"speed": 2.0}, ConfigError, "velocity_scaling"),
+            ("home", {"speed": 0}, ConfigError, "velocity_scaling"),
+            ([1e300] * 7, {}, ConfigError, "positions"),
+            (pose(1e30, 0.0, 0.0), {}, ConfigError, "position.x"),
+            (pose(0.4, 0.0, 0.4), {"via": (0.4, 0.1, 0.4), "around": (0.4, 0.1, 0.4)}, ConfigError, "via or center"),
+            (pose(0.4, 0.0, 0.4), {"via": (0.4, 0.1, 0.4), "straight": True}, ConfigError, "straight"),
+            (pose(0.4, 0.0, 0.4), {"goal": 3}, ConfigError, "goal"),
             ("home", {"sped": 2.0}, ConfigError, "choices"),
             ("home", {"via": (1, 2)}, ConfigError, "pose"),
             ("home", {"planner": "nobody"}, (MotionFailed, RemoteError), "nobody"),
         ):
-            with pytest.raises(error, match=words):
+            with pytest.raises(error, match=words) as told:
                 await cell.arm.move(to, **how)  # type: ignore[arg-type]
+            assert "\n" not in str(told.value)
+        for asked in (cell.arm.execute(None), cell.arm.stop(None), cell.call(None), cell.call("motion/hold", 3),  # type: ignore[arg-type]
+                      cell.arm.jog(linear=(1, 0)), anext(cell.listen(None))):  # type: ignore[arg-type]
+            with pytest.raises(ConfigError):
+                await asked
+        with pytest.raises(ConfigError, match="rpy"):
+            pose(0.4, 0.0, 0.4, rpy=(0.0, 0.0))
         assert np.allclose(await cell.arm.joints(), before, atol=1e-6)
 
     run(program)
@@ -125,11 +139,30 @@ def test_a_motion_that_is_cancelled_comes_to_rest_and_the_next_one_goes() -> Non
     run(program)
 
 
+def test_a_motion_stops_when_its_cell_is_left_and_whoever_waits_is_told() -> None:
+    async def program(cell: Cell) -> None:
+        async with Cell.on(cell.bus, owner="program") as inner:
+            moving = asyncio.create_task(inner.arm.move(pose(0.4, 0.4, 0.3), speed=0.1))
+            await until_moving(cell)
+            with pytest.raises(ZencellError, match="joined already"):
+                await inner.__aenter__()
+        assert moving.cancelled()
+        await asyncio.sleep(1.0)
+        assert (await cell.arm.status()).state == "cancelled" and np.abs(await cell.arm.velocities()).max() < 1e-3
+
+    run(program)
+
+
 def test_stop_of_ones_own_is_ended_by_the_next_motion_and_that_of_others_is_not() -> None:
     async def program(cell: Cell) -> None:
         await cell.arm.stop("lunch")
         assert "lunch" in (await cell.arm.status()).stopped
         await cell.arm.move("home")
+        assert (await cell.gripper.open()).state == "succeeded"
+        other = Cell.on(cell.bus, owner="other")
+        for seconds in (0.2, 1.0):
+            with pytest.raises(NotJogged, match="lunch"):
+                await other.arm.jog(linear=(0.0, 0.0, 0.1), seconds=seconds)
         stop = cell.bus.client(topics.MOTION_STOP)
         await stop.call(StopRequest(owner="another", reason="in the way"))
         with pytest.raises(MotionFailed, match="another") as refused:
@@ -175,6 +208,24 @@ def test_motion_that_is_owned_is_nobody_elses_until_the_block_ends() -> None:
     run(program)
 
 
+@pytest.mark.parametrize("after", [0.0, 0.001, 0.002, 0.01])
+def test_whoever_is_cancelled_while_taking_the_motion_does_not_keep_it(after: float) -> None:
+    async def program(cell: Cell) -> None:
+        async def own() -> None:
+            async with cell.arm.owned():
+                await asyncio.sleep(5.0)
+
+        owning = asyncio.create_task(own())
+        await asyncio.sleep(after)
+        owning.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await owning
+        await asyncio.sleep(0.05)  # in which the executor tells
+        assert (await cell.arm.owner_now()).kind == "none"
+
+    run(program)
+
+
 def test_jogging_moves_as_long_as_it_is_asked_for_and_no_longer() -> None:
     async def program(cell: Cell) -> None:
         before = await cell.arm.pose()
@@ -182,6 +233,8 @@ def test_jogging_moves_as_long_as_it_is_asked_for_and_no_longer() -> None:
         await asyncio.sleep(0.5)
         after = await cell.arm.pose()
         moved = after[:3, 3] - before[:3, 3]
+        await cell.arm.jog(linear=(0.0, -0.1, 0.0), seconds=0.2)
+        await cell.arm.move("home")  # it rests when jogging returns
         assert 0.03 < moved[1] < 0.11 and abs(moved[0]) < 5e-3 and abs(moved[2]) < 5e-3
         assert np.abs(await cell.arm.velocities()).max() < 1e-3
         with pytest.raises(UnknownName, match="elbow"):
@@ -213,7 +266,7 @@ def test_a_pick_takes_ten_lines() -> None:
         ball, *_ = await cell.objects(least=1)
         x, y, z = ball.pose.position.x, ball.pose.position.y, ball.pose.position.z
         await cell.arm.move(pose(x, y, z + 0.15))
-        await cell.arm.move(pose(x, y, z), straight=True, touch=[ball.id])
+        await cell.arm.move(pose(x, y, z), straight=True, touch=ball.id)
         assert (await cell.gripper.close()).holding
         await cell.arm.move(pose(x, y, z + 0.15), straight=True)
         (held,) = [each.id for each in await cell.world.objects() if each.state == "held"]
@@ -325,6 +378,9 @@ def test_any_key_is_called_and_listened_to() -> None:
         ):
             with pytest.raises(error, match=words):
                 await asked
+        with pytest.raises(NothingHeard, match="scene_object_updates"):
+            async for _ in cell.listen("scene_object_updates", timeout=0.5):
+                pass
         async for packed in cell.listen("joint_states", plain=True):
             assert len(packed["position"]) >= 7
             break
