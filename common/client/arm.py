@@ -394,7 +394,7 @@ def check_seconds(seconds: float) -> None:
 
 
 def _asked(more: dict[str, Any], **given: Any) -> dict[str, Any]:
-    for name in given.keys() & more.keys():
+    for name in {"goal", *given} & more.keys():
         raise ConfigError(name, more[name], "is said twice")
     return {**{name: value for name, value in given.items() if value is not None}, **more}
 

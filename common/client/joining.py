@@ -23,7 +23,7 @@ from common.transport.endpoint import endpoint_of
 TOOL = "zencell"
 CONNECT_TIMEOUT = 2.0  # [s] to reach the router
 PROBE_TIMEOUT, PROBE_PERIOD = 0.5, 0.1  # [s] to see whether anything listens where a router would; between two tries
-LOOK_TIMEOUT = 1.0  # [s] to hear who is there
+LOOK_TIMEOUT = 3.0  # [s] to hear who is there: a busy host stands still for a second
 ASK_TIMEOUT = 1.0  # [s]
 
 

@@ -22,6 +22,7 @@ from common.transport.router import PortInUse
 READY = 60.0  # [s] wall in which it is up
 LOOK = 0.1  # [s] between looks whether it is
 ENDS = 15.0  # [s] in which it ends when it is told to
+TRIES, TAKEN = 3, "is in use by"  # of domains; what `up` says of one that is not free
 LAST_LINES = 5  # that are told of a start that failed
 
 
@@ -57,7 +58,17 @@ class Started:
     async def __aenter__(self) -> Started:
         cell, overrides, world, seed = self._loaded
         loaded = await asyncio.to_thread(load_cell, cell, overrides, world=world, seed=seed)  # says what is wrong
-        self.name, self.domain = loaded.name, free_domain() if self._domain is None else parse_domain(self._domain)
+        self.name = loaded.name
+        for left in reversed(range(TRIES)):
+            self.domain = free_domain() if self._domain is None else parse_domain(self._domain)
+            try:
+                return await self._bring_up()
+            except NotStarted as error:  # somebody else may have found the same domain free
+                if TAKEN not in str(error) or self._domain is not None or not left:
+                    raise
+        raise AssertionError
+
+    async def _bring_up(self) -> Started:
         self._folder = tempfile.TemporaryDirectory(prefix="zencell-")
         self._log = Path(self._folder.name, "log")
         self._process = await asyncio.to_thread(self._begin)

@@ -26,7 +26,7 @@ SAYS = {  # what a script prints among other lines
     "world": r"ball_2 was added, 2 are seen\noff_table: .*\nball_2 is seen [0-4]\.\d mm from where it is\nleft: ball_1",
 }
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(240)]  # jogging is a matter of 0.1 s
 
 
 def test_every_script_is_run_here_and_listed_for_people() -> None:
