@@ -203,7 +203,11 @@ def jog(
 ) -> None:
     """Move the arm by hand for a while: at most 0.25 m/s, and it stands 0.2 s after Ctrl-C or the end of this."""
     from cli.inspection import in_cell
+    from common.client.arm import LONGEST_JOG
 
+    duration = options.number("--seconds", seconds)
+    if not 0 < duration <= LONGEST_JOG:
+        raise ConfigError("--seconds", seconds, f"must be more than 0 and at most {LONGEST_JOG:g} s")
     if not (joint or linear or angular):
         raise ConfigError("jog", ..., "needs --joint NAME=V, --linear X,Y,Z or --angular X,Y,Z")
     joints = {}
@@ -213,7 +217,7 @@ def jog(
     asked: dict[str, Any] = {
         "joints": joints, "linear": tuple(_vector("--linear", linear).values()),
         "angular": tuple(_vector("--angular", angular).values()), "frame": frame,
-        "seconds": options.number("--seconds", seconds)}
+        "seconds": duration}
     in_cell(lambda joined: joined.arm.jog(**asked), cell, domain, connect)
 
 

@@ -39,9 +39,10 @@ def chain(messages: list[TFMessage], frame: str) -> np.ndarray:
     return T
 
 
-async def test_it_reads_joint_states_and_writes_tf() -> None:
+async def test_it_reads_joint_states_and_writes_tf_and_what_the_robot_is() -> None:
     found = await wiring(robot_state_publisher.run, config())
-    assert found.reads == {topics.JOINT_STATES} and found.writes == {topics.TF, topics.TF_STATIC} and not found.serves
+    assert found.reads == {topics.JOINT_STATES} and not found.serves
+    assert found.writes == {topics.TF, topics.TF_STATIC, topics.ROBOT_DESCRIPTION}
 
 
 async def test_frames_agree_with_forward_kinematics_and_each_has_one_parent(robot: RobotModel) -> None:
