@@ -107,24 +107,25 @@ with Cell.start("panda") as cell:
 
 
 def test_ctrl_c_stops_the_arm_and_ends_the_cell(tmp_path: Path) -> None:
-    script = subprocess.Popen(
+    with subprocess.Popen(
         [sys.executable, "-c", SLOWLY], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"})
-    assert script.stdout is not None and script.stdout.readline() == "ready\n"
-    with pytest.raises(subprocess.TimeoutExpired):
-        script.wait(3.0)  # it moves for longer
-    script.send_signal(signal.SIGINT)
-    out, told = script.communicate(timeout=60)
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    ) as script:
+        assert script.stdout is not None and script.stdout.readline() == "ready\n"
+        with pytest.raises(subprocess.TimeoutExpired):
+            script.wait(3.0)  # it moves for longer
+        script.send_signal(signal.SIGINT)
+        out, told = script.communicate(timeout=60)
     assert out == "cancelled True\n", (out, told)
     assert told.rstrip().endswith("KeyboardInterrupt") and script.returncode != 0 and not left(tmp_path)
 
 
 def test_a_script_that_is_killed_takes_its_cell_with_it(tmp_path: Path) -> None:
-    script = subprocess.Popen(
-        [sys.executable, "-c", SLOWLY], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    assert script.stdout is not None and script.stdout.readline() == "ready\n" and left(tmp_path)
-    script.kill()
-    script.wait()
+    with subprocess.Popen(
+        [sys.executable, "-c", SLOWLY], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as script:
+        assert script.stdout is not None and script.stdout.readline() == "ready\n" and left(tmp_path)
+        script.kill()
     _, alive = psutil.wait_procs(left(tmp_path), timeout=60)
     assert not alive
 
