@@ -6,13 +6,13 @@ import asyncio
 import contextlib
 import logging
 import socket
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from common import topics
 from common.config import Cell
-from common.errors import ConfigError, DecodeError, ZencellError
+from common.errors import ConfigError, DecodeError, NoRouter, ZencellError
 from common.messages import Notice, ServiceStatus, SupervisorStatus
 from common.sources import monotonic
 from common.supervision.interrupts import Interrupts
@@ -21,6 +21,7 @@ from common.supervision.liveness_watchdog import PERIOD, Elsewhere, LivenessWatc
 from common.supervision.supervisor import Supervisor
 from common.transport.credentials import SUPERVISOR
 from common.transport.expiry import EndWatch
+from common.transport.keys import alive_key
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -32,6 +33,7 @@ CONNECT_TIMEOUT = 5.0  # [s] to reach somebody else's router
 LOOK_TIMEOUT = 1.0  # [s] to hear who is up there
 SECRET = "token"  # in the path of an override: is not told
 NOTICE_PERIOD = 60.0  # [s] between looks at certificates
+LATE_PERIOD = 2.0  # [s] between looks at who is not ready yet: by then the token of one that was killed has gone
 STATUS_PERIOD = 0.25  # [s] between looks at the connection to the router
 
 log = logging.getLogger(NAME)
@@ -108,7 +110,8 @@ async def _work(
             await _require_unused(bus, endpoint, {entry.name for entry in cell.services.values()})
         prepare(bus)
         here = Elsewhere(socket.gethostname(), [service.name for service in supervisor.statuses])
-        return await beside(keep_plain_keys(bus, here), supervise(bus, cell, launch, supervisor, work))
+        helping = beside(keep_plain_keys(bus, here), ask_for_the_late(cell.name, endpoint, supervisor, launch.near))
+        return await beside(helping, supervise(bus, cell, launch, supervisor, work))
     finally:
         log.removeHandler(to_topic)
         await connecting.__aexit__(None, None, None)
@@ -139,6 +142,35 @@ async def _bring_up_and_work(bus: Bus, supervisor: Supervisor, work: Callable[[B
     await supervisor.admit_all()
     await bus.ready()
     return await work(bus)
+
+
+async def ask_for_the_late(cell: str, endpoint: str, supervisor: Supervisor, near: Sequence[str] | None = None) -> None:
+    """Mark services as ready whose readiness tokens the router has and the network did not tell of.
+
+    Zenoh was seen to leave one out that came up while the watch of the tokens began, once in some hundred starts. A
+    question of the same session is answered from what its watch was told, so that one of its own asks.
+
+    Args:
+        cell: its name.
+        endpoint: of the router.
+        supervisor: of the processes.
+        near: endpoints of the same router to be tried first.
+    """
+    from common.transport.connect import connect
+
+    late: set[str] = set()
+    while True:
+        await asyncio.sleep(LATE_PERIOD)
+        before, late = late, set(supervisor.starting)
+        if not before & late:
+            continue
+        with contextlib.suppress(NoRouter):
+            asking = connect(cell=cell, service=NAME, endpoint=endpoint, identity=SUPERVISOR, near=near)
+            async with asking as bus:
+                tokens = await bus.raw_tokens(alive_key(cell), LOOK_TIMEOUT)
+            for name in {token.rpartition("/")[2] for token in tokens} & before & set(supervisor.starting):
+                log.warning("%s is ready, which the network did not tell; the router was asked", name)
+                supervisor.mark_alive(name, alive=True)
 
 
 async def _require_unused(bus: Bus, endpoint: str, names: set[str]) -> None:

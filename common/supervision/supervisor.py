@@ -198,10 +198,14 @@ class Supervisor:
         return [watched.status.model_copy(update={"pid": watched.child.pid}) for watched in self._all if watched.again]
 
     @property
+    def starting(self) -> list[str]:
+        """Names of the processes on their way to be ready."""
+        return [watched.child.name for watched in self._all if watched.status.state == "starting"]
+
+    @property
     def stopped(self) -> list[str]:
-        """Names of the processes on their way to be ready that the system does not run (SIGSTOP)."""
-        starting = [watched.child for watched in self._all if watched.status.state == "starting"]
-        return [child.name for child in starting if child.stopped]
+        """Names of those of them that the system does not run (SIGSTOP)."""
+        return [name for name in self.starting if self._by_name[name].child.stopped]
 
     def kill(self, name: str, reason: str) -> None:
         """End a process that is of no use any more; it is started again."""

@@ -10,9 +10,14 @@ import psutil
 import pytest
 
 from common.config import Cell, ServiceEntry, load_cell
+from common.supervision import operation
 from common.supervision import supervisor as module
 from common.supervision.launch import Launch
 from common.supervision.supervisor import BadConfiguration, StartFailed, Supervisor
+from common.transport.endpoint import endpoint_of
+from common.transport.router import open_router
+from common.transport.zenoh_session import open_zenoh
+from tests.harness import free_domain
 
 GATE = "import sys; sys.stdin.readline(); print('in', flush=True); "
 WAIT = GATE + "import time; time.sleep(60)"
@@ -193,3 +198,24 @@ async def test_stop_does_not_wait_for_a_restart_that_is_due() -> None:
             await watch.supervisor.changed.wait()
     assert watch.state("first") == "stopped"
     assert watch.pid("first") is None
+
+
+async def test_a_token_that_the_network_did_not_tell_of_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(operation, "LATE_PERIOD", 0.1)
+    endpoint = endpoint_of(free_domain())
+    router = await asyncio.to_thread(open_router, [endpoint])
+    async with watching(first=WAIT, second=WAIT) as watch:
+        service = await open_zenoh(endpoint)
+        asking = asyncio.create_task(operation.ask_for_the_late("panda", endpoint, watch.supervisor))
+        admitting = asyncio.create_task(watch.supervisor.admit_all())
+        await watch.said("first", "in")
+        service.token("panda/alive/second")  # which is not let through yet
+        service.token("panda/alive/first")
+        await admitting  # nobody calls `mark_alive` here
+        asking.cancel()
+        assert [status.state for status in watch.supervisor.statuses] == ["ready", "ready"]
+        assert "first is ready, which the network did not tell" in caplog.text
+        await asyncio.to_thread(service.close)
+    await asyncio.to_thread(router.close)
