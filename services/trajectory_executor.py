@@ -173,11 +173,11 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     async def stop(request: StopRequest) -> MotionStatus:
         if request.by == "person":
             bus.log.info("stopped by %s: %s", request.owner or SOMEBODY, request.reason)
-        return await kept_answer(cycle.stop(request, bus.clock.now()))
+        return await kept_answer(cycle.authority.stop(request, bus.clock.now()))
 
     async def hold(request: HoldRequest) -> MotionStatus:
         before = len(inhibits.all)
-        status, let_go = cycle.hold(request)
+        status, let_go = cycle.authority.hold(request)
         who = (request.owner or SOMEBODY) if request.by == "person" else request.by
         why = request.reason or "asked to"
         if request.hold:
@@ -213,8 +213,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         return cycle.command(request, bus.clock.now(), late).model_copy(update={"header": bus.header()})
 
     async def own(request: OwnRequest) -> MotionOwner:
-        before = cycle.owner
-        now = cycle.own(request, bus.clock.now())
+        before = cycle.authority.owner
+        now = cycle.authority.own(request, bus.clock.now())
         if now.owner != before.owner and {before.kind, now.kind} != {"none", "task"}:
             bus.log.info("%s: the motion was %s, it is %s now", request.owner, before.told, now.told)
         if problem := await decisions.keep():
@@ -305,7 +305,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         bus.clock.speed,
     )
     cycle.beside = True
-    decisions.on_change = cycle.tell_inhibits
+    decisions.on_change = cycle.authority.tell_inhibits
     memory = SavedBeside(standing_file) if standing_file and bus.has_threads else standing_file
     if kept is not None:
         bus.log.info("the arm and what is about it are as they were")
@@ -356,14 +356,14 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         while True:
             was, there = there, task in bus.alive
             if was and not there:
-                cycle.disown()
-            cycle.wait(alone.look(there, cycle.goal, config.when_alone), f"{task} is gone")
+                cycle.authority.disown()
+            cycle.authority.wait(alone.look(there, cycle.goal, config.when_alone), f"{task} is gone")
             turn()
             if jogs.done():
                 jogs.result()
             await asyncio.sleep(due - loop.time())
     except asyncio.CancelledError:  # whatever ends it: the arm comes to rest on its path first
-        cycle.wait(True, f"{bus.service} ends")
+        cycle.authority.wait(True, f"{bus.service} ends")
         while not cycle.at_rest:
             await asyncio.sleep(due - loop.time())
             turn()

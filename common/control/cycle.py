@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 
 from common.config import GripperConfig
+from common.control.authority import Authority
 from common.control.checks import Tolerances
 from common.control.controller import PERIOD, TrajectoryController
 from common.control.faults import Fault, asked
 from common.control.goals import Judged
 from common.control.gripper_controller import GripperController
-from common.control.inhibits import SOMEBODY, Inhibits
+from common.control.inhibits import Inhibits
 from common.control.jogging import Jogging, ToolKinematics
-from common.control.ownership import NOT_OWNER, Ownership
+from common.control.payload import Payload
 from common.errors import ConfigError, Refused
 from common.hardware.interface import ControlledArm, Hardware, HardwareFault, Limits, SimulatedGripper, Vector
 from common.messages import (
@@ -25,17 +26,13 @@ from common.messages import (
     GripperCommand,
     GripperState,
     Header,
-    HoldRequest,
-    Inhibit,
     JogCommand,
     JointState,
     MotionOwner,
     MotionStatus,
-    OwnRequest,
     RobotCommand,
     RobotStatus,
     SceneUpdate,
-    StopRequest,
     WorldEdit,
     WorldEditReply,
     WorldObjects,
@@ -43,7 +40,6 @@ from common.messages import (
 from common.robot.finger_joints import finger_positions, finger_velocities
 from common.sim.interface import SimulatedWorld, StandingObject
 from common.sim.standing import Standing
-from common.sources import monotonic
 
 PROGRESS_PERIOD = 0.1  # cell time between reports of progress [s]
 WORLD_PERIOD = 0.05  # cell time between reports of an object that moves [s]
@@ -109,9 +105,7 @@ class ControlCycle:
             self._arm.delay, self._arm.bridges = self._own.delay, self._own.ahead
         self._cap = 1.0  # of the speed, as persons and programs say
         self._told_robot: dict[str, Any] | None = None
-        self._carried: float | None = None  # [kg] that the arm's controller was told is held
-        self._payload = 0  # number of that order
-        self._untold = False  # whether it came to nothing: it is given again when the arm has moved
+        self._payload = Payload(self._own, gripper)
         self._arm_fault, self._hand_fault = Fault("the arm"), Fault("the gripper")
         self._width_rate = 0.0
         self._told_motion: MotionStatus | None = None
@@ -124,17 +118,11 @@ class ControlCycle:
         self.apart = False  # the world is changed by somebody else, and stands still here
         self._kept: object = None
         self._stood: tuple[int, dict[str, StandingObject]] | None = None  # the objects, as of a version of the world
-        self._waits = False  # held by ourselves
-        self._jogging = Jogging(limits, kinematics)
-        self._owners = Ownership()
-        self._jogged = False  # until the arm rests
-        self._told_owner: tuple[MotionOwner, bool] | None = None
         self._followed: ExecuteRequest | None = None  # the newest goal that was accepted
-        self._held_goal = ""  # that the scene monitor holds
         self._inhibits = inhibits or Inhibits()
         if self._own is not None:
             self._own.stopped = self._own.stopped or self._inhibits.arm_stopped
-        self.tell_inhibits()
+        self.authority = Authority(self._arm, Jogging(limits, kinematics), self._inhibits)
 
     def step(self, header: Header) -> Report:
         """Do one cycle at the header's time and say what is new."""
@@ -146,16 +134,14 @@ class ControlCycle:
             except HardwareFault as fault:
                 self._arm_fault.failed(str(fault), now)
                 self._arm.fault(str(fault))
-                self._jogging.interrupt(monotonic())
+                self.authority.interrupt_jogging()
         if self._own is not None:
             self._inhibits.arm_stopped = self._own.stopped
         report.robot = self._news_of_robot(header)
         report.notes = [*filter(None, (self._arm_fault.news(), self._hand_fault.news(), self._arm.news(),
-                                       self._news_of_payload()))]
-        if self._held_goal and self._held_goal != self._arm.goal:  # nothing is in the way of what is over
-            self.hold(HoldRequest(hold=False, by="scene_monitor"))
-        self._owners.look(bool(self._arm.goal) or not self._arm.at_rest or self._fingers_move, monotonic())
-        report.owner = self._news_of_owner(header)
+                                       self._payload.news()))]
+        self.authority.look(bool(self._arm.goal) or not self._arm.at_rest or self._fingers_move)
+        report.owner = self.authority.news(header)
         report.motion = self._news_of_motion(header, now)
         report.gripper = self._news_of_gripper(header, now)
         if self._world is not None and not self.apart:
@@ -187,35 +173,18 @@ class ControlCycle:
         if self._own is not None:
             own, self._arm.delay = self._own.state, self._own.delay
             self._arm.speed_scaling = self._cap * own.speed
-            self._tell_payload(own.mode == "running")
+            held = self._gripper.held_mass if self._gripper is not None else 0.0
+            self._payload.tell(held, own.mode == "running", self._arm.at_rest)
             if own.mode != "running":  # there is no need to leave it alone: it says how it is
                 self._arm.fault(own.message or own.mode)
-                self._jogging.interrupt(monotonic())
+                self.authority.interrupt_jogging()
                 return self._joint_state(header, dq)
-        self._arm.jog(self._jogging.velocity(self._arm.set_point, monotonic(), self._arm.speed_scaling))
+        self._arm.jog(self.authority.jog_velocity(self._arm.speed_scaling))
         set_points = self._arm.update(now, self._q, dq)
         if set_points is not None:
             asked("sending set-points", self._hardware.write, *set_points, now)
             self._arm_fault.works(now)
         return self._joint_state(header, dq)
-
-    def _tell_payload(self, ready: bool) -> None:
-        """Have the arm's controller know what it carries, at rest: when that changes, and when it is ready anew."""
-        if not ready or (self._untold and not self._arm.at_rest):
-            self._carried, self._untold = None, False
-        elif not self._arm.at_rest or self._own is None:
-            return
-        elif self._gripper is not None and self._fingers is not None and self._fingers.payload is not None:
-            held = self._gripper.held_mass
-            if held != self._carried and not self._payload:
-                self._carried = held
-                self._payload = self._own.order("payload", *self._fingers.payload.with_held(held))
-
-    def _news_of_payload(self) -> str:
-        if self._own is None or not self._payload or (outcome := self._own.outcome(self._payload)) is None:
-            return ""
-        self._payload, self._untold = 0, bool(outcome)
-        return outcome and f"the arm was not told what it carries: {outcome}"
 
     def standing(self) -> Standing | None:
         """What simulated hardware would be found like after a restart, if it has changed since the last call."""
@@ -259,19 +228,16 @@ class ControlCycle:
         self, request: ExecuteRequest, now: float, objection: Refused | None = None, judged: Judged | None = None
     ) -> MotionStatus:
         """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
-        inhibited = self._inhibits.objection(request.id, request.owner, request.heard)
-        others = self._owners.objection(request.owner)
+        authority = self.authority
+        objection = (authority.inhibited(request, request.id) or objection or authority.others(request.owner)
+                     or self._unfit)
         status = self._arm.accept(
-            request.id, request.trajectory, now, self._q, inhibited or objection or others or self._unfit, judged,
-            request.plan, request.scene_stamp,
+            request.id, request.trajectory, now, self._q, objection, judged, request.plan, request.scene_stamp,
         )
-        if status.error == NOT_OWNER and not request.owner and self._owners.now.asked:
-            # A task that was kept from going on does not do so by itself once the motion is given back.
-            self._inhibits.stop(StopRequest(reason=str(others), owner=self._owners.now.owner))
-            self.tell_inhibits()
+        authority.refused(request, status)
         if request.id == self._arm.goal and (self._followed is None or self._followed.id != request.id):
             self._followed = request
-            self._owners.use(request.owner, monotonic())
+            authority.use(request.owner)
         return status
 
     @property
@@ -287,50 +253,7 @@ class ControlCycle:
         Raises:
             Refused: with the reason. It counts again after a pause.
         """
-        objection = late or self._inhibits.objection("", request.owner, request.heard) or self._unfit
-        if objection is None and self._arm.status.fault:
-            objection = Refused("hardware_fault", self._arm.status.fault)
-        if objection is None and self._arm.status.held:
-            objection = Refused("held", self._arm.status.message or "the robot is held")
-        objection = objection or self._owners.objection(request.owner)
-        if objection is None and self._arm.goal:
-            objection = Refused("busy", f"goal {self._arm.goal!r} is still being followed")
-        self._jogging.ask(request, monotonic(), objection)
-        self._owners.use(request.owner, monotonic())
-
-    def own(self, request: OwnRequest, now: float) -> MotionOwner:
-        """Whose the motion is, after it was asked for or given back.
-
-        What is taken over is brought to rest. A task that lost it waits for a person to start it again, as after a
-        stop, so that no restart of anything has it go on.
-
-        Raises:
-            Refused: it is somebody else's.
-        """
-        if request.act == "give":
-            self._owners.give(request.owner)
-            return self.owner
-        before = self._owners.take(request, monotonic())
-        reason = f"{request.owner} took the motion over{before and f', which was {before}'}"
-        if request.over and request.kind != "task":
-            self._inhibits.stop(StopRequest(reason=reason, owner=request.owner))  # also of who is just being restarted
-        if before or request.over:
-            self._jogging.interrupt(monotonic())
-            if goal := self._arm.goal:
-                self._inhibits.never([goal])
-                self._arm.cancel(goal, reason, now)
-            self.tell_inhibits()
-        return self.owner
-
-    def disown(self) -> None:
-        """Have the motion be nobody's once what moves has ended: the task that had it is gone."""
-        if self._owners.now.kind == "task":
-            self._owners.let_end()
-
-    @property
-    def owner(self) -> MotionOwner:
-        """Whose the motion is."""
-        return self._owners.now.model_copy(update={"jogging": self._jogged})
+        self.authority.jog(request, late or self._unfit)
 
     def followed(self, goal: str) -> ExecuteRequest:
         """What was asked for with the goal that is followed.
@@ -341,63 +264,6 @@ class ControlCycle:
         if self._followed is None or not goal == self._followed.id == self._arm.goal:
             raise Refused("unknown_goal", f"goal {goal!r} is not followed now")
         return self._followed
-
-    def stop(self, request: StopRequest, now: float) -> MotionStatus:
-        """The state of the goal, which is being brought to rest if it was moving the robot.
-
-        A person's stop keeps every other motion from beginning, until it is let go of.
-        """
-        running, known = self._arm.goal, not request.id or self._arm.knows(request.id)
-        if request.by == "person":
-            self._inhibits.stop(request)
-            self._owners.end()
-            self._jogging.interrupt(monotonic())
-            if running:
-                self._arm.cancel(running, request.reason, now)
-        stopped = [goal for goal in (running if request.by == "person" or not request.id else "", request.id) if goal]
-        # One that runs must not come to life again should its request come once more after a restart.
-        self._inhibits.never(goal for goal in stopped if goal == running or not self._arm.knows(goal))
-        self.tell_inhibits()
-        status = self._arm.cancel(request.id, request.reason, now)
-        if known:
-            return status
-        return status.model_copy(update={"message": f"{status.message}; it is refused if it comes"})
-
-    def hold(self, request: HoldRequest) -> tuple[MotionStatus, list[Inhibit]]:
-        """The status, and what was let go of.
-
-        The arm is being brought to rest on its path, or goes on when nobody holds it; the fingers finish their motion.
-        """
-        if request.by != "person" and request.hold and request.goal not in ("", self._arm.goal):
-            return self._arm.status, []  # that one is over
-        let_go = self._inhibits.hold(request)
-        if request.hold:
-            self._jogging.interrupt(monotonic())
-        elif request.into_stop or (
-            request.stops and (request.override or self._owners.now.owner == (request.owner or SOMEBODY))
-        ):
-            self._owners.end()  # handed over to whoever moves the robot now: the person, or the task that is started
-        if request.by == "scene_monitor":
-            self._held_goal = request.goal if request.hold else ""
-        if request.by != "person":
-            self._arm.hold(request.hold, request.reason, request.by)
-        self.tell_inhibits()
-        return self._arm.status, let_go
-
-    def wait(self, wait: bool, reason: str = "") -> None:
-        """Bring the arm to rest on its path of our own accord, or let it go on."""
-        if wait != self._waits:
-            self._waits = wait
-            self._jogging.interrupt(monotonic())
-            self._inhibits.hold_ourselves("controller", wait, reason)
-            self._arm.hold(wait, reason, "controller")
-            self.tell_inhibits()
-
-    def tell_inhibits(self) -> None:
-        """Have the arm held as persons say, and told of all who keep it."""
-        reasons = [hold.reason for hold in self._inhibits.holds]
-        self._arm.inhibits = self._inhibits.all
-        self._arm.hold(bool(reasons), "; ".join(filter(None, reasons)), "person")
 
     @property
     def goal(self) -> str:
@@ -431,12 +297,12 @@ class ControlCycle:
         """
         if self._gripper is None:
             raise Refused("no_gripper", "this robot has no gripper")
-        objection = (self._inhibits.objection(request.id, request.owner, request.heard) or late
-                     or self._owners.objection(request.owner) or self._hand_fault.objection)
+        objection = (self.authority.inhibited(request, request.id) or late
+                     or self.authority.others(request.owner) or self._hand_fault.objection)
         try:
             state = self._gripper.command(request, now, objection)
             if objection is None:
-                self._owners.use(request.owner, monotonic())
+                self.authority.use(request.owner)
             return state
         except HardwareFault as fault:
             self._hand_fault.failed(str(fault), now)
@@ -538,14 +404,6 @@ class ControlCycle:
             return None
         self._told_robot = robot
         return self.robot.model_copy(update={"header": header})
-
-    def _news_of_owner(self, header: Header) -> MotionOwner | None:
-        self._jogged = bool(self._jogging.owner) or (self._jogged and not self._arm.at_rest)
-        now = (self._owners.now, self._jogged)
-        if now == self._told_owner:
-            return None
-        self._told_owner = now
-        return self.owner.model_copy(update={"header": header})
 
     def _news_of_gripper(self, header: Header, now: float) -> GripperState | None:
         if self._gripper is None:

@@ -79,7 +79,7 @@ class Moved:
             return call(*args)
 
     def own(self, act="take", owner="ann", **more):
-        return self.asked(self.cycle.own, OwnRequest(act=act, owner=owner, **more), self.stamp * 1e-9)
+        return self.asked(self.cycle.authority.own, OwnRequest(act=act, owner=owner, **more), self.stamp * 1e-9)
 
     def execute(self, goal, owner="", **more):
         begin = self.q
@@ -95,7 +95,7 @@ class Moved:
 
     @property
     def owner(self):
-        return self.cycle.owner.owner, self.cycle.owner.kind
+        return self.cycle.authority.owner.owner, self.cycle.authority.owner.kind
 
     def rests(self, seconds=0.3):
         before = self.q
@@ -250,13 +250,13 @@ def test_after_a_stop_or_a_hold_who_keeps_asking_moves_nothing_until_they_let_go
     joint = {arm.robot.joint_names[0]: 0.2}
     arm.jog(0.3, joints=joint)
     if end == "stop":
-        arm.asked(arm.cycle.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
+        arm.asked(arm.cycle.authority.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
     else:
-        arm.asked(arm.cycle.hold, HoldRequest(hold=True, owner="bob"))
+        arm.asked(arm.cycle.authority.hold, HoldRequest(hold=True, owner="bob"))
     arm.jog(0.2, joints=joint)
     before = arm.q
     arm.jog(1.0, joints=joint)
-    arm.asked(arm.cycle.hold, HoldRequest(hold=False, owner="bob", stops=True))
+    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
     arm.jog(1.0, joints=joint)
     assert np.array_equal(arm.q, before)
     arm.run(0.35)
@@ -266,7 +266,7 @@ def test_after_a_stop_or_a_hold_who_keeps_asking_moves_nothing_until_they_let_go
 
 def test_who_stopped_the_arm_jogs_it_and_nobody_else(arm):
     joint = {arm.robot.joint_names[0]: 0.2}
-    heard = arm.asked(arm.cycle.stop, StopRequest(owner="ann"), arm.stamp * 1e-9).newest
+    heard = arm.asked(arm.cycle.authority.stop, StopRequest(owner="ann"), arm.stamp * 1e-9).newest
     arm.jog(0.3, joints=joint, owner="bob", heard=heard)
     arm.jog(0.3, joints=joint)
     assert arm.rests() and set(arm.refused) == {"stopped", "let_go"}
@@ -343,16 +343,16 @@ def test_who_takes_over_from_a_task_stops_it_for_good(arm):
     assert arm.cycle._inhibits.record.inhibits[0].by == "ann"
     assert arm.execute("three", "ann", heard=arm.stamp + 1).state == "active"
     arm.run(3.0)
-    arm.asked(arm.cycle.hold, HoldRequest(hold=False, owner="ann", stops=True))  # she starts the task
+    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="ann", stops=True))  # she starts the task
     assert arm.owner == ("", "none") and arm.own(owner="sorting", kind="task").owner == "sorting"
     assert arm.execute("four").state == "active"
 
 
 def test_a_start_by_another_does_not_take_it_from_who_has_it(arm):
     arm.own()
-    arm.asked(arm.cycle.hold, HoldRequest(hold=False, owner="bob", stops=True))
+    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
     assert arm.owner == ("ann", "operator") and arm.execute("one").error == "not_owner"
-    arm.asked(arm.cycle.hold, HoldRequest(hold=False, owner="bob", stops=True, override=True))
+    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True, override=True))
     assert arm.owner == ("", "none")
 
 
@@ -360,20 +360,20 @@ def test_a_stop_and_a_hold_need_no_ownership_and_a_stop_ends_it(arm):
     arm.own()
     arm.execute("one", "ann")
     arm.run(0.5)
-    assert arm.asked(arm.cycle.hold, HoldRequest(hold=True, owner="bob"))[0].held
+    assert arm.asked(arm.cycle.authority.hold, HoldRequest(hold=True, owner="bob"))[0].held
     arm.run(0.5)
     assert arm.rests()
-    arm.asked(arm.cycle.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
+    arm.asked(arm.cycle.authority.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
     assert arm.owner == ("", "none")
 
 
 def test_a_task_that_is_gone_has_the_motion_no_more(arm):
     arm.own(owner="sorting", kind="task")
-    arm.cycle.disown()
+    arm.cycle.authority.disown()
     arm.step()
     assert arm.owner == ("", "none")
     arm.own()
-    arm.cycle.disown()
+    arm.cycle.authority.disown()
     assert arm.owner == ("ann", "operator")
 
 
@@ -437,13 +437,13 @@ def test_a_stream_of_before_moves_nothing_when_the_executor_is_started_again(arm
 def test_however_many_ask_in_vain_who_kept_asking_over_a_stop_moves_nothing(arm, others):
     joint = {arm.robot.joint_names[0]: 0.2}
     arm.jog(0.3, joints=joint)
-    arm.asked(arm.cycle.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
+    arm.asked(arm.cycle.authority.stop, StopRequest(owner="bob"), arm.stamp * 1e-9)
     for _ in range(10):
         for k in range(others):
             with pytest.raises(Refused):
                 arm.asked(arm.cycle.jog, JogCommand(owner=f"other {k}", joints=joint))
         arm.jog(0.02, joints=joint)
-    arm.asked(arm.cycle.hold, HoldRequest(hold=False, owner="bob", stops=True))
+    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
     before = arm.q
     arm.jog(0.5, joints=joint)
     assert np.array_equal(arm.q, before)
@@ -456,7 +456,7 @@ def test_what_a_dead_task_left_running_is_taken_over_too(arm):
     arm.own(owner="sorting", kind="task")
     assert arm.execute("one").state == "active"
     arm.run(0.3)
-    arm.cycle.disown()
+    arm.cycle.authority.disown()
     with pytest.raises(Refused):
         arm.own(owner="bob")
     arm.own(over=True)
@@ -478,5 +478,5 @@ def test_a_task_that_was_kept_from_going_on_does_not_when_the_motion_is_given_ba
     arm.own("give")
     assert arm.execute("two").error == "stopped"
     assert arm.execute("three", "bob").error == "stopped"
-    arm.asked(arm.cycle.hold, HoldRequest(hold=False, owner="bob", stops=True))
+    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
     assert arm.execute("four").state == "active"

@@ -1,0 +1,195 @@
+"""Who may move the arm now: what persons decided, whose the motion is, and what a stop, a hold and a hand-over do."""
+
+from __future__ import annotations
+
+from common.control.controller import TrajectoryController
+from common.control.inhibits import SOMEBODY, Inhibits
+from common.control.jogging import Jogging
+from common.control.ownership import NOT_OWNER, Ownership
+from common.errors import Refused
+from common.hardware.interface import Vector
+from common.messages import (
+    ExecuteRequest,
+    GripperCommand,
+    Header,
+    HoldRequest,
+    Inhibit,
+    JogCommand,
+    MotionOwner,
+    MotionStatus,
+    OwnRequest,
+    StopRequest,
+)
+from common.sources import monotonic
+
+
+class Authority:
+    """What keeps the arm from moving, and who has it move."""
+
+    def __init__(self, arm: TrajectoryController, jogging: Jogging, inhibits: Inhibits) -> None:
+        """Let persons' decisions of before, as `inhibits` have them, hold the arm from the start."""
+        self._arm, self._jogging, self.inhibits = arm, jogging, inhibits
+        self._owners = Ownership()
+        self._jogged = False  # until the arm rests
+        self._told: tuple[MotionOwner, bool] | None = None
+        self._held_goal = ""  # that the scene monitor holds
+        self._waits = False  # held by ourselves
+        self.tell_inhibits()
+
+    # --- may it begin ---------------------------------------------------------------------------------------------
+
+    def inhibited(self, request: ExecuteRequest | GripperCommand | JogCommand, goal: str = "") -> Refused | None:
+        """What persons decided that speaks against a motion, or None."""
+        return self.inhibits.objection(goal, request.owner, request.heard)
+
+    def others(self, owner: str) -> Refused | None:
+        """That the motion is somebody else's, or None."""
+        return self._owners.objection(owner)
+
+    def use(self, owner: str) -> None:
+        """Take note that somebody without an objection begins a motion."""
+        self._owners.use(owner, monotonic())
+
+    def refused(self, request: ExecuteRequest, status: MotionStatus) -> None:
+        """Take note of how a goal was answered.
+
+        A task that was kept from going on by an operator does not do so by itself once the motion is given back.
+        """
+        if status.error == NOT_OWNER and not request.owner and self._owners.now.asked:
+            self.inhibits.stop(StopRequest(reason=status.message, owner=self._owners.now.owner))
+            self.tell_inhibits()
+
+    def jog(self, request: JogCommand, objection: Refused | None) -> None:
+        """Move the arm while that comes again and again, unless there is an objection.
+
+        Raises:
+            Refused: with the reason. It counts again after a pause.
+        """
+        objection = objection or self.inhibited(request)
+        if objection is None and self._arm.status.fault:
+            objection = Refused("hardware_fault", self._arm.status.fault)
+        if objection is None and self._arm.status.held:
+            objection = Refused("held", self._arm.status.message or "the robot is held")
+        objection = objection or self.others(request.owner)
+        if objection is None and self._arm.goal:
+            objection = Refused("busy", f"goal {self._arm.goal!r} is still being followed")
+        self._jogging.ask(request, monotonic(), objection)
+        self.use(request.owner)
+
+    def jog_velocity(self, share: float) -> Vector | None:
+        """Velocities at which the arm is jogged now (dof,) [rad/s], at this share of its speed, or None."""
+        return self._jogging.velocity(self._arm.set_point, monotonic(), share)
+
+    def interrupt_jogging(self) -> None:
+        """End it: who jogs has to let go of the button first."""
+        self._jogging.interrupt(monotonic())
+
+    # --- whose it is ----------------------------------------------------------------------------------------------
+
+    @property
+    def owner(self) -> MotionOwner:
+        """Whose the motion is."""
+        return self._owners.now.model_copy(update={"jogging": self._jogged})
+
+    def own(self, request: OwnRequest, now: float) -> MotionOwner:
+        """Whose the motion is, after it was asked for or given back; cell time [s].
+
+        What is taken over is brought to rest. A task that lost it waits for a person to start it again, as after a
+        stop, so that no restart of anything has it go on.
+
+        Raises:
+            Refused: it is somebody else's.
+        """
+        if request.act == "give":
+            self._owners.give(request.owner)
+            return self.owner
+        before = self._owners.take(request, monotonic())
+        reason = f"{request.owner} took the motion over{before and f', which was {before}'}"
+        if request.over and request.kind != "task":
+            self.inhibits.stop(StopRequest(reason=reason, owner=request.owner))  # also of who is just being restarted
+        if before or request.over:
+            self.interrupt_jogging()
+            if goal := self._arm.goal:
+                self.inhibits.never([goal])
+                self._arm.cancel(goal, reason, now)
+            self.tell_inhibits()
+        return self.owner
+
+    def disown(self) -> None:
+        """Have the motion be nobody's once what moves has ended: the task that had it is gone."""
+        if self._owners.now.kind == "task":
+            self._owners.let_end()
+
+    def look(self, moving: bool) -> None:
+        """Let go of what is over; once a cycle."""
+        if self._held_goal and self._held_goal != self._arm.goal:  # nothing is in the way of what is over
+            self.hold(HoldRequest(hold=False, by="scene_monitor"))
+        self._owners.look(moving, monotonic())
+
+    def news(self, header: Header) -> MotionOwner | None:
+        """Whose the motion is, if that is new."""
+        self._jogged = bool(self._jogging.owner) or (self._jogged and not self._arm.at_rest)
+        now = (self._owners.now, self._jogged)
+        if now == self._told:
+            return None
+        self._told = now
+        return self.owner.model_copy(update={"header": header})
+
+    # --- stops and holds ------------------------------------------------------------------------------------------
+
+    def stop(self, request: StopRequest, now: float) -> MotionStatus:
+        """The state of the goal, which is being brought to rest if it was moving the robot; cell time [s].
+
+        A person's stop keeps every other motion from beginning, until it is let go of.
+        """
+        running, known = self._arm.goal, not request.id or self._arm.knows(request.id)
+        if request.by == "person":
+            self.inhibits.stop(request)
+            self._owners.end()
+            self.interrupt_jogging()
+            if running:
+                self._arm.cancel(running, request.reason, now)
+        stopped = [goal for goal in (running if request.by == "person" or not request.id else "", request.id) if goal]
+        # One that runs must not come to life again should its request come once more after a restart.
+        self.inhibits.never(goal for goal in stopped if goal == running or not self._arm.knows(goal))
+        self.tell_inhibits()
+        status = self._arm.cancel(request.id, request.reason, now)
+        if known:
+            return status
+        return status.model_copy(update={"message": f"{status.message}; it is refused if it comes"})
+
+    def hold(self, request: HoldRequest) -> tuple[MotionStatus, list[Inhibit]]:
+        """The status, and what was let go of.
+
+        The arm is being brought to rest on its path, or goes on when nobody holds it; the fingers finish their motion.
+        """
+        if request.by != "person" and request.hold and request.goal not in ("", self._arm.goal):
+            return self._arm.status, []  # that one is over
+        let_go = self.inhibits.hold(request)
+        if request.hold:
+            self.interrupt_jogging()
+        elif request.into_stop or (
+            request.stops and (request.override or self._owners.now.owner == (request.owner or SOMEBODY))
+        ):
+            self._owners.end()  # handed over to whoever moves the robot now: the person, or the task that is started
+        if request.by == "scene_monitor":
+            self._held_goal = request.goal if request.hold else ""
+        if request.by != "person":
+            self._arm.hold(request.hold, request.reason, request.by)
+        self.tell_inhibits()
+        return self._arm.status, let_go
+
+    def wait(self, wait: bool, reason: str = "") -> None:
+        """Bring the arm to rest on its path of our own accord, or let it go on."""
+        if wait != self._waits:
+            self._waits = wait
+            self.interrupt_jogging()
+            self.inhibits.hold_ourselves("controller", wait, reason)
+            self._arm.hold(wait, reason, "controller")
+            self.tell_inhibits()
+
+    def tell_inhibits(self) -> None:
+        """Have the arm held as persons say, and told of all who keep it."""
+        reasons = [hold.reason for hold in self.inhibits.holds]
+        self._arm.inhibits = self.inhibits.all
+        self._arm.hold(bool(reasons), "; ".join(filter(None, reasons)), "person")
