@@ -139,6 +139,7 @@ async def supervise(
 
 
 async def _bring_up_and_work(bus: Bus, supervisor: Supervisor, work: Callable[[Bus], Awaitable[T]]) -> T:
+    await bus.alive.known()  # a token that comes up while its watch begins may not be told of
     await supervisor.admit_all()
     await bus.ready()
     return await work(bus)
