@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from cli import completion, options
+from cli import completion, options, robot_new
 from common.errors import ConfigError
 from common.terminal import echo
 
@@ -21,6 +21,10 @@ app = typer.Typer(help="Prepare a robot, ask its controller, jog it.", no_args_i
 @app.callback()
 def robot() -> None:
     """Prepare a robot, ask its controller, jog it."""
+
+
+app.command()(robot_new.new)
+app.command()(robot_new.check)
 
 
 @app.command()

@@ -13,7 +13,7 @@ import pytest
 from common.topics import Request, Topic
 
 ROOT = Path(__file__).resolve().parent.parent
-PURE = ("robot", "scene", "planning", "perception", "tasks", "hardware", "sim", "recording", "reporting")
+PURE = ("robot", "scene", "planning", "perception", "tasks", "hardware", "sim", "recording", "reporting", "setup")
 NOT_PURE = ("asyncio", "zenoh", "common.topics", "common.transport", "common.supervision", "services", "cli")
 CONTAINER_FILES = ("Dockerfile", "compose.yaml", ".dockerignore")
 MACHINE_PATH = re.compile(rb"(?<![\w.])/(?:home|root|work|Users|farm)/\w")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from common.errors import ConfigError
 from common.robot.description import find_description
 
 WORLD = "world"
+FULL_TURN = 2 * math.pi  # [rad]
 
 Numbers = Sequence[float]
 
@@ -19,12 +21,13 @@ def merged_urdf(config: RobotConfig) -> str:
     """The robot as one URDF whose root is a link `world`, with `base_link` fixed to it where the robot file says.
 
     What a URDF has above `base_link` is dropped: it says where the robot stands, which is the robot file's to say.
-    Meshes that are given by relative paths lie beside the URDF that names them.
+    Meshes that are given by relative paths lie beside the URDF that names them. Joints that turn on and on end after a
+    full turn either way, or where `position_limits` of the robot file say.
 
     Raises:
         ConfigError: a description is not there or does not parse, or the parts do not fit together.
     """
-    robot = _read("robot.urdf", config.urdf, config.package_dirs)
+    robot = read_urdf("robot.urdf", config.urdf, config.package_dirs)
     _drop_above(robot, config)
     for index, attachment in enumerate(config.attachments):
         _attach(robot, attachment, f"robot.attachments.{index}", config.package_dirs)
@@ -35,12 +38,23 @@ def merged_urdf(config: RobotConfig) -> str:
             raise ConfigError("robot.tcp.link", tcp.link, "is a link of the URDF already; give tcp_link instead")
         _fix(robot, tcp.link, tcp.parent, tcp.position, tcp.rpy)
         ET.SubElement(robot, "link", name=tcp.link)
+    links = _links(robot)
+    for joint in robot.findall("joint"):
+        if joint.get("type") == "continuous":
+            _give_ends(joint)
+        elif joint.get("type") == "fixed" and joint.get("name") in links:  # frames of both would have one name
+            joint.set("name", f"{joint.get('name')}_fixed")
     ET.SubElement(robot, "link", name=WORLD)
     _fix(robot, config.base_link, WORLD, config.base_position, config.base_rpy)
     return ET.tostring(robot, encoding="unicode")
 
 
-def _read(field: str, reference: str, package_dirs: Sequence[str]) -> ET.Element:
+def read_urdf(field: str, reference: str, package_dirs: Sequence[str]) -> ET.Element:
+    """The elements of a URDF, whose meshes are given by absolute paths where they were relative ones.
+
+    Raises:
+        ConfigError: it is not there or does not parse; names the field.
+    """
     path = find_description(field, reference, package_dirs)
     try:
         root = ET.parse(path).getroot()
@@ -84,8 +98,17 @@ def _drop_above(robot: ET.Element, config: RobotConfig) -> None:
         robot.remove(next(element for element in robot.findall("link") if element.get("name") == link))
 
 
+def _give_ends(joint: ET.Element) -> None:
+    """Make a joint that turns on and on one with ends, a full turn either way: joints have one position each."""
+    joint.set("type", "revolute")
+    limit = joint.find("limit")
+    limit = ET.SubElement(joint, "limit", effort="0", velocity="0") if limit is None else limit
+    limit.set("lower", _text([-FULL_TURN]))
+    limit.set("upper", _text([FULL_TURN]))
+
+
 def _attach(robot: ET.Element, attachment: AttachmentConfig, field: str, package_dirs: Sequence[str]) -> None:
-    part = _read(f"{field}.urdf", attachment.urdf, package_dirs)
+    part = read_urdf(f"{field}.urdf", attachment.urdf, package_dirs)
     _known(robot, f"{field}.parent_link", attachment.parent_link)
     for tag in ("link", "joint"):
         names = {element.get("name") for element in robot.findall(tag)}

@@ -1,0 +1,99 @@
+"""Arms that nobody set up: `zencell robot new --yes` for each, then seven balls in a world of its own reach.
+
+    python -m benchmarks.arms [--only NAME] [--seeds A-B] [--folder DIR] [--urdf FILE [--gripper FILE]]
+
+Prints a table in Markdown. All runs are on the virtual clock. The descriptions are those of example-robot-data, which
+is installed with the project, and what is named with --urdf.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from cli.simulate import seeds_of
+from common.config import Cell, load_cell
+from common.virtual.simulation import Simulation
+
+DATA = "package://example-robot-data/robots"
+GRIPPER = str(Path(__file__).resolve().parent.parent / "config" / "robots" / "robotiq_2f85.urdf")
+
+
+@dataclass(frozen=True)
+class Case:
+    """An arm: its description, and that of a gripper where it has none."""
+
+    name: str
+    urdf: str
+    gripper: str = ""
+
+
+CASES = (
+    Case("panda", f"{DATA}/panda_description/urdf/panda.urdf"),
+    Case("ur3", f"{DATA}/ur_description/urdf/ur3_robot.urdf", GRIPPER),
+    Case("ur5", f"{DATA}/ur_description/urdf/ur5_robot.urdf", GRIPPER),
+    Case("ur10", f"{DATA}/ur_description/urdf/ur10_robot.urdf", GRIPPER),
+    Case("xarm7", f"{DATA}/xarm_description/urdf/xarm7.urdf", GRIPPER),
+    Case("kinova_j2s6s200", f"{DATA}/kinova_description/robots/kinova.urdf", GRIPPER),
+    Case("tiago_pro", f"{DATA}/tiago_pro_description/robots/tiago_pro.urdf"),
+    Case("tiago", f"{DATA}/tiago_description/robots/tiago_no_hand.urdf", GRIPPER),
+    Case("talos_arm", f"{DATA}/talos_data/robots/talos_left_arm.urdf"),
+    Case("baxter", f"{DATA}/baxter_description/urdf/baxter.urdf"),
+    Case("z1", f"{DATA}/z1_description/urdf/z1.urdf"),
+    Case("so101", f"{DATA}/so_arm_description/urdf/so101.urdf"),
+    Case("two_dof", f"{DATA}/asr_twodof_description/urdf/TwoDofs.urdf"),
+)
+
+
+def written(case: Case, folder: Path) -> str:
+    """Nothing when the robot file and the cell were written; else the line that says why not."""
+    options = ["--name", case.name, "--out", str(folder / f"{case.name}.yaml"), "--yes", "--force",
+               "--cell", str(folder / f"{case.name}_cell.yaml"), *(["--gripper", case.gripper] if case.gripper else [])]
+    done = subprocess.run([sys.executable, "-m", "zencell", "robot", "new", case.urdf, *options],
+                          capture_output=True, text=True, check=False)
+    print(f"--- {case.name}\n{done.stdout}{done.stderr}", file=sys.stderr, flush=True)
+    if done.returncode == 0:
+        return ""
+    lost = [line.removeprefix("lost: ") for line in done.stdout.splitlines() if line.startswith("lost: ")]
+    return "; ".join(lost) or done.stderr.strip().splitlines()[-1].removeprefix("zencell: ")
+
+
+def told(cell: Cell, seed: int) -> str:
+    """How one seed ended, in a few words."""
+    outcome = Simulation(cell, seed).run()
+    wrong = [*outcome.broken, *outcome.crashes]
+    return (f"{outcome.state} {outcome.done} of {outcome.total} in {outcome.seconds:.0f} s"
+            + (f" ({outcome.message})" if outcome.message and outcome.state != "DONE" else "")
+            + (f", broken: {wrong[0]}" if wrong else ""))
+
+
+def main() -> None:
+    """Print a row for each arm."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--only", action="append", metavar="NAME", help="of the arms; repeatable")
+    parser.add_argument("--seeds", default="1-1", metavar="A-B")
+    parser.add_argument("--folder", metavar="DIR", help="where the files are written and stay [a temporary one]")
+    parser.add_argument("--urdf", metavar="FILE", help="an arm of your own, in the place of those")
+    parser.add_argument("--gripper", default="", metavar="FILE", help="for --urdf")
+    given = parser.parse_args()
+    cases = (Case(Path(given.urdf).stem, given.urdf, given.gripper),) if given.urdf else CASES
+    print("| arm | gripper | edits | result |\n|---|---|---|---|", flush=True)
+    with tempfile.TemporaryDirectory() as kept:
+        folder = Path(given.folder or kept)
+        for case in cases:
+            if given.only and case.name not in given.only:
+                continue
+            refused = written(case, folder)
+            result = refused or "; ".join(
+                f"seed {seed}: {told(load_cell(str(folder / f'{case.name}_cell.yaml')), seed)}"
+                for seed in seeds_of(given.seeds))
+            gripper = Path(case.gripper).stem if case.gripper else "its own"
+            print(f"| {case.name} | {gripper} | 0 | {result} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

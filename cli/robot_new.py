@@ -1,0 +1,172 @@
+"""`robot new`: a robot file for an arm of which there is only a URDF. `robot check`: whether one says what is so."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cli import completion
+from common.errors import ConfigError
+from common.terminal import echo
+
+if TYPE_CHECKING:
+    from common.robot.model import RobotModel
+    from common.setup.proposal import Proposal
+
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")
+
+
+def new(
+    urdf: Annotated[str, typer.Argument(metavar="URDF", help="of the arm: a path, package://..., or a xacro file")],
+    gripper: Annotated[str, typer.Option("--gripper", metavar="URDF", help="mounted on the flange")] = "",
+    name: Annotated[str, typer.Option("--name", metavar="NAME", help="of the robot")] = "",
+    out: Annotated[str, typer.Option("--out", "-o", metavar="FILE.yaml", help="[NAME.yaml]; its pairs of links that "
+                                                                              "are not checked lie beside it")] = "",
+    tip: Annotated[str | None, typer.Option("--tip", metavar="LINK", help="at the end of the arm: the tool centre "
+                                            "point, or what --gripper is mounted on")] = None,
+    package_dir: Annotated[list[str] | None, typer.Option(
+        "--package-dir", metavar="DIR", help="where package:// is looked up; repeatable")] = None,
+    cell: Annotated[str, typer.Option("--cell", metavar="FILE.yaml", help="write a cell too, whose world lies in "
+                                                                          "reach of this arm")] = "",
+    like: Annotated[str, typer.Option("--like", metavar="CELL", help="which that cell is like",
+                                      autocompletion=completion.cells)] = "",
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="ask nothing: take the best guess")] = False,
+    force: Annotated[bool, typer.Option("--force", help="overwrite what is there")] = False,
+) -> None:
+    """Write a robot file for an arm from its URDF: what it says, what is measured on it, and guesses marked as such."""
+    from common.config import names_of
+    from common.robot.merging import read_urdf
+    from common.setup.meshes import folders_of_meshes
+    from common.setup.proposal import draft, finish
+    from common.setup.tree import find_wrists, read_tree
+    from common.setup.writing import robot_file
+
+    urdf, gripper = (_described(each, out) for each in (urdf, gripper))
+    folders = [str(Path(each).expanduser().resolve()) for each in package_dir or []]
+    for field, each in (("urdf", urdf), ("--gripper", gripper)):
+        folders += [found for found in folders_of_meshes(field, each, folders) if found not in folders] if each else []
+    tree = read_tree(read_urdf("urdf", urdf, folders), urdf)
+    chosen = name or _asked("name of the robot", _plain_name(tree.name or Path(urdf).stem), yes)
+    if not NAME.fullmatch(chosen):
+        raise ConfigError("--name", chosen, "must be letters, digits, - and _, and begin with a letter")
+    path = Path(out or f"{chosen}.yaml").expanduser()
+    pairs = path.with_suffix(".srdf")
+    template = like or names_of("cells")[0]
+    _writable("--out", path, force)
+    _writable("--out", pairs, force)
+    if cell:
+        _writable("--cell", Path(cell), force)
+    wrists = find_wrists(tree)
+    if tip is None and len(wrists) > 1 and not yes:
+        longest = max(wrists, key=lambda link: len(tree.above(link)))
+        tip = _asked(f"arms end at {', '.join(wrists)}; which", longest, yes)
+    made = draft(urdf, chosen, gripper=gripper, tip=tip, package_dirs=folders)
+    fitting = [each.link for each in made.candidates if each.fits]
+    if tip is None and len(fitting) > 1 and not yes:
+        tip = _asked(f"tool centre point: {', '.join(fitting)}; which", made.values.get("tcp_link", fitting[0]), yes)
+        made = draft(urdf, chosen, gripper=gripper, tip=tip, package_dirs=folders)
+    echo("finding which links can touch, and a home: some seconds, a minute with detailed meshes", err=True)
+    robot = finish(made)
+    head = f"{chosen}, written by `zencell robot new` from its URDF. What is GUESSED is marked so: look at it."
+    path.write_text(robot_file(made, head, path.parent, pairs.name), encoding="utf-8")
+    pairs.write_text(made.srdf, encoding="utf-8")
+    _tell(made, robot, path, pairs)
+    if cell:
+        _write_cell(Path(cell).expanduser(), template, path)
+    echo(f"next: zencell robot check {path}")
+    echo(f"      zencell run {cell or f'{template} --set robot={path}'}")
+
+
+def check(
+    name: Annotated[
+        str, typer.Argument(metavar="ROBOT", help="a name of config/robots, or the path of a YAML file",
+                            autocompletion=completion.robots)
+    ],
+) -> None:
+    """Check what a robot file says of the tool on the robot's model; exit code 1 with a line for all that is not so."""
+    from common.config import RobotConfig, find_file, read_robot
+    from common.config import check as checked
+    from common.planning.robot_geometry import RobotGeometry
+    from common.robot.model import RobotModel
+    from common.setup.fingers import tool_complaints
+    from common.setup.home import hits
+
+    robot = RobotModel.load(checked(RobotConfig, read_robot(find_file("robots", name)), "robot"))
+    complaints = tool_complaints(robot)
+    touching = hits(robot, RobotGeometry(robot), robot.named("home"))
+    complaints += [f"named_poses.home: {pair} touch" for pair in touching]
+    for line in complaints:
+        echo(line)
+    if complaints:
+        raise typer.Exit(1)
+    gripper = robot.config.gripper
+    fingers = f", fingers close along its {gripper.closing_axis}" if gripper and gripper.joints else ""
+    echo(f"{robot.config.name}: {robot.dof} joints, tool centre point {robot.config.tcp_link}{fingers}, home is free")
+
+
+def _asked(question: str, guess: str, yes: bool) -> str:
+    """What a person answers; the guess where nobody is asked."""
+    return guess if yes else str(typer.prompt(question, default=guess))
+
+
+def _plain_name(text: str) -> str:
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_-")[:40]
+    return name if NAME.fullmatch(name) else "robot"
+
+
+def _writable(option: str, path: Path, force: bool) -> None:
+    if path.suffix not in (".yaml", ".yml", ".srdf"):
+        raise ConfigError(option, str(path), "must end in .yaml")
+    if not path.parent.is_dir():
+        raise ConfigError(option, str(path), f"cannot be written: the folder {path.parent} does not exist")
+    if path.exists() and not force:
+        raise ConfigError(option, str(path), "is there already; --force overwrites it")
+
+
+def _described(urdf: str, out: str) -> str:
+    """The URDF, made of a xacro file where it is one."""
+    if not urdf.endswith(".xacro"):
+        return urdf
+    from common.setup.xacro import urdf_of_xacro
+
+    return urdf_of_xacro(urdf, Path(out).expanduser().parent if out else Path())
+
+
+def _write_cell(path: Path, template: str, robot_path: Path) -> None:
+    """A cell like another, with this robot and a world in its reach."""
+    import yaml
+
+    from common.application import find_application
+    from common.config import RobotConfig, find_file, load_cell, read_robot, read_yaml
+    from common.config import check as checked
+    from common.robot.model import RobotModel
+
+    robot = RobotModel.load(checked(RobotConfig, read_robot(robot_path), "robot"))
+    application = find_application(load_cell(template).application)
+    fit = application.find("reach", "fitted")
+    if fit is None:
+        raise ConfigError("--like", template, f"is for {application.name}, which lays out no world by reach")
+    tree: dict[str, Any] = fit(robot, read_yaml(find_file("cells", template)))
+    tree |= {"cell": path.stem, "robot": os.path.relpath(robot_path.resolve(), path.parent.resolve())}
+    head = f"# As {template}, for {robot.config.name}: its world was laid out in reach by `zencell robot new`.\n"
+    path.write_text(head + yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=118), encoding="utf-8")
+
+
+def _tell(made: Proposal, robot: RobotModel, path: Path, pairs: Path) -> None:
+    gripper = robot.config.gripper
+    hand = f"fingers open by {1e3 * gripper.max_width:.0f} mm" if gripper else "no gripper"
+    echo(f"{path}, {pairs}: {robot.dof} joints, tool centre point {robot.config.tcp_link}, {hand}")
+    for each in made.candidates:
+        echo(f"  {each.link}: z points {each.z}")
+    for title, lines in (("guessed", made.guessed), ("check", made.check), ("lost", made.lost)):
+        _listed(title, lines)
+
+
+def _listed(title: str, lines: Sequence[str]) -> None:
+    for line in lines:
+        echo(f"{title}: {line}")

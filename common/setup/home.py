@@ -1,0 +1,138 @@
+"""Where an arm that nobody has set up may wait: tool down over the table in front of it, free, far from joint ends."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from common.planning.ik import solve_ik
+from common.planning.robot_geometry import RobotGeometry
+from common.robot.model import RobotModel
+from common.robot.transforms import tool_down
+
+Array = NDArray[np.float64]
+
+RADII, HEIGHTS = (0.4, 0.5, 0.6, 0.7), (0.2, 0.3, 0.4, 0.5)  # of the tool, in reaches of the arm that points down
+LOW = 0.03  # above the table, in reaches of the stretched arm
+TURNS = (0.0, math.pi / 2, -math.pi / 2, math.pi, math.pi / 4, -math.pi / 4)  # of the tool [rad]
+SEEDS = 6
+TRIED_OUT = 12  # of the best candidates
+PLACES = [(radius, angle) for radius in (0.45, 0.65, 0.85) for angle in (-0.9, -0.45, 0.0, 0.45, 0.9)]
+STEPS = 16  # as the reach test of a cell takes from home
+
+
+@dataclass(frozen=True)
+class Home:
+    """Joint positions (dof,) [rad]; whether the tool points down there, and the share of places it was tried for."""
+
+    positions: Array
+    down: bool
+    served: float
+    hits: list[str]  # pairs of links that touch there: none but where no free pose was found
+
+
+def find_home(robot: RobotModel, geometry: RobotGeometry) -> Home:
+    """The pose from which most places in front of the arm are reached with the tool down.
+
+    Poses with the tool down in front of the base are tried, in all postures that inverse kinematics finds; of those
+    that are free of collisions the ones farthest from joint ends, with the links high above the table, are tried out.
+    Where the arm cannot point down the middle of its joints is taken, or the freest of random poses.
+    """
+    rng = np.random.default_rng(0)
+    middle = (robot.lower + robot.upper) / 2
+    rest = np.clip(np.zeros(robot.dof), robot.lower + 0.15 * (robot.upper - robot.lower),
+                   robot.upper - 0.15 * (robot.upper - robot.lower))
+    seeds = [rest, middle, *(rng.uniform(robot.lower, robot.upper) for _ in range(SEEDS))]
+    found: list[tuple[float, Array]] = []
+    table = float(robot.config.base_position[2])
+    reach = down_reach(robot, table)
+    for radius, height, turn in itertools.product(RADII, HEIGHTS, TURNS) if reach else ():
+        x, y = place(robot, radius * reach, 0.0)
+        target = tool_down(x, y, table + height * reach, turn)
+        for seed in seeds:
+            q = solve_ik(robot, target, seed, restarts=0, iterations=60)
+            if q is not None and not hits(robot, geometry, q):
+                found.append((_comfort(robot, q, rest, table), q))
+    found.sort(key=lambda each: -each[0])
+    best = [(_served(robot, geometry, q, table, reach), value, q) for value, q in _different(found)[:TRIED_OUT]]
+    if best:
+        served, _, q = max(best, key=lambda each: each[0] + each[1])
+        return Home(q, True, served, [])
+    poses = [rest, middle, *(rng.uniform(robot.lower, robot.upper) for _ in range(200))]
+    free = [q for q in poses if not hits(robot, geometry, q)]
+    if free[:1]:
+        return Home(max(free, key=lambda q: _comfort(robot, q, rest, table)), False, 0.0, [])
+    return Home(rest, False, 0.0, hits(robot, geometry, rest))
+
+
+def down_reach(robot: RobotModel, table: float) -> float:
+    """How far [m] from the axis of the base the tool can point down a little above a table at a height [m].
+
+    0 where it cannot anywhere.
+    """
+    middle = (robot.lower + robot.upper) / 2
+    for share in np.arange(1.0, 0.1, -0.05):
+        x, y = place(robot, float(share) * robot.reach, 0.0)
+        targets = (tool_down(x, y, table + 2 * LOW * robot.reach, turn) for turn in TURNS)
+        if any(solve_ik(robot, target, middle, restarts=30, iterations=40) is not None for target in targets):
+            return float(share) * robot.reach
+    return 0.0
+
+
+def place(robot: RobotModel, radius: float, angle: float) -> tuple[float, float]:
+    """(x, y) [m] in front of the arm: at a radius [m], to the side by an angle [rad] from the base's x axis."""
+    heading = robot.base_axes[:2, 0]
+    turned = math.atan2(heading[1], heading[0]) + angle
+    x, y = robot.foot[:2] + radius * np.array([math.cos(turned), math.sin(turned)])
+    return float(x), float(y)
+
+
+def _comfort(robot: RobotModel, q: Array, rest: Array, table: float) -> float:
+    """The larger the better: away from joint ends and singular poses, close to zero, links above the table."""
+    margin = float((np.minimum(q - robot.lower, robot.upper - q) / (robot.upper - robot.lower)).min())
+    singular = float(np.linalg.svd(robot.jacobian(q), compute_uv=False)[min(robot.dof, 6) - 1])
+    heights = [pose[2, 3] - table for pose in robot.link_poses(q).values()]
+    low = min(0.0, float(np.sort(heights)[min(2, len(heights) - 1)]) - 0.02 * robot.reach)
+    raised = float(np.mean(heights)) / robot.reach
+    away = float(np.abs(q - rest).max()) / math.pi
+    return 2 * min(margin, 0.15) + min(singular, 0.2) + raised / 2 - 0.5 * away + 10 * low
+
+
+def _different(found: list[tuple[float, Array]]) -> list[tuple[float, Array]]:
+    """Without those that are like one before them."""
+    kept: list[tuple[float, Array]] = []
+    for value, q in found:
+        if all(float(np.abs(q - other).max()) > 0.3 for _, other in kept):
+            kept.append((value, q))
+    return kept
+
+
+def _served(robot: RobotModel, geometry: RobotGeometry, home: Array, table: float, reach: float) -> float:
+    """The share of places in front of the arm to which inverse kinematics comes from there, with all above the table.
+
+    A posture that puts the elbow through the table when the tool is low comes to few.
+    """
+    tried = []
+    for (radius, angle), height in itertools.product(PLACES, (LOW, 3 * LOW)):
+        targets = (tool_down(*place(robot, radius * reach, angle), table + height * robot.reach, turn)
+                   for turn in TURNS)
+        found = (solve_ik(robot, target, home, restarts=0, iterations=STEPS) for target in targets)
+        tried.append(any(
+            q is not None and not hits(robot, geometry, q)
+            and min(pose[2, 3] for pose in robot.link_poses(q).values()) > table - 0.01 for q in found))
+    return sum(map(bool, tried)) / len(tried)
+
+
+def hits(robot: RobotModel, geometry: RobotGeometry, q: Array) -> list[str]:
+    """Pairs of links that touch at a pose."""
+    data, shapes = robot.model.createData(), pin.GeometryData(geometry.geometry)
+    pin.computeCollisions(robot.model, data, geometry.geometry, shapes, q, False)
+    pairs = geometry.geometry.collisionPairs
+    return list(dict.fromkeys(f"{geometry.links[pair.first]} and {geometry.links[pair.second]}"
+                              for pair, result in zip(pairs, shapes.collisionResults, strict=True)
+                              if result.isCollision()))

@@ -1,0 +1,31 @@
+"""A URDF made of a xacro file, where the tool for that is installed."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+from common.errors import ConfigError
+from common.robot.description import find_description
+
+
+def urdf_of_xacro(reference: str, folder: Path) -> str:
+    """Path of the URDF that was made of a xacro file and written to a folder.
+
+    Raises:
+        ConfigError: the tool is not installed, or it does not read the file.
+    """
+    path = find_description("urdf", reference)
+    try:
+        xacro = importlib.import_module("xacro")
+    except ImportError:
+        raise ConfigError("urdf", reference, "is a xacro file: pip install xacro, which makes a URDF of it") from None
+    try:
+        text = xacro.process_file(str(path)).toxml()
+    except Exception as error:  # whatever the tool makes of it
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError("urdf", reference, f"is no xacro file that can be read: {said}") from None
+    name = path.name.removesuffix(".xacro").removesuffix(".urdf")
+    made = folder / f"{name}.urdf"
+    made.write_text(text, encoding="utf-8")
+    return str(made)
