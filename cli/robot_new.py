@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -59,8 +59,10 @@ def new(
     template = like or names_of("cells")[0]
     _writable("--out", path, force)
     _writable("--out", pairs, force)
+    layout = None
     if cell:
-        _writable("--cell", Path(cell), force)
+        _writable("--cell", Path(cell).expanduser(), force)
+        layout = _layout_of(template)
     wrists = find_wrists(tree)
     if tip is None and len(wrists) > 1 and not yes:
         longest = max(wrists, key=lambda link: len(tree.above(link)))
@@ -76,8 +78,8 @@ def new(
     path.write_text(robot_file(made, head, path.parent, pairs.name), encoding="utf-8")
     pairs.write_text(made.srdf, encoding="utf-8")
     _tell(made, robot, path, pairs)
-    if cell:
-        _write_cell(Path(cell).expanduser(), template, path)
+    if layout is not None:
+        _write_cell(Path(cell).expanduser(), template, path, layout)
     echo(f"next: zencell robot check {path}")
     echo(f"      zencell run {cell or f'{template} --set robot={path}'}")
 
@@ -137,21 +139,31 @@ def _described(urdf: str, out: str) -> str:
     return urdf_of_xacro(urdf, Path(out).expanduser().parent if out else Path())
 
 
-def _write_cell(path: Path, template: str, robot_path: Path) -> None:
+Layout = Callable[["RobotModel", dict[str, Any]], dict[str, Any]]
+
+
+def _layout_of(template: str) -> Layout:
+    """What lays out a world in reach of an arm, for the application of a cell."""
+    from common.application import find_application
+    from common.config import load_cell
+
+    application = find_application(load_cell(template).application)
+    layout: Layout | None = application.find("reach", "fitted")
+    if layout is None:
+        raise ConfigError("--like", template, f"is for {application.name}, which lays out no world by reach")
+    return layout
+
+
+def _write_cell(path: Path, template: str, robot_path: Path, layout: Layout) -> None:
     """A cell like another, with this robot and a world in its reach."""
     import yaml
 
-    from common.application import find_application
-    from common.config import RobotConfig, find_file, load_cell, read_robot, read_yaml
+    from common.config import RobotConfig, find_file, read_robot, read_yaml
     from common.config import check as checked
     from common.robot.model import RobotModel
 
     robot = RobotModel.load(checked(RobotConfig, read_robot(robot_path), "robot"))
-    application = find_application(load_cell(template).application)
-    fit = application.find("reach", "fitted")
-    if fit is None:
-        raise ConfigError("--like", template, f"is for {application.name}, which lays out no world by reach")
-    tree: dict[str, Any] = fit(robot, read_yaml(find_file("cells", template)))
+    tree = layout(robot, read_yaml(find_file("cells", template)))
     tree |= {"cell": path.stem, "robot": os.path.relpath(robot_path.resolve(), path.parent.resolve())}
     head = f"# As {template}, for {robot.config.name}: its world was laid out in reach by `zencell robot new`.\n"
     path.write_text(head + yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=118), encoding="utf-8")

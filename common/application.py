@@ -14,6 +14,8 @@ What it brings lies in modules of these names within the package, or else in the
     page      (optional) labels and layers of the operator's page
     recording (optional) how its messages are written for other tools, as common/recording/foxglove.py says
     verbs     (optional) verbs of the command line, as common/verbs.py says
+    reach     (optional) for `zencell robot new --cell`:
+                fitted(RobotModel, tree of a cell file) -> that tree with a world in reach of the robot
     double    (optional) a service, with `Config` and `run`, that stands for its perception in `simulate --doubles`:
                 REPLACES   kinds of the services that it stands for
                 SETTINGS   (optional) of a cell in which it does, as of `--set`: what makes a run short

@@ -91,7 +91,7 @@ class RobotModel:
         try:
             full_model = pin.buildModelFromXML(urdf)
         except ValueError as error:
-            raise ConfigError("robot.urdf", config.urdf, f"does not parse: {error}") from None
+            raise ConfigError("robot.urdf", config.urdf, f"does not parse: {str(error).strip()}") from None
         return cls(config, full_model, urdf, srdf)
 
     @property

@@ -171,8 +171,8 @@ def tool_complaints(robot: RobotModel, points: dict[str, Array] | None = None) -
         return [f"gripper.joints: no two links that {', '.join(gripper.joints)} move come together"]
     complaints = []
     if abs(found.closing["xy".index(axis)]) < ALIGNED:
-        complaints.append(f"gripper.closing_axis: the fingers close along {told(found.closing)} of {name}, not along "
-                          f"{axis}")
+        way = told(found.closing).removeprefix("-")
+        complaints.append(f"gripper.closing_axis: the fingers close along {way} of {name}, not along {axis}")
     if found.approach[2] < ALIGNED:
         complaints.append(f"tcp_link: z of {name} must point from the palm to the tips of the fingers, which is "
                           f"{told(found.approach)}")

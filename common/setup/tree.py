@@ -139,6 +139,9 @@ def _joint(element: ET.Element, links: Sequence[str], source: str) -> Joint:
             raise ConfigError("urdf", source, f"has a joint {name!r} whose {key} is {text!r}, no number")
         return number
 
+    missing = next((key for key in ("effort", "velocity") if limit is not None and limit.get(key) is None), None)
+    if missing is not None and kind in MOVING:
+        raise ConfigError("urdf", source, f"has a joint {name!r} whose limit has no {missing}, which a URDF must give")
     follows = None
     if mimic is not None:
         factor = value(mimic, "multiplier")
