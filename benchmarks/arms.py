@@ -59,7 +59,7 @@ def written(case: Case, folder: Path) -> str:
     if done.returncode == 0:
         return ""
     lost = [line.removeprefix("lost: ") for line in done.stdout.splitlines() if line.startswith("lost: ")]
-    return "; ".join(lost) or done.stderr.strip().splitlines()[-1].removeprefix("zencell: ")
+    return "no cell: " + "; ".join(lost) if lost else done.stderr.strip().splitlines()[-1].removeprefix("zencell: ")
 
 
 def told(cell: Cell, seed: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -46,7 +47,7 @@ def new(
     from common.setup.tree import find_wrists, read_tree
     from common.setup.writing import robot_file
 
-    urdf, gripper = (_described(each, out) for each in (urdf, gripper))
+    urdf, gripper = (_described(each, out, force) for each in (urdf, gripper))
     folders = [str(Path(each).expanduser().resolve()) for each in package_dir or []]
     for field, each in (("urdf", urdf), ("--gripper", gripper)):
         folders += [found for found in folders_of_meshes(field, each, folders) if found not in folders] if each else []
@@ -81,7 +82,8 @@ def new(
     if layout is not None:
         _write_cell(Path(cell).expanduser(), template, path, layout)
     echo(f"next: zencell robot check {path}")
-    echo(f"      zencell run {cell or f'{template} --set robot={path}'}")
+    if robot.config.gripper is not None:
+        echo(f"      zencell run {cell or f'{template} --set robot={path}'}")
 
 
 def check(
@@ -113,7 +115,14 @@ def check(
 
 def _asked(question: str, guess: str, yes: bool) -> str:
     """What a person answers; the guess where nobody is asked."""
-    return guess if yes else str(typer.prompt(question, default=guess))
+    if yes:
+        return guess
+    try:
+        return str(typer.prompt(question, default=guess))
+    except typer.Abort:
+        if sys.stdin.isatty():
+            raise
+        raise ConfigError("--yes", ..., "is needed where nobody answers: it takes the best guesses") from None
 
 
 def _plain_name(text: str) -> str:
@@ -130,13 +139,13 @@ def _writable(option: str, path: Path, force: bool) -> None:
         raise ConfigError(option, str(path), "is there already; --force overwrites it")
 
 
-def _described(urdf: str, out: str) -> str:
+def _described(urdf: str, out: str, force: bool) -> str:
     """The URDF, made of a xacro file where it is one."""
     if not urdf.endswith(".xacro"):
         return urdf
     from common.setup.xacro import urdf_of_xacro
 
-    return urdf_of_xacro(urdf, Path(out).expanduser().parent if out else Path())
+    return urdf_of_xacro(urdf, Path(out).expanduser().parent if out else Path(), overwrite=force)
 
 
 Layout = Callable[["RobotModel", dict[str, Any]], dict[str, Any]]

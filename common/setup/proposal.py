@@ -89,7 +89,7 @@ def draft(
     fingers = list(arm.fingers)
     if gripper:
         if fingers:
-            raise ConfigError("--gripper", gripper, f"cannot be mounted: the arm has {fingers[0].name} already")
+            raise ConfigError("--gripper", gripper, f"cannot be mounted: {fingers[0].name} moves there already")
         fingers = _mount(made, tree, arm, gripper, tip, package_dirs)
         others += fingers
     made.values["locked_joints"] = {joint.name: _rest(joint) for joint in others}
@@ -292,5 +292,5 @@ def finish(made: Proposal) -> RobotModel:
                          f"{', '.join(home.hits[:3])}")
     made.guessed.append(f"named_poses.home: the tool at ({x:.2f}, {y:.2f}, {z:.2f})")
     made.check += tool_complaints(robot)
-    made.check.append("base_position: the base stands at the origin of the world")
+    made.check.append("base_position: is not given, so the base stands at the origin of the world")
     return robot

@@ -9,11 +9,11 @@ from common.errors import ConfigError
 from common.robot.description import find_description
 
 
-def urdf_of_xacro(reference: str, folder: Path) -> str:
+def urdf_of_xacro(reference: str, folder: Path, *, overwrite: bool) -> str:
     """Path of the URDF that was made of a xacro file and written to a folder.
 
     Raises:
-        ConfigError: the tool is not installed, or it does not read the file.
+        ConfigError: the tool is not installed, or does not read the file, or a URDF of that name is there already.
     """
     path = find_description("urdf", reference)
     try:
@@ -27,5 +27,7 @@ def urdf_of_xacro(reference: str, folder: Path) -> str:
         raise ConfigError("urdf", reference, f"is no xacro file that can be read: {said}") from None
     name = path.name.removesuffix(".xacro").removesuffix(".urdf")
     made = folder / f"{name}.urdf"
+    if made.exists() and not overwrite:
+        raise ConfigError("urdf", reference, f"becomes {made}, which is there already; --force overwrites it")
     made.write_text(text, encoding="utf-8")
     return str(made)

@@ -109,6 +109,25 @@ def test_a_person_is_asked_for_the_name_with_a_guess(made: Path, monkeypatch: py
     assert yaml.safe_load((made / "side_arm.yaml").read_text())["name"] == "side_arm"
 
 
+def test_where_nobody_answers_that_is_told(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    asked = ask(made, "robot", "new", "side_arm.urdf")
+    assert asked.returncode == 2
+    assert asked.stderr.splitlines()[-1] == "zencell: --yes: is needed where nobody answers: it takes the best guesses"
+
+
+def test_a_xacro_file_is_read_and_its_urdf_overwrites_none(tmp_path: Path) -> None:
+    pytest.importorskip("xacro")
+    head = '<robot name="x" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:property name="speed" value="2.5"/>'
+    text = URDF.read_text().replace('<robot name="side arm">', head).replace('velocity="3"', 'velocity="${speed}"')
+    (tmp_path / "arm.urdf.xacro").write_text(text)
+    done = ask(tmp_path, "robot", "new", "arm.urdf.xacro", "--yes")
+    assert done.returncode == 0, done.stderr
+    assert yaml.safe_load((tmp_path / "x.yaml").read_text())["velocity_limits"] == [2, 2, 2, 2.5, 2.5, 1]
+    again = ask(tmp_path, "robot", "new", "arm.urdf.xacro", "--yes", "--name", "y")
+    assert again.returncode == 2 and "arm.urdf, which is there already" in again.stderr
+
+
 BAD: dict[str, tuple[str, list[str], list[str]]] = {
     "no file": ("", ["gone.urdf"], ["gone.urdf", "is not there"]),
     "no XML": ("joint: 1", ["bad.urdf"], ["bad.urdf", "does not parse"]),
@@ -121,7 +140,7 @@ BAD: dict[str, tuple[str, list[str], list[str]]] = {
     "folder that is not there": (URDF.read_text(), ["bad.urdf", "--out", "no/a.yaml"], ["--out", "does not exist"]),
     "out that is no YAML": (URDF.read_text(), ["bad.urdf", "--out", "a.txt"], ["--out", "'a.txt'", ".yaml"]),
     "gripper on fingers": (
-        URDF.read_text(), ["bad.urdf", "--gripper", str(URDF)], ["--gripper", "the arm has upper_slide already"]),
+        URDF.read_text(), ["bad.urdf", "--gripper", str(URDF)], ["--gripper", "upper_slide moves there already"]),
     "limits that are none": (
         URDF.read_text().replace('lower="-1.5"', 'lower="3"'), ["bad.urdf"], ["'lift'", "needs limits"]),
     "limit that is no number": (
