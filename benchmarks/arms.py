@@ -1,6 +1,6 @@
 """Arms that nobody set up: `zencell robot new --yes` for each, then seven balls in a world of its own reach.
 
-    python -m benchmarks.arms [--only NAME] [--seeds A-B] [--folder DIR] [--urdf FILE [--gripper FILE]]
+    python -m benchmarks.arms [--only NAME] [--seeds A-B] [--folder DIR] [--urdf FILE [--gripper FILE] [--package-dir DIR]]
 
 Prints a table in Markdown. All runs are on the virtual clock. The descriptions are those of example-robot-data, which
 is installed with the project, and what is named with --urdf.
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cli.simulate import seeds_of
-from common.config import Cell, load_cell
+from common.config import load_cell
 from common.virtual.simulation import Simulation
 
 DATA = "package://example-robot-data/robots"
@@ -30,6 +30,7 @@ class Case:
     name: str
     urdf: str
     gripper: str = ""
+    package_dir: str = ""
 
 
 CASES = (
@@ -52,7 +53,8 @@ CASES = (
 def written(case: Case, folder: Path) -> str:
     """Nothing when the robot file and the cell were written; else the line that says why not."""
     options = ["--name", case.name, "--out", str(folder / f"{case.name}.yaml"), "--yes", "--force",
-               "--cell", str(folder / f"{case.name}_cell.yaml"), *(["--gripper", case.gripper] if case.gripper else [])]
+               "--cell", str(folder / f"{case.name}_cell.yaml"), *(["--gripper", case.gripper] if case.gripper else []),
+               *(["--package-dir", case.package_dir] if case.package_dir else [])]
     done = subprocess.run([sys.executable, "-m", "zencell", "robot", "new", case.urdf, *options],
                           capture_output=True, text=True, check=False)
     print(f"--- {case.name}\n{done.stdout}{done.stderr}", file=sys.stderr, flush=True)
@@ -62,9 +64,9 @@ def written(case: Case, folder: Path) -> str:
     return "no cell: " + "; ".join(lost) if lost else done.stderr.strip().splitlines()[-1].removeprefix("zencell: ")
 
 
-def told(cell: Cell, seed: int) -> str:
-    """How one seed ended, in a few words."""
-    outcome = Simulation(cell, seed).run()
+def told(cell: str, seed: int) -> str:
+    """How a cell ended under one seed, which also says where everything lies, in a few words."""
+    outcome = Simulation(load_cell(cell, seed=seed), seed).run()
     wrong = [*outcome.broken, *outcome.crashes]
     return (f"{outcome.state} {outcome.done} of {outcome.total} in {outcome.seconds:.0f} s"
             + (f" ({outcome.message})" if outcome.message and outcome.state != "DONE" else "")
@@ -79,8 +81,9 @@ def main() -> None:
     parser.add_argument("--folder", metavar="DIR", help="where the files are written and stay [a temporary one]")
     parser.add_argument("--urdf", metavar="FILE", help="an arm of your own, in the place of those")
     parser.add_argument("--gripper", default="", metavar="FILE", help="for --urdf")
+    parser.add_argument("--package-dir", default="", metavar="DIR", help="for --urdf")
     given = parser.parse_args()
-    cases = (Case(Path(given.urdf).stem, given.urdf, given.gripper),) if given.urdf else CASES
+    cases = (Case(Path(given.urdf).stem, given.urdf, given.gripper, given.package_dir),) if given.urdf else CASES
     print("| arm | gripper | edits | result |\n|---|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as kept:
         folder = Path(given.folder or kept)
@@ -89,7 +92,7 @@ def main() -> None:
                 continue
             refused = written(case, folder)
             result = refused or "; ".join(
-                f"seed {seed}: {told(load_cell(str(folder / f'{case.name}_cell.yaml')), seed)}"
+                f"seed {seed}: {told(str(folder / f'{case.name}_cell.yaml'), seed)}"
                 for seed in seeds_of(given.seeds))
             gripper = Path(case.gripper).stem if case.gripper else "its own"
             print(f"| {case.name} | {gripper} | 0 | {result} |", flush=True)

@@ -47,10 +47,12 @@ def new(
     from common.setup.tree import find_wrists, read_tree
     from common.setup.writing import robot_file
 
+    sources = {"urdf": urdf, "--gripper": gripper}
     urdf, gripper = (_described(each, out, force) for each in (urdf, gripper))
     folders = [str(Path(each).expanduser().resolve()) for each in package_dir or []]
     for field, each in (("urdf", urdf), ("--gripper", gripper)):
-        folders += [found for found in folders_of_meshes(field, each, folders) if found not in folders] if each else []
+        if each:
+            folders += folders_of_meshes(field, each, folders, sources[field])
     tree = read_tree(read_urdf("urdf", urdf, folders), urdf)
     chosen = name or _asked("name of the robot", _plain_name(tree.name or Path(urdf).stem), yes)
     if not NAME.fullmatch(chosen):

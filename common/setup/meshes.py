@@ -10,14 +10,14 @@ from common.robot.description import SCHEME, find_description, package_folders
 from common.robot.merging import read_urdf
 
 
-def folders_of_meshes(field: str, urdf: str, configured: Sequence[str]) -> list[str]:
-    """Folders above a URDF that hold packages which it names and that are not found otherwise.
+def folders_of_meshes(field: str, urdf: str, configured: Sequence[str], source: str = "") -> list[str]:
+    """Folders above a URDF, or above the file that it was made of, that hold packages which are not found otherwise.
 
     Raises:
         ConfigError: a mesh is nowhere.
     """
     root = read_urdf(field, urdf, configured)
-    above = find_description(field, urdf, configured).parents
+    above = find_description(field, source or urdf, configured).parents
     found: list[str] = []
     missing: list[str] = []
     for name in dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh")):
