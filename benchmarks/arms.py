@@ -1,9 +1,10 @@
 """Arms that nobody set up: `zencell robot new --yes` for each, then seven balls in a world of its own reach.
 
-    python -m benchmarks.arms [--only NAME] [--seeds A-B] [--folder DIR] [--urdf FILE [--gripper FILE] [--package-dir DIR]]
+    python -m benchmarks.arms [--only NAME] [--seeds A-B] [--folder DIR]
+    python -m benchmarks.arms --urdf FILE [--gripper FILE] [--package-dir DIR]
 
 Prints a table in Markdown. All runs are on the virtual clock. The descriptions are those of example-robot-data, which
-is installed with the project, and what is named with --urdf.
+comes with the project, or the one that is named with --urdf.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ def find_home(robot: RobotModel, geometry: RobotGeometry) -> Home:
         for seed in seeds:
             q = solve_ik(robot, target, seed, restarts=0, iterations=60)
             if q is not None and not hits(robot, geometry, q):
-                found.append((_comfort(robot, q, rest, table), q))
+                found.append((_comfort(robot, q, rest, table) + height, q))
     found.sort(key=lambda each: -each[0])
     best = [(_served(robot, geometry, q, table, reach), value, q) for value, q in _different(found)[:TRIED_OUT]]
     if best:

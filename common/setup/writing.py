@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from common.config import config_root
 from common.robot.description import SCHEME, find_description, installed_share
 from common.setup.proposal import Proposal
 
@@ -44,8 +45,12 @@ def robot_file(made: Proposal, head: str, folder: Path, srdf: str) -> str:
 
 
 def reference(urdf: str, folder: Path) -> str:
-    """What a robot file in a folder calls a description: package://... where it is installed, else a path."""
-    if urdf.startswith(SCHEME):
+    """What a robot file in a folder calls a description: package://... where it is installed, else a path.
+
+    One of config/robots that was given by its name stays a name.
+    """
+    by_name = not Path(urdf).expanduser().is_file() and (config_root() / "robots" / urdf).is_file()
+    if urdf.startswith(SCHEME) or by_name:
         return urdf
     path, share = find_description("urdf", urdf), installed_share()
     if share is not None and path.is_relative_to(share):
