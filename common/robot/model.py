@@ -50,7 +50,7 @@ class RobotModel:
         if self.joint_names != config.joints:
             raise ConfigError("robot.joints", config.joints, f"must be in the URDF's order: {self.joint_names}")
         if self.model.nq != len(self.joint_names):
-            raise ConfigError("robot.joints", config.joints, "must have one position each; continuous joints have two")
+            raise ConfigError("robot.joints", config.joints, "must have one position each, which planar ones do not")
         self.dof: int = self.model.nq
         if config.position_limits:
             lowest, highest = np.array(config.position_limits, dtype=float).T

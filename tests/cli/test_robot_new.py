@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import shlex
 import sys
 from pathlib import Path
 
@@ -167,3 +168,15 @@ def test_an_arm_that_nobody_set_up_takes_all_that_lies_in_its_reach(made: Path) 
     outcome = Simulation(load_cell(str(made / "side_cell.yaml")), 1).run()
     assert (outcome.state, outcome.done, outcome.total) == ("DONE", 7, 7), outcome.message
     assert (outcome.broken, outcome.crashes) == ([], [])
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_docs_set_up_an_arm_and_have_it_clear_its_table(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "robots.md").read_text()
+    block = page.split("```sh\n")[1].split("```")[0].replace("\\\n", " ")
+    commands = [shlex.split(line) for line in block.strip().splitlines()]
+    assert [command[:3] for command in commands[:2]] == [["zencell", "robot", "new"], ["zencell", "robot", "check"]]
+    for command in commands:
+        done = ask(tmp_path, *command[1:])
+        assert done.returncode == 0, done.stdout + done.stderr
+    assert "seed 1: DONE" in done.stdout

@@ -68,6 +68,20 @@ def test_where_the_description_stands_the_base_is_not_what_counts(make):
     assert np.allclose(robot.link_poses([0.0])["base"][:3, 3], (0, 0, 1))
 
 
+def test_a_joint_that_turns_on_and_on_ends_after_a_full_turn_or_where_the_robot_file_says(make):
+    turning = ARM.replace('type="revolute"', 'type="continuous"').replace('lower="-2" upper="2" ', "")
+    robot = make(turning)
+    assert (robot.dof, robot.lower.tolist(), robot.upper.tolist()) == (1, [-2 * np.pi], [2 * np.pi])
+    narrow = make(turning, position_limits=[(-1.0, 3.0)])
+    assert (narrow.lower.tolist(), narrow.upper.tolist()) == ([-1.0], [3.0])
+
+
+def test_a_fixed_joint_may_be_called_as_a_link_is(make):
+    robot = make(ARM + link("stand") + joint("arm", "stand", "fixed").replace('"arm_stand"', '"stand"'))
+    assert "stand" in robot.link_names
+    assert robot.link_poses([0.3])["stand"][2, 3] == pytest.approx(1.0)
+
+
 def test_attachment_hangs_on_its_link_and_tcp_on_the_attachment(make, tmp_path):
     tcp = {"link": "tip", "parent": "thumb", "position": [0, 0, 0.05], "rpy": [0, np.pi / 2, 0]}
     robot = make(attachments=mounted(tmp_path, rpy=[0, 0, np.pi / 2]), tcp=tcp, tcp_link="")
