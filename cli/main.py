@@ -18,6 +18,7 @@ from cli import (
     bringup,
     calibrate,
     catalogue,
+    check,
     commands,
     completion,
     doctor,
@@ -126,6 +127,7 @@ app.command()(exporting.export)
 app.add_typer(secure.app, name="secure")
 app.add_typer(router.app, name="router")
 app.command()(simulate.simulate)
+app.command()(check.check)
 app.command()(doctor.doctor)
 
 

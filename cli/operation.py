@@ -23,6 +23,7 @@ from common.terminal import printable
 if TYPE_CHECKING:
     from cli.screens import Content, Screen
     from common.chaos.agent import Chaos
+    from common.checking.finding import Finding
     from common.config import Cell
     from common.messages import Inhibit
     from common.supervision.collector import Collector
@@ -92,6 +93,7 @@ class Operation:
                          speed=self.launch.clock.speed, containers=list(loaded.world.containers))
         self.summary = self.fold.summary
         require_modules(loaded)
+        _require_safe(loaded)
         if endpoint is None:
             require_free_port(endpoint_of(number))
         self.cell = share.part_of(loaded)
@@ -357,6 +359,8 @@ class Operation:
         self.summary.ready = time.monotonic() - self.began
         if self._page and self._screen:
             self._screen.note(f"Open {self._page.address}")
+        for found in await asyncio.to_thread(_doubts, self.cell):
+            self._note(f"{found.severity}: {printable(found.line)}")
         if self._disturbance is not None:
             from common.chaos.setting import chaos_in, keys_of
 
@@ -373,6 +377,27 @@ class Operation:
         beside_it = self.file.with_name(self.file.name + ".part")
         beside_it.write_text(text, encoding="utf-8")
         beside_it.replace(self.file)  # a reader sees all of it or none
+
+
+def _require_safe(cell: Cell) -> None:
+    """Return when nothing is known because of which the arm or its fingers would move wrongly.
+
+    Raises:
+        ConfigError: something is; as `zencell check` says it.
+    """
+    from common.checking.cell import refused
+    from common.errors import ConfigError
+
+    for found in refused(cell):
+        field, _, rest = found.line.partition(": ")
+        raise ConfigError(field, ..., rest)
+
+
+def _doubts(cell: Cell) -> list[Finding]:
+    """What else will not work, as far as it is told quickly; once the cell is up, so that nobody waits for it."""
+    from common.checking.cell import quick
+
+    return [found for found in quick(cell) if not found.refused]
 
 
 def zenoh_cli_line(endpoint: str, cell: str) -> str:

@@ -13,7 +13,8 @@ from typing import Any, Literal
 from pydantic import Field
 
 from common import topics
-from common.config import Motion, Parameters, Pipeline, RobotConfig, Run
+from common.checking.arm import require_free_home
+from common.config import Motion, Parameters, Pipeline, RobotConfig, Run, Surroundings
 from common.errors import Refused, RemoteError, RequestFailed
 from common.messages import (
     CameraInfo,
@@ -50,6 +51,7 @@ class Config(Parameters):
     motion: Motion
     pipeline: Pipeline
     run: Run
+    world: Surroundings = Surroundings()
     watch: bool = Field(True, description="hold the arm while something in the newest planning scene is in the way of "
                                           "the motion that runs; one planner of a cell does so")
     points: PointsOptions | None = Field(None, description="cameras whose points are obstacles")
@@ -102,7 +104,14 @@ async def run(bus: Bus, config: Config) -> None:
 
 
 def _load(config: Config) -> PlanningPipeline:
-    return PlanningPipeline(RobotModel.load(config.robot), config.motion, config.pipeline, seed=config.run.seed)
+    """The pipeline, of an arm that may be at home.
+
+    Raises:
+        ConfigError: the robot file does not fit its description, or the arm touches something at home.
+    """
+    pipeline = PlanningPipeline(RobotModel.load(config.robot), config.motion, config.pipeline, seed=config.run.seed)
+    require_free_home(config.robot, config.world, pipeline.geometry)
+    return pipeline
 
 
 class Watcher:

@@ -1,0 +1,71 @@
+"""The robot file against the description that it names, read as text: within milliseconds, without loading a model.
+
+What `RobotModel` refuses by itself (joints, locked_joints, tcp_link, base_link, named poses beyond limits) is its own.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+
+from common.checking.finding import Finding, error, warning
+from common.config import GripperConfig, RobotConfig
+from common.robot.merging import merged_urdf
+
+TURNS, SLIDES = ("revolute", "continuous"), ("prismatic",)
+SLACK = 1e-3  # [m] or [rad] by which a finger may be asked beyond its limit: rounded numbers of two files
+
+
+def check_robot_file(config: RobotConfig) -> Iterator[Finding]:
+    """What does not fit between a robot file and its description.
+
+    Raises:
+        ConfigError: the description is not there, or does not parse.
+    """
+    gripper = config.gripper
+    if gripper is None:
+        return
+    robot = ET.fromstring(merged_urdf(config))
+    links = [link.get("name", "") for link in robot.findall("link")]
+    joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
+    for name in gripper.links:
+        if name not in links:
+            yield error(f"robot.gripper.links: {name!r} is no link of the description, so that the fingers may not "
+                        "touch what they take", f"name links among {', '.join(links)}", refused=True)
+    moving = [name for name, joint in joints.items() if joint.get("type") in (*TURNS, *SLIDES)]
+    for number, name in enumerate(gripper.joints):
+        if name not in moving:
+            yield error(f"robot.gripper.joints: {name!r} is no joint of the description that moves",
+                        f"name joints among {', '.join(moving)}", refused=True)
+        elif name in config.joints:
+            yield error(f"robot.gripper.joints: {name!r} is one of robot.joints, too: the arm would move as the "
+                        "fingers close", "leave it in one of the two", refused=True)
+        else:
+            yield from _opening(gripper, number, joints[name])
+
+
+def _opening(gripper: GripperConfig, number: int, joint: ET.Element) -> Iterator[Finding]:
+    """Whether a finger's joint moves as widths are turned into its positions."""
+    name, turns = gripper.joints[number], joint.get("type") in TURNS
+    if turns and gripper.linkage is None and number == 0:
+        yield error(f"robot.gripper.joints: {name!r} turns ({joint.get('type')}), but without gripper.linkage half of "
+                    "the width [m] is taken for its position [rad]", "give gripper.linkage: length, open_angle and "
+                    "closed", refused=True)
+        return
+    if not turns and gripper.linkage is not None and number == 0:
+        yield error(f"robot.gripper.joints: {name!r} slides ({joint.get('type')}), but gripper.linkage gives angles "
+                    "for it", "leave gripper.linkage out", refused=True)
+        return
+    if turns and gripper.linkage is None:
+        return
+    limit, factor = joint.find("limit"), gripper.mimic[number] if gripper.mimic else 1.0
+    if limit is None or joint.get("type") == "continuous":
+        return
+    low, high = (float(limit.get(side, "nan")) for side in ("lower", "upper"))
+    bars, unit = gripper.linkage, "rad" if turns else "m"
+    ends = (0.0, factor * (gripper.max_width / 2 if bars is None else bars.closed))
+    if not (math.isnan(low) or math.isnan(high)) and (min(ends) < low - SLACK or max(ends) > high + SLACK):
+        yield warning(f"robot.gripper: {name!r} would go from {min(ends):g} to {max(ends):g} {unit} between closed and "
+                      f"open, its limits are {low:g} to {high:g}",
+                      "correct gripper.max_width, gripper.linkage or gripper.mimic")
