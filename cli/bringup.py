@@ -64,7 +64,10 @@ def _operation(
 
 
 def run(**given: Any) -> None:
-    """Bring a cell up, run its task to the end, print a summary and shut down; exit 0 only if the task is DONE."""
+    """Bring a cell up, run its task to the end, print a summary and shut down; exit 0 only if the task is DONE.
+
+    Exit 3 if it is DONE, but the simulated world knows of something that was left and that the summary does not name.
+    """
     of_applications = {name: given.pop(name) for name in given.keys() - _OPTIONS}
     before = verbs.before_run(given["cell"], given["overrides"], given["world"], of_applications)
     operation = _operation(**{**given, "overrides": before.overrides}, until_ended=True)

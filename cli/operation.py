@@ -34,6 +34,7 @@ T = TypeVar("T")
 
 START_REQUEST_TIMEOUT = 5.0  # [s]
 LAST_WORDS = 5.0  # [s] for whoever is slow to read what became of a run
+LEFT = 3  # exit code
 FIRST_WORD = 2.0  # [s] in which the executor of a cell that is up has said how the robot is
 EXECUTOR, OURSELVES = "trajectory_executor", ("watchdog", "controller", "scene_monitor")
 
@@ -179,7 +180,10 @@ class Operation:
         return results[0]
 
     def run_to_end(self) -> int:
-        """Exit code of a run: 0 when the task is DONE, 1 when it is not, 130 after Ctrl-C."""
+        """Exit code of a run: 0 when the task is DONE, 1 when it is not, 130 after Ctrl-C.
+
+        3 when it is DONE and something was left of which the summary says no reason: the simulated world knows.
+        """
         from common.process.lossy import LossyWriter
         from common.reporting.summary import describe
         from common.supervision.supervisor import StartFailed
@@ -195,7 +199,7 @@ class Operation:
         for line in describe(self.summary.as_dict(), self.fold.figures):
             out.put(printable(line) + "\n")
         out.flush(LAST_WORDS)
-        return code
+        return LEFT if code == 0 and self.summary.unexplained else code
 
     def stay(self) -> int:
         """Exit code of staying up until a signal: 0 when that came after the cell was up."""

@@ -28,10 +28,11 @@ class Config(DetectorOptions):
     world: Surroundings
 
 
-def markers(detections: list[Detection], around: Surroundings, stamp: int) -> MarkerArray:
+def markers(detections: list[Detection], around: Surroundings, stamp: int, remark: str = "") -> MarkerArray:
     """The message of what was found in the frame that was exposed at `stamp`."""
     return MarkerArray(
         header=Header(stamp=stamp, frame_id=WORLD),
+        remark=remark,
         markers=[
             _marker(index, d.position, d.pixel, d.partial, around.ball_radius, around.ball_color)
             for index, d in enumerate(detections)
@@ -49,6 +50,14 @@ def _marker(
         scale=Vector3(x=2 * radius, y=2 * radius, z=2 * radius), color=Color(r=color[0], g=color[1], b=color[2]),
         pixel=pixel, partial=partial,
     )
+
+
+def _remark(detector: Detector, service: str) -> str:
+    """What there is in the last picture that is too small to be looked at; empty without."""
+    if not (count := detector.too_small):
+        return ""
+    are = "blob is" if count == 1 else "blobs are"
+    return f"{count} red {are} smaller than {service}.min_contour_area_px = {detector.options.min_contour_area_px:g}"
 
 
 async def run(bus: Bus, config: Config) -> None:
@@ -69,7 +78,7 @@ async def run(bus: Bus, config: Config) -> None:
             left_out.note(error)
             continue
         detections = detector.detect(picture, camera)
-        found.put(markers(detections, config.world, image.header.stamp))
+        found.put(markers(detections, config.world, image.header.stamp, _remark(detector, bus.service)))
         if shown.matched:
             shown.put(array_to_image(annotate(picture, detections), "bgr8", image.header))
 

@@ -79,7 +79,7 @@ async def run(bus: Bus, config: Config) -> None:
         unfinished = seen if verdict.unknown else []
         header = Header(stamp=min(one.frame.header.stamp for one in seen), frame_id=WORLD)
         poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in verdict.targets]
-        validated.put(PoseArray(header=header, poses=poses))
+        validated.put(PoseArray(header=header, poses=poses, remark=verdict.remark))
         if verdict.rejections:
             rejected.put(Rejections(header=header, rejected=verdict.rejections))
         for one in verdict.rejections:

@@ -66,6 +66,7 @@ class MarkerArray(Message):
 
     header: Header
     markers: list[Marker] = Field(max_length=1000)
+    remark: Text = Field("", description="what was seen there and is no marker, and why")
 
 
 class PointCloud2(Message):

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import SMALL, Fraction, Header, Label, Message, Metres, Name
+from common.messages.basics import SMALL, Fraction, Header, Label, Message, Metres, Name, Text
 
 Unit = Annotated[float, Field(ge=-1.001, le=1.001)]  # part of a quaternion
 MOST_POSES = 256
@@ -57,6 +57,7 @@ class PoseArray(Message):
     poses: list[Pose] = Field([], max_length=MOST_POSES)
     ids: Labels = []
     labels: Labels = Field([], description="of truth: table, held, falling, box, or elsewhere (out of sight)")
+    remark: Text = Field("", description="what was seen and is none of the poses, and why")
 
     @model_validator(mode="after")
     def _same_length(self) -> PoseArray:

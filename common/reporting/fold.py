@@ -41,7 +41,8 @@ class Fold:
             listeners: who else is fed, as a recheck, and with what.
         """
         self.figures: Figures = figures_of(application)(robot, pictured=gathering is not None)
-        self.summary = Summary(cell, seed, speed, self.figures, containers)
+        self.summary = Summary(cell, seed, speed, self.figures, containers,
+                               fills=application is not None and application.fills)
         self.gathering = gathering
         self.status: TaskStatus | None = None
         self._topics: dict[str, Topic[Any]] = {}

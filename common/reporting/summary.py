@@ -76,7 +76,8 @@ class Summary:
     """Gathers the figures of one run."""
 
     def __init__(
-        self, cell: str, seed: int, speed: float, figures: Figures | None = None, containers: Sequence[str] = ()
+        self, cell: str, seed: int, speed: float, figures: Figures | None = None, containers: Sequence[str] = (),
+        *, fills: bool = False,
     ) -> None:
         """Start with nothing seen.
 
@@ -86,6 +87,7 @@ class Summary:
             speed: seconds of cell time per second of wall time.
             figures: what the application says of the run.
             containers: ids of those that the cell has.
+            fills: the task brings all that there is into containers.
         """
         self.figures = figures or Figures()
         self.cell = cell
@@ -95,6 +97,7 @@ class Summary:
         self.ready: float | None = None  # wall time [s] from the start of the process to the cell being ready
         self.first_motion: float | None = None  # wall time [s] from the start of the process
         self.truth = Truth(tuple(containers))
+        self.fills = fills
         self.rejected = Rejected()
         self.restarts: dict[str, int] = {}
         self.failed = False  # the cell did not come up
@@ -138,10 +141,22 @@ class Summary:
         """Where the task ended; ERROR too when the cell did not come up."""
         return "ERROR" if self.failed else self.status.state
 
-    def as_dict(self) -> dict[str, Any]:
-        """The summary file."""
+    @property
+    def unexplained(self) -> list[list[float]]:
+        """Where [m] a task that is DONE left something for no reason that it tells, by the truth of a simulated world."""
+        if not (self.fills and self.state == "DONE"):
+            return []
+        named = [_xyz(place.position) for place in self._all_rejected().places]
+        return [[round(value, 4) for value in thing.position] for thing in self.truth.left(named)]
+
+    def _all_rejected(self) -> Rejected:
         rejected = Rejected(list(self.rejected.places))
         rejected.add(self.status.skipped)
+        return rejected
+
+    def as_dict(self) -> dict[str, Any]:
+        """The summary file."""
+        rejected = self._all_rejected()
         figures = self._before + self._now
         took = self._task_until - self._task_since if self._task_since is not None else 0.0
         return {
@@ -168,6 +183,8 @@ class Summary:
             "seed": self.seed,
             "speed": self.speed,
             "truth": self.truth.counted(),
+            "overlooked": self.status.overlooked,
+            "unexplained": self.unexplained,
             "figures": dict(self.status.figures),
             **self.figures.blocks(),
             **({"chaos": list(self.chaos)} if self.chaos is not None else {}),
@@ -195,6 +212,10 @@ def describe(summary: dict[str, Any], application: Figures) -> list[str]:
     for place in summary["rejected"]:
         x, y, z = place["position"]
         lines.append(f"  left at ({x:.3f}, {y:.3f}, {z:.3f}): {place['reason']}")
+    if summary.get("overlooked"):
+        lines.append(f"  {summary['overlooked']}")
+    for x, y, z in summary.get("unexplained", ()):
+        lines.append(f"  left at ({x:.3f}, {y:.3f}, {z:.3f}): not among what was rejected")
     times = [
         f"ready {_seconds(seconds['ready'])}",
         f"first motion {_seconds(seconds['first_motion'])}",

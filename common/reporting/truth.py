@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from common.messages import PoseArray, WorldObjects
 
+SAME = 0.05  # [m] from where something is to where it was seen: less well where the picture cuts it off
 BOX = "box"  # the container of recordings that do not tell its id
 
 
@@ -57,6 +59,11 @@ class Truth:
     def settled(self) -> bool:
         """Whether nothing is on its way any more."""
         return not any(thing.state in ("falling", "held") for thing in self.things or ())
+
+    def left(self, named: Sequence[Sequence[float]]) -> list[Thing]:
+        """What lies in no container and at none of the places (x, y, ...) [m] that are named."""
+        return [thing for thing in self.things or () if thing.state != "contained" and all(
+            math.dist(thing.position[:2], place[:2]) > SAME for place in named)]
 
     def counted(self) -> dict[str, Any] | None:
         """How much lies in containers, on the table and anywhere else; None without simulated hardware."""

@@ -151,7 +151,7 @@ def test_a_run_ends_with_everything_in_the_box_and_all_figures(tmp_path: Path) -
     }
     assert set(summary) == {
         "cell", "state", "placed", "targets", "rejected", "failures", "retries", "seconds", "plans",
-        "frame_to_target_ms", "restarts", "seed", "speed", "truth", "figures",
+        "frame_to_target_ms", "restarts", "seed", "speed", "truth", "figures", "overlooked", "unexplained",
     }
     seconds = summary["seconds"]
     assert set(seconds) == {"ready", "first_motion", "task", "moving", "planning"}

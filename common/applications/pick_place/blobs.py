@@ -88,6 +88,13 @@ def find_blobs(closed: Mask, fine: Mask, camera: Pinhole, min_area: float) -> li
     return blobs
 
 
+def small_blobs(closed: Mask, min_area: float) -> list[tuple[float, float]]:
+    """Where there are blobs of less than `min_area` [px^2] in the closed mask: centres (u, v) [px]."""
+    outer, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    small = [np.asarray(c).reshape(-1, 2).mean(axis=0) for c in outer if cv2.contourArea(c) < min_area]
+    return [(float(u), float(v)) for u, v in small]
+
+
 def _off_border(pixels: Array, camera: Pinhole) -> npt.NDArray[np.bool_]:
     u, v = pixels[:, 0], pixels[:, 1]
     clear: npt.NDArray[np.bool_] = (u >= 1) & (u <= camera.width - 2) & (v >= 1) & (v <= camera.height - 2)

@@ -93,9 +93,11 @@ def _in_a_window(hsv: tuple[int, int, int], o: DetectorOptions) -> bool:
 
 
 def _area(at: np.ndarray, radius: float, config: CameraConfig) -> float:
-    """Of the picture of a sphere [px^2]; 0 behind the camera."""
+    """Of the picture of a sphere within its outermost pixels [px^2], as contours have it; 0 behind the camera."""
     distance = float(Pinhole.from_config(config).to_camera(at)[2])
-    return math.pi * config.fx * config.fy * (radius / distance) ** 2 if distance > 0 else 0.0
+    if distance <= 0:
+        return 0.0
+    return math.pi * math.prod(max(focal * radius / distance - 0.5, 0.0) for focal in (config.fx, config.fy))
 
 
 def _room(name: str, container: Container, radius: float) -> Iterator[Finding]:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from common.applications.pick_place.blobs import Blob, Mask, find_blobs
+from common.applications.pick_place.blobs import Blob, Mask, find_blobs, small_blobs
 from common.applications.pick_place.fit import fit_each, fit_spheres
 from common.applications.pick_place.resting import Resting
 from common.applications.pick_place.separation import separate
@@ -93,6 +93,7 @@ class Detector:
         """
         self.options = options or DetectorOptions()
         self.resting = Resting.of(surroundings)
+        self.too_small = 0  # blobs in the last picture that were not looked at, but for those in the container
         self._last: tuple[Picture, Pinhole, DetectorOptions, list[Detection]] | None = None
 
     def masks(self, picture: Picture) -> tuple[Mask, Mask]:
@@ -121,6 +122,9 @@ class Detector:
     def _look_at(self, picture: Picture, camera: Pinhole) -> list[Detection]:
         fine, closed = self.masks(picture)
         blobs = find_blobs(closed, fine, camera, self.options.min_contour_area_px)
+        small = small_blobs(closed, self.options.min_contour_area_px)
+        # What shows of a ball below others in the container is small, too.
+        self.too_small = sum(not self.resting.shows_container(camera, pixel) for pixel in small)
         pixel_size = abs(float(camera.position[2]) - self.resting.plane) / camera.fx  # at the plane of the balls
         offset = self.options.outline_offset_px * pixel_size
         seen: list[_Seen] = []

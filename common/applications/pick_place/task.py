@@ -17,6 +17,7 @@ from common.tasks.stages import MISSES, Cycle, Grip, Look, Move, Stage
 from common.tasks.watchdogs import Patience
 
 GONE = "the ball is no longer where it was seen"
+MOST = 400  # characters of a message
 CONTAINED_FOR = 0.5  # [s] balls that are seen in the container for so long are there
 
 
@@ -73,7 +74,7 @@ class PickPlace(Task[PickPlaceView]):
             self.row.append(self._rows.open())
         self.row += self._rows.pick_and_place(cycle)
         self.patience.reset()
-        self.status.message = ""
+        self.status.message = self.status.overlooked = ""
         return True
 
     def _wait_for_the_end(self, view: PickPlaceView) -> None:
@@ -90,7 +91,10 @@ class PickPlace(Task[PickPlaceView]):
             seen = max(self.look_after, min(view.stamps))
             done = self.patience.lasts(bool(left), seen) >= (self.p.grace if left else self.p.empty)
             done = done and len(view.objects("contained")) <= self.status.done  # else it is about to be counted
-            self.status.message = f"{left} objects are left that cannot be taken" if left else "the table looks empty"
+            remark = view.seen.remark if view.seen else ""
+            message = f"{left} objects are left that cannot be taken" if left else "the table looks empty"
+            self.status.overlooked = f"{message}{':' if left else ', but'} {remark}"[:MOST] if remark else ""
+            self.status.message = self.status.overlooked or message
         self.status.state, self.status.stage, self.status.subject = "DONE" if done else "IDLE", "", ""
 
     # --- what happened ---------------------------------------------------------------------------------------

@@ -24,12 +24,26 @@ class Verdict:
         rejections: cannot, with the reason; only those that were not told before.
         inside: number of those in the container, which are nobody's target and no rejection.
         unknown: inverse kinematics has to tell first.
+        refused: all that cannot be taken, and why, told before or not.
+        remarks: of who made the frames.
     """
 
     targets: list[Place] = field(default_factory=list)
     rejections: list[Rejection] = field(default_factory=list)
     inside: int = 0
     unknown: list[Place] = field(default_factory=list)
+    refused: list[tuple[Place, str]] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+
+    @property
+    def remark(self) -> str:
+        """What was seen and is no target, in words; empty when there is nothing of that kind."""
+        parts = list(dict.fromkeys(self.remarks))
+        if self.refused:
+            count, reason = len(self.refused), self.refused[0][1]
+            parts.append(f"{count} of {count + len(self.targets)} {'was' if count == 1 else 'were'} rejected, "
+                         f"{'' if count == 1 else 'the first as '}{reason}")
+        return ", and ".join(parts)
 
 
 @dataclass
@@ -68,11 +82,15 @@ class Validation:
             joined.rejections += verdict.rejections
             joined.inside += verdict.inside
             joined.unknown += verdict.unknown
+            others = [place for place, _ in joined.refused]
+            joined.refused += [(p, why) for p, why in verdict.refused
+                               if all(math.dist(p, q) >= self._same_place for q in others)]
+            joined.remarks += verdict.remarks
         return joined
 
     def judge(self, frame: MarkerArray, camera: Pinhole) -> Verdict:
         """What becomes of the detections of a frame. The same frame may be judged again when more is known."""
-        verdict = Verdict()
+        verdict = Verdict(remarks=[frame.remark] if frame.remark else [])
         stamp = frame.header.stamp
         self._told = [told for told in self._told if stamp - told.seen <= self.forget_after * 1e9]
         for marker in frame.markers:
@@ -82,6 +100,7 @@ class Validation:
             elif reason == INSIDE_CONTAINER:
                 verdict.inside += 1
             elif reason:
+                verdict.refused.append((place, reason))
                 self._tell(verdict, place, reason, stamp)
             else:
                 verdict.targets.append(place)
