@@ -11,6 +11,8 @@ What it brings lies in modules of these names within the package, or else in the
                 VIEWS      (optional) {Topic: function(WorldObjects) -> message}: truth as the application calls it,
                            published by whoever simulates the world
     figures   (optional) what the summary, the report and the recheck say of a run
+    truth     (optional) `wrong_in(WorldObjects) -> str`: what is wrong with where things really are when the task says
+              DONE, in words; empty when nothing is. For the evaluation of a simulated run only
     page      (optional) labels and layers of the operator's page
     recording (optional) how its messages are written for other tools, as common/recording/foxglove.py says
     verbs     (optional) verbs of the command line, as common/verbs.py says
@@ -112,6 +114,12 @@ class Application:
         return found if hasattr(found, "REPLACES") else None
 
     @property
+    def wrong_in(self) -> Callable[[WorldObjects], str] | None:
+        """What is wrong with the truth at the end, in words; None for an application that does not judge it."""
+        found: Callable[[WorldObjects], str] | None = self.find("truth", "wrong_in")
+        return found
+
+    @property
     def topics(self) -> dict[str, AnyTopic]:
         """Its own topics by key, in the order of its file."""
         return _topics_in(self.part("topics"))
@@ -145,11 +153,24 @@ def find_application(name: str) -> Application:
     return found
 
 
+_beside: dict[str, None] = {}  # folders about the cell files that were read
+
+
 def look_where_one_stands() -> None:
-    """Have modules of a person's own found in the working directory, after all others."""
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.append(here)
+    """Have modules of a person's own found in the working directory, and about the cell file, after all others."""
+    sys.path.extend(place for place in own_places() if place not in sys.path)
+
+
+def look_beside(cell_file: Path) -> None:
+    """Have modules found in the folder of a cell file, and that folder as a package of its own name."""
+    folder = cell_file.resolve().parent
+    _beside.update({str(folder): None, str(folder.parent): None})
+    look_where_one_stands()
+
+
+def own_places() -> list[str]:
+    """Where modules of a person's own may lie, beside `PYTHONPATH`."""
+    return list(dict.fromkeys([str(Path.cwd()), *_beside]))
 
 
 def application_of_task(task: str) -> str:

@@ -8,13 +8,14 @@ from collections import deque
 from common import topics
 from common.applications.outlining.messages import Contours
 from common.applications.outlining.perceived_solids import perceived_solids
-from common.applications.outlining.scene import HomeWatch, planning_scene
+from common.applications.outlining.scene import planning_scene
 from common.applications.outlining.topics import CONTOURS
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Image
 from common.perception.image import ImageError, image_to_array
 from common.perception.intake import Cameras, LeftOut, Unusable
 from common.process.service import main
+from common.scene.home import HomeWatch
 from common.transport.bus import Bus
 
 KEPT = 5  # depth images that wait for their contours

@@ -1,4 +1,4 @@
-"""Keeps the planning scene: fixtures, perceived balls with ids of its own, the ball in the hand, balls in the box."""
+"""Keeps the planning scene: fixtures, perceived objects with ids of its own, the one in the hand, those in boxes."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import asyncio
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from common import topics
 from common.applications.pick_place.perceived import PerceivedScene
@@ -15,12 +16,15 @@ from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError
 from common.process.service import main
 from common.robot.model import RobotModel
+from common.scene.home import HomeWatch
 from common.transport.bus import Bus
 
 
 class Config(ViewsParameters, SceneParameters):
     """Parameters of the tracking and the sections that it needs."""
 
+    only_at_home: bool = Field(False, description="only pictures count that were taken with the arm at home: for a "
+                                                  "camera before which the arm hides what lies there")
     robot: RobotConfig
     world: Surroundings
 
@@ -34,6 +38,7 @@ async def run(bus: Bus, config: Config) -> None:
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: scene_manager needs a robot with one")
+    home = HomeWatch(config.robot.named_poses["home"]) if config.only_at_home else None
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
     out.put(scene.scene())
     await bus.ready()
@@ -55,12 +60,22 @@ async def run(bus: Bus, config: Config) -> None:
                 hand()
                 out.put(scene.scene())
 
+    async def watch_arm(home: HomeWatch) -> None:
+        async for measured in joints:
+            q = robot.order(measured.name, measured.position)
+            if q is not None:
+                home.note(q.tolist(), measured.header.stamp)
+
     async def look(view: int, seen: Seen) -> None:
+        if home is not None and not home.covers(seen.frame.header.stamp):
+            return
         scene.see(seen.frame, seen.camera, hand(), view)
         out.put(scene.scene())
 
     async with asyncio.TaskGroup() as group:
         group.create_task(watch_hand())
+        if home is not None:
+            group.create_task(watch_arm(home))
         group.create_task(views.watch(look))
 
 

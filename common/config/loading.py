@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from common.application import application_of_task, find_application
+from common.application import application_of_task, find_application, look_beside
 from common.config.basics import Parameters
 from common.config.cell import Cell
 from common.config.checking import check, is_section
@@ -66,6 +66,8 @@ def load_cell(
         ConfigError, UnknownName: one line naming the field, the value and the choices.
     """
     path = find_file("cells", cell)
+    if cell.endswith((".yaml", ".yml")):
+        look_beside(path)
     tree = read_yaml(path)
     parsed = [parse_override(text) for text in expanded(overrides)]
     given = {parts[0]: value for parts, value in parsed if len(parts) == 1}  # which file to read may be overridden

@@ -19,7 +19,7 @@ class CollisionObject(Message):
     prism has the convex hull of `outline` [m] as its cross-section and, as all shapes, its pose at half its length.
     """
 
-    later: ClassVar[tuple[str, ...]] = ("grip_effort", "mass")
+    later: ClassVar[tuple[str, ...]] = ("grip_effort", "mass", "kind")
 
     id: Name
     role: Literal["fixture", "container", "target", "contained", "attached"]
@@ -32,6 +32,7 @@ class CollisionObject(Message):
         0.0, description="force that it is to be gripped with [N]; 0: the gripper's own default"
     )
     mass: Annotated[float, Field(ge=0, le=1000)] = Field(0.0, description="[kg]; 0: not known")
+    kind: Label = Field("", description="what it is, as the detector that saw it calls it; empty: not known")
 
     @model_validator(mode="after")
     def _dimensions_fit_shape(self) -> CollisionObject:

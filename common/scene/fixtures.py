@@ -1,4 +1,4 @@
-"""Solids that are known beforehand: fixtures, and the container as a floor and four walls."""
+"""Solids that are known beforehand: fixtures, and containers as a floor and four walls each."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ def color_of(rgb: Rgb) -> m.Color:
 
 def fixed_objects(around: Surroundings) -> list[m.CollisionObject]:
     """All solids that never move, poses in world."""
-    return fixture_objects(around) + container_panels(around.container, around.table_height)
+    panels = [panel for box in around.containers.values() for panel in container_panels(box, around.table_height)]
+    return fixture_objects(around) + panels
 
 
 def fixture_objects(around: Surroundings) -> list[m.CollisionObject]:
-    """The fixtures, without the container: a cell that fills none has none."""
+    """The fixtures, without containers: a cell that fills none has none."""
     return [
         m.CollisionObject(
             id=f.id, role="fixture", shape=f.shape, dimensions=list(f.dimensions), color=color_of(f.color),

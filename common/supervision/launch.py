@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from common.application import look_where_one_stands
+from common.application import look_where_one_stands, own_places
 from common.clock import MAX_SPEED, MIN_SPEED, Clock
 from common.config import Cell, ServiceEntry
 from common.errors import ConfigError
@@ -106,9 +106,9 @@ def python_module(module: str) -> list[str]:
 
 
 def python_path(inherited: Mapping[str, str] = os.environ) -> str:
-    """PYTHONPATH of the processes: the project first, then the caller's, then the working directory."""
+    """PYTHONPATH of the processes: the project first, then the caller's, then the working directory and the cell's."""
     given = [part for part in inherited.get("PYTHONPATH", "").split(os.pathsep) if part]
-    return os.pathsep.join(dict.fromkeys([str(PROJECT_ROOT), *given, str(Path.cwd())]))
+    return os.pathsep.join(dict.fromkeys([str(PROJECT_ROOT), *given, *own_places()]))
 
 
 def require_modules(cell: Cell) -> None:

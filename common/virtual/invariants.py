@@ -34,6 +34,7 @@ from common.messages import (
     StopRequest,
     TaskCommand,
     WorldEdit,
+    WorldObjects,
 )
 from common.topics import AnyTopic
 from common.transport.codec import decode
@@ -79,6 +80,7 @@ TRUTH = "nothing that decides saw the truth"
 OUTCOMES = "every request ends in one of five ways"
 NEWER = "nothing is read twice, or after what is newer"
 BELIEVED = "as many lie there as the task says"
+JUDGED = "everything is in the end where its application wants it"
 
 
 def rate_of(cell: Cell) -> float:
@@ -114,7 +116,8 @@ class Invariants:
         self._requests, self._now = requests, now
         requests.on_ask, requests.on_serve, requests.on_answer = self._on_ask, self._on_serve, self._on_answer
         application = find_application(cell.application)
-        self._fills = application.fills
+        self._fills, self._wrong_in = application.fills, application.wrong_in
+        self._newest_truth = b""  # as it travelled
         self._doubles = {entry.name for entry in cell.services.values() if is_double(entry)}
         self._cycle = CYCLES / rate_of(cell)  # [s] of cell time
         known: dict[str, AnyTopic] = {**topics.platform_topics(), **application.topics}
@@ -201,6 +204,7 @@ class Invariants:
             self._jogged = decode(MotionOwner, sample.payload).jogging
         elif sample.key == self._objects:
             self._on_truth(msgpack.unpackb(sample.payload)["objects"])
+            self._newest_truth = sample.payload
 
     def _on_goal(self, key: str, life: str, goal: str, state: str) -> None:
         known = self._goals.setdefault(key, _Goals())
@@ -386,3 +390,7 @@ class Invariants:
             within = sum(label == CONTAINED for label, _ in self._lying.values())
             if self._broke(done == within, BELIEVED):
                 self._tell(BELIEVED, f"{done} are, {within} really")
+        if state == "DONE" and self._wrong_in is not None and self._newest_truth:
+            wrong = self._wrong_in(decode(WorldObjects, self._newest_truth))
+            if self._broke(not wrong, JUDGED):
+                self._tell(JUDGED, wrong)

@@ -8,11 +8,12 @@ from pydantic import Field
 from common import topics
 from common.applications.outlining.messages import OutlinePoints
 from common.applications.outlining.perceived_solids import PerceivedSolid
-from common.applications.outlining.scene import HomeWatch, planning_scene
+from common.applications.outlining.scene import planning_scene
 from common.applications.outlining.topics import CONTOUR_PATH
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import Header, Pose, Vector3, WorldObject
 from common.process.pace import Pace
+from common.scene.home import HomeWatch
 from common.transport.bus import Bus
 
 REPLACES = ("depth_camera", "contour_detector", "pixel_to_world", "duplicate_remover", "outline_scene")

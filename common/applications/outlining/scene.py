@@ -11,8 +11,6 @@ from common.applications.outlining.perceived_solids import PerceivedSolid
 from common.config import Surroundings
 from common.scene.fixtures import fixture_objects
 
-AT_HOME = 0.02  # [rad] from it the arm is out of the picture as well
-
 
 def planning_scene(around: Surroundings, solids: Sequence[PerceivedSolid], stamp: int) -> m.PlanningScene:
     """Fixtures and perceived solids, in world, as seen in the picture with that stamp."""
@@ -28,32 +26,3 @@ def collision_object(solid: PerceivedSolid) -> m.CollisionObject:
         outline=[(float(u), float(v)) for u, v in solid.outline - np.array([x, y])],
         pose=m.Pose(position=m.Vector3(x=float(x), y=float(y), z=solid.base + solid.height / 2)),
     )
-
-
-class HomeWatch:
-    """Knows since when the arm is at home: only then does a picture show the objects without the arm."""
-
-    def __init__(self, home: Sequence[float]) -> None:
-        """Start with nothing known of the arm.
-
-        Args:
-            home: joint positions [rad] at which the arm hides nothing.
-        """
-        self._home = np.array(home)
-        self._since: int | None = None
-        self._until: int | None = None
-        self._known = False
-
-    def note(self, q: Sequence[float], stamp: int) -> None:
-        """Take in joint positions [rad] and when they were measured [ns]."""
-        if np.abs(np.array(q) - self._home).max() > AT_HOME:
-            self._until = stamp if self._until is None else self._until
-        elif not self._known:
-            self._since = 0  # it has not moved before, as far as anybody here knows
-        elif self._until is not None:
-            self._since, self._until = stamp, None
-        self._known = True
-
-    def covers(self, stamp: int) -> bool:
-        """Whether the arm was at home at a time [ns]."""
-        return self._since is not None and self._since <= stamp and (self._until is None or stamp < self._until)

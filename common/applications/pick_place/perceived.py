@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from common.scene.slots import occupied_slots, slot_positions
 
 Array = NDArray[np.float64]
 
+LEVEL = 0.005  # [m] what is seen so little above the table lies on it
+
 
 class PerceivedScene:
     """Keeps what was seen and felt, and says it as a planning scene."""
@@ -29,13 +32,15 @@ class PerceivedScene:
 
         Args:
             parameters: of the tracking; they may change meanwhile.
-            around: fixtures, container, and how large balls are, of which the container has slots.
+            around: fixtures, containers, and how large balls are, of which the first container has slots.
             gripper: its links may touch what is held.
             tcp_link: what is held moves with this link.
         """
         self.around, self.gripper, self.tcp_link = around, gripper, tcp_link
         self.p, self._tracks = parameters, Tracks(parameters)
-        self._fixed, self._resting = fixed_objects(around), Resting.of(around)
+        self._fixed = fixed_objects(around)
+        self._resting = [replace(Resting.of(around), container=box) for box in around.containers.values()]
+        self._with_slots = next((box.container for box in self._resting), None)
         self._slots = slot_positions(around.container, around.ball_radius, around.table_height).reshape(-1, 3)
         self._in_slots = [
             self._ball(f"slot_{k}", "contained", m.Pose(position=m.Vector3(x=x, y=y, z=z)))
@@ -69,11 +74,11 @@ class PerceivedScene:
             if thing is None:
                 continue
             pixel = marker.pixel or tuple(camera.project(list(thing.position)))
-            if self._resting.shows_container(camera, pixel):
-                if thing.shape == "sphere":
-                    in_container.append((pixel[0], pixel[1]))
-                else:
-                    beside_slots.append(thing)
+            shown = [box for box in self._resting if box.shows_container(camera, pixel)]
+            if shown and thing.shape == "sphere" and shown[0].container is self._with_slots:
+                in_container.append((pixel[0], pixel[1]))
+            elif shown:
+                beside_slots.append(thing)
             elif hand is None or math.dist(hand, thing.position) > max(thing.size) / 2:
                 on_table.append(thing)
         self._beside_slots[view] = beside_slots
@@ -129,10 +134,23 @@ class PerceivedScene:
         held = [self._held] if self._held is not None else []
         return m.PlanningScene(
             header=m.Header(stamp=self._stamp, frame_id="world"),
-            objects=[*self._fixed, *table, *contained],
+            objects=[*self._fixed, *table, *contained, *self._below(table)],
             attached=held,
             allowed_collisions=[(link, h.object.id) for h in held for link in self.gripper.links],
         )
+
+    def _below(self, table: list[m.CollisionObject]) -> list[m.CollisionObject]:
+        """Columns under what stands above the table: something carries it, though a camera above sees none of that."""
+        columns = []
+        for thing in table:
+            gap = thing.pose.position.z - thing.dimensions[-1] / 2 - self.around.table_height
+            if thing.shape != "sphere" and gap > LEVEL:
+                at = m.Vector3(x=thing.pose.position.x, y=thing.pose.position.y, z=self.around.table_height + gap / 2)
+                pose = thing.pose.model_copy(update={"position": at})
+                columns.append(thing.model_copy(update={
+                    "id": f"below_{thing.id}", "role": "fixture", "kind": "", "pose": pose, "mass": 0.0,
+                    "dimensions": [*thing.dimensions[:-1], gap]}))
+        return columns
 
     def _occupied_slots(self) -> set[int]:
         """Slots in which any view shows something now."""
@@ -150,7 +168,7 @@ class PerceivedScene:
         return m.CollisionObject.model_validate({
             "id": name, "role": role, "shape": thing.shape, "dimensions": thing.dimensions, "pose": pose,
             "color": thing.color, "grip_effort": self.around.grip_efforts.get(thing.kind, 0.0),
-            "mass": self.around.masses.get(thing.kind, 0.0),
+            "mass": self.around.masses.get(thing.kind, 0.0), "kind": thing.kind,
         })
 
 

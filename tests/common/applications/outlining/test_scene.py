@@ -5,9 +5,10 @@ import math
 import numpy as np
 
 from common.applications.outlining.perceived_solids import PerceivedSolid
-from common.applications.outlining.scene import HomeWatch, collision_object, planning_scene
+from common.applications.outlining.scene import collision_object, planning_scene
 from common.config import Surroundings, load_cell
 from common.messages import Color
+from common.scene.home import HomeWatch
 
 CELL = load_cell("ur5")
 HOME = CELL.robot.named_poses["home"]

@@ -1,0 +1,276 @@
+"""Objects that a camera saw are brought somewhere else: what any task of that kind does the same way.
+
+A task of one's own says in `choose` which object comes next, and in `destination` where the one in the hand is to
+stand. From there on all is done here: gripping a box by its faces, carrying it, putting it down, looking again from
+home, going on with what is in the hand after a restart, and leaving alone for a while what does not work.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from common import messages as m
+from common.config import Grasp, Surroundings, Tunable
+from common.robot.transforms import invert, matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, tool_down
+from common.scene.home import AT_HOME
+from common.tasks.deciding import TaskConfig
+from common.tasks.engine import Task
+from common.tasks.stages import MISSES, Cycle, Grip, Look, Move, Place, Stage, View, place_of
+
+Array = npt.NDArray[np.float64]
+
+DROP = 0.004  # [m] what is put down is let go so far above what it is to stand on
+SQUARE = 0.002  # [m] a box whose sides differ by less looks the same after a quarter turn
+ASIDE = 0.08  # [m] from the middle of anything else there is room to put something down
+
+
+class HandlingStatus(m.TaskStatus):
+    """What a task says that brings objects somewhere."""
+
+    state: Literal["IDLE", "GRASPING", "PLACING", "HOMING", "DONE", "ERROR"] = "IDLE"
+
+
+class HandlingConfig(TaskConfig):
+    """How objects are taken and put down; times are cell time unless they say wall."""
+
+    world: Surroundings
+    grasp: Grasp
+    frame_timeout: Tunable[float] = Field(
+        3.0, ge=0.1, le=60, description="an older picture starts no motion [s, wall time]"
+    )
+    settle: Tunable[float] = Field(1.0, ge=0, le=600, description="for so long all must look done before it is [s]")
+    give_up: Tunable[float] = Field(20.0, gt=0, le=3600, description="wait for what is missing [s]")
+    most_tries: Tunable[int] = Field(4, ge=1, le=100, description="for one object, before the task gives up")
+    width_tolerance: Tunable[float] = Field(
+        0.01, gt=0, le=0.05, description="what is gripped may be so much wider or narrower than it was seen [m]"
+    )
+
+
+class Handling(Task[View]):
+    """Takes objects and puts them down, one after the other, looking from home in between."""
+
+    p: HandlingConfig
+
+    def __init__(self, config: HandlingConfig, status: m.TaskStatus, prefix: str, speed: float = 1.0) -> None:
+        """Start from nothing known: see `Task`."""
+        super().__init__(config, status, prefix, speed)
+        self._tries: Counter[str] = Counter()  # by object: how often it did not work
+        self._problem = ""  # with the last of them
+        self._home = config.robot.named_poses["home"]
+
+    # --- what a task of one's own says ---------------------------------------------------------------------------
+
+    def choose(self, view: View) -> None:
+        """With an empty hand, at home, with a fresh picture: `bring` one of what is seen, `finish`, or `lack`."""
+        raise NotImplementedError
+
+    def destination(self, thing: m.CollisionObject, view: View) -> m.Pose | None:
+        """Where the middle of what is in the hand is to be, in world; None puts it aside, to be seen first."""
+        raise NotImplementedError
+
+    # --- what it may say so with ---------------------------------------------------------------------------------
+
+    def bring(self, things: Sequence[m.CollisionObject], view: View) -> None:
+        """Take the first of these that failed least often to its destination; after too many tries that is the end."""
+        thing = min(things, key=lambda one: self._tries[one.id])
+        if self._tries[thing.id] >= self.p.most_tries:
+            x, y, _ = place_of(thing.pose)
+            self.end("ERROR", f"{thing.kind or thing.id} at ({x:.3f}, {y:.3f}): {self._problem}")
+            return
+        self.patience.reset()
+        self.row += self._take(thing, view)
+
+    def finish(self, view: View, **figures: float) -> None:
+        """It is done, if it looks so for a while; with the task's own figures."""
+        if self.patience.lasts("done", view.scene_stamp) >= self.p.settle:
+            self.status.figures.update(figures)
+            self.end("DONE")
+
+    def lack(self, what: str, view: View) -> None:
+        """Something is missing: wait for it a while, then give up."""
+        self.status.message = what
+        if self.patience.lasts(what, view.scene_stamp) >= self.p.give_up:
+            self.end("ERROR", what)
+
+    def container_of(self, thing: m.CollisionObject) -> str:
+        """The id of the container over or in which a thing is; empty when it is none's."""
+        x, y, _ = place_of(thing.pose)
+        return next((name for name, box in self.p.world.containers.items()
+                     if max(abs(x - box.x), abs(y - box.y)) < box.half_side), "")
+
+    def inside(self, container: str, view: View) -> list[m.CollisionObject]:
+        """What is seen in a container."""
+        return [thing for thing in view.objects("contained") if self.container_of(thing) == container]
+
+    def room_in(self, container: str, thing: m.CollisionObject, view: View) -> m.Pose:
+        """Above the corner of a container that is furthest from what lies in it, clear of its walls."""
+        box, others = self.p.world.containers[container], [place_of(o.pose) for o in self.inside(container, view)]
+        corners = [(box.x + dx, box.y + dy) for dx in (-box.slot_offset, box.slot_offset)
+                   for dy in (-box.slot_offset, box.slot_offset)]
+        x, y = max(corners, key=lambda at: min((math.dist(at, other[:2]) for other in others), default=math.inf))
+        z = self.p.world.table_height + box.wall_height + height_of(thing)
+        return m.Pose(position=m.Vector3(x=x, y=y, z=z))
+
+    def on_top(self, thing: m.CollisionObject, below: m.CollisionObject) -> m.Pose:
+        """On another thing, turned as that is."""
+        x, y, z = place_of(below.pose)
+        return below.pose.model_copy(update={"position": m.Vector3(x=x, y=y, z=z + (height_of(below) + height_of(
+            thing)) / 2)})
+
+    # --- what is decided -----------------------------------------------------------------------------------------
+
+    def decide(self, view: View) -> None:
+        """Bring on what is in the hand; with an empty one go home, look, and choose."""
+        assert view.gripper is not None and view.q is not None and view.scene is not None
+        if self.status.state == "DONE":  # whatever is put there now: nobody has asked for more
+            return
+        if view.holding and view.gripper.outcome in MISSES:  # it is not what was to be taken
+            self.row += [self._open(None), *self.back_off(view.let_go())]
+        elif view.holding:
+            if view.scene.attached:  # else the planning scene has not caught up yet
+                held = view.scene.attached[0].object
+                self.row += self._put(held, held.pose, Cycle(held.id), view)
+        elif max(abs(a - b) for a, b in zip(view.q, self._home, strict=True)) > AT_HOME:
+            self.row += self.back_off(view)
+        elif self.sees(view):
+            self.status.state, self.status.stage, self.status.subject, self.status.message = "IDLE", "", "", ""
+            self.choose(view)
+
+    def plan_failed(self, move: Move, response: m.PlanResponse, view: View) -> None:
+        """Another turn of the hand, or another object, may do better."""
+        if move.cycle is not None:
+            self._note_try(move.cycle, response.message)
+        super().plan_failed(move, response, view)
+
+    def missed(self, stage: Grip, view: View) -> None:
+        """Open, back off and look again."""
+        if stage.cycle is not None:
+            self._note_try(stage.cycle, stage.problem)
+        super().missed(stage, view)
+
+    def succeeded(self, stage: Stage, view: View) -> None:
+        """What was put down is no longer one that did not work."""
+        if stage.name == "release" and stage.cycle is not None:
+            del self._tries[stage.cycle.subject]
+
+    def _note_try(self, cycle: Cycle, problem: str) -> None:
+        self._tries[cycle.subject] += 1
+        self._problem = problem
+
+    def began_anew(self) -> None:
+        """What did not work before may do so now."""
+        self._tries.clear()
+
+    # --- its stages ----------------------------------------------------------------------------------------------
+
+    def _take(self, thing: m.CollisionObject, view: View) -> list[Stage]:
+        """Open, above it, straight down, close, up; then what follows from there on."""
+        x, y, z = place_of(thing.pose)
+        yaw, width = self._grips(thing)[self._tries[thing.id] % 2]
+        low, cycle = self.p.grasp.height(z), Cycle(thing.id)
+        T_world_tcp = tool_down(x, y, low, yaw)
+        held = matrix_to_pose(invert(T_world_tcp) @ pose_to_matrix(thing.pose))
+        above = _raised(T_world_tcp, self.p.grasp.approach_clearance)
+        return [
+            self._open(cycle),
+            Move("pre-grasp", "GRASPING", cycle, goal=_at(above), whole=True, fresh=True),
+            Move("descend", "GRASPING", cycle, goal=_at(T_world_tcp), straight=True, touches=self._fingers_on(thing)),
+            Grip("close", "GRASPING", cycle, width=0.0, holds=True, effort=thing.grip_effort, mass=thing.mass,
+                 expected_width=width, width_tolerance=self.p.width_tolerance),
+            Move("lift", "GRASPING", cycle, goal=_at(above), straight=True, carries=True, attach=thing.id,
+                 attach_pose=held),
+            *self._put(thing, held, cycle, view),
+        ]
+
+    def _put(self, thing: m.CollisionObject, held: m.Pose, cycle: Cycle, view: View) -> list[Stage]:
+        """Across, straight down, let go; up, home, and look."""
+        goal = self.destination(thing, view) if thing.kind else None
+        goal = goal or self._aside(thing, view)
+        tools = sorted(self._tools(thing, held, goal), key=lambda tool: abs(_yaw(tool)))
+        tool = tools[self._tries[cycle.subject] % len(tools)]
+        x, y, z = (float(value) for value in tool[:3, 3])
+        down = tool_down(x, y, z + DROP, _yaw(tool))
+        above = _raised(down, self.p.grasp.approach_clearance)
+        expected = None if view.holding else held
+        return [
+            Move("across", "PLACING", cycle, goal=_at(above), carries=True, attach=thing.id, attach_pose=expected),
+            Move("lower", "PLACING", cycle, goal=_at(down), straight=True, carries=True, attach=thing.id,
+                 attach_pose=expected),
+            Grip("release", "PLACING", cycle, width=self.gripper.max_width, carries=True, holds=False),
+            Move("up", "HOMING", cycle, goal=_at(above), straight=True, touches=self._fingers_on(thing)),
+            Move("home", "HOMING", cycle, goal=m.JointGoal(named="home")),
+            Look(),
+        ]
+
+    def _tools(self, thing: m.CollisionObject, held: m.Pose, goal: m.Pose) -> Iterator[Array]:
+        """Poses (4, 4) of the tool with which a thing is where it is to be, turned in any way that looks the same."""
+        turns = 4 if thing.shape != "box" or abs(thing.dimensions[0] - thing.dimensions[1]) < SQUARE else 2
+        for turn in range(turns):
+            turned = pose_to_matrix(goal)
+            turned[:3, :3] = turned[:3, :3] @ rpy_to_matrix(0.0, 0.0, 2 * math.pi * turn / turns)
+            yield turned @ invert(pose_to_matrix(held))
+
+    def _grips(self, thing: m.CollisionObject) -> list[tuple[float, float | None]]:
+        """Yaws [rad] of the tool, and the width between the fingers there [m]: on two faces of a box, or the others."""
+        turn = math.pi / 2 if self.gripper.closing_axis == "x" else 0.0
+        if thing.shape != "box":
+            width = 2 * thing.dimensions[0]
+            return [(turn, width), (turn + math.pi / 2, width)]
+        yaw = _yaw(pose_to_matrix(thing.pose))
+        ways = [(math.remainder(yaw + turn + quarter, math.pi), width)
+                for quarter, width in ((0.0, thing.dimensions[1]), (math.pi / 2, thing.dimensions[0]))]
+        ways.sort(key=lambda way: abs(way[0] - turn))
+        fitting = [way for way in ways if way[1] < self.gripper.max_width] or ways
+        return [fitting[0], fitting[-1]]
+
+    def _aside(self, thing: m.CollisionObject, view: View) -> m.Pose:
+        """The nearest free place on the table to where the hand is now, within easy reach."""
+        x, y, _ = view.tool
+        far = min(max(math.hypot(x, y), 0.40), 0.55)  # [m] from the base axis
+        others = [place_of(o.pose) for role in ("target", "contained") for o in view.objects(role)]
+        others += [(box.x, box.y, 0.0) for box in self.p.world.containers.values()]
+        turns = sorted((math.radians(5 * k) for k in range(-12, 13)), key=lambda turn: abs(turn - math.atan2(y, x)))
+        places = [(far * math.cos(turn), far * math.sin(turn)) for turn in turns]
+        at = next((p for p in places if all(math.dist(p, o[:2]) > ASIDE + self._half(o) for o in others)), places[0])
+        return m.Pose(position=m.Vector3(x=at[0], y=at[1], z=self.p.world.table_height + height_of(thing) / 2))
+
+    def _half(self, place: Place) -> float:
+        """How far what has its middle there reaches if it is a container [m]."""
+        return next((box.half_side for box in self.p.world.containers.values() if (box.x, box.y) == place[:2]), 0.0)
+
+    def _open(self, cycle: Cycle | None) -> Grip:
+        return Grip("open", "GRASPING", cycle, width=self.gripper.max_width)
+
+    def _fingers_on(self, thing: m.CollisionObject) -> list[tuple[str, str]]:
+        return [(link, thing.id) for link in self.gripper.links]
+
+
+def height_of(thing: m.CollisionObject) -> float:
+    """Of what stands upright [m]."""
+    return 2 * thing.dimensions[0] if thing.shape == "sphere" else thing.dimensions[-1]
+
+
+def top_of(thing: m.CollisionObject) -> float:
+    """Height of the top of what stands upright, in world [m]."""
+    return thing.pose.position.z + height_of(thing) / 2
+
+
+def _yaw(T_world_thing: Array) -> float:
+    return matrix_to_rpy(T_world_thing[:3, :3])[2]
+
+
+def _raised(T_world_tcp: Array, height: float) -> Array:
+    raised = T_world_tcp.copy()
+    raised[2, 3] += height
+    return raised
+
+
+def _at(T_world_tcp: Array) -> m.PoseGoal:
+    return m.PoseGoal(pose=matrix_to_pose(T_world_tcp))

@@ -1,0 +1,98 @@
+"""Finds boxes of known colours and sizes in the pictures of a depth camera, and says where they are in the world."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections import deque
+
+import cv2
+
+from common import topics
+from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE
+from common.messages import Color, Header, Image, Marker, MarkerArray, Pose, Quaternion, Vector3
+from common.perception.boxes import BoxDetector, BoxOptions, SeenBox, outlined
+from common.perception.depth import DepthError, check_depth
+from common.perception.image import ImageError, array_to_image, image_to_array
+from common.perception.intake import Cameras, LeftOut, Unusable, picture_of
+from common.process.service import main
+from common.transport.bus import Bus
+
+KEPT = 5  # depth images that wait for their pictures
+WORLD = "world"
+
+
+class Config(BoxOptions):
+    """Which boxes are looked for."""
+
+
+def markers(found: list[SeenBox], config: Config, stamp: int) -> MarkerArray:
+    """The message of what was found in the picture that was exposed at `stamp`."""
+    return MarkerArray(header=Header(stamp=stamp, frame_id=WORLD), markers=[
+        _marker(index, box, config) for index, box in enumerate(found)
+    ])
+
+
+def _marker(index: int, box: SeenBox, config: Config) -> Marker:
+    kind = config.kinds[box.kind]
+    (x, y, z), (r, g, b), (u, v) = box.position, kind.color, box.corners.mean(axis=0)
+    return Marker(
+        ns=box.kind, id=index, type="box", scale=Vector3(x=kind.size[0], y=kind.size[1], z=kind.size[2]),
+        pose=Pose(position=Vector3(x=x, y=y, z=z),
+                  orientation=Quaternion(z=math.sin(box.yaw / 2), w=math.cos(box.yaw / 2))),
+        color=Color(r=r, g=g, b=b), pixel=(float(u), float(v)), partial=box.partial,
+    )
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """Look at every picture once its depth is here; what cannot be looked at is dropped, counted and told once."""
+    images, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
+    infos, statics = bus.reader(topics.DEPTH_CAMERA_INFO), bus.reader(topics.TF_STATIC)
+    found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
+    cv2.setNumThreads(1)  # the other cores have other services
+    detector, cameras = BoxDetector(config), Cameras()
+    left_out = LeftOut(bus.log, "a picture")
+    kept: deque[Image] = deque(maxlen=KEPT)
+    newest, turn = 0, asyncio.Lock()
+    await bus.ready()
+
+    async def look(image: Image | None) -> None:
+        nonlocal newest
+        depth = next((one for one in kept if image is not None and one.header.stamp == image.header.stamp), None)
+        if image is None or depth is None or image.header.stamp <= newest:
+            return
+        newest = image.header.stamp
+        try:
+            camera = cameras.of(infos.latest, statics.latest, image.header.frame_id)
+            picture, metres = picture_of(image, camera), image_to_array(depth)
+            check_depth(metres, camera.width, camera.height)
+        except (Unusable, ImageError) as error:
+            left_out.note(error)
+            return
+        except DepthError as error:
+            left_out.note(Unusable(error.kind, str(error)))
+            return
+        detector.options = config.model_copy()
+        boxes = await asyncio.to_thread(detector.detect, picture, metres, camera)
+        found.put(markers(boxes, config, image.header.stamp))
+        if shown.matched:
+            shown.put(array_to_image(outlined(picture, boxes), "bgr8", image.header))
+
+    async def watch_depths() -> None:
+        async for depth in depths:
+            kept.append(depth)
+            async with turn:
+                await look(images.latest)
+
+    async def watch_images() -> None:
+        async for image in images:
+            async with turn:
+                await look(image)
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(watch_depths())
+        group.create_task(watch_images())
+
+
+if __name__ == "__main__":
+    main(run, Config)
