@@ -37,6 +37,8 @@ class BuildWithFolders(build_py):
         shutil.rmtree(inside, ignore_errors=True)  # what an earlier build left and the clone no longer has
         for folder in FOLDERS:
             shutil.copytree(folder, inside / folder, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
+        for example in Path("examples").glob("*/cell.yaml"):  # `zencell new` begins with one
+            shutil.copytree(example.parent, inside / example.parent, ignore=shutil.ignore_patterns("__pycache__"))
         shutil.copy("constraints.txt", inside)  # `zencell doctor` compares
         compile_kernel(inside / KERNEL, cache)
         shutil.rmtree(cache, ignore_errors=True)

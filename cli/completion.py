@@ -101,6 +101,16 @@ def services(incomplete: str) -> list[Offer]:
     return _starting(incomplete, ((path.stem, _doc(path)) for path in _modules("services")))
 
 
+def tasks(incomplete: str) -> list[Offer]:
+    """Kinds of tasks that a project may begin as."""
+    return _starting(incomplete, ((kind, _doc(ROOT / "examples" / kind / "task.py")) for kind in task_kinds()))
+
+
+def task_kinds() -> list[str]:
+    """Examples with a cell of their own: each is what a new project may begin as."""
+    return sorted(path.parent.name for path in (ROOT / "examples").glob("*/cell.yaml"))
+
+
 def planners(incomplete: str) -> list[Offer]:
     """Planners by name."""
     return _starting(incomplete, ((path.stem, _doc(path)) for path in _modules("common/planning/planners")))

@@ -24,6 +24,7 @@ from cli import (
     doctor,
     exporting,
     graph,
+    new,
     node,
     param,
     playing,
@@ -103,6 +104,7 @@ app.callback()(completion.root)
 of_applications = verbs.ApplicationVerbs(app, {"task": commands.task}, bringup.run, last="chaos")
 app.command()(bringup.run)
 app.command()(bringup.up)
+app.command()(new.new)
 app.command()(catalogue.cells)
 app.command()(catalogue.services)
 app.command()(catalogue.service)

@@ -129,15 +129,18 @@ class Handling(Task[View]):
     def decide(self, view: View) -> None:
         """Bring on what is in the hand; with an empty one go home, look, and choose."""
         assert view.gripper is not None and view.q is not None and view.scene is not None
+        away = max(abs(a - b) for a, b in zip(view.q, self._home, strict=True)) > AT_HOME
         if self.status.state == "DONE":  # whatever is put there now: nobody has asked for more
             return
         if view.holding and view.gripper.outcome in MISSES:  # it is not what was to be taken
             self.row += [self._open(None), *self.back_off(view.let_go())]
+        elif view.holding and not view.scene.header.stamp:  # what stands around is seen from home only
+            self.row += [self.home(view), Look()] if away else []
         elif view.holding:
             if view.scene.attached:  # else the planning scene has not caught up yet
                 held = view.scene.attached[0].object
                 self.row += self._put(held, held.pose, Cycle(held.id), view)
-        elif max(abs(a - b) for a, b in zip(view.q, self._home, strict=True)) > AT_HOME:
+        elif away:
             self.row += self.back_off(view)
         elif self.sees(view):
             self.status.state, self.status.stage, self.status.subject, self.status.message = "IDLE", "", "", ""
@@ -202,12 +205,19 @@ class Handling(Task[View]):
         return [
             Move("across", "PLACING", cycle, goal=_at(above), carries=True, attach=thing.id, attach_pose=expected),
             Move("lower", "PLACING", cycle, goal=_at(down), straight=True, carries=True, attach=thing.id,
-                 attach_pose=expected),
+                 attach_pose=expected, touches=[(thing.id, other.id) for other in self._under(thing, goal, view)]),
             Grip("release", "PLACING", cycle, width=self.gripper.max_width, carries=True, holds=False),
             Move("up", "HOMING", cycle, goal=_at(above), straight=True, touches=self._fingers_on(thing)),
             Move("home", "HOMING", cycle, goal=m.JointGoal(named="home")),
             Look(),
         ]
+
+    def _under(self, thing: m.CollisionObject, goal: m.Pose, view: View) -> list[m.CollisionObject]:
+        """What a thing may come to stand on where it is to be."""
+        x, y, z = place_of(goal)
+        lowest = z - height_of(thing) / 2 + DROP
+        return [other for other in view.objects("target") if other.id != thing.id and top_of(other) <= lowest
+                and math.dist((x, y), place_of(other.pose)[:2]) < _reach(thing) + _reach(other)]
 
     def _tools(self, thing: m.CollisionObject, held: m.Pose, goal: m.Pose) -> Iterator[Array]:
         """Poses (4, 4) of the tool with which a thing is where it is to be, turned in any way that looks the same."""
@@ -260,6 +270,11 @@ def height_of(thing: m.CollisionObject) -> float:
 def top_of(thing: m.CollisionObject) -> float:
     """Height of the top of what stands upright, in world [m]."""
     return thing.pose.position.z + height_of(thing) / 2
+
+
+def _reach(thing: m.CollisionObject) -> float:
+    """Of the circle about it, seen from above [m]."""
+    return math.hypot(*thing.dimensions[:2]) / 2 if thing.shape == "box" else thing.dimensions[0]
 
 
 def _yaw(T_world_thing: Array) -> float:
