@@ -190,3 +190,42 @@ def test_objects_of_a_kind_say_how_hard_they_are_to_be_gripped() -> None:
     assert [o.grip_effort for o in s.scene().objects if o.role == "target"] == [3.0]
     s.feel(gripper(1.2, True), tool_down(0.4, 0.0, 0.03))
     assert s.scene().attached[0].object.grip_effort == 3.0
+
+
+def boxes(stamp: float, camera: Pinhole, *places: tuple[str, float, float, float]) -> m.MarkerArray:
+    markers = []
+    for k, (kind, x, y, z) in enumerate(places):
+        u, v = camera.project([x, y, z])
+        markers.append(m.Marker(ns=kind, id=k, type="box", scale=m.Vector3(x=0.04, y=0.04, z=0.04), pixel=(u, v),
+                                pose=m.Pose(position=m.Vector3(x=x, y=y, z=z))))
+    return m.MarkerArray(header=m.Header(stamp=int(stamp * 1e9), frame_id="world"), markers=markers)
+
+
+def test_boxes_keep_their_kind_and_what_lies_in_any_of_several_containers_is_contained() -> None:
+    around = Surroundings.model_validate({"containers": {"left": {"y": 0.3}, "right": {"y": -0.3}}})
+    camera = Pinhole.from_config(around.camera)
+    assert CELL.robot.gripper is not None
+    s = PerceivedScene(SceneParameters(confirm_frames=1), around, CELL.robot.gripper, "panda_hand_tcp")
+    assert sum(o.role == "container" for o in s.scene().objects) == 10
+    s.see(boxes(1.0, camera, ("red", 0.4, 0.0, 0.02), ("green", 0.55, 0.3, 0.025), ("red", 0.55, -0.3, 0.025)),
+          camera, AWAY)
+    found = [(o.role, o.kind, round(o.pose.position.y, 2)) for o in s.scene().objects if o.kind]
+    assert found == [("target", "red", 0.0), ("contained", "green", 0.3), ("contained", "red", -0.3)]
+
+
+def test_a_world_without_containers_has_no_panels() -> None:
+    around = Surroundings()
+    assert CELL.robot.gripper is not None
+    s = PerceivedScene(SceneParameters(), around, CELL.robot.gripper, "panda_hand_tcp")
+    assert s.scene().objects == []
+
+
+def test_something_is_thought_to_carry_what_stands_above_the_table() -> None:
+    around = Surroundings()
+    camera = Pinhole.from_config(around.camera)
+    assert CELL.robot.gripper is not None
+    s = PerceivedScene(SceneParameters(confirm_frames=1), around, CELL.robot.gripper, "panda_hand_tcp")
+    s.see(boxes(1.0, camera, ("red", 0.4, 0.0, 0.02), ("green", 0.55, 0.1, 0.10)), camera, AWAY)
+    column, = [o for o in s.scene().objects if o.role == "fixture"]
+    assert column.dimensions == pytest.approx([0.04, 0.04, 0.08]) and column.pose.position.z == pytest.approx(0.04)
+    assert (column.pose.position.x, column.pose.position.y) == (0.55, 0.1)

@@ -1,0 +1,82 @@
+"""Boxes of two colours in pictures of the simulated world, against where they really are."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from common.config import CameraConfig, Surroundings
+from common.messages import Color, Pose, Quaternion, Vector3, WorldObject
+from common.perception.boxes import BoxDetector, BoxKind, BoxOptions, SeenBox
+from common.sim.rendering import Renderer
+
+RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.7, 0.2)
+SIDE = 0.04  # [m]
+AROUND = Surroundings.model_validate({
+    "fixtures": [{"id": "table", "dimensions": [1.0, 1.2, 0.05], "position": [0.5, 0.0, -0.025]}],
+    "camera": CameraConfig(fx=1000, fy=1000, position=(0.6, 0.0, 1.3)),
+})
+KINDS = {"red": BoxKind(color=RED, size=(SIDE, SIDE, SIDE)), "green": BoxKind(color=GREEN, size=(SIDE, SIDE, SIDE))}
+
+
+def cube(name: str, x: float, y: float, z: float = SIDE / 2, yaw: float = 0.0, side: float = SIDE) -> WorldObject:
+    r, g, b = RED if name.startswith("red") else GREEN
+    return WorldObject(
+        id=name, shape="box", size=Vector3(x=side, y=side, z=side), color=Color(r=r, g=g, b=b),
+        pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))),
+    )
+
+
+def seen(*cubes: WorldObject, **options: object) -> list[SeenBox]:
+    view = Renderer(AROUND)
+    shown = view.see(list(cubes))
+    detector = BoxDetector(BoxOptions.model_validate({"kinds": KINDS, **options}))
+    return detector.detect(shown.colour, np.asarray(shown.depth, np.float32), view.camera)
+
+
+def quarter(angle: float) -> float:
+    """What is left of an angle [rad] when quarter turns look the same."""
+    return math.remainder(angle, math.pi / 2)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.3, math.pi / 4, 1.2, -2.0])
+def test_kind_place_and_turn_are_those_of_the_cube(yaw: float) -> None:
+    cubes = [cube("red", 0.45, -0.15, yaw=yaw), cube("green", 0.7, 0.2, yaw=-yaw)]
+    for thing, box in zip(cubes, seen(*cubes), strict=True):
+        assert box.kind == thing.id and not box.partial
+        at = thing.pose.position
+        np.testing.assert_allclose(box.position, (at.x, at.y, at.z), atol=0.0015)
+        turned = yaw if thing.id == "red" else -yaw
+        assert abs(quarter(box.yaw - turned)) < math.radians(3)
+
+
+def test_of_a_stack_the_top_is_seen_at_its_height_and_the_walls_below_are_no_cube() -> None:
+    heights = [SIDE / 2, 1.5 * SIDE, 2.5 * SIDE]
+    for names in (("red", "green", "red"), ("red", "red", "red")):
+        stack = [cube(f"{name}_{k}", 0.75, 0.25, z) for k, (name, z) in enumerate(zip(names, heights, strict=True))]
+        box, = seen(*stack)
+        assert box.kind == "red" and box.position[2] == pytest.approx(2.5 * SIDE, abs=1e-3)
+
+
+def test_cubes_of_one_colour_that_touch_are_told_apart() -> None:
+    boxes = seen(cube("red_1", 0.5, 0.0), cube("red_2", 0.5, SIDE), cube("red_3", 0.5, 2 * SIDE))
+    assert sorted(round(box.position[1], 2) for box in boxes) == [0.0, 0.04, 0.08]
+
+
+def test_what_is_as_large_as_no_cube_of_its_colour_is_left_out() -> None:
+    assert seen(cube("red", 0.5, 0.0, z=0.03, side=0.06), cube("green", 0.5, 0.2, z=0.0125, side=0.025)) == []
+
+
+def test_a_cube_that_another_one_hides_in_part_is_left_out() -> None:
+    boxes = seen(cube("red", 0.6, 0.0), cube("green", 0.62, 0.02, z=0.09))
+    assert [box.kind for box in boxes] == ["green"]
+
+
+def test_colours_that_nobody_asked_for_and_pictures_without_depth_show_nothing() -> None:
+    assert seen(cube("red", 0.5, 0.0), kinds={"green": KINDS["green"]}) == []
+    view = Renderer(AROUND)
+    shown = view.see([cube("red", 0.5, 0.0)])
+    nothing = np.full(np.shape(shown.depth), np.nan, np.float32)
+    assert BoxDetector(BoxOptions(kinds=KINDS)).detect(shown.colour, nothing, view.camera) == []
