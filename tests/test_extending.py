@@ -292,11 +292,21 @@ def test_task_of_one_file_moves_a_cube_and_ends_the_run_with_a_status_and_figure
     with no_processes():
         ran = ask(folder, *shlex.split(CUBE)[1:], "--summary", str(file), "--domain", str(free_domain()))
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    line = next(line for line in COMMANDS if line.startswith("zencell simulate"))
+    line = next(line for line in COMMANDS if line.startswith("zencell simulate cube"))
     places = shlex.split(CUBE)[3:]  # of the same run
     simulated = ask(folder, *shlex.split(line)[1:], *places, "--trace", str(recording))
     assert simulated.returncode == 0 and "seed 1: DONE" in simulated.stdout, simulated.stdout + simulated.stderr
     assert_cube_moved(file, ran.stdout, recording, folder, tmp_path / "elsewhere")
+
+
+@pytest.mark.slow
+def test_new_task_runs_at_once(tmp_path: Path) -> None:
+    new, = (line for line in COMMANDS if line.startswith("zencell new"))
+    made = ask(tmp_path, *shlex.split(new)[1:])
+    assert (made.returncode, made.stderr) == (0, "")
+    simulate, = (line for line in COMMANDS if line.startswith("zencell simulate my_task"))
+    simulated = ask(tmp_path, *shlex.split(simulate.replace("1-3", "1"))[1:])
+    assert simulated.returncode == 0 and "1 of 1 (100.0%)" in simulated.stdout, simulated.stdout + simulated.stderr
 
 
 def test_task_of_one_file_goes_on_with_what_is_in_the_hand(folder: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from common import messages as m
 from common.config import Surroundings, load_cell
 from common.robot.model import RobotModel
-from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix, rpy_to_matrix, tool_down, transform
+from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix, rpy_to_matrix, transform
 from common.tasks.handling import Handling, HandlingConfig, HandlingStatus
 from common.tasks.stages import Cycle, Grip, Move, View
 
