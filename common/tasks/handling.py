@@ -99,6 +99,10 @@ class Handling(Task[View]):
         if self.patience.lasts(what, view.scene_stamp) >= self.p.give_up:
             self.end("ERROR", what)
 
+    def shown(self, view: View) -> bool:
+        """Whether the scene shows all that was done so far: else it is too early to count."""
+        return self.running is None and not view.holding and view.scene_stamp > self.look_after
+
     def container_of(self, thing: m.CollisionObject) -> str:
         """The id of the container over or in which a thing is; empty when it is none's."""
         x, y, _ = place_of(thing.pose)

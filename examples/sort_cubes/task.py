@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from common import messages as m
+from common.applications.pick_place.topics import DETECTION_IMAGE
 from common.process.service import main
 from common.process.task_runner import run_task
 from common.tasks.handling import Handling, HandlingConfig, HandlingStatus
@@ -20,6 +21,7 @@ class SortStatus(HandlingStatus):
 
 
 STATUS = Topic("sort_cubes_status", SortStatus, "state", "how many cubes are in the box of their colour")
+ANNOTATED = DETECTION_IMAGE  # what the page shows of what was found
 
 
 class Config(HandlingConfig):
@@ -44,8 +46,8 @@ class SortCubes(Handling):
         return self.room_in(thing.kind, thing, view)
 
     def note(self, view: View) -> None:
-        """Count, while nothing is in the hand or in the air."""
-        if not view.holding and self.running is None:
+        """Count what a picture shows in which nothing is under way."""
+        if self.shown(view):
             cubes = self._cubes(view)
             self.status.total = len(cubes)
             self.status.done = sum(self.container_of(cube) == cube.kind for cube in cubes)

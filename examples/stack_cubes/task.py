@@ -7,6 +7,7 @@ import math
 from pydantic import Field
 
 from common import messages as m
+from common.applications.pick_place.topics import DETECTION_IMAGE
 from common.config import Tunable
 from common.process.service import main
 from common.process.task_runner import run_task
@@ -24,6 +25,7 @@ class StackStatus(HandlingStatus):
 
 
 STATUS = Topic("stack_cubes_status", StackStatus, "state", "how many cubes stand upon each other")
+ANNOTATED = DETECTION_IMAGE  # what the page shows of what was found
 
 
 class Config(HandlingConfig):
@@ -55,10 +57,10 @@ class StackCubes(Handling):
         return self.on_top(thing, stack) if stack is not None and stack.id != thing.id else None
 
     def note(self, view: View) -> None:
-        """Count, while nothing is in the hand or in the air."""
+        """Count what a picture shows in which nothing is under way."""
         stack = self._stack(view)
         self.status.total = self.p.cubes
-        if stack is not None and not view.holding and self.running is None:
+        if stack is not None and self.shown(view):
             self.status.done = min(self._cubes_to(stack), self.p.cubes)
 
     def _stack(self, view: View) -> m.CollisionObject | None:

@@ -19,6 +19,7 @@ from common.scene.slots import occupied_slots, slot_positions
 
 Array = NDArray[np.float64]
 
+GREY = m.Color(r=0.6, g=0.6, b=0.6)  # of what is not seen
 LEVEL = 0.005  # [m] what is seen so little above the table lies on it
 
 
@@ -148,7 +149,7 @@ class PerceivedScene:
                 at = m.Vector3(x=thing.pose.position.x, y=thing.pose.position.y, z=self.around.table_height + gap / 2)
                 pose = thing.pose.model_copy(update={"position": at})
                 columns.append(thing.model_copy(update={
-                    "id": f"below_{thing.id}", "role": "fixture", "kind": "", "pose": pose, "mass": 0.0,
+                    "id": f"below_{thing.id}", "role": "fixture", "kind": "", "pose": pose, "mass": 0.0, "color": GREY,
                     "dimensions": [*thing.dimensions[:-1], gap]}))
         return columns
 
