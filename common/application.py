@@ -153,24 +153,26 @@ def find_application(name: str) -> Application:
     return found
 
 
-_beside: dict[str, None] = {}  # folders about the cell files that were read
-
-
 def look_where_one_stands() -> None:
-    """Have modules of a person's own found in the working directory, and about the cell file, after all others."""
-    sys.path.extend(place for place in own_places() if place not in sys.path)
+    """Have modules of a person's own found in the working directory, after all others."""
+    _look_in(str(Path.cwd()))
 
 
-def look_beside(cell_file: Path) -> None:
-    """Have modules found in the folder of a cell file, and that folder as a package of its own name."""
-    folder = cell_file.resolve().parent
-    _beside.update({str(folder): None, str(folder.parent): None})
-    look_where_one_stands()
+def look_beside(cell: str) -> None:
+    """Have modules found about the file of a cell, after all others."""
+    _look_in(*places_beside(cell))
 
 
-def own_places() -> list[str]:
-    """Where modules of a person's own may lie, beside `PYTHONPATH`."""
-    return list(dict.fromkeys([str(Path.cwd()), *_beside]))
+def places_beside(cell: str) -> list[str]:
+    """The folder of a cell file, and the one around it, where the former is a package; none for a cell's name."""
+    if not cell.endswith((".yaml", ".yml")):
+        return []
+    folder = Path(cell).expanduser().resolve().parent
+    return [str(folder), str(folder.parent)]
+
+
+def _look_in(*places: str) -> None:
+    sys.path.extend(place for place in places if place not in sys.path)
 
 
 def application_of_task(task: str) -> str:

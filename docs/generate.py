@@ -44,7 +44,6 @@ def rows_of(model: type[BaseModel], prefix: str, values: BaseModel | None = None
         value = getattr(values, name, None) if values is not None else info.get_default(call_default_factory=True)
         if isinstance(annotation, type) and issubclass(annotation, c.Section) and issubclass(model, c.Parameters):
             continue
-        value = "" if info.is_required() and values is None else value  # it must be given
         if isinstance(value, BaseModel):
             rows += rows_of(type(value), f"{prefix}.{name}", value)
             continue

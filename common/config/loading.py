@@ -66,8 +66,7 @@ def load_cell(
         ConfigError, UnknownName: one line naming the field, the value and the choices.
     """
     path = find_file("cells", cell)
-    if cell.endswith((".yaml", ".yml")):
-        look_beside(path)
+    look_beside(cell)
     tree = read_yaml(path)
     parsed = [parse_override(text) for text in expanded(overrides)]
     given = {parts[0]: value for parts, value in parsed if len(parts) == 1}  # which file to read may be overridden

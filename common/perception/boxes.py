@@ -41,9 +41,7 @@ class BoxKind(Section):
 class BoxOptions(Parameters):
     """What is looked for, and how exactly. HSV as OpenCV has it: hue 0 to 180, saturation and value 0 to 255."""
 
-    kinds: dict[str, BoxKind] = Field(
-        min_length=1, max_length=20, description="boxes to look for, by what to call them"
-    )
+    kinds: dict[str, BoxKind] = Field({}, max_length=20, description="boxes to look for, by what to call them")
     hue_tolerance: Tunable[int] = Field(10, ge=1, le=90, description="a hue this far from that of a kind is of it")
     min_saturation: Tunable[int] = Field(90, ge=0, le=255, description="what is paler has no colour")
     min_value: Tunable[int] = Field(40, ge=0, le=255, description="what is darker has no colour")

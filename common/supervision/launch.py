@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from common.application import look_where_one_stands, own_places
+from common.application import look_where_one_stands, places_beside
 from common.clock import MAX_SPEED, MIN_SPEED, Clock
 from common.config import Cell, ServiceEntry
 from common.errors import ConfigError
@@ -67,7 +67,8 @@ class Launch:
     def environment(self, inherited: Mapping[str, str] = os.environ) -> dict[str, str]:
         """Environment of every process: the caller's, what is extra, where the router is near, clock, and packages."""
         near = {NEAR_VARIABLE: f"{endpoint_of(self.domain)}={','.join(self.near)}"} if self.near else {}
-        return {**inherited, **self.extra, **near, **self.clock.environment(), "PYTHONPATH": python_path(inherited)}
+        return {**inherited, **self.extra, **near, **self.clock.environment(),
+                "PYTHONPATH": python_path(inherited, self.cell)}
 
 
 def clock_of(speed: float, epoch: int | None = None) -> Clock:
@@ -105,10 +106,16 @@ def python_module(module: str) -> list[str]:
     return [sys.executable, "-P", "-m", module]
 
 
-def python_path(inherited: Mapping[str, str] = os.environ) -> str:
-    """PYTHONPATH of the processes: the project first, then the caller's, then the working directory and the cell's."""
+def python_path(inherited: Mapping[str, str] = os.environ, cell: str = "") -> str:
+    """PYTHONPATH of the processes: the project, then the caller's, the working directory, and what is beside a cell.
+
+    Args:
+        inherited: the caller's environment.
+        cell: name, or path of a YAML file.
+    """
     given = [part for part in inherited.get("PYTHONPATH", "").split(os.pathsep) if part]
-    return os.pathsep.join(dict.fromkeys([str(PROJECT_ROOT), *given, *own_places()]))
+    places = [str(PROJECT_ROOT), *given, str(Path.cwd()), *places_beside(cell)]
+    return os.pathsep.join(dict.fromkeys(places))
 
 
 def require_modules(cell: Cell) -> None:

@@ -11,6 +11,7 @@ import pytest
 from cli import completion
 from common.application import find_application
 from common.config import load_cell
+from common.supervision.launch import Launch
 from tests.harness import ask, environment
 
 KINDS = completion.task_kinds()
@@ -37,15 +38,14 @@ def test_new_project_has_a_cell_a_task_a_test_and_five_lines_about_them(kind: st
     assert find_application(cell.application).status.key == f"{name}_status"
 
 
-def test_module_beside_a_cell_file_runs_as_a_process_from_anywhere(tmp_path: Path) -> None:
+def test_module_beside_a_cell_file_is_found_by_its_processes_from_anywhere(tmp_path: Path) -> None:
     assert ask(tmp_path, "new", "beside_me").returncode == 0
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    line = ("import sys; from common.config import load_cell; from common.supervision.launch import python_path; "
-            "load_cell(sys.argv[1]); print(python_path({}))")
-    told = subprocess.run([sys.executable, "-c", line, str(tmp_path / "beside_me" / "cell.yaml")], cwd=elsewhere,
-                          env=environment(), capture_output=True, text=True, check=True)
-    assert str(tmp_path) in told.stdout.strip().split(":")
+    made = Launch(str(tmp_path / "beside_me" / "cell.yaml")).environment({})
+    told = subprocess.run([sys.executable, "-P", "-m", "beside_me.task", "--help"], cwd=elsewhere, capture_output=True,
+                          env=environment() | made, text=True, check=False)
+    assert told.returncode == 0 and "--cell" in told.stdout, told.stderr
 
 
 @pytest.mark.parametrize(("arguments", "wanted"), [
