@@ -218,6 +218,12 @@ def test_modules_of_ones_own_import_the_project_of_a_wheel(wheel: Installation, 
 
 
 @pytest.mark.slow
+def test_wheel_begins_a_project_that_runs(wheel: Installation, tmp_path: Path) -> None:
+    wheel.run(tmp_path, "new", "fresh_task", "--task", "stack_cubes")
+    assert "DONE" in wheel.run(tmp_path, "simulate", "fresh_task/cell.yaml", "--seed", "1").stdout
+
+
+@pytest.mark.slow
 def test_zenoh_cli_finds_the_codec_of_a_wheel(wheel: Installation, tmp_path: Path) -> None:
     script = """
 from importlib.metadata import entry_points

@@ -67,3 +67,40 @@ async def test_seen_ball_becomes_an_object_with_an_id_and_moves_into_the_hand_th
             camera.cancel()
         assert held.attached[0].link == "panda_hand_tcp"
         assert ("panda_hand", held.attached[0].object.id) in held.allowed_collisions
+
+
+async def test_pictures_that_the_arm_may_hide_something_in_do_not_count_where_the_cell_says_so() -> None:
+    net = LocalNetwork()
+    bus = net.bus("tester", cell="test", clock=Clock())
+    detected, scene = bus.writer(DETECTED_OBJECTS), bus.reader(topics.PLANNING_SCENE)
+    bus.writer(topics.CAMERA_INFO).put(CAMERA.info(bus.header("camera_optical_frame")))
+    bus.writer(topics.TF_STATIC).put(m.TFMessage(transforms=[m.TransformStamped(
+        header=bus.header("world"), child_frame_id="camera_optical_frame",
+        transform=matrix_to_pose(CAMERA.T_world_optical))]))
+    joints, home = bus.writer(topics.JOINT_STATES), CELL.robot.named_poses["home"]
+    config = service_config(CELL, "scene_manager", scene_manager.Config)
+    config = config.model_copy(update={"only_at_home": True, "confirm_frames": 1})
+    stamp = 0
+
+    def expose(q: list[float], ball: tuple[float, float]) -> None:
+        nonlocal stamp
+        stamp += 10
+        joints.put(m.JointState(header=m.Header(stamp=stamp), name=CELL.robot.joints, position=q))
+        detected.put(frame(stamp + 5, ball))
+
+    async def seen(q: list[float], ball: tuple[float, float]) -> tuple[float, float]:
+        async with asyncio.TaskGroup() as group:
+            camera = group.create_task(film(lambda: expose(q, ball)))
+            while not (found := [o for o in (await scene.next()).objects if o.role == "target"]):
+                pass
+            camera.cancel()
+        return found[0].pose.position.x, found[0].pose.position.y
+
+    async with running_service(net, scene_manager.run, config, name="scene_manager"):
+        assert await seen(home, (0.45, -0.1)) == (0.45, -0.1)
+        for _ in range(5):
+            expose([0.3, *home[1:]], (0.60, 0.1))  # the arm is away
+            await asyncio.sleep(0.02)
+        assert scene.latest is not None and scene.latest.header.stamp < stamp - 30
+        places = {(o.pose.position.x, o.pose.position.y) for o in scene.latest.objects if o.role == "target"}
+        assert places == {(0.45, -0.1)}

@@ -14,10 +14,12 @@ from common.messages import (
     MotionStatus,
     PlanRequest,
     StopRequest,
+    WorldObject,
+    WorldObjects,
 )
 from common.transport.codec import encode
 from common.transport.session import RawSample
-from common.virtual.invariants import ASKED, NEVER, Invariants, _Goals
+from common.virtual.invariants import ASKED, JUDGED, NEVER, Invariants, _Goals
 from common.virtual.loop import Life, context_of
 from common.virtual.process import Requests
 
@@ -98,3 +100,20 @@ def test_arm_that_a_person_stopped_brakes_and_rests_and_does_not_move_when_its_p
     invariants._last = None
     then.run(move, seconds, 20)
     assert any(ASKED in line for line in invariants.broken) != holds
+
+
+def test_application_judges_the_truth_when_its_task_says_done_and_not_before(tmp_path, monkeypatch):
+    (tmp_path / "judging").mkdir()
+    (tmp_path / "judging" / "task.py").write_text(
+        "from common.messages import TaskStatus\nfrom common.topics import Topic\n"
+        "STATUS = Topic('judging_status', TaskStatus, 'state', '')\n"
+        "def wrong_in(truth):\n    return ', '.join(thing.id for thing in truth.objects)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    cell = load_cell("panda").model_copy(update={"application": "judging.task"})
+    for state, broken in (("ERROR", False), ("DONE", True)):
+        invariants = Invariants(cell, Requests(), lambda: 1.0)
+        key, world = "panda/scene_objects", WorldObjects(objects=[WorldObject(id="thing", shape="box")])
+        invariants.on_put("executor", "executor 1", RawSample(key, encode(world), "", None))
+        invariants.on_end(0, state)
+        assert [line.endswith(f"{JUDGED}: thing") for line in invariants.broken] == [True] * broken
+    assert JUDGED not in Invariants(load_cell("panda"), Requests(), lambda: 1.0).checked

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from common import messages as m
+from common import topics
+from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE
+from common.clock import Clock
+from common.config import CameraConfig
+from common.perception.boxes import BoxKind
+from common.perception.image import array_to_image
+from common.perception.pinhole import Pinhole
+from common.process.in_process import running_service
+from common.robot.transforms import matrix_to_pose
+from common.transport.local import LocalNetwork
+from services import box_detector
+
+CAMERA = Pinhole.from_config(CameraConfig(width=320, height=240, fx=500, fy=500, cx=160, cy=120,
+                                          position=(0.5, 0.0, 1.04)))
+CONFIG = box_detector.Config(kinds={"red": BoxKind(color=(0.9, 0.1, 0.1), size=(0.04, 0.04, 0.04))})
+FRAME = "depth_camera_optical_frame"
+
+
+class Camera:
+    """Says what a depth camera says that looks down at one cube in the middle of its picture, or at none."""
+
+    def __init__(self, net: LocalNetwork) -> None:
+        bus = net.bus("tester", cell="test", clock=Clock())
+        self.images, self.depths = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
+        self.found, self.shown = bus.reader(DETECTED_OBJECTS), bus.reader(DETECTION_IMAGE)
+        bus.writer(topics.DEPTH_CAMERA_INFO).put(CAMERA.info(m.Header(frame_id=FRAME)))
+        bus.writer(topics.TF_STATIC).put(m.TFMessage(transforms=[m.TransformStamped(
+            header=m.Header(frame_id="world"), child_frame_id=FRAME, transform=matrix_to_pose(CAMERA.T_world_optical),
+        )]))
+
+    def depth(self, stamp: int, *, rows: int = 240) -> None:
+        depth = np.full((rows, 320), 1.04, np.float32)
+        depth[110:130, 150:170] = 1.0  # 20 pixels of 2 mm
+        self.depths.put(array_to_image(depth, "32FC1", m.Header(stamp=stamp, frame_id=FRAME)))
+
+    def picture(self, stamp: int) -> None:
+        picture = np.full((240, 320, 3), 120, np.uint8)
+        picture[110:130, 150:170] = (25, 25, 230)
+        self.images.put(array_to_image(picture, "bgr8", m.Header(stamp=stamp, frame_id=FRAME)))
+
+
+async def test_cube_is_told_with_kind_size_place_and_the_stamp_of_its_picture_whichever_comes_first() -> None:
+    net = LocalNetwork()
+    camera = Camera(net)
+    async with running_service(net, box_detector.run, CONFIG):
+        for stamp, order in ((5, (camera.depth, camera.picture)), (6, (camera.picture, camera.depth))):
+            for say in order:
+                say(stamp)
+            frame = await camera.found.next()
+            marker, = frame.markers
+            assert (frame.header.stamp, frame.header.frame_id, marker.ns, marker.type) == (stamp, "world", "red", "box")
+            assert (marker.scale.x, marker.scale.y, marker.scale.z, marker.partial) == (0.04, 0.04, 0.04, False)
+            at = marker.pose.position
+            assert math.dist((at.x, at.y, at.z), (0.5, 0.0, 0.02)) < 2e-3
+            assert marker.pixel is not None and math.dist(marker.pixel, (159.5, 119.5)) < 1
+        shown = await camera.shown.next()
+        assert (shown.width, shown.height) == (320, 240)
+
+
+async def test_picture_with_the_depth_of_another_one_or_of_another_size_is_left_out() -> None:
+    net = LocalNetwork()
+    camera = Camera(net)
+    async with running_service(net, box_detector.run, CONFIG):
+        camera.depth(5)
+        camera.picture(6)
+        camera.depth(7, rows=120)
+        camera.picture(7)
+        camera.depth(8)
+        camera.picture(8)
+        assert (await camera.found.next()).header.stamp == 8
