@@ -21,6 +21,7 @@ from common.viewer.feeds import Feeds, Periods, Topics
 from common.viewer.guard import close_server, make_server
 from common.viewer.layers import Layers, find_layers
 from common.viewer.layout import load_layout
+from common.viewer.line import Line
 from common.viewer.page import Page
 from common.viewer.plots import Limits
 
@@ -97,17 +98,18 @@ async def run(bus: Bus, config: Config) -> None:
     feeds = Feeds(bus, read.always, read.on_demand)
     doors = Doors(lambda line: bus.log.info("%s", line))
     console = Console(bus, config.members, feeds, read.requests, doors)
+    line = Line(console)
     status = feeds.reader(read.status) if read.status is not None else None
     motions = OperatorMotion(bus, [status] if status is not None else [], owner=lambda: doors.person)
     folder = None if bus.declares_only else secure_folder()
     server = make_server(
         config.host, config.port, config.token, published=config.published, secured=folder is not None,
-        tokens=tokens_in(folder, bus.cell) if folder is not None else None, doors=doors,
+        tokens=tokens_in(folder, bus.cell) if folder is not None else None, doors=doors, beside=line.serve,
     )
     try:
         page = Page(
-            server, feeds, console, motions, config.members, application, layers, cell=config.run.cell, layout=layout,
-            layout_file=config.layout, periods=Periods(picture=1 / config.picture_rate),
+            server, feeds, console, motions, config.members, application, layers, line, cell=config.run.cell,
+            layout=layout, layout_file=config.layout, periods=Periods(picture=1 / config.picture_rate),
         )
         await bus.ready()
         host = "127.0.0.1" if config.published else config.host
@@ -123,7 +125,7 @@ async def run(bus: Bus, config: Config) -> None:
             loop = asyncio.get_running_loop()
             due = loop.time()
             while True:
-                page.refresh(loop.time(), bus.alive.names)
+                page.refresh(loop.time(), bus.alive.names, bus.connected)
                 due = max(due + (1 / config.rate if page.pages else IDLE_PERIOD), loop.time())  # late: from now on
                 await asyncio.sleep(due - loop.time())
     finally:

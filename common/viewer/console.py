@@ -7,7 +7,7 @@ import contextlib
 import math
 from collections.abc import Callable, Coroutine, Iterable
 from contextvars import Context, copy_context
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
 
 import viser
 from pydantic import JsonValue
@@ -17,7 +17,8 @@ from common.config import Members
 from common.errors import RequestFailed, ZencellError
 from common.messages import (
     Message,
-    MotionStatus,
+    MotionOwner,
+    OwnRequest,
     Parameter,
     ParameterRequest,
     StopRequest,
@@ -26,7 +27,7 @@ from common.messages import (
     WorldEdit,
 )
 from common.topics import Request, Topic
-from common.viewer.doors import Doors, Need
+from common.viewer.doors import VISITOR, Doors, Need
 from common.viewer.feeds import Feeds
 from common.viewer.words import problem
 
@@ -88,6 +89,7 @@ class Desk:
         self.doors.refused = lambda line: self.put(lambda: self.tell(line))
         self._loop = asyncio.get_running_loop()
         self._orders: asyncio.Queue[tuple[Act, Context]] = asyncio.Queue()
+        self._pressed: dict[str, Act] = {}
 
     def put(self, act: Act) -> None:
         """Have something done for who asks now; from any thread. A loop that has ended does nothing more."""
@@ -112,6 +114,17 @@ class Desk:
             await doing
         except ZencellError as error:
             self.tell(problem(error))
+
+    def on_press(self, name: str, act: Act, what: str, need: Need = "operate") -> None:
+        """Do something whenever a button of `markup.press` is clicked by somebody who may; `what` is for the log."""
+        self.doors.need(f"press:{name}", need, what)
+        self._pressed[name] = act
+
+    def press(self, name: str) -> None:
+        """A button was clicked by who asks now; one that there is not does nothing. From any thread."""
+        act = self._pressed.get(name)
+        if act is not None and self.doors.admit(VISITOR.get(), f"press:{name}"):
+            self.put(act)
 
     # Callbacks of viser that are coroutines run on its loop at once; others would wait for a thread.
 
@@ -172,7 +185,7 @@ class Console(Desk):
         self._feeds = feeds
         self._newest = 0  # `since` of the stop that was said here
         asked: list[Request[Any, Any]] = [
-            topics.TASK_COMMAND, topics.MOTION_STOP, topics.ROBOT_COMMAND, topics.WORLD_EDIT]
+            topics.TASK_COMMAND, topics.MOTION_STOP, topics.MOTION_OWN, topics.ROBOT_COMMAND, topics.WORLD_EDIT]
         self._clients: dict[str, Client[Any, Any]] = {request.key: bus.client(request) for request in [*asked, *more]}
         self._parameters = {name: bus.client(topics.parameters_of(name)) for name in members.services}
 
@@ -192,22 +205,33 @@ class Console(Desk):
         said = {"command": command, "by": self.doors.person, "override": override, "heard": heard}
         await self.ask(topics.TASK_COMMAND, TaskCommand.model_validate(said))
 
-    async def stop(self) -> None:
-        """Bring the arm to rest and end the task, at the same time: one that fails does not hold the other back.
+    async def stop(self) -> str:
+        """Bring the arm to rest and end the task, at the same time; returns in a line what was stopped, and by whom.
 
         Raises:
-            RequestFailed: the arm could not be told; or it could, but the task could not.
+            RequestFailed: the arm could not be told; the task was, if it could.
         """
-        told = await asyncio.gather(
+        arm, task = await asyncio.gather(
             self.ask(topics.MOTION_STOP, StopRequest(reason="stopped on the page", owner=self.doors.person), _SOON),
             self.ask(topics.TASK_COMMAND, TaskCommand(command="stop", by=self.doors.person), _SOON),
             return_exceptions=True,
         )
-        for answer in told:
-            if isinstance(answer, BaseException):
-                raise answer
-            if isinstance(answer, MotionStatus):
-                self._newest = answer.newest
+        if isinstance(arm, BaseException):
+            raise arm
+        self._newest = arm.newest
+        if isinstance(task, RequestFailed):
+            return f"Arm stopped by {self.doors.person}; not the task: {problem(task)}"
+        if isinstance(task, BaseException):
+            raise task
+        return f"Stopped by {self.doors.person}"
+
+    async def own(self, act: Literal["take", "give"], over: bool = False) -> MotionOwner:
+        """Have the motion of the robot for who asks now until it is given back, or give it back."""
+        return await self.ask(topics.MOTION_OWN, OwnRequest(act=act, owner=self.doors.person, over=over), _SOON)
+
+    def answers(self, request: Request[Any, Any]) -> bool:
+        """Whether somebody serves a request now."""
+        return self._clients[request.key].available
 
     async def move(self, object_id: str, x: float, y: float) -> None:
         """Put an object of the simulated world somewhere [m]."""

@@ -5,6 +5,7 @@ Where no token is asked for there is one person, who may do everything. Anybody 
 
 from __future__ import annotations
 
+import secrets
 import threading
 from collections.abc import Callable
 from contextvars import ContextVar
@@ -25,13 +26,13 @@ LONGEST = 60  # characters of a value in the log
 class Visitor:
     """Somebody who has the page open, for as long as that connection lasts."""
 
-    number: int
+    number: int  # 0: of a connection that did not tell yet of which page it is
     address: str
     roles: frozenset[str]
 
     def __str__(self) -> str:
         """As it is shown and logged."""
-        return f"page {self.number} ({', '.join(sorted(self.roles - {'look'})) or 'look'}, {self.address})"
+        return f"page {self.number or '?'} ({', '.join(sorted(self.roles - {'look'})) or 'look'}, {self.address})"
 
 
 VISITOR: ContextVar[Visitor | None] = ContextVar("visitor", default=None)  # whose message is being handled
@@ -49,11 +50,24 @@ class Doors:
         self._holder: Visitor | None = None
         self._acted = 0.0  # when who operates did so last [s, monotonic]
         self._noted: dict[tuple[Visitor | None, str], float] = {}
+        self._pages: dict[str, Visitor] = {}  # by the key that only this page knows
         self._lock = threading.Lock()
 
     def need(self, part: str, need: Need, what: str) -> None:
         """Say what a part of the page needs; one of which nothing is said moves the arm."""
         self._needs[part] = (need, what)
+
+    def key_of(self, visitor: Visitor) -> str:
+        """A key by which the other connection of the same page tells whose it is."""
+        key = secrets.token_urlsafe(16)
+        with self._lock:
+            self._pages[key] = visitor
+        return key
+
+    def page_of(self, key: str) -> Visitor | None:
+        """Who was given that key, as long as the page is open."""
+        with self._lock:
+            return self._pages.get(key)
 
     @property
     def person(self) -> str:
@@ -71,6 +85,7 @@ class Doors:
         """Take note that somebody has closed the page: who operated does not any more."""
         with self._lock:
             self._noted = {known: when for known, when in self._noted.items() if known[0] != visitor}
+            self._pages = {key: known for key, known in self._pages.items() if known != visitor}
             if visitor is not None and visitor == self._holder:
                 self._holder = None
                 self._note(f"{visitor} has gone and does not operate any more")
@@ -88,7 +103,14 @@ class Doors:
             self.refused(why)
         return not why
 
-    def _why_not(self, visitor: Visitor | None, need: Need) -> str:
+    def objection(self, visitor: Visitor | None, need: Need) -> str:
+        """Why somebody may not do what needs that now; empty when they may, or would once they claim it."""
+        if not self.guarded:
+            return ""
+        with self._lock:
+            return self._why_not(visitor, need, claim=False)
+
+    def _why_not(self, visitor: Visitor | None, need: Need, *, claim: bool = True) -> str:
         if need in ("stop", "look"):
             return ""
         role = "operate" if need == "take" else need
@@ -100,6 +122,8 @@ class Doors:
         free = before is None or before == visitor or now - self._acted >= IDLE
         if not free and need != "take":
             return f"{before} operates: Take over, or wait until that is given back"
+        if not claim:
+            return ""
         if before != visitor:
             self._note(f"{visitor} operates" + (f" instead of {before}" if before is not None else ""))
         self._holder, self._acted = visitor, now

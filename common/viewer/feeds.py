@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=Message)
 
 ALWAYS: tuple[Topic[Any], ...] = (
-    topics.JOINT_STATES, topics.MOTION_STATUS, topics.ROBOT_STATUS, topics.GRIPPER_STATE, topics.SUPERVISOR_STATUS,
-    topics.COUNTERS, topics.LOG,
+    topics.JOINT_STATES, topics.MOTION_STATUS, topics.MOTION_OWNER, topics.ROBOT_STATUS, topics.GRIPPER_STATE,
+    topics.SUPERVISOR_STATUS, topics.COUNTERS, topics.LOG,
 )
 LIVE, ANNOTATED = "live", "annotated"  # pictures
 _LOG_SIZE = 2000  # lines that may wait
@@ -184,6 +184,7 @@ class Periods:
     picture: float = 0.1
     task: float = 0.2
     health: float = 0.25
+    line: float = 0.25
     plots: float = 0.5
     _due: dict[str, float] = field(default_factory=dict)
 

@@ -13,7 +13,7 @@ import itertools
 import logging
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from http import HTTPStatus
 from typing import Any
@@ -37,7 +37,7 @@ from common.viewer.access import (
     refusal,
 )
 from common.viewer.doors import VISITOR, Doors, Visitor
-from common.viewer.viser_inside import File, Process, client_files, let_in, made_server, quiet
+from common.viewer.viser_inside import LINE, Beside, File, Process, client_files, let_in, made_server, quiet
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ POLICY = (
 
 def make_server(
     host: str, port: int, token: str = "", *, published: bool = False, secured: bool = False,
-    tokens: Mapping[str, str] | None = None, doors: Doors | None = None,
+    tokens: Mapping[str, str] | None = None, doors: Doors | None = None, beside: Beside | None = None,
 ) -> viser.ViserServer:
     """A server of pages at host and port that refuses foreign web pages, foreign names, and who has not the token.
 
@@ -71,6 +71,7 @@ def make_server(
         secured: there must be a token, wherever it listens.
         tokens: by role, beside that for everything.
         doors: are asked whether somebody may do what comes from a browser, where there is a token.
+        beside: has the other connection of each page (line.py); without it that is closed at once.
 
     Raises:
         ConfigError: the port is taken (names by whom), the host is not of this machine, or the token is missing or
@@ -86,7 +87,7 @@ def make_server(
         "127.0.0.1" if published else host, listening.getsockname()[1], token, tokens or {},
         gateways() if published else frozenset(),
     ), doors)
-    server = made_server(listening, guard.before, OPTIONS)
+    server = made_server(listening, guard.before, OPTIONS, beside or _nobody)
     if doors is not None:
         doors.guarded = guard.access.asks
         let_in(server, partial(_admit, doors))
@@ -96,6 +97,16 @@ def make_server(
             "127.0.0.1 is the safe way", guard.access.port, guard.access.port,
         )
     return server
+
+
+async def _nobody(connection: websocket_server.ServerConnection) -> None:
+    """Say nothing: the connection ends."""
+
+
+def _pages(connections: Iterable[websocket_server.ServerConnection], line: bool) -> int:
+    """How many connections of that kind there are."""
+    paths = [urlsplit(each.request.path).path for each in connections if each.request is not None]
+    return sum((path == LINE) == line for path in paths)
 
 
 def close_server(server: viser.ViserServer) -> None:
@@ -133,12 +144,13 @@ class Guard:
         async def guarded(connection: websocket_server.ServerConnection, request: Request) -> Response | None:
             said = {name: request.headers.get_all(name) for name in ("host", "origin", "cookie")}
             upgrade = "upgrade" in request.headers
+            line = urlsplit(request.path).path == LINE
             peer = str((connection.remote_address or ("",))[0])
             answer = self.access.answer(request.path, said, upgrade=upgrade, peer=peer)
-            if answer is None and upgrade and len(connection.server.connections) >= MAX_PAGES:
+            if answer is None and upgrade and _pages(connection.server.connections, line) >= MAX_PAGES:
                 answer = Answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_PAGES} pages are open already: close one\n")
             if upgrade and answer is None:  # from here on this task and all that it starts handle their messages
-                visitor = Visitor(next(self._numbers), peer, self.access.roles(said["cookie"]))
+                visitor = Visitor(0 if line else next(self._numbers), peer, self.access.roles(said["cookie"]))
                 VISITOR.set(visitor)
                 waiting = asyncio.create_task(self._see_off(connection, visitor))
                 self._waiting.add(waiting)

@@ -9,6 +9,8 @@ from common.terminal import printable
 
 GOOD, BUSY, BAD, OFF = "good", "busy", "bad", "off"  # how something is, as a colour beside the word
 
+ARM = ' data-needs="arm"'
+
 STYLE = """<style>
 .zc { padding: 0 0.75em 0.4em; font-size: 0.8125em; line-height: 1.5; overflow-wrap: anywhere; }
 .zc table { width: 100%; border-collapse: collapse; font-variant-numeric: tabular-nums; }
@@ -27,6 +29,17 @@ STYLE = """<style>
 .zc .log td:first-child, .zc .log td:nth-child(2) { white-space: nowrap; opacity: 0.6; }
 .zc .fields { display: grid; grid-template-columns: repeat(auto-fit, minmax(4.6em, 1fr)); gap: 0.2em 0.6em; }
 .zc .fields b { display: block; font-size: 1.25em; font-weight: 600; font-variant-numeric: tabular-nums; }
+.zc .buttons { display: flex; flex-wrap: wrap; gap: 0.35em; align-items: center; margin: 0.3em 0; }
+.zc .buttons .what { flex: 0 0 4.5em; }
+.zc button { flex: 1 1 4.5em; min-height: 2.2em; padding: 0.2em 0.6em; font: inherit; border-radius: 0.25em;
+  border: 1px solid #4dabf7; color: #4dabf7; background: transparent; cursor: pointer; }
+.zc button:hover { background: rgba(77, 171, 247, 0.15); }
+.zc button:focus-visible { outline: 2px solid currentColor; outline-offset: 1px; }
+.zc button.hold { touch-action: none; user-select: none; -webkit-user-select: none; flex: 0 1 3.6em;
+  min-height: 2.6em; }
+.zc button.held { background: #f59f00; border-color: #f59f00; color: #000; }
+.zc button[aria-disabled="true"] { border-color: rgba(128, 128, 128, 0.4); color: rgba(128, 128, 128, 0.8);
+  background: transparent; cursor: not-allowed; }
 /* A tick stands before its words, which then need not wrap. */
 .mantine-Flex-root:has(> div input[type="checkbox"]) { flex-direction: row-reverse; justify-content: flex-end; }
 .mantine-Flex-root:has(> div input[type="checkbox"]) > div { flex-grow: 0 !important; }
@@ -63,6 +76,33 @@ def fields(values: Mapping[str, object]) -> str:
         for name, value in values.items()
     )
     return f'<div class="fields">{"".join(cells)}</div>'
+
+
+def press(label: str, name: str, why_not: str = "", *, arm: bool = False) -> str:
+    """A button that is clicked, which the desk knows by a name.
+
+    Args:
+        label: on it.
+        name: that the desk knows.
+        why_not: why it does nothing now.
+        arm: it moves the arm: it is off, too, on the pages of those who may not do that.
+    """
+    return _button(label, f'data-press="{text(name)}"' + arm * ARM, why_not, "")
+
+
+def hold(label: str, name: str, told: str, why_not: str = "") -> str:
+    """A button that does something while it is held down; `told` is what a screen reader says."""
+    return _button(label, f'data-hold="{text(name)}"{ARM} aria-label="{text(told)}"', why_not, "hold")
+
+
+def _button(label: str, data: str, why_not: str, kind: str) -> str:
+    off = f' aria-disabled="true" title="{text(why_not)}"' if why_not else ""
+    return f'<button type="button" class="{text(kind)}" {data}{off}>{text(label)}</button>'
+
+
+def buttons(*made: str, label: str = "") -> str:
+    """Buttons side by side, with what they are for before them."""
+    return f'<div class="buttons">{span(label, "dim what") if label else ""}{"".join(made)}</div>'
 
 
 def table(head: Iterable[str], rows: Iterable[str], kind: str = "") -> str:

@@ -22,21 +22,26 @@ from common import topics
 from common.application import Application
 from common.config import Members, check
 from common.errors import ZencellError
-from common.messages import Rejections
+from common.messages import Rejections, TaskStatus
 from common.reporting.summary import Rejected
 from common.topics import Topic
+from common.viewer import words
 from common.viewer.arm_panel import ArmPanel
 from common.viewer.console import Console
+from common.viewer.doors import VISITOR
 from common.viewer.feeds import ANNOTATED, LIVE, Feeds, News, Periods, Topics
 from common.viewer.health import HealthPanel, LogPanel
 from common.viewer.layers import Layers, layers_shown
 from common.viewer.layout import TABS, Layout, Tab, Viewpoint, save_layout
+from common.viewer.line import HOLD, STOP, Line
+from common.viewer.losses import Losses
 from common.viewer.markup import block, span
 from common.viewer.move import Motions, MovePanel
 from common.viewer.pictures import PicturePanel
 from common.viewer.plots import Limits, PlotPanel
 from common.viewer.task_panel import TaskPanel
 from common.viewer.tuning import TuningPanel
+from common.viewer.viser_inside import introduce
 from common.viewer.words import TaskWords, gripper
 
 if TYPE_CHECKING:
@@ -53,7 +58,7 @@ class Page:
 
     def __init__(
         self, server: viser.ViserServer, feeds: Feeds, console: Console, motions: Motions, members: Members,
-        application: Application | None, layers: Layers, *, cell: str, layout: Layout, layout_file: str,
+        application: Application | None, layers: Layers, line: Line, *, cell: str, layout: Layout, layout_file: str,
         periods: Periods,
     ) -> None:
         """Lay the page out; on the running loop.
@@ -66,6 +71,7 @@ class Page:
             members: of the cell.
             application: what the cell is for.
             layers: of the scene.
+            line: the other connection of each browser.
             cell: its name.
             layout: what is on.
             layout_file: where the layout is kept; empty for the project's file.
@@ -79,7 +85,7 @@ class Page:
         self._layout, self._layout_file, self._periods = layout, layout_file, periods
         self._topics, self._words = Topics(application, layers.values(), members.keys), TaskWords.of(application)
         self._shown, self._editing = layers_shown(layout.layers, layers), layout.edit_world
-        self._rejected = Rejected()
+        self._rejected, self._line, self._losses = Rejected(), line, Losses()
         self._happened: list[tuple[Topic[Any], Any]] = []  # before there is a scene: an event does not come again
         self._scene: Scene | None = None
         self._plots: PlotPanel | None = None
@@ -93,7 +99,9 @@ class Page:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(layout.panel_width)
         self._task = TaskPanel(gui, console, self._words, self._home)
-        console.tell = self._task.tell
+        console.tell, line.stop = self._task.tell, self._task.stop
+        console.doors.need(STOP, "stop", "STOP")
+        console.doors.need(HOLD, "operate", "jogs")
         self._arm = ArmPanel(gui, console)
         make = application.find("page", "Controls") if application is not None else None
         self._controls = make(gui, console) if make is not None else None
@@ -121,7 +129,12 @@ class Page:
         async def count(_client: viser.ClientHandle) -> None:
             console.put(self._count)
 
-        server.on_client_connect(count)
+        async def greet(client: viser.ClientHandle) -> None:
+            if (visitor := VISITOR.get()) is not None:
+                introduce(client, console.doors.key_of(visitor))
+            console.put(self._count)
+
+        server.on_client_connect(greet)
         server.on_client_disconnect(count)
 
     def _lay_out_view(self, gui: viser.GuiApi) -> None:
@@ -173,23 +186,25 @@ class Page:
         self._happened.clear()
         self._scene = scene
 
-    def refresh(self, now: float, alive: frozenset[str]) -> None:
+    def refresh(self, now: float, alive: frozenset[str], connected: bool = True) -> None:
         """Show what is new at a wall time [s], monotonic; without a browser only what plots need is kept.
 
         Args:
             now: wall time.
             alive: the services that are ready.
+            connected: whether the router is reached.
         """
+        if self._periods.due("line", now):
+            self._say_how(now, alive, connected)
         state = self._feeds.fresh(topics.JOINT_STATES)
         if state is not None and self._plots is not None:
             self._plots.measured(state, now)
         if not self.pages:
             return
         if self._periods.due("task", now):
-            task = self._feeds.latest(self._topics.status) if self._topics.status is not None else None
             holding = self._feeds.latest(topics.GRIPPER_STATE)
-            self._task.show(task, self._feeds.latest(topics.MOTION_STATUS), gripper(holding),
-                            len(self._rejected.places))
+            self._task.show(self._status, self._feeds.latest(topics.MOTION_STATUS),
+                            self._feeds.latest(topics.MOTION_OWNER), gripper(holding), len(self._rejected.places))
             self._arm.show(self._feeds.latest(topics.ROBOT_STATUS))
             self._log.show()
         if self._periods.due("health", now):
@@ -202,6 +217,26 @@ class Page:
             self._news.tell(now)
         if self._scene is not None:
             self._scene.refresh(now)
+
+    @property
+    def _status(self) -> TaskStatus | None:
+        """What the task says of itself."""
+        return self._feeds.latest(self._topics.status) if self._topics.status is not None else None
+
+    def _say_how(self, now: float, alive: frozenset[str], connected: bool) -> None:
+        """Bring up to date what stands above the page in every browser."""
+        motion, owner = self._feeds.latest(topics.MOTION_STATUS), self._feeds.latest(topics.MOTION_OWNER)
+        how = [(self._cell, "dim"), self._words.state(self._status), (f"arm {words.motion(motion)}", "")]
+        if owner is not None and owner.kind != "none":
+            how.append((f"motion: {owner.owner or 'the task'}", "dim"))
+        if self.console.doors.guarded:
+            how.append((f"operates: {self.console.doors.operator or 'nobody'}", "dim"))
+        answers = {"arm": ("The arm's controller does not answer: where it is nobody knows, and STOP may not reach it",
+                           self.console.answers(topics.MOTION_STOP)),
+                   "task": ("The task does not answer: what it does is not known",
+                            self.console.answers(topics.TASK_COMMAND))}
+        lost = self._losses.update(connected, alive, answers, now)
+        self._line.tell(how, lost, self._task.note, owner)
 
     def _show_pictures(self) -> None:
         for name, sources in self._topics.images.items():

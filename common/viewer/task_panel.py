@@ -1,29 +1,26 @@
-"""The panel that is always there: stop, what the task does, and what a person tells it."""
+"""The panel that is always there: what the task does, what a person tells it, and whose the arm is."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable, Coroutine
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import viser
 
+from common import topics
 from common.errors import RemoteError, ZencellError
-from common.messages import MotionStatus, TaskStatus
+from common.messages import MotionOwner, MotionStatus, TaskStatus
 from common.viewer import words
 from common.viewer.console import SLIDING, Console, assign
-from common.viewer.markup import STYLE, block, fields, span, text
+from common.viewer.doors import VISITOR
+from common.viewer.markup import STYLE, block, buttons, fields, press, span, text
 from common.viewer.words import problem
 
 COMMANDS = ("Start", "Pause", "Resume")
 SLOWEST = 5  # [%]
-# viser has no large button: the one after the mark is made so, and kept in sight.
-STOP_STYLE = """<style>
-div:has(> div > .zc-stop) + div { position: sticky; top: 0; z-index: 10; }
-div:has(> .zc-stop) + div { position: sticky; top: 0; z-index: 10; }
-div:has(> div > .zc-stop) + div button, div:has(> .zc-stop) + div button {
-  height: 3.2em !important; font-size: 1.05em; font-weight: 700; letter-spacing: 0.12em; }
-</style><div class="zc-stop"></div>"""
 
 
 class TaskPanel:
@@ -44,21 +41,23 @@ class TaskPanel:
         self._console, self._words = console, told
         self._refused = ""  # command that was, because another person holds the arm
         self._speed_told = self._speed_heard = 100  # [%]
-        gui.add_html(STYLE + STOP_STYLE)
-        stop = gui.add_button("STOP", color="red", icon=viser.Icon.HAND_STOP)
-        console.on_click(stop, self._stop, "stop")
-        hotkey = gui.add_command("Stop the arm and the task", hotkey="escape", icon=viser.Icon.HAND_STOP)
+        self.note = (0, "", "")  # the newest line for persons, and how good it is
+        gui.add_html(STYLE)
+        palette = gui.add_command("Stop the arm and the task", icon=viser.Icon.HAND_STOP)
 
         async def pressed(_event: object) -> None:
             console.put(self._stop)
 
-        console.doors.need(hotkey._impl.uuid, "stop", "STOP")
-        hotkey.on_trigger(pressed)
-        console.on_choice(gui.add_button_group("Task", COMMANDS), self._command)
-        console.on_choice(gui.add_button_group("Arm", ("Go home",)), lambda _: home())
-        if console.doors.guarded:
-            take = gui.add_button("Take over", hint="one at a time moves the arm; STOP is for everybody")
-            console.on_click(take, lambda: self.tell("You operate", "good"), "take")
+        console.doors.need(palette._impl.uuid, "stop", "STOP")
+        palette.on_trigger(pressed)
+        for name in COMMANDS:
+            console.on_press(name.lower(), partial(self._command, name), name)
+        console.on_press("home", home, "Go home")
+        console.on_press("take", partial(self._own, "take"), "Take the arm")
+        console.on_press("give", partial(self._own, "give"), "Give the arm back")
+        console.on_press("operate", lambda: self.tell("You operate", "good"), "Take over", "take")
+        console.on_press("leave", self._leave, "Let others operate", "look")
+        self._buttons = gui.add_html("")
         self._speed = gui.add_slider("Speed [%]", SLOWEST, 100, 5, 100, hint="share of the planned speed, at once")
         console.on_change(self._speed, self._set_speed)
         # Below all that is pressed: lines come and go here, and a button that moves away under the pointer is missed.
@@ -68,17 +67,23 @@ class TaskPanel:
 
     def tell(self, line: str, kind: str = "bad") -> None:
         """Show a line about what a person asked for; an empty one takes it away."""
+        self.note = (self.note[0] + 1, line, kind)
         self._notice.content = block(span(line, kind), "notice", kind=kind) if line else ""
 
-    def show(self, task: TaskStatus | None, motion: MotionStatus | None, gripper: str, rejected: int) -> None:
+    def show(
+        self, task: TaskStatus | None, motion: MotionStatus | None, owner: MotionOwner | None, gripper: str,
+        rejected: int,
+    ) -> None:
         """Show how the task is doing.
 
         Args:
             task: what it says of itself.
             motion: what the arm does.
+            owner: whose the motion is.
             gripper: what the fingers do, in words.
             rejected: places that cannot be taken.
         """
+        self._show_buttons(task, motion, owner)
         word, kind = self._words.state(task)
         lines = [f'<div>{span("●", kind + " dot")} {span(word, "big")}</div>']
         if task is not None and task.stage and task.state not in ("DONE", "ERROR"):
@@ -86,6 +91,8 @@ class TaskPanel:
         if task is not None and task.message:
             lines.append(f"<div>{span(task.message, 'bad' if task.state == 'ERROR' else 'dim')}</div>")
         lines.append(f"<div>{span('Arm:', 'dim')} {text(words.motion(motion))} · {text(gripper)}</div>")
+        if owner is not None:
+            lines.append(f"<div>{span('The motion is', 'dim')} {text(owner.told)}</div>")
         if self._console.doors.guarded:
             lines.append(f"<div>{span('Operates:', 'dim')} {text(self._console.doors.operator or 'nobody')}</div>")
         for one in motion.inhibits if motion is not None else ():
@@ -103,9 +110,61 @@ class TaskPanel:
             self._speed_heard = self._speed_told = percent  # what a person is just setting is heard of when it is set
             assign(self._speed, max(SLOWEST, percent))
 
+    def _show_buttons(self, task: TaskStatus | None, motion: MotionStatus | None, owner: MotionOwner | None) -> None:
+        task = task if self._console.answers(topics.TASK_COMMAND) else None
+        motion = motion if self._console.answers(topics.MOTION_STOP) else None
+        why_not = words.why_not(task, motion)
+        doors = self._console.doors
+        rows = [
+            buttons(*(press(name, name.lower(), why_not[name]) for name in COMMANDS), label="Task"),
+            buttons(
+                press("Go home", "home", words.kept(task, motion), arm=True),
+                press("Take", "take", "it is taken already" if owner is not None and owner.asked and owner.kind ==
+                      "operator" and owner.owner == doors.person else ""),
+                press("Give back", "give", "" if owner is not None and owner.kind == "operator" else
+                      "no person has it"), label="Arm"),
+        ]
+        if doors.guarded:
+            rows.append(buttons(
+                press("Take over", "operate"),
+                press("Let others", "leave", "" if doors.operator else "nobody operates"), label="Page"))
+        content = block("".join(rows), "orders")
+        if content != self._buttons.content:
+            self._buttons.content = content
+
+    async def stop(self) -> str:
+        """Stop arm and task; returns what was done, in a line.
+
+        Raises:
+            RequestFailed: the arm was not stopped.
+        """
+        try:
+            line = await self._console.stop()
+        except ZencellError as error:
+            self.tell(f"NOT stopped: {problem(error)}")
+            raise
+        self.tell(line, "busy")
+        return line
+
     async def _stop(self) -> None:
-        await self._console.stop()
-        self.tell("Stopped", "busy")
+        with contextlib.suppress(ZencellError):  # it is told
+            await self.stop()
+
+    def _leave(self) -> None:
+        self._console.doors.leave(VISITOR.get())
+        self.tell("Nobody operates now", "good")
+
+    async def _own(self, act: Literal["take", "give"]) -> None:
+        over, self._refused = self._refused == act, ""
+        try:
+            now = await self._console.own(act, over)
+        except RemoteError as error:
+            if act == "give" or error.code != "not_owner":
+                raise
+            self._refused = act
+            self.tell(f"{problem(error)}: press Take again for that")
+        else:
+            self.tell(f"The motion is {now.told}", "good")
 
     async def _command(self, chosen: str) -> None:
         if chosen in COMMANDS:
@@ -114,7 +173,7 @@ class TaskPanel:
             try:
                 await self._console.command(chosen.lower(), override)
             except RemoteError as error:
-                if error.code != "held":
+                if error.code not in ("held", "not_owner"):
                     raise
                 self._refused = chosen
                 self.tell(f"{problem(error)}: press {chosen} again for that")

@@ -1,6 +1,6 @@
 """Everything of the page that reaches inside viser, and what viser would have to offer in its place.
 
-Four things have no public call in viser 1.1; whoever updates viser reads this file, and nothing else of the page.
+Five things have no public call in viser 1.1; whoever updates viser reads this file, and nothing else of the page.
 
 - **Who may open the page, and at which socket.** viser has no authentication, takes a WebSocket from any web page, and
   tries the next port when one is taken. Its server is one call of `websockets`' `serve`, which can ask a function about
@@ -13,12 +13,18 @@ Four things have no public call in viser 1.1; whoever updates viser reads this f
   contents in it, it compiles while it loads, and a browser keeps what it has compiled for the next opening.
   Upstream requests: a client build in separate files; `configure_environment_map(hdri=None)` and the antialiasing of
   edges as options that are known before the client begins.
+- **A bar above everything, and buttons that are held down.** viser's panels can be collapsed, scrolled and covered by
+  dialogs; its buttons tell a click, or at a rate that they are held, over the connection in which pictures wait too.
+  overlay.js and overlay.css put a bar above the element that viser fills, which they make smaller, and speak over a
+  WebSocket of their own at `LINE` (line.py), which `made_server` hands to us. `introduce` tells the script which of
+  viser's connections is of the same page.
+  Upstream requests: a panel that is always in view; a WebSocket path for the application; a button event for release.
 - **Messages from any thread.** viser wakes its loop by an `asyncio.Event` that it sets from the thread that asks, which
   may fail or wake nobody; it sets it a second time on its loop, which is enough (`_Event`).
   Upstream request: leave the first one out.
 
-The style sheets in markup.py and task_panel.py name two of the client's CSS classes; without them the page only looks
-different. Upstream requests: a large and sticky button, and a checkbox whose label stands behind it.
+The style sheet in markup.py names one of the client's CSS classes; without it the page only looks different. Upstream
+request: a checkbox whose label stands behind it.
 """
 
 from __future__ import annotations
@@ -35,6 +41,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import viser
@@ -44,6 +51,7 @@ from rich import get_console
 from viser._messages import (
     GetRenderResponseMessage,
     GuiUpdateMessage,
+    RunJavascriptMessage,
     ShareUrlDisconnect,
     ShareUrlRequest,
     ViewerCameraMessage,
@@ -54,6 +62,8 @@ from websockets.http11 import Request, Response
 if TYPE_CHECKING:
     import socket
 
+LINE = "/line"  # the path of our own WebSocket
+Beside = Callable[[websocket_server.ServerConnection], Awaitable[None]]
 Process = Callable[[websocket_server.ServerConnection, Request], "Awaitable[Response | None] | Response | None"]
 
 _replacing = threading.Lock()
@@ -86,7 +96,7 @@ AsyncMessageBuffer.__init__ = _begin_safely  # type: ignore[method-assign, assig
 
 
 def made_server(
-    listening: socket.socket, before: Callable[[Process], Process], options: Mapping[str, Any]
+    listening: socket.socket, before: Callable[[Process], Process], options: Mapping[str, Any], beside: Beside,
 ) -> viser.ViserServer:
     """A viser server that listens at a socket, and nowhere else.
 
@@ -94,6 +104,7 @@ def made_server(
         listening: the socket; closed if that fails.
         before: makes of the function that viser asks about each request the one that is asked instead.
         options: of the WebSocket server, in place of viser's.
+        beside: has the WebSocket connections at `LINE`, on the server's own loop; ends with them.
 
     Raises:
         RuntimeError: viser serves in another way than this file knows.
@@ -102,10 +113,15 @@ def made_server(
 
     def serve(handler: Any, host: Any, port: Any, *, process_request: Process | None = None, **theirs: Any) -> Any:
         del host, port  # viser would try the next port, and the next, when one is taken
+
+        async def either(connection: websocket_server.ServerConnection) -> None:
+            at = urlsplit(connection.request.path).path if connection.request is not None else ""
+            await (beside if at == LINE else handler)(connection)
+
         if process_request is not None:
             in_place.append(process_request)
             theirs["process_request"] = before(process_request)
-        return original(handler, **theirs | {**options, "sock": listening})
+        return original(either, **theirs | {**options, "sock": listening})
 
     try:
         with _replacing, quiet():
@@ -157,6 +173,11 @@ def let_in(server: viser.ViserServer, may: Callable[[str, object], bool]) -> Non
         await handle(client_id, message)
 
     inside._handle_incoming_message = handle_what_may_be  # type: ignore[method-assign]
+
+
+def introduce(client: viser.ClientHandle, key: str) -> None:
+    """Tell the script in a browser by which key its page is known."""
+    client._websock_connection.queue_message(RunJavascriptMessage(f"window.zencellPage?.({json.dumps(key)})"))
 
 
 @contextmanager
@@ -227,11 +248,17 @@ class File:
 def client_files() -> Mapping[str, File]:
     """The files of the installed viser's client by path; takes a third of a second, once."""
     page = Path(viser.__file__).parent / "client" / "build" / "index.html"
-    return files_of(page.read_text(encoding="utf-8"))
+    return files_of(page.read_text(encoding="utf-8"), overlay())
 
 
-def files_of(page: str) -> Mapping[str, File]:
-    """The files that a packed page becomes; of one that is packed in another way, itself with the prelude."""
+def overlay() -> str:
+    """The bar above the page, as HTML for its head."""
+    style, script = (Path(__file__).with_name(f"overlay.{end}").read_text(encoding="utf-8") for end in ("css", "js"))
+    return f"<style>{style}</style><script>{script}</script>"
+
+
+def files_of(page: str, more: str = "") -> Mapping[str, File]:
+    """The files that a packed page becomes; of one that is packed in another way, itself with the prelude and more."""
     packed = PACKED.search(page)
     decoder = DECODER.search(packed[4]) if packed else None
     files: dict[str, File] = {}
@@ -249,7 +276,7 @@ def files_of(page: str) -> Mapping[str, File]:
             files[names[name]] = _file(kind, contents, lasts=True)
         start = START.format(**names)
         page = page.replace(packed[0], "")
-    page = page.replace("<head>", f"<head>{PRELUDE}", 1).replace("</head>", f"{start}</head>", 1)
+    page = page.replace("<head>", f"<head>{PRELUDE}{more}", 1).replace("</head>", f"{start}</head>", 1)
     files["/"] = files["/index.html"] = _file(HTML, page.encode(), lasts=False)
     return files
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from common.application import Application
 from common.errors import NoResponder, RemoteError, ZencellError
 from common.messages import GripperState, MotionStatus, PlanResponse, RobotStatus, TaskStatus
+from common.process.operator_motion import AT_REST
 from common.viewer.markup import BAD, BUSY, GOOD, OFF
 
 STATES = {"IDLE": "Waiting", "HOMING": "Going home", "DONE": "Done", "ERROR": "Failed"}
@@ -106,6 +107,33 @@ class TaskWords:
         if status is None:
             return motion.progress if motion is not None and motion.state == "active" else 0.0
         return 1.0 if status.state == "DONE" else self.progress(status, motion)
+
+
+def kept(task: TaskStatus | None, motion: MotionStatus | None) -> str:
+    """Why nobody can move the arm by hand now, whoever asks; empty when one can."""
+    if motion is None:
+        return "the arm does not say how it is, or does not answer"
+    if motion.fault:
+        return f"the arm does not work: {motion.fault}"
+    if task is not None and task.paused:
+        return "the task is paused and has the arm: STOP ends it"
+    if task is not None and task.started and task.state not in AT_REST:
+        return "the task has the arm: STOP ends it"
+    return ""
+
+
+def why_not(task: TaskStatus | None, motion: MotionStatus | None) -> dict[str, str]:
+    """Why each order to the task would do nothing now; empty when it would do something."""
+    if task is None:
+        return dict.fromkeys(("Start", "Pause", "Resume"), "the task does not say how it is, or does not answer")
+    stopped = motion is not None and bool(motion.stopped)
+    runs = task.started and task.state not in ("DONE", "ERROR")
+    paused = task.paused or (motion is not None and motion.paused)
+    moves = motion is not None and motion.state == "active"
+    start = "" if not runs or stopped else "it is paused: Resume goes on" if paused else "it runs already"
+    pause = "it is paused already" if paused else "" if runs or moves else "nothing runs"
+    resume = "nothing is paused" if not paused else "the arm was stopped: Start goes on" if stopped else ""
+    return {"Start": start, "Pause": pause, "Resume": resume}
 
 
 def service_state(state: str, restarts: int) -> tuple[str, str]:

@@ -169,35 +169,62 @@ async def page(panda: Played) -> AsyncIterator[BrowserDouble]:
 
 
 async def test_stop_stops_the_arm_and_the_task(panda: Played, page: BrowserDouble) -> None:
-    await page.click("STOP")
+    await page.speak(do="stop", n=3)
     await until(lambda: panda.stops and panda.commands)
     assert (panda.stops, panda.commands) == (["stopped on the page"], ["stop"])
-    await page.until(lambda: ">Stopped<" in page.text)
+    await page.until(lambda: ">Stopped by page<" in page.text and page.said == [(3, "Stopped by page", "good")])
+    await page.until(lambda: page.news["note"]["line"] == "Stopped by page")
 
 
 async def test_arm_is_stopped_though_no_task_answers_and_that_is_told(panda: Played) -> None:
     async with page_of("panda", serve=False) as alone:
         alone.bus.serve(topics.MOTION_STOP, alone.stop)
         async with opened(alone.port) as page:
-            await page.click("STOP")
+            await page.speak(do="stop", n=1)
             await until(lambda: alone.stops)
-            await page.until(lambda: "nobody answers task/command now" in page.text)
+            line = "Arm stopped by page; not the task: nobody answers task/command now"
+            await page.until(lambda: line in page.text and page.said == [(1, line, "good")])
 
 
-@pytest.mark.parametrize("command", ["Start", "Pause", "Resume"])
-async def test_task_is_told_what_is_clicked(panda: Played, page: BrowserDouble, command: str) -> None:
-    await page.click(command)
+async def test_stop_that_reaches_nobody_says_so() -> None:
+    async with page_of("panda", serve=False) as played, opened(played.port) as page:
+        await page.speak(do="stop", n=7)
+        line = "NOT stopped: nobody answers motion/stop now"
+        await page.until(lambda: line in page.text and page.said == [(7, line, "bad")])
+
+
+@pytest.mark.parametrize(("command", "state", "others"), [
+    ("Start", {"state": "IDLE"}, {"Pause": "nothing runs", "Resume": "nothing is paused"}),
+    ("Pause", {"state": "GRASPING", "started": True}, {"Start": "it runs already", "Resume": "nothing is paused"}),
+    ("Resume", {"state": "GRASPING", "started": True, "paused": True},
+     {"Start": "it is paused: Resume goes on", "Pause": "it is paused already"}),
+    ("Start", {"state": "DONE", "started": True}, {"Pause": "nothing runs", "Resume": "nothing is paused"}),
+])
+async def test_task_is_told_what_is_clicked_and_only_what_does_something_is_on(
+    panda: Played, page: BrowserDouble, command: str, state: dict[str, Any], others: dict[str, str]
+) -> None:
+    panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus())
+    panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus(**state))
+    await page.press(command)
     await until(lambda: panda.commands)
     assert panda.commands == [command.lower()]
+    assert {label: page.button(label)[1] for label in others} == others
+
+
+async def test_nothing_is_on_before_task_and_arm_say_how_they_are(panda: Played, page: BrowserDouble) -> None:
+    await page.until(lambda: "does not say how it is" in page.button("Start")[1])
+    assert "the arm does not say" in page.button("Go home")[1]
 
 
 async def test_robot_that_another_holds_goes_on_when_that_is_said_twice(panda: Played, page: BrowserDouble) -> None:
     panda.holder = "anna"
-    await page.click("Resume")
+    panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
+    panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(held=True))
+    await page.press("Resume")
     await page.until(lambda: "the robot is held by anna: press Resume again for that" in page.text)
-    await page.click("Start")
+    await page.press("Start")
     await page.until(lambda: "press Start again" in page.text)
-    await page.click("Start")
+    await page.press("Start")
     await page.until(lambda: "press Start again" not in page.text)
     assert panda.commands == ["resume", "start", "start"]
 
@@ -310,11 +337,13 @@ async def test_odd_messages_leave_the_page_and_the_service_as_they_are(
     speed = page.label("Speed [%]")
     for value in ("fast", None, [1], float("nan"), 1e300):
         await page.say({"type": "GuiUpdateMessage", "uuid": speed, "updates": {"value": value}})
-    await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Start"), "updates": {"value": "Explode"}})
+    await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Goal"), "updates": {"value": "Explode"}})
     await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Show"), "updates": {"value": "nothing"}})
     panda.bus.writer(DETECTION_IMAGE).put(m.Image(
         header=m.Header(), height=4, width=4, encoding="bgr8", data=b"short"))
-    await page.click("Pause")
+    for words in ({}, {"do": "explode"}, {"do": "press"}, {"do": "press", "what": 2000 * "x"}, {"do": "hold", "at": ""}):
+        await page.speak(**words)
+    await page.speak(do="press", what="pause")
     await until(lambda: panda.commands)
     assert panda.commands == ["pause"]
     capfd.readouterr()  # viser prints what it could not convert
@@ -323,8 +352,8 @@ async def test_odd_messages_leave_the_page_and_the_service_as_they_are(
 async def test_light_comes_before_what_it_falls_on() -> None:
     """Else a browser makes the shaders of everything twice, which takes it seconds without a graphics card."""
     async with page_of("panda") as played, opened(played.port) as page:
-        await page.until(lambda: page.label("STOP"))
-        first = next(number for number, kind in enumerate(page.kinds) if kind in ("GuiButtonMessage", "MeshMessage"))
+        await page.until(lambda: page.label("Speed [%]"))
+        first = next(number for number, kind in enumerate(page.kinds) if kind in ("GuiSliderMessage", "MeshMessage"))
         lights = ("EnableLightsMessage", "EnvironmentMapMessage", "HemisphereLightMessage")
         assert max(map(page.kinds.index, lights)) < first
 
@@ -442,7 +471,7 @@ async def test_rejection_that_came_before_the_scene_is_shown_in_it(
     async with page_of("panda") as played, opened(played.port) as page:
         rejected = m.Rejections(header=m.Header(), rejected=[m.Rejection(position=m.Vector3(x=1.0), reason="too far")])
         played.bus.writer(REJECTED_TARGETS).put(rejected)
-        await page.click("Pause")  # the page is there before the scene is
+        await page.speak(do="press", what="pause")  # the page is there before the scene is
         await until(lambda: played.commands)
         go.set()
         await until(lambda: scenes and scenes[0].told("happened") == [(REJECTED_TARGETS, rejected)])

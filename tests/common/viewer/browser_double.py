@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import html
+import json
+import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
@@ -23,11 +26,14 @@ CAMERA = {
 class BrowserDouble:
     """What a browser would show: `parts` are the fields and texts of the panels by their uuid.
 
-    `kinds` are the types of the messages, in the order in which they came.
+    `kinds` are the types of the messages, in the order in which they came; `news` and `said` what came over the line.
     """
 
-    def __init__(self, connection: ClientConnection) -> None:
-        self._connection = connection
+    def __init__(self, connection: ClientConnection, line: ClientConnection) -> None:
+        self._connection, self._line = connection, line
+        self.news: dict[str, Any] = {}
+        self.said: list[tuple[int, str, str]] = []
+        self._known = asyncio.Event()  # which of the pages this is
         self.parts: dict[str, dict[str, Any]] = {}
         self.values: dict[str, Any] = {}
         self.kinds: list[str] = []
@@ -56,9 +62,34 @@ class BrowserDouble:
                 self._take(message)
             self._changed.set()
 
+    async def listen_to_the_line(self) -> None:
+        """Take in what comes beside."""
+        async for data in self._line:
+            words = json.loads(data)
+            self.news = words.get("news", self.news)
+            if "said" in words:
+                self.said.append((words["n"], words["said"], words["kind"]))
+            self._changed.set()
+
+    async def speak(self, **words: Any) -> None:
+        """Say something over the line, as the script of the page does."""
+        await asyncio.wait_for(self._known.wait(), PATIENCE)
+        await self._line.send(json.dumps(words))
+
+    def button(self, label: str) -> tuple[str, str]:
+        """Name of the button of our own that is called so, and why it is off."""
+        found = re.findall(rf'<button [^>]*data-(?:press|hold)="([^"]+)"([^>]*)>{re.escape(label)}</button>', self.text)
+        if len(found) != 1:
+            raise LookupError(f"{label!r}: {len(found)} buttons are called so")
+        why = re.search(r'title="([^"]*)"', found[0][1])
+        return found[0][0], html.unescape(why[1]) if why else ""
+
     def _take(self, message: dict[str, Any]) -> None:
         uuid = str(message.get("uuid"))
         self.kinds.append(message["type"])
+        if message["type"] == "RunJavascriptMessage" and "zencellPage" in message["source"]:
+            key = message["source"].partition("(")[2].strip("()")
+            asyncio.get_running_loop().create_task(self._introduce(json.loads(key)))
         if "props" in message and str(message["type"]).startswith("Gui"):
             self.parts[uuid] = message["props"]
             self.values[uuid] = message.get("value")
@@ -86,6 +117,15 @@ class BrowserDouble:
         uuid = self.label(label)
         await self.say({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
 
+    async def _introduce(self, key: str) -> None:
+        await self._line.send(json.dumps({"do": "page", "what": key}))
+        self._known.set()
+
+    async def press(self, label: str) -> None:
+        """Click a button of our own as soon as it is on."""
+        await self.until(lambda: not self.button(label)[1])
+        await self.speak(do="press", what=self.button(label)[0])
+
     async def click(self, label: str) -> None:
         """Click a button, also one of a group."""
         await self.until(lambda: self.label(label))
@@ -100,15 +140,17 @@ class BrowserDouble:
 @asynccontextmanager
 async def opened(port: int) -> AsyncIterator[BrowserDouble]:
     """A page that is open inside the block."""
-    async with connect(
-        f"ws://127.0.0.1:{port}/", proxy=None, max_size=None, open_timeout=PATIENCE,
-        subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
-    ) as connection:
-        browser = BrowserDouble(connection)
-        listening = asyncio.create_task(browser.listen())
+    async with (
+        connect(f"ws://127.0.0.1:{port}/", proxy=None, max_size=None, open_timeout=PATIENCE,
+                subprotocols=[Subprotocol(f"viser-v{viser.__version__}")]) as connection,
+        connect(f"ws://127.0.0.1:{port}/line", proxy=None, open_timeout=PATIENCE) as line,
+    ):
+        browser = BrowserDouble(connection, line)
+        listening = {asyncio.create_task(browser.listen()), asyncio.create_task(browser.listen_to_the_line())}
         await browser.say(CAMERA)
         try:
             yield browser
         finally:
-            listening.cancel()
-            await asyncio.wait({listening})
+            for task in listening:
+                task.cancel()
+            await asyncio.wait(listening)

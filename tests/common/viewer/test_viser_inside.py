@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from viser._messages import RunJavascriptMessage
 from viser.infra._async_message_buffer import AsyncMessageBuffer
 
-from common.viewer.viser_inside import ALPHABET, client_files, decoded, files_of
+from common.viewer.viser_inside import ALPHABET, client_files, decoded, files_of, overlay
 
 PAGE = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text(encoding="utf-8")
 
@@ -43,14 +43,15 @@ def test_client_of_the_installed_viser_is_taken_apart() -> None:
     parts = set(re.findall(r'"(/[0-9a-f]+\.(?:css|js|wasm))"', page))
     contents = {path.rsplit(".")[1]: gzip.decompress(files[path].body) for path in parts}
     assert set(contents) == {"css", "js", "wasm"} and parts | {"/", "/index.html"} == set(files)
-    assert len(page) < 10_000 < len(PAGE) and "data-p=" not in page
+    assert len(page) < 10_000 + len(overlay()) < len(PAGE) and "data-p=" not in page
+    assert 'id="zc-stop"' in page and "STOP" in page
     assert b"WebSocket" in contents["js"] and contents["wasm"].startswith(b"\0asm") and b"mantine" in contents["css"]
     assert all(files[path].lasts for path in parts) and not files["/"].lasts
 
 
 def test_name_of_a_part_tells_its_contents() -> None:
     changed = PAGE.replace('data-ss="', 'data-ss="0', 1)
-    assert set(files_of(changed)) == set(client_files())
+    assert set(files_of(changed)) == set(client_files())  # the bar is in the page itself
     size = int(re.search(r'data-ss="(\d+)"', PAGE)[1])  # type: ignore[index]
     other = PAGE.replace(f'data-ss="{size}"', f'data-ss="{size - 1}"', 1)
     assert not {path for path in files_of(other) if path.endswith("css")} & set(client_files())
