@@ -23,9 +23,9 @@ from common.viewer.layers import Layers, find_layers
 from common.viewer.layout import load_layout
 from common.viewer.line import Line
 from common.viewer.page import Page
-from common.viewer.plots import Limits
 
 if TYPE_CHECKING:
+    from common.robot.model import RobotModel
     from common.viewer.scene import Scene
 
 IDLE_PERIOD = 0.1  # [s] wall: without a browser
@@ -48,7 +48,9 @@ class Config(Parameters):
         False, description="the port is reached through a loopback only, as compose.yaml has it: from its gateway no "
                            "token is needed in an open cell"
     )
-    layout: str = Field("", description="file of the layout; empty: config/viewer.yaml")
+    layout: str = Field(
+        "", description="file of the layout; empty: viewer.yaml of this user, in the folder ZENCELL_STATE"
+    )
     layers: list[str] = Field([], description="layers of the scene of your own: dotted modules, as my_pkg.my_layer")
     rate: float = Field(30.0, ge=1, le=60, description="of the moving robot, wall time [Hz]")
     picture_rate: float = Field(10.0, gt=0, le=30, description="of each camera picture at most, wall time [Hz]")
@@ -56,8 +58,8 @@ class Config(Parameters):
 
 def load(
     server: viser.ViserServer, config: Config, layers: Layers, console: Console, feeds: Feeds, shown: dict[str, bool]
-) -> tuple[Scene, Limits, list[str]]:
-    """The scene with its meshes, the limits of the joints and the names of the planners; takes seconds."""
+) -> tuple[Scene, RobotModel, list[str]]:
+    """The scene with its meshes, the robot and the names of the planners; takes seconds."""
     from common.planning.planners import planner_names
     from common.robot.model import RobotModel
     from common.viewer.scene import Scene
@@ -65,9 +67,8 @@ def load(
 
     client_files()  # kept from now on
     robot = RobotModel.load(config.robot)
-    limits = Limits(robot.joint_names, robot.lower, robot.upper, robot.velocity)
     scene = Scene(server, robot, config.world, layers, console, feeds.latest, shown=shown)
-    return scene, limits, planner_names()
+    return scene, robot, planner_names()
 
 
 async def quiet(bus: Bus, config: Config, page: Page) -> None:

@@ -16,6 +16,7 @@ from common import topics
 from common.config import Members
 from common.errors import RequestFailed, ZencellError
 from common.messages import (
+    JogCommand,
     Message,
     MotionOwner,
     OwnRequest,
@@ -182,10 +183,11 @@ class Console(Desk):
             doors: know who may do what on the page.
         """
         super().__init__(doors)
-        self._feeds = feeds
+        self._feeds, self._bus, self._jog = feeds, bus, bus.writer(topics.MOTION_JOG)
         self._newest = 0  # `since` of the stop that was said here
         asked: list[Request[Any, Any]] = [
-            topics.TASK_COMMAND, topics.MOTION_STOP, topics.MOTION_OWN, topics.ROBOT_COMMAND, topics.WORLD_EDIT]
+            topics.TASK_COMMAND, topics.MOTION_STOP, topics.MOTION_OWN, topics.GRIPPER_COMMAND,
+            topics.ROBOT_COMMAND, topics.WORLD_EDIT]
         self._clients: dict[str, Client[Any, Any]] = {request.key: bus.client(request) for request in [*asked, *more]}
         self._parameters = {name: bus.client(topics.parameters_of(name)) for name in members.services}
 
@@ -228,6 +230,11 @@ class Console(Desk):
     async def own(self, act: Literal["take", "give"], over: bool = False) -> MotionOwner:
         """Have the motion of the robot for who asks now until it is given back, or give it back."""
         return await self.ask(topics.MOTION_OWN, OwnRequest(act=act, owner=self.doors.person, over=over), _SOON)
+
+    def jog(self, heard: int, **velocities: Any) -> None:
+        """Move with velocities for the next 0.1 s, as a `JogCommand` has them; without any come to rest."""
+        fields = {"header": self._bus.header(), "owner": self.doors.person, "heard": heard, **velocities}
+        self._jog.put(JogCommand.model_validate(fields))
 
     def answers(self, request: Request[Any, Any]) -> bool:
         """Whether somebody serves a request now."""

@@ -32,7 +32,7 @@ class Visitor:
 
     def __str__(self) -> str:
         """As it is shown and logged."""
-        return f"page {self.number or '?'} ({', '.join(sorted(self.roles - {'look'})) or 'look'}, {self.address})"
+        return f"page {self.number} ({', '.join(sorted(self.roles - {'look'})) or 'look'}, {self.address})"
 
 
 VISITOR: ContextVar[Visitor | None] = ContextVar("visitor", default=None)  # whose message is being handled

@@ -15,9 +15,9 @@ from common.viewer.console import Desk
 from common.viewer.layout import LogLevel
 from common.viewer.markup import block, row, span, table, text
 
-HEAD = ("Service", "State", "PID ", "Restarts ", "Busiest topic", "Skipped ", "Lost ")
-SKIPPED, LOST = "Skipped: a newer one came before it was read.", "Lost: refused, or one too many."
-LEGEND = f"<div>{span(f'{SKIPPED} {LOST}', 'dim small')}</div>"
+# What a newer one replaced before it was read is not counted here: with streams that is how it is meant.
+HEAD = ("Service", "State", "PID ", "Restarts ", "Busiest topic", "Lost ")
+LEGEND = f"<div>{span('Lost: messages that were refused, or one too many.', 'dim small')}</div>"
 
 LEVELS: tuple[LogLevel, ...] = ("debug", "info", "warning", "error")
 _RANK = {"debug": 0, "info": 1, "warning": 2, "error": 3, "critical": 4}
@@ -65,7 +65,6 @@ class HealthPanel:
         word, kind = words.service_state(state, restarts)
         busiest = self._rates.busiest_of(name) if kind == "good" else None
         counted = self._counters.get(name)
-        skipped = sum(counted.dropped.values()) if counted else 0
         lost = sum(counted.overflow.values()) + sum(counted.invalid.values()) if counted else 0
         return row(
             span(name, "tight"),
@@ -73,7 +72,6 @@ class HealthPanel:
             text(pid if pid is not None else "–"),
             str(restarts),
             span(f"{busiest[0]} {busiest[1]:.0f} Hz", "tight") if busiest else span("–", "dim"),
-            str(skipped),
             span(lost, "bad") if lost else "0",
             service=name, state=state, pid=pid or "", restarts=restarts,
         )

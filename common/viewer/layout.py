@@ -1,11 +1,8 @@
-"""How the page opens: a file of the project, which "Save layout" on the page writes."""
+"""How the page opens: a file of the user, which "Save layout" on the page writes; before that the project's."""
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import os
-import tempfile
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -13,6 +10,8 @@ import yaml
 from pydantic import Field
 
 from common.config import Section, check, config_root, read_yaml
+from common.control.record_file import lasting_folder
+from common.viewer.taught import write_whole
 
 FILE = "viewer.yaml"
 Tab = Literal["Cameras", "Health", "Plots", "Log", "Tuning", "Move", "View"]
@@ -51,19 +50,21 @@ class Layout(Section):
 
 
 def layout_file(given: str) -> Path:
-    """The file of the layout: the one that was given, or that of the project."""
-    return Path(given).expanduser() if given else config_root() / FILE
+    """The file of the layout: the one that was given, or this user's own."""
+    return Path(given).expanduser() if given else lasting_folder() / FILE
 
 
 def load_layout(given: str) -> Layout:
-    """The layout in a file; without a file of its own the project's, or what is usual where there is none.
+    """The layout in a file; without one this user's own, else the project's.
 
     Raises:
         ConfigError: the file that was given is not there, does not parse, or names something unknown.
     """
     path = layout_file(given)
     if not given and not path.is_file():
-        return Layout()
+        path = config_root() / FILE
+        if not path.is_file():
+            return Layout()
     return check(Layout, read_yaml(path), str(path))
 
 
@@ -78,14 +79,5 @@ def save_layout(given: str, layout: Layout) -> Path:
     body = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
     if path.exists() and not path.stat().st_mode & 0o222:  # a rename would not ask
         raise PermissionError(errno.EACCES, "it is read-only", str(path))
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(HEADER + body)
-        Path(name).chmod(path.stat().st_mode if path.exists() else 0o644)
-        Path(name).replace(path)
-    except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            Path(name).unlink()
-        raise
+    write_whole(path, HEADER + body)
     return path

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -53,6 +53,7 @@ class NewsOfAll:
     lost: tuple[Loss, ...] = ()
     note: tuple[int, str, str] = (0, "", "")  # number, line, kind
     owner: MotionOwner | None = None
+    live: Mapping[str, str] = field(default_factory=dict)  # numbers that stand in panels, by name
     at: float = field(default_factory=monotonic)
 
 
@@ -81,10 +82,10 @@ class Line:
 
     def tell(
         self, how: Iterable[tuple[str, str]], lost: Iterable[Loss], note: tuple[int, str, str],
-        owner: MotionOwner | None,
+        owner: MotionOwner | None, live: Mapping[str, str],
     ) -> None:
-        """Say from now on how the cell is, what is lost, the newest line for persons, and whose the motion is."""
-        self._news = NewsOfAll(tuple(how), tuple(lost), note, owner)
+        """Say from now on how the cell is, what is lost, the newest line, whose the motion is, and numbers."""
+        self._news = NewsOfAll(tuple(how), tuple(lost), note, owner, live)
 
     async def serve(self, connection: ServerConnection) -> None:
         """Answer a page until it is closed."""
@@ -110,7 +111,8 @@ class Line:
             number, line, kind = news.note
             try:
                 await connection.send(json.dumps({"news": {
-                    "how": news.how, "kept": self._kept(news.owner), "lost": lost, "unknown": sorted(unknown),
+                    "how": news.how, "kept": self._kept(news.owner), "live": dict(news.live), "lost": lost,
+                    "unknown": sorted(unknown),
                     "note": {"number": number, "line": line, "kind": kind}}}))
             except ConnectionClosed:
                 return

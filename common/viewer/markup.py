@@ -40,6 +40,10 @@ STYLE = """<style>
 .zc button.held { background: #f59f00; border-color: #f59f00; color: #000; }
 .zc button[aria-disabled="true"] { border-color: rgba(128, 128, 128, 0.4); color: rgba(128, 128, 128, 0.8);
   background: transparent; cursor: not-allowed; }
+.zc .pad { display: grid; grid-template-columns: repeat(auto-fill, minmax(13em, 1fr)); gap: 0.3em 1em; }
+.zc .pad > div { display: flex; gap: 0.35em; align-items: center; }
+.zc .pad .name { flex: 1; min-width: 2em; } .zc .live { min-width: 4.6em; text-align: right;
+  font-variant-numeric: tabular-nums; }
 /* A tick stands before its words, which then need not wrap. */
 .mantine-Flex-root:has(> div input[type="checkbox"]) { flex-direction: row-reverse; justify-content: flex-end; }
 .mantine-Flex-root:has(> div input[type="checkbox"]) > div { flex-grow: 0 !important; }
@@ -98,6 +102,11 @@ def hold(label: str, name: str, told: str, why_not: str = "") -> str:
 def _button(label: str, data: str, why_not: str, kind: str) -> str:
     off = f' aria-disabled="true" title="{text(why_not)}"' if why_not else ""
     return f'<button type="button" class="{text(kind)}" {data}{off}>{text(label)}</button>'
+
+
+def live(name: str) -> str:
+    """A number that the page brings up to date four times a second, by its name."""
+    return f'<span class="live" data-live="{text(name)}">–</span>'
 
 
 def buttons(*made: str, label: str = "") -> str:

@@ -1,29 +1,45 @@
-"""How a person has the arm moved to a goal of their own: a panel, and a marker in the scene to pull about."""
+"""How a person has the arm moved: jogged, or to a goal of their own: the marker, numbers, or a pose with a name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine, Iterable, Sequence
+import asyncio
+import math
+from collections.abc import Callable, Coroutine, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
+from common import topics
 from common.errors import ZencellError
-from common.messages import JointGoal, JointTrajectory, MotionStatus, PlanResponse, Pose, PoseGoal
-from common.robot.transforms import invert
-from common.viewer.console import Desk, assign
-from common.viewer.markup import block, span, text
-from common.viewer.nodes import FLAT, matrix_wxyz, pose_from, position_of, wxyz_of
+from common.messages import (
+    JointGoal,
+    JointTrajectory,
+    MotionOwner,
+    MotionStatus,
+    PlanResponse,
+    Pose,
+    PoseGoal,
+    TaskStatus,
+)
+from common.robot.transforms import matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, transform
+from common.viewer import words
+from common.viewer.console import Console, assign
+from common.viewer.hand_panel import HandPanel
+from common.viewer.jog import AXES, Jogger, JogPanel
+from common.viewer.markup import block, buttons, press, span, text
+from common.viewer.taught_panel import TaughtPanel
 from common.viewer.words import plan, problem
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
-    from common.viewer.robot_meshes import Piece
 
 PIPELINE = "pipeline"
-PLAN, GO = "Plan here", "Go there"
-HAND = (255, 170, 60)
-_SIZE = 0.18  # of the marker [m]
+MARKER, TOOL, JOINTS = "goal marker", "tool: numbers", "joints: numbers"
+SETTLED = 0.5  # [s] for which the marker rests before it is looked for why it cannot be reached, which takes longer
+Numbers = tuple[float, float, float]
+RESTARTS = 20  # of the search for joint positions
 
 
 class Motions(Protocol):
@@ -35,6 +51,12 @@ class Motions(Protocol):
     async def move(self, goal: PoseGoal | JointGoal, *, planner: str = "") -> MotionStatus:
         """The end of a motion to a goal."""
 
+    async def follow(self, trajectory: JointTrajectory, *, plan: PlanResponse | None = None) -> MotionStatus:
+        """The end of following what was planned."""
+
+    async def require_free(self) -> MotionStatus:
+        """How the arm is, when it is nobody else's."""
+
 
 class Goal(Protocol):
     """Where the goal marker is in the scene."""
@@ -42,48 +64,170 @@ class Goal(Protocol):
     def goal_marker(self, on: bool) -> None:
         """Show or hide it."""
 
+    def goal_reached(self, reached: bool | None) -> None:
+        """Show whether the arm can be there."""
+
     @property
     def goal_pose(self) -> Pose:
         """Its pose in world."""
 
+    def play(self, plan: JointTrajectory) -> None:
+        """Show a plan as a motion of the ghost."""
+
 
 class MovePanel:
-    """A tick for the goal marker, a list of planners, buttons to plan and go, and how it went."""
+    """Jogging, fingers, goals and taught poses, and how it went."""
 
     def __init__(
-        self, gui: viser.GuiApi, desk: Desk, motions: Motions, goal: Goal,
-        planners: Sequence[str], *, planner: str, marker: bool, tell: Callable[[str, str], None],
-        play: Callable[[JointTrajectory], None],
+        self, gui: viser.GuiApi, console: Console, motions: Motions, scene: Goal, robot: RobotModel,
+        planners: Sequence[str], *, cell: str, planner: str, marker: bool, tell: Callable[[str, str], None],
     ) -> None:
         """Lay the panel out where the GUI stands.
 
         Args:
             gui: of the server.
-            desk: takes the orders.
+            console: takes the orders.
             motions: carry them out.
-            goal: the goal marker.
+            scene: has the goal marker and the ghost.
+            robot: not used by another thread.
             planners: that may be asked.
+            cell: its name.
             planner: that is asked at first.
             marker: whether the goal marker is shown at first.
             tell: called with a line about how it went, and whether that is good, busy or bad.
-            play: shows a plan as a motion.
         """
-        self._motions, self._goal, self._tell_all, self._play = motions, goal, tell, play
+        self._console, self._motions, self._goal, self._robot, self._tell_all = console, motions, scene, robot, tell
         self.planner = planner if planner in planners else PIPELINE
         self.marker = marker
-        self._tick = gui.add_checkbox("Goal marker", marker, hint="drag it in the scene to where the tool should be")
-        desk.on_change(self._tick, self.set_marker)
-        names = gui.add_dropdown("Planner", [PIPELINE, *planners], initial_value=self.planner,
-                                 hint="pipeline: the cell's planners, in their order")
-        desk.on_change(names, self._set_planner)
-        desk.on_choice(gui.add_button_group("Goal", (PLAN, GO)), self._go)
+        self._kind = MARKER
+        self._found: PlanResponse | None = None
+        self._reached: tuple[Pose, float, bool] | None = None  # goal, since when, whether it was looked for why not
+        q = robot.named("home")
+        self._xyz, self._rpy, self._q = self._numbers(q)
+        with gui.add_folder("Jog", expand_by_default=True):
+            fastest = robot.velocity.tolist()
+            self._jog = JogPanel(gui, console, robot.joint_names, fastest)
+        self.jogger = Jogger(console, self._jog.velocities, self._state, lambda: self._kept)
+        self._kept = ""
+        gripper = robot.config.gripper
+        self._hand: HandPanel | None = None
+        if gripper is not None:
+            with gui.add_folder("Gripper", expand_by_default=True):
+                self._hand = HandPanel(gui, console, gripper, motions.require_free)
+        with gui.add_folder("Go to", expand_by_default=True):
+            self._choice = gui.add_dropdown("Goal", [MARKER], initial_value=MARKER)
+            console.on_change(self._choice, self._set_kind)
+            self._tick = gui.add_checkbox("Goal marker", marker,
+                                          hint="drag it in the scene to where the tool should be")
+            console.on_change(self._tick, self.set_marker)
+            self._at = gui.add_vector3("Tool at [mm]", self._xyz, step=1.0, visible=False, hint="x, y, z in world")
+            self._turned = gui.add_vector3("Turned [°]", self._rpy, step=1.0, visible=False,
+                                           hint="about x, y and z of world, in that order")
+            console.on_change(self._at, self._set_xyz)
+            console.on_change(self._turned, self._set_rpy)
+            self._angles = [gui.add_number(f"{name} {unit}", value, step=0.1, visible=False)
+                            for name, unit, value in zip(robot.joint_names, self._units, self._q, strict=True)]
+            for number, field in enumerate(self._angles):
+                console.on_change(field, self._setter(number))
+            names = gui.add_dropdown("Planner", [PIPELINE, *planners], initial_value=self.planner,
+                                     hint="pipeline: the cell's planners, in their order")
+            console.on_change(names, self._set_planner)
+            for name, act, told in (
+                ("plan", self._plan_it, "Plan"), ("execute", self._execute, "Execute"), ("go", self._go, "Go there"),
+                ("here", self._take_numbers, "Numbers from the arm"),
+            ):
+                console.on_press(f"move:{name}", act, told)
+            self._buttons = gui.add_html("")
+            self._html = gui.add_html(_line("Choose a goal, plan, look at the ghost, then execute.", "dim"))
+        with gui.add_folder("Taught poses", expand_by_default=False):
+            self._taught = TaughtPanel(gui, console, cell, robot.joint_names, self._joints, self._offer, self._through)
+        self._offer()
         if marker:
-            goal.goal_marker(True)
-        self._html = gui.add_html(_line("Show the goal marker, drag it, then plan or go there.", "dim"))
+            scene.goal_marker(True)
+
+    # --- what is shown ---------------------------------------------------------------------------------------------
+
+    @property
+    def _scales(self) -> NDArray[np.float64]:
+        """What joint positions are multiplied by to be shown: degrees, or mm of a joint that slides."""
+        return np.array([1e3 if joint.shortname().startswith("JointModelP") else 180 / math.pi
+                         for joint in self._robot.model.joints[1:]])
+
+    @property
+    def _units(self) -> list[str]:
+        return ["[mm]" if scale == 1e3 else "[°]" for scale in self._scales]
+
+    def _joints(self) -> NDArray[np.float64] | None:
+        """Where the joints are (dof,) [rad, m], if that is known."""
+        state = self._console.latest(topics.JOINT_STATES)
+        return self._robot.order(state.name, state.position) if state is not None else None
+
+    def _numbers(self, q: NDArray[np.float64]) -> tuple[Numbers, Numbers, list[float]]:
+        """Position [mm] and turn [degrees] of the tool in world, and joints [degrees, mm], rounded."""
+        T_world_tcp = self._robot.fk(q)
+        x, y, z = (round(1e3 * float(value), 1) for value in T_world_tcp[:3, 3])
+        roll, pitch, yaw = (round(math.degrees(value), 1) for value in matrix_to_rpy(T_world_tcp[:3, :3]))
+        return (x, y, z), (roll, pitch, yaw), [round(float(value), 2) for value in q * self._scales]
+
+    def live(self) -> dict[str, str]:
+        """Numbers of the arm now, for the panels."""
+        q = self._joints()
+        if q is None:
+            return {}
+        xyz, rpy, joints = self._numbers(q)
+        units = [unit.strip("[]") for unit in self._units]
+        shown = {f"j:{name}": f"{value:.1f} {unit}" for name, value, unit in
+                 zip(self._robot.joint_names, joints, units, strict=True)}
+        shown |= {f"p:{axis}": f"{value:.1f} mm" for axis, value in zip(AXES, xyz, strict=True)}
+        return shown | {f"r:{axis}": f"{value:.1f} °" for axis, value in zip(AXES, rpy, strict=True)}
+
+    def show(self, task: TaskStatus | None, now: float) -> None:
+        """Bring buttons and marker up to date at a wall time [s], monotonic."""
+        motion = self._console.latest(topics.MOTION_STATUS) if self._console.answers(topics.MOTION_STOP) else None
+        self._kept = words.kept(task, motion)
+        jogged = self._kept or words.not_jogged(motion)
+        self._jog.show(jogged)
+        if self._hand is not None:
+            self._hand.show(self._kept)
+        self._taught.show(self._kept)
+        found = "" if self._found is not None else "plan first"
+        content = block(buttons(
+            press("Plan", "move:plan"), press("Execute", "move:execute", self._kept or found, arm=True),
+            press("Go there", "move:go", self._kept, arm=True),
+            press("Numbers from the arm", "move:here", "" if self._kind in (TOOL, JOINTS) else
+                  "for goals in numbers")), "orders")
+        if content != self._buttons.content:
+            self._buttons.content = content
+        self._reach(now)
+
+    def _reach(self, now: float) -> None:
+        """Look whether the arm can be at the marker, and once that rests why not."""
+        from common.planning.ik import solve_ik, why_no_ik
+
+        if not self.marker or (seed := self._joints()) is None:
+            return
+        pose, before = self._goal.goal_pose, self._reached
+        if before is not None and before[0] == pose and (before[2] or now - before[1] < SETTLED):
+            return
+        target = pose_to_matrix(pose)
+        if before is None or before[0] != pose:
+            there = solve_ik(self._robot, target, seed, restarts=RESTARTS) is not None
+            self._goal.goal_reached(there)
+            self._reached = (pose, now, there)
+            self._html.content = _line("The arm can be there; Plan tells what is in the way." if there
+                                       else "The arm cannot be there.", "good" if there else "bad")
+        else:
+            self._reached = (pose, before[1], True)
+            self._html.content = _line(f"The arm cannot be there: {why_no_ik(self._robot, target, seed)}", "bad")
+
+    def _state(self) -> tuple[MotionStatus | None, MotionOwner | None]:
+        return self._console.latest(topics.MOTION_STATUS), self._console.latest(topics.MOTION_OWNER)
+
+    # --- what a person does ----------------------------------------------------------------------------------------
 
     def set_marker(self, on: bool) -> None:
         """Show or hide the goal marker."""
-        self.marker = on
+        self.marker, self._reached = on, None
         assign(self._tick, on)
         self._goal.goal_marker(on)
 
@@ -91,17 +235,46 @@ class MovePanel:
         """Have the arm go home."""
         await self._do(self._move(JointGoal(named="home"), "", "At home"), "Going home …")
 
-    async def _go(self, chosen: str) -> None:
-        if not self.marker:
-            self.set_marker(True)
-            self._tell("Drag the goal marker to where the tool should be, then try again.", "busy")
+    def _target(self) -> PoseGoal | JointGoal | None:
+        """What was chosen; None while the marker is not shown yet.
+
+        Raises:
+            ConfigError: a taught pose that is gone.
+        """
+        if self._kind == TOOL:
+            rotation = rpy_to_matrix(*(math.radians(value) for value in self._rpy))
+            x, y, z = (1e-3 * value for value in self._xyz)
+            return PoseGoal(pose=matrix_to_pose(transform(rotation, (x, y, z))))
+        if self._kind == JOINTS:
+            return JointGoal(positions=(np.array(self._q) / self._scales).tolist())
+        if self._kind in self._robot.config.named_poses:
+            return JointGoal(named=self._kind)
+        if self._kind != MARKER:
+            return JointGoal(positions=self._taught.positions(self._kind))
+        if self.marker:
+            return PoseGoal(pose=self._goal.goal_pose)
+        self.set_marker(True)
+        self._tell("Drag the goal marker to where the tool should be, then try again.", "busy")
+        return None
+
+    @property
+    def _asked(self) -> str:
+        return "" if self.planner == PIPELINE else self.planner
+
+    async def _plan_it(self) -> None:
+        if (goal := self._target()) is not None:
+            await self._do(self._plan(goal), "Planning …")
+
+    async def _go(self) -> None:
+        if (goal := self._target()) is not None:
+            await self._do(self._move(goal, self._asked, "There"), "Planning and going there …")
+
+    async def _execute(self) -> None:
+        found = self._found
+        if found is None or found.trajectory is None:
+            self._tell("Plan first.", "bad")
             return
-        planner = "" if self.planner == PIPELINE else self.planner
-        there = PoseGoal(pose=self._goal.goal_pose)
-        if chosen == PLAN:
-            await self._do(self._plan(there, planner), "Planning …")
-        elif chosen == GO:
-            await self._do(self._move(there, planner, "There"), "Planning and going there …")
+        await self._do(self._follow(found, found.trajectory), "Executing the plan …")
 
     async def _do(self, doing: Coroutine[Any, Any, None], line: str) -> None:
         self._tell(line, "busy")
@@ -110,15 +283,78 @@ class MovePanel:
         except ZencellError as error:
             self._tell(problem(error), "bad")
 
-    async def _plan(self, goal: PoseGoal, planner: str) -> None:
-        response = await self._motions.plan(goal, planner=planner)
+    async def _plan(self, goal: PoseGoal | JointGoal) -> None:
+        self._found = None
+        response = await self._motions.plan(goal, planner=self._asked)
         self._tell(plan(response), "good" if response.ok else "bad")
         if response.ok and response.trajectory is not None:
-            self._play(response.trajectory)
+            self._found = response
+            self._goal.play(response.trajectory)
+
+    async def _follow(self, found: PlanResponse, trajectory: JointTrajectory) -> None:
+        self._found = None  # it begins where the arm is now
+        await self._motions.follow(trajectory, plan=found)
+        self._tell("There", "good")
 
     async def _move(self, goal: PoseGoal | JointGoal, planner: str, there: str) -> None:
+        self._found = None
         await self._motions.move(goal, planner=planner)
         self._tell(there, "good")
+
+    async def _through(self, names: list[str]) -> None:
+        goals = [JointGoal(positions=self._taught.positions(name)) for name in names]
+
+        async def go() -> None:
+            for name, goal in zip(names, goals, strict=True):
+                self._tell(f"Going to {name} …", "busy")
+                await self._move(goal, self._asked, f"At {name}")
+                await asyncio.sleep(0)
+
+        await self._do(go(), "Going through the poses …")
+
+    # --- fields ----------------------------------------------------------------------------------------------------
+
+    def _offer(self) -> None:
+        """Have the goals that there are chosen from."""
+        options = [MARKER, TOOL, JOINTS, *self._robot.config.named_poses, *self._taught.names]
+        self._choice.options = options
+        if self._kind not in options:
+            self._set_kind(MARKER)
+        assign(self._choice, self._kind)
+
+    def _set_kind(self, kind: str) -> None:
+        self._kind, self._found = kind, None
+        self._tick.visible = kind == MARKER
+        self._at.visible = self._turned.visible = kind == TOOL
+        for number_field in self._angles:
+            number_field.visible = kind == JOINTS
+        if kind in (TOOL, JOINTS):
+            self._take_numbers()
+        elif kind == MARKER and not self.marker:
+            self.set_marker(True)
+
+    def _take_numbers(self) -> None:
+        q = self._joints()
+        if q is None:
+            self._tell("Where the arm is is not known.", "bad")
+            return
+        self._xyz, self._rpy, self._q = self._numbers(q)
+        assign(self._at, self._xyz)
+        assign(self._turned, self._rpy)
+        for field, value in zip(self._angles, self._q, strict=True):
+            assign(field, value)
+
+    def _set_xyz(self, xyz: Numbers) -> None:
+        self._xyz, self._found = xyz, None
+
+    def _set_rpy(self, rpy: Numbers) -> None:
+        self._rpy, self._found = rpy, None
+
+    def _setter(self, number: int) -> Callable[[float], None]:
+        def put(value: float) -> None:
+            self._q[number], self._found = value, None
+
+        return put
 
     def _set_planner(self, name: str) -> None:
         self.planner = name
@@ -130,62 +366,3 @@ class MovePanel:
 
 def _line(line: str, kind: str) -> str:
     return block(f"{span('●', kind + ' dot')} {text(line)}", "move", kind=kind)
-
-
-class GoalMarker:
-    """A gizmo with the gripper in it: where the tool centre point is to go."""
-
-    def __init__(self, scene: viser.SceneApi, name: str, robot: RobotModel, pieces: Iterable[Piece]) -> None:
-        """Put it, hidden, where the tool is at home.
-
-        Args:
-            scene: to which it is added.
-            name: of its node.
-            robot: whose tool it is for.
-            pieces: meshes of the robot; those that move with the tool are shown.
-        """
-        links = robot.link_poses(robot.named("home"))
-        T_world_tcp = links[robot.config.tcp_link]
-        self._node = scene.add_transform_controls(
-            name, scale=_SIZE, depth_test=False, opacity=0.9, visible=False, position=T_world_tcp[:3, 3],
-            wxyz=matrix_wxyz(T_world_tcp), line_width=3.0,
-        )
-        hand = _hand(robot)
-        self._scene = scene
-        self._undrawn = [(piece, invert(T_world_tcp) @ links[piece.link]) for piece in pieces if piece.link in hand]
-
-    @property
-    def visible(self) -> bool:
-        """Whether it is shown."""
-        return self._node.visible
-
-    @visible.setter
-    def visible(self, on: bool) -> None:
-        if on:
-            self._draw()
-        self._node.visible = on
-
-    @property
-    def pose(self) -> Pose:
-        """Where it is, in world."""
-        return pose_from(np.array(self._node.position), np.array(self._node.wxyz))
-
-    @pose.setter
-    def pose(self, pose: Pose) -> None:
-        self._node.position, self._node.wxyz = position_of(pose), wxyz_of(pose)
-
-    def _draw(self) -> None:
-        """Send the meshes, once: a browser takes its time over meshes that are hidden, too."""
-        for number, (piece, T_tcp_link) in enumerate(self._undrawn):
-            self._scene.add_mesh_simple(
-                f"{self._node.name}/{number}", piece.vertices, piece.faces, color=HAND, opacity=0.45,
-                position=T_tcp_link[:3, 3], wxyz=matrix_wxyz(T_tcp_link), **FLAT,
-            )
-        self._undrawn.clear()
-
-
-def _hand(robot: RobotModel) -> set[str]:
-    """Links that hang on the last joint of the arm, with those that hang on them."""
-    model = robot.full_model
-    last = model.getJointId(robot.joint_names[-1])
-    return {f.name for f in model.frames if f.name in robot.link_names and last in list(model.supports[f.parentJoint])}

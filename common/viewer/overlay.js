@@ -69,6 +69,10 @@
       told = news.note.number;
     }
     keep(news.kept);
+    for (const element of document.querySelectorAll("[data-live]")) {
+      const value = news.live[element.dataset.live] ?? "–";
+      if (element.textContent !== value) element.textContent = value;
+    }
     banner(news.lost.map(([what, age]) => `${what} (since ${time(Date.now() - 1000 * age)})`), news.unknown);
   }
 

@@ -45,6 +45,7 @@ from common.viewer.viser_inside import introduce
 from common.viewer.words import TaskWords, gripper
 
 if TYPE_CHECKING:
+    from common.robot.model import RobotModel
     from common.viewer.scene import Scene
 
 
@@ -163,20 +164,22 @@ class Page:
         """Whether each layer of the scene is shown."""
         return dict(self._shown)
 
-    def complete(self, scene: Scene, limits: Limits, planners: list[str]) -> None:
+    def complete(self, scene: Scene, robot: RobotModel, planners: list[str]) -> None:
         """Add what takes a while to load, and show what the cell says in the scene from now on.
 
         Args:
             scene: of the server.
-            limits: of the joints.
+            robot: not used by another thread.
             planners: that may be asked.
         """
         gui = self._server.gui
         with self._place["Plots"]:
+            limits = Limits(robot.joint_names, robot.lower, robot.upper, robot.velocity)
             self._plots = PlotPanel(gui, limits, self._words.latency)
         with self._place["Move"]:
-            self._move = MovePanel(gui, self.console, self._motions, scene, planners, planner=self._layout.planner,
-                                   marker=self._layout.goal_marker, tell=self._task.tell, play=scene.play)
+            self._move = MovePanel(gui, self.console, self._motions, scene, robot, planners, cell=self._cell,
+                                   planner=self._layout.planner, marker=self._layout.goal_marker, tell=self._task.tell)
+            self._line.holder = self._move.jogger
         for name, on in self._shown.items():
             scene.set_shown(name, on)
         if self._editing:
@@ -205,6 +208,8 @@ class Page:
             holding = self._feeds.latest(topics.GRIPPER_STATE)
             self._task.show(self._status, self._feeds.latest(topics.MOTION_STATUS),
                             self._feeds.latest(topics.MOTION_OWNER), gripper(holding), len(self._rejected.places))
+            if self._move is not None:
+                self._move.show(self._status, now)
             self._arm.show(self._feeds.latest(topics.ROBOT_STATUS))
             self._log.show()
         if self._periods.due("health", now):
@@ -226,7 +231,8 @@ class Page:
     def _say_how(self, now: float, alive: frozenset[str], connected: bool) -> None:
         """Bring up to date what stands above the page in every browser."""
         motion, owner = self._feeds.latest(topics.MOTION_STATUS), self._feeds.latest(topics.MOTION_OWNER)
-        how = [(self._cell, "dim"), self._words.state(self._status), (f"arm {words.motion(motion)}", "")]
+        does = "is jogged" if owner is not None and owner.jogging else words.motion(motion)
+        how = [(self._cell, "dim"), self._words.state(self._status), (f"arm {does}", "")]
         if owner is not None and owner.kind != "none":
             how.append((f"motion: {owner.owner or 'the task'}", "dim"))
         if self.console.doors.guarded:
@@ -236,7 +242,8 @@ class Page:
                    "task": ("The task does not answer: what it does is not known",
                             self.console.answers(topics.TASK_COMMAND))}
         lost = self._losses.update(connected, alive, answers, now)
-        self._line.tell(how, lost, self._task.note, owner)
+        self._line.tell(how, lost, self._task.note, owner,
+                        self._move.live() if self._move is not None else {})
 
     def _show_pictures(self) -> None:
         for name, sources in self._topics.images.items():

@@ -17,8 +17,8 @@ from common.topics import Topic
 from common.viewer.console import Console
 from common.viewer.feeds import Latest, News
 from common.viewer.figure import LinkPoses, Transforms
+from common.viewer.goal_marker import GoalMarker
 from common.viewer.layers import Layers, layers_shown
-from common.viewer.move import GoalMarker
 from common.viewer.pictures import Picture
 from common.viewer.robot_meshes import coarse, visual_pieces
 from common.viewer.stage import Stage
@@ -147,3 +147,7 @@ class Scene:
     def goal_pose(self) -> Pose:
         """Pose of the goal marker in world."""
         return self.goal.pose
+
+    def goal_reached(self, reached: bool | None) -> None:
+        """Show whether the arm can be at the goal marker; None: not known."""
+        self.goal.show_reached(reached)

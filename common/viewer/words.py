@@ -122,6 +122,15 @@ def kept(task: TaskStatus | None, motion: MotionStatus | None) -> str:
     return ""
 
 
+def not_jogged(motion: MotionStatus | None) -> str:
+    """What beside a task keeps the arm from being jogged; empty if nothing does."""
+    if motion is None:
+        return ""
+    if motion.held:
+        return "the arm is held: Resume or Start lets it go"
+    return "the arm follows a motion" if motion.state == "active" else ""
+
+
 def why_not(task: TaskStatus | None, motion: MotionStatus | None) -> dict[str, str]:
     """Why each order to the task would do nothing now; empty when it would do something."""
     if task is None:

@@ -35,6 +35,7 @@ from common.errors import Refused
 from common.process.in_process import running_service
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
+from common.transport.reader import Reader
 from common.viewer.layout import Layout
 from services import viewer
 from tests.common.viewer.browser_double import PATIENCE, BrowserDouble, opened
@@ -333,15 +334,15 @@ async def test_log_lines_are_text_whatever_is_in_them(panda: Played, page: Brows
 async def test_odd_messages_leave_the_page_and_the_service_as_they_are(
     panda: Played, page: BrowserDouble, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    await page.until(lambda: page.label("Speed [%]"))
+    await page.until(lambda: page.label("Planner") and page.label("Speed [%]"))
     speed = page.label("Speed [%]")
     for value in ("fast", None, [1], float("nan"), 1e300):
         await page.say({"type": "GuiUpdateMessage", "uuid": speed, "updates": {"value": value}})
-    await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Goal"), "updates": {"value": "Explode"}})
+    await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Planner"), "updates": {"value": "Explode"}})
     await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Show"), "updates": {"value": "nothing"}})
     panda.bus.writer(DETECTION_IMAGE).put(m.Image(
         header=m.Header(), height=4, width=4, encoding="bgr8", data=b"short"))
-    for words in ({}, {"do": "explode"}, {"do": "press"}, {"do": "press", "what": 2000 * "x"}, {"do": "hold", "at": ""}):
+    for words in ({}, {"do": "explode"}, {"do": "press"}, {"do": "press", "what": 2000 * "x"}, {"do": "hold", "at": 1}):
         await page.speak(**words)
     await page.speak(do="press", what="pause")
     await until(lambda: panda.commands)
@@ -449,11 +450,11 @@ async def test_plan_to_the_marker_tells_what_is_in_the_way(
 
     panda.bus.serve(topics.MOTION_PLAN, plan)
     await until(lambda: scenes)
-    await page.click("Plan here")
+    await page.press("Plan")
     await page.until(lambda: "Drag the goal marker" in page.text)
     await until(lambda: scenes[0].told("goal_marker") == [(True,)])
     await page.set("Planner", "chomp")
-    await page.click("Plan here")
+    await page.press("Plan")
     await page.until(lambda: "the goal collides; panda_hand would touch table" in page.text)
     assert (asked[0].planner, asked[0].goal) == ("chomp", m.PoseGoal(pose=scenes[0].goal_pose))
 
@@ -495,6 +496,175 @@ async def test_meshes_are_read_when_the_cell_is_up_or_somebody_looks(
         await until(lambda: scenes)
 
 
+async def jogs_of(reader: Reader[m.JogCommand], count: int) -> list[m.JogCommand]:
+    async with asyncio.timeout(PATIENCE):
+        return [await reader.next() for _ in range(count)]
+
+
+async def ready_to_jog(panda: Played, page: BrowserDouble) -> Reader[m.JogCommand]:
+    reader = panda.bus.reader(topics.MOTION_JOG)
+    panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus())
+    await page.until(lambda: not page.button("Open")[1])
+    return reader
+
+
+async def test_arm_is_jogged_by_each_word_that_a_button_is_held_and_by_nothing_else(
+    panda: Played, page: BrowserDouble
+) -> None:
+    reader = await ready_to_jog(panda, page)
+    held = []
+    for _ in range(3):
+        await page.hold("joint:panda_joint2:-")
+        held += await jogs_of(reader, 1)
+    assert {tuple(jog.joints) for jog in held} == {("panda_joint2",)} and held[0].joints["panda_joint2"] < 0
+    assert {jog.owner for jog in held} == {"page"} and all(jog.header.stamp for jog in held)
+    await page.speak(do="release")
+    (rest,) = await jogs_of(reader, 1)
+    assert not rest.joints and rest.linear == m.Vector3()
+    await page.set("Jogged", "tool, its own axes")
+    await page.until(lambda: "move:tool:z:+" in page.text)
+    await page.hold("move:tool:z:+")
+    (jog,) = await jogs_of(reader, 1)
+    assert jog.frame == "tool" and jog.linear.z == pytest.approx(0.2 * 0.25) and not jog.joints
+    for odd in ("move:moon:z:+", "joint:elbow:+", "joint:panda_joint2:", "move:tool:w:-", ""):
+        await page.hold(odd)
+    await page.speak(do="release")
+    (rest,) = await jogs_of(reader, 1)
+    assert rest.linear == m.Vector3()
+
+
+async def test_arm_comes_to_rest_when_the_page_that_jogs_it_is_closed(panda: Played) -> None:
+    async with opened(panda.port) as page:
+        reader = await ready_to_jog(panda, page)
+        await page.hold("joint:panda_joint1:+")
+        (jog,) = await jogs_of(reader, 1)
+        assert jog.joints
+    (rest,) = await jogs_of(reader, 1)
+    assert not rest.joints
+
+
+async def test_stop_ends_jogging_until_the_button_is_let_go(panda: Played, page: BrowserDouble) -> None:
+    reader, status = await ready_to_jog(panda, page), panda.bus.writer(topics.MOTION_STATUS)
+    await page.hold("joint:panda_joint1:+")
+    await jogs_of(reader, 1)
+    stop = m.Inhibit(kind="stopped", by="page", since=7)
+    status.put(m.MotionStatus(inhibits=[stop]))
+    await page.until(lambda: "stopped since" in page.text)
+    await page.hold("joint:panda_joint1:+")
+    assert not (await jogs_of(reader, 1))[0].joints
+    await page.until(lambda: page.said and "is not jogged: it is stopped" in page.said[-1][1])
+    await page.hold("joint:panda_joint1:+")  # pressed anew: one's own stop
+    (jog,) = await jogs_of(reader, 1)
+    assert jog.joints and jog.heard == 7
+    status.put(m.MotionStatus(inhibits=[stop.model_copy(update={"by": "anna", "since": 8})]))
+    await page.until(lambda: "by anna" in page.text)
+    await page.speak(do="release")
+    await page.hold("joint:panda_joint1:+")
+    await page.until(lambda: "by anna" in page.said[-1][1])
+
+
+async def test_arm_that_a_task_has_is_not_jogged_and_the_buttons_say_why(panda: Played, page: BrowserDouble) -> None:
+    reader = await ready_to_jog(panda, page)
+    panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus(state="GRASPING", started=True))
+    await page.until(lambda: "the task has the arm" in page.button("Open")[1])
+    await page.hold("joint:panda_joint1:+")
+    await page.until(lambda: page.said and "not jogged: the task has the arm" in page.said[-1][1])
+    assert reader.latest is None
+
+
+async def test_fingers_open_by_the_gripper_that_there_is(panda: Played, page: BrowserDouble) -> None:
+    asked: list[m.GripperCommand] = []
+
+    async def grip(request: m.GripperCommand) -> m.GripperState:
+        asked.append(request)
+        return m.GripperState(id=request.id, state="active")
+
+    panda.bus.serve(topics.GRIPPER_COMMAND, grip)
+    await ready_to_jog(panda, page)
+    await page.set("Width [mm]", 30.0)
+    await page.set("Force [N]", 12.0)
+    for button in ("To width", "Open", "Close"):
+        await page.press(button)
+        await until(lambda button=button: len(asked) == 1 + ("To width", "Open", "Close").index(button))
+    assert [(round(one.width, 4), one.effort) for one in asked] == [(0.03, 12.0), (0.08, 12.0), (0.0, 12.0)]
+
+
+async def test_taught_pose_is_a_goal_and_is_kept_for_the_next_page(panda: Played, page: BrowserDouble) -> None:
+    asked: list[m.PlanRequest] = []
+
+    async def plan(request: m.PlanRequest) -> m.PlanResponse:
+        asked.append(request)
+        return m.PlanResponse(id=request.id, ok=False, error="unreachable", message="not today")
+
+    panda.bus.serve(topics.MOTION_PLAN, plan)
+    names = [f"panda_joint{k}" for k in range(1, 8)]
+    q = [0.1, -0.7, 0.0, -2.0, 0.0, 1.5, 0.7]
+    panda.bus.writer(topics.JOINT_STATES).put(m.JointState(header=m.Header(stamp=1), name=names, position=q))
+    await ready_to_jog(panda, page)
+    await page.until(lambda: page.news.get("live", {}).get("j:panda_joint1") == "5.7 °")
+    assert page.button("Teach")[1] == "give it a name first"
+    await page.set("Name", "over, there")
+    await page.press("Teach")
+    await page.until(lambda: "'over, there'" in page.text or "over, there" in page.news["note"]["line"])
+    await page.set("Name", "bin")
+    await page.press("Teach")
+    await page.until(lambda: "bin" in page.parts[page.label("Goal")]["options"])
+    await page.set("Goal", "bin")
+    await page.press("Plan")
+    await until(lambda: asked)
+    assert asked[0].goal == m.JointGoal(positions=q)
+    async with page_of("panda") as again, opened(again.port) as later:
+        await later.until(lambda: "bin" in later.parts[later.label("Goal")]["options"])
+
+
+async def test_plan_that_was_found_is_executed_once(panda: Played, page: BrowserDouble) -> None:
+    found = m.JointTrajectory(header=m.Header(stamp=5), joint_names=["a"], points=[
+        m.JointTrajectoryPoint(positions=[float(k)], velocities=[0.0], accelerations=[0.0], time_from_start=float(k))
+        for k in range(2)])
+    asked: list[m.ExecuteRequest] = []
+
+    async def plan(request: m.PlanRequest) -> m.PlanResponse:
+        return m.PlanResponse(id=request.id, ok=True, planner="ompl", trajectory=found)
+
+    async def execute(request: m.ExecuteRequest) -> m.MotionStatus:
+        asked.append(request)
+        return m.MotionStatus(id=request.id, state="succeeded")
+
+    panda.bus.serve(topics.MOTION_PLAN, plan)
+    panda.bus.serve(topics.MOTION_EXECUTE, execute)
+    panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
+    await ready_to_jog(panda, page)
+    assert page.button("Execute")[1] == "plan first"
+    await page.set("Goal", "home")
+    await page.press("Plan")
+    await page.press("Execute")
+    await until(lambda: asked)
+    assert asked[0].trajectory == found and asked[0].plan
+    await page.until(lambda: page.button("Execute")[1] == "plan first")
+
+
+async def test_whose_the_motion_is_is_told_and_it_is_taken_over_when_that_is_said_twice(
+    panda: Played, page: BrowserDouble
+) -> None:
+    asked: list[m.OwnRequest] = []
+    anna = m.MotionOwner(owner="anna", kind="operator", asked=True, since=1)
+
+    async def own(request: m.OwnRequest) -> m.MotionOwner:
+        asked.append(request)
+        if not request.over:
+            raise Refused("not_owner", f"the motion is {anna.told}")
+        return m.MotionOwner(owner=request.owner, kind="operator", asked=True)
+
+    panda.bus.serve(topics.MOTION_OWN, own)
+    panda.bus.writer(topics.MOTION_OWNER).put(anna)
+    await page.until(lambda: "anna&#x27;s (operator)" in page.text and "anna's (operator)" in page.news["kept"])
+    await page.press("Take")
+    await page.until(lambda: "press Take again for that" in page.text)
+    await page.press("Take")
+    await page.until(lambda: "The motion is page" in page.text)
+    assert [(one.act, one.over, one.owner) for one in asked] == [("take", False, "page"), ("take", True, "page")]
+
+
 async def test_plan_that_was_found_is_played(
     panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
 ) -> None:
@@ -506,7 +676,7 @@ async def test_plan_that_was_found_is_played(
     panda.bus.serve(topics.MOTION_PLAN, plan)
     await page.set("Goal marker", True)
     await until(lambda: scenes and scenes[0].told("goal_marker"))
-    await page.click("Plan here")
+    await page.press("Plan")
     await page.until(lambda: "Planned by ompl" in page.text)
     await until(lambda: scenes[0].told("play") == [(found,)])
 

@@ -6,6 +6,7 @@ import asyncio
 import html
 import json
 import re
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
@@ -75,6 +76,10 @@ class BrowserDouble:
         """Say something over the line, as the script of the page does."""
         await asyncio.wait_for(self._known.wait(), PATIENCE)
         await self._line.send(json.dumps(words))
+
+    async def hold(self, what: str) -> None:
+        """Say once that a button of our own is held down."""
+        await self.speak(do="hold", what=what, at=1e3 * time.monotonic())
 
     def button(self, label: str) -> tuple[str, str]:
         """Name of the button of our own that is called so, and why it is off."""

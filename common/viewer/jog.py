@@ -1,0 +1,165 @@
+"""Jogging on the page: the arm moves only while a button is held down.
+
+The page says so each 40 ms (overlay.js); every word becomes one `JogCommand`, and nothing repeats it: when words cease,
+for whatever reason, the executor brakes 0.1 s after the last one. A stop, a hold, or another page's word ends it until
+the button was let go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import viser
+
+from common.messages import MotionOwner, MotionStatus
+from common.process.operator_motion import OURSELVES, SOMEBODY
+from common.sources import monotonic
+from common.viewer.console import Desk
+from common.viewer.doors import Doors
+from common.viewer.line import Holder
+from common.viewer.markup import block, hold, live, text
+
+OTHERS = 0.5  # [s] after the last word of a page, in which no other one jogs
+TOOL_SPEED, TURN_SPEED = 0.25, 1.0  # [m/s] reduced speed of ISO 10218-1, [rad/s], at 100 %
+SLOW = 20  # [%] at first
+JOINTS = "joints"
+FRAMES = {"tool, axes of the base": "base", "tool, its own axes": "tool", "tool, axes of the world": "world"}
+AXES = "xyz"
+
+Velocities = Mapping[str, Any]  # fields of a JogCommand
+
+
+class Jogs(Protocol):
+    """Sends velocities for a person: `Console`."""
+
+    doors: Doors  # know who that person is
+
+    def jog(self, heard: int, **velocities: Any) -> None:
+        """Move so for a moment; without any come to rest."""
+
+
+class Jogger(Holder):
+    """Turns words of a page into velocities; one page at a time."""
+
+    def __init__(
+        self, jogs: Jogs, velocities: Callable[[str], Velocities | None],
+        state: Callable[[], tuple[MotionStatus | None, MotionOwner | None]], kept: Callable[[], str],
+    ) -> None:
+        """Make one.
+
+        Args:
+            jogs: sends them.
+            velocities: of a button by its name.
+            state: what the arm does, and whose the motion is.
+            kept: why nobody can move the arm now.
+        """
+        self._jogs, self._velocities, self._state, self._kept = jogs, velocities, state, kept
+        self._who: object = None
+        self._what = ""
+        self._at, self._heard = 0.0, 0
+
+    def hold(self, who: object, what: str, refuse: Callable[[str], None]) -> None:
+        """Move the arm for the next 0.1 s as the button says, or tell why not."""
+        velocities, now = self._velocities(what), monotonic()
+        if velocities is None:
+            return
+        motion, owner = self._state()
+        begins = who is not self._who or what != self._what
+        if self._who not in (None, who) and now - self._at < OTHERS:
+            refuse("Another page jogs the arm")
+        elif why := self._kept():
+            self.release(who)
+            refuse(f"The arm is not jogged: {why}")
+        elif others := self._inhibited(motion):
+            self.release(who)
+            refuse(f"The arm is not jogged: it is {others}")
+        elif not begins and motion is not None and motion.newest > self._heard:
+            self.release(who)
+            refuse(f"The arm is not jogged: it is {motion.inhibits[-1].told if motion.inhibits else 'stopped'}")
+        else:
+            if begins:
+                self._heard = motion.newest if motion is not None else 0
+            self._who, self._what, self._at = who, what, now
+            self._jogs.jog(self._heard, **velocities)
+            if owner is not None and owner.kind == "task":
+                refuse(f"The arm is not jogged: the motion is {owner.told}")
+
+    def _inhibited(self, motion: MotionStatus | None) -> str:
+        """Who else stopped the arm, in words."""
+        ours = (self._jogs.doors.person, SOMEBODY, *OURSELVES)
+        return "; ".join(one.told for one in (motion.inhibits if motion is not None else ()) if one.by not in ours)
+
+    def release(self, who: object) -> None:
+        """Have the arm come to rest, if that page moved it."""
+        if who is self._who:
+            self._who = None
+            self._jogs.jog(self._heard)
+
+
+class JogPanel:
+    """What is jogged, how fast, and a pad of buttons to hold down."""
+
+    def __init__(self, gui: viser.GuiApi, desk: Desk, joints: Sequence[str], fastest: Sequence[float]) -> None:
+        """Lay the panel out where the GUI stands.
+
+        Args:
+            gui: of the server.
+            desk: takes what is chosen.
+            joints: names, in order.
+            fastest: their greatest velocities [rad/s].
+        """
+        self._joints, self._fastest = list(joints), list(fastest)
+        self._mode, self._share = JOINTS, SLOW / 100
+        mode = gui.add_dropdown("Jogged", [JOINTS, *FRAMES], initial_value=JOINTS)
+        desk.on_change(mode, self._set_mode, "look")
+        speed = gui.add_slider("Jog speed [%]", 1, 100, 1, SLOW, hint="100: the tool at 250 mm/s, turning at 1 rad/s, "
+                                                                       "or a joint as fast as it may be jogged")
+        desk.on_change(speed, self._set_speed)
+        self._why = ""
+        self._html = gui.add_html(self._pad())
+
+    def show(self, why: str) -> None:
+        """Have the buttons off for a reason, or on without one."""
+        if why != self._why:
+            self._why = why
+            self._html.content = self._pad()
+
+    def velocities(self, button: str) -> Velocities | None:
+        """What a button of the pad moves, as fields of a `JogCommand`; None for one that there is not."""
+        kind, _, rest = button.partition(":")
+        name, _, sign = rest.rpartition(":")
+        if sign not in ("+", "-"):
+            return None
+        share = self._share if sign == "+" else -self._share
+        if kind == "joint" and name in self._joints:
+            return {"joints": {name: share * self._fastest[self._joints.index(name)]}}
+        frame, _, axis = name.rpartition(":")
+        if frame not in FRAMES.values() or len(axis) != 1 or axis not in AXES or kind not in ("move", "turn"):
+            return None
+        field, fastest = ("linear", TOOL_SPEED) if kind == "move" else ("angular", TURN_SPEED)
+        return {"frame": frame, field: {axis: share * fastest}}
+
+    def _pad(self) -> str:
+        if self._mode == JOINTS:
+            rows = [self._row(name.rpartition("_")[2], f"joint:{name}", f"joint {name}", f"j:{name}")
+                    for name in self._joints]
+        else:
+            frame = FRAMES[self._mode]
+            rows = [self._row(axis.upper(), f"move:{frame}:{axis}", f"tool along {axis}", f"p:{axis}") for axis in AXES]
+            rows += [self._row(f"about {axis.upper()}", f"turn:{frame}:{axis}", f"turn the tool about {axis}",
+                               f"r:{axis}") for axis in AXES]
+        note = self._why or "Moves while a button is held down. Nothing looks for obstacles."
+        return block(f'<div class="dim small">{text(note)}</div><div class="pad">{"".join(rows)}</div>', "jog")
+
+    def _row(self, label: str, name: str, told: str, number: str) -> str:
+        less = hold("−", f"{name}:-", f"jog {told}, minus", self._why)
+        more = hold("+", f"{name}:+", f"jog {told}, plus", self._why)
+        return f'<div><span class="name">{text(label)}</span>{live(number)}{less}{more}</div>'
+
+    def _set_mode(self, mode: str) -> None:
+        self._mode = mode
+        self._html.content = self._pad()
+
+    def _set_speed(self, percent: float) -> None:
+        self._share = min(max(percent, 1.0), 100.0) / 100
