@@ -27,8 +27,6 @@ def take(cell: str, page: Page) -> None:
     """Wait for the moment and write the picture."""
     page.locator("canvas").first.wait_for()
     page.get_by_text("STOP", exact=True).wait_for()
-    if page.get_by_text("Software WebGL rendering detected").count():
-        page.locator(".mantine-Notification-closeButton").first.click()
     page.get_by_role("button", name="Start", exact=True).click()
     if cell == "panda":
         page.wait_for_function(f"[...document.querySelectorAll('*')].some(e => e.textContent.trim() === '{PLACED}')")

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import viser
 
+from common.control.jogging import PAUSE
 from common.messages import MotionOwner, MotionStatus
 from common.process.operator_motion import OURSELVES, SOMEBODY
 from common.sources import monotonic
@@ -20,6 +21,7 @@ from common.viewer.doors import Doors
 from common.viewer.line import Holder
 from common.viewer.markup import block, hold, live, text
 
+UNANSWERED = 1.0  # [s] of asking in vain, after which that is told
 OTHERS = 0.5  # [s] after the last word of a page, in which no other one jogs
 TOOL_SPEED, TURN_SPEED = 0.25, 1.0  # [m/s] reduced speed of ISO 10218-1, [rad/s], at 100 %
 SLOW = 20  # [%] at first
@@ -57,7 +59,7 @@ class Jogger(Holder):
         self._jogs, self._velocities, self._state, self._kept = jogs, velocities, state, kept
         self._who: object = None
         self._what = ""
-        self._at, self._heard = 0.0, 0
+        self._at, self._began, self._heard = 0.0, 0.0, 0
 
     def hold(self, who: object, what: str, refuse: Callable[[str], None]) -> None:
         """Move the arm for the next 0.1 s as the button says, or tell why not."""
@@ -79,11 +81,19 @@ class Jogger(Holder):
             refuse(f"The arm is not jogged: it is {motion.inhibits[-1].told if motion.inhibits else 'stopped'}")
         else:
             if begins:
-                self._heard = motion.newest if motion is not None else 0
+                self._began = now
+                newest = motion.newest if motion is not None else 0
+                if newest != self._heard:  # the executor wants a pause after a stop: else this press would never count
+                    self._heard, self._began = newest, now + PAUSE
             self._who, self._what, self._at = who, what, now
-            self._jogs.jog(self._heard, **velocities)
-            if owner is not None and owner.kind == "task":
-                refuse(f"The arm is not jogged: the motion is {owner.told}")
+            if now >= self._began:
+                self._jogs.jog(self._heard, **velocities)
+            if owner is not None and now - self._began > UNANSWERED and not (
+                owner.jogging and owner.owner == self._jogs.doors.person
+            ):
+                self.release(who)
+                whose = "" if owner.kind == "none" else f"; the motion is {owner.told}"
+                refuse(f"The arm is not jogged: its controller does not take it{whose}")
 
     def _inhibited(self, motion: MotionStatus | None) -> str:
         """Who else stopped the arm, in words."""

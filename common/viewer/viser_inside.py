@@ -23,8 +23,8 @@ Five things have no public call in viser 1.1; whoever updates viser reads this f
   may fail or wake nobody; it sets it a second time on its loop, which is enough (`_Event`).
   Upstream request: leave the first one out.
 
-The style sheet in markup.py names one of the client's CSS classes; without it the page only looks different. Upstream
-request: a checkbox whose label stands behind it.
+The style sheets in markup.py and overlay.css name a class and a width of the client's; without them the page only looks
+different. Upstream requests: a checkbox whose label stands behind it; a panel as wide as a phone.
 """
 
 from __future__ import annotations
