@@ -153,8 +153,11 @@ class Line:
             answer("the page is still loading: nothing was done", "busy")
         elif said.do == "press":
             desk.press(said.what)
-        elif delays.late(said.at * 1e-3, monotonic()) <= LATE and doors.admit(VISITOR.get(), HOLD, said.what):
-            desk.put(lambda: self.holder.hold(connection, said.what, lambda line: answer(line, "bad")))
+        elif delays.late(said.at * 1e-3, monotonic()) <= LATE:
+            if why := doors.objection(VISITOR.get(), "operate"):
+                answer(why, "bad")  # which has the script let go
+            elif doors.admit(VISITOR.get(), HOLD, said.what):
+                desk.put(lambda: self.holder.hold(connection, said.what, lambda line: answer(line, "bad")))
         return False
 
     async def _stop(self, answer: Callable[[str, str], None]) -> None:

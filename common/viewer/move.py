@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from common import topics
 from common.errors import ZencellError
@@ -23,11 +22,12 @@ from common.messages import (
     PoseGoal,
     TaskStatus,
 )
-from common.robot.transforms import matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, transform
+from common.robot.transforms import matrix_to_pose, pose_to_matrix, rpy_to_matrix, transform
 from common.viewer import words
+from common.viewer.arm_numbers import ArmNumbers, Numbers
 from common.viewer.console import Console, assign
 from common.viewer.hand_panel import HandPanel
-from common.viewer.jog import AXES, Jogger, JogPanel
+from common.viewer.jog import Jogger, JogPanel
 from common.viewer.markup import block, buttons, press, span, text
 from common.viewer.taught_panel import TaughtPanel
 from common.viewer.words import plan, problem
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 PIPELINE = "pipeline"
 MARKER, TOOL, JOINTS = "goal marker", "tool: numbers", "joints: numbers"
 SETTLED = 0.5  # [s] for which the marker rests before it is looked for why it cannot be reached, which takes longer
-Numbers = tuple[float, float, float]
 RESTARTS = 20  # of the search for joint positions
 
 
@@ -102,8 +101,9 @@ class MovePanel:
         self._kind = MARKER
         self._found: PlanResponse | None = None
         self._reached: tuple[Pose, float, bool] | None = None  # goal, since when, whether it was looked for why not
+        self.numbers = ArmNumbers(robot, console.latest)
         q = robot.named("home")
-        self._xyz, self._rpy, self._q = self._numbers(q)
+        self._xyz, self._rpy, self._q = self.numbers.of(q)
         with gui.add_folder("Jog", expand_by_default=True):
             fastest = robot.velocity.tolist()
             self._jog = JogPanel(gui, console, robot.joint_names, fastest)
@@ -126,7 +126,7 @@ class MovePanel:
             console.on_change(self._at, self._set_xyz)
             console.on_change(self._turned, self._set_rpy)
             self._angles = [gui.add_number(f"{name} {unit}", value, step=0.1, visible=False)
-                            for name, unit, value in zip(robot.joint_names, self._units, self._q, strict=True)]
+                            for name, unit, value in zip(robot.joint_names, self.numbers.units, self._q, strict=True)]
             for number, field in enumerate(self._angles):
                 console.on_change(field, self._setter(number))
             names = gui.add_dropdown("Planner", [PIPELINE, *planners], initial_value=self.planner,
@@ -140,46 +140,13 @@ class MovePanel:
             self._buttons = gui.add_html("")
             self._html = gui.add_html(_line("Choose a goal, plan, look at the ghost, then execute.", "dim"))
         with gui.add_folder("Taught poses", expand_by_default=False):
-            self._taught = TaughtPanel(gui, console, cell, robot.joint_names, self._joints, self._offer, self._through)
+            self._taught = TaughtPanel(
+                gui, console, cell, robot.joint_names, self.numbers.joints, self._offer, self._through)
         self._offer()
         if marker:
             scene.goal_marker(True)
 
     # --- what is shown ---------------------------------------------------------------------------------------------
-
-    @property
-    def _scales(self) -> NDArray[np.float64]:
-        """What joint positions are multiplied by to be shown: degrees, or mm of a joint that slides."""
-        return np.array([1e3 if joint.shortname().startswith("JointModelP") else 180 / math.pi
-                         for joint in self._robot.model.joints[1:]])
-
-    @property
-    def _units(self) -> list[str]:
-        return ["[mm]" if scale == 1e3 else "[°]" for scale in self._scales]
-
-    def _joints(self) -> NDArray[np.float64] | None:
-        """Where the joints are (dof,) [rad, m], if that is known."""
-        state = self._console.latest(topics.JOINT_STATES)
-        return self._robot.order(state.name, state.position) if state is not None else None
-
-    def _numbers(self, q: NDArray[np.float64]) -> tuple[Numbers, Numbers, list[float]]:
-        """Position [mm] and turn [degrees] of the tool in world, and joints [degrees, mm], rounded."""
-        T_world_tcp = self._robot.fk(q)
-        x, y, z = (round(1e3 * float(value), 1) for value in T_world_tcp[:3, 3])
-        roll, pitch, yaw = (round(math.degrees(value), 1) for value in matrix_to_rpy(T_world_tcp[:3, :3]))
-        return (x, y, z), (roll, pitch, yaw), [round(float(value), 2) for value in q * self._scales]
-
-    def live(self) -> dict[str, str]:
-        """Numbers of the arm now, for the panels."""
-        q = self._joints()
-        if q is None:
-            return {}
-        xyz, rpy, joints = self._numbers(q)
-        units = [unit.strip("[]") for unit in self._units]
-        shown = {f"j:{name}": f"{value:.1f} {unit}" for name, value, unit in
-                 zip(self._robot.joint_names, joints, units, strict=True)}
-        shown |= {f"p:{axis}": f"{value:.1f} mm" for axis, value in zip(AXES, xyz, strict=True)}
-        return shown | {f"r:{axis}": f"{value:.1f} °" for axis, value in zip(AXES, rpy, strict=True)}
 
     def show(self, task: TaskStatus | None, now: float) -> None:
         """Bring buttons and marker up to date at a wall time [s], monotonic."""
@@ -204,7 +171,7 @@ class MovePanel:
         """Look whether the arm can be at the marker, and once that rests why not."""
         from common.planning.ik import solve_ik, why_no_ik
 
-        if not self.marker or (seed := self._joints()) is None:
+        if not self.marker or (seed := self.numbers.joints()) is None:
             return
         pose, before = self._goal.goal_pose, self._reached
         if before is not None and before[0] == pose and (before[2] or now - before[1] < SETTLED):
@@ -246,7 +213,7 @@ class MovePanel:
             x, y, z = (1e-3 * value for value in self._xyz)
             return PoseGoal(pose=matrix_to_pose(transform(rotation, (x, y, z))))
         if self._kind == JOINTS:
-            return JointGoal(positions=(np.array(self._q) / self._scales).tolist())
+            return JointGoal(positions=(np.array(self._q) / self.numbers.scales).tolist())
         if self._kind in self._robot.config.named_poses:
             return JointGoal(named=self._kind)
         if self._kind != MARKER:
@@ -334,11 +301,11 @@ class MovePanel:
             self.set_marker(True)
 
     def _take_numbers(self) -> None:
-        q = self._joints()
+        q = self.numbers.joints()
         if q is None:
             self._tell("Where the arm is is not known.", "bad")
             return
-        self._xyz, self._rpy, self._q = self._numbers(q)
+        self._xyz, self._rpy, self._q = self.numbers.of(q)
         assign(self._at, self._xyz)
         assign(self._turned, self._rpy)
         for field, value in zip(self._angles, self._q, strict=True):

@@ -243,7 +243,7 @@ class Page:
                             self.console.answers(topics.TASK_COMMAND))}
         lost = self._losses.update(connected, alive, answers, now)
         self._line.tell(how, lost, self._task.note, owner,
-                        self._move.live() if self._move is not None else {})
+                        self._move.numbers.live() if self._move is not None else {})
 
     def _show_pictures(self) -> None:
         for name, sources in self._topics.images.items():
