@@ -13,6 +13,8 @@ from typing import Any, ClassVar
 
 import pytest
 import yaml
+from websockets.asyncio.client import connect
+from websockets.exceptions import InvalidStatus
 
 from common import messages as m
 from common import topics
@@ -40,6 +42,7 @@ from common.viewer.layout import Layout
 from services import viewer
 from tests.common.viewer.browser_double import PATIENCE, BrowserDouble, opened
 
+TOKEN = "a-token-that-is-long-enough"
 MIN_AREA = "services.vision_detector.min_area"
 
 
@@ -572,6 +575,35 @@ async def test_arm_that_a_task_has_is_not_jogged_and_the_buttons_say_why(panda: 
     await page.hold("joint:panda_joint1:+")
     await page.until(lambda: page.said and "not jogged: the task has the arm" in page.said[-1][1])
     assert reader.latest is None
+
+
+async def test_of_two_operators_one_operates_and_the_other_sees_whom_and_takes_over() -> None:
+    async with (
+        page_of("panda", token=TOKEN) as played,
+        opened(played.port, TOKEN) as first, opened(played.port, TOKEN) as second,
+    ):
+        reader = await ready_to_jog(played, first)
+        await first.hold("joint:panda_joint1:+")
+        await jogs_of(reader, 1)
+        await second.until(lambda: "operates: Take over, or wait" in second.news["kept"])
+        assert first.news["kept"] == "", "its two connections are one page"
+        await second.hold("joint:panda_joint1:-")
+        await second.until(lambda: second.said and "operates: Take over" in second.said[-1][1])
+        await second.speak(do="stop", n=1)
+        await until(lambda: played.stops)
+        await second.press("Take over")
+        await first.until(lambda: "operates: Take over" in first.news["kept"] and second.news["kept"] == "")
+        assert all(not jog.joints or jog.joints["panda_joint1"] > 0 for jog in [reader.latest] if jog)
+
+
+async def test_line_is_closed_to_other_pages_and_to_who_has_no_token() -> None:
+    async with page_of("panda", token=TOKEN) as played:
+        address = f"ws://127.0.0.1:{played.port}/line"
+        for status, headers in ((401, {}), (403, {"Cookie": f"zencell-{played.port}={TOKEN}", "Origin": "http://a.b"})):
+            with pytest.raises(InvalidStatus) as refused:
+                async with connect(address, proxy=None, additional_headers=headers):
+                    pass
+            assert refused.value.response.status_code == status
 
 
 async def test_fingers_open_by_the_gripper_that_there_is(panda: Played, page: BrowserDouble) -> None:

@@ -143,12 +143,13 @@ class BrowserDouble:
 
 
 @asynccontextmanager
-async def opened(port: int) -> AsyncIterator[BrowserDouble]:
-    """A page that is open inside the block."""
+async def opened(port: int, token: str = "") -> AsyncIterator[BrowserDouble]:
+    """A page that is open inside the block, by somebody who has a token."""
+    cookie = {"Cookie": f"zencell-{port}={token}"} if token else None
     async with (
         connect(f"ws://127.0.0.1:{port}/", proxy=None, max_size=None, open_timeout=PATIENCE,
-                subprotocols=[Subprotocol(f"viser-v{viser.__version__}")]) as connection,
-        connect(f"ws://127.0.0.1:{port}/line", proxy=None, open_timeout=PATIENCE) as line,
+                subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], additional_headers=cookie) as connection,
+        connect(f"ws://127.0.0.1:{port}/line", proxy=None, open_timeout=PATIENCE, additional_headers=cookie) as line,
     ):
         browser = BrowserDouble(connection, line)
         listening = {asyncio.create_task(browser.listen()), asyncio.create_task(browser.listen_to_the_line())}
