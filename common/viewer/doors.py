@@ -90,6 +90,15 @@ class Doors:
                 self._holder = None
                 self._note(f"{visitor} has gone and does not operate any more")
 
+    def give_back(self, visitor: Visitor | None) -> bool:
+        """Whether somebody operated, and does not any more."""
+        with self._lock:
+            had = visitor is not None and visitor == self._holder
+            if had:
+                self._holder = None
+                self._note(f"{visitor} does not operate any more")
+        return had
+
     def admit(self, visitor: Visitor | None, part: str, value: object = None) -> bool:
         """Whether somebody may do something with a part of the page; if not it is said why, if so it is logged."""
         if not self.guarded:

@@ -58,47 +58,46 @@ class Jogger(Holder):
         """
         self._jogs, self._velocities, self._state, self._kept = jogs, velocities, state, kept
         self._who: object = None
-        self._what = ""
+        self._press: tuple[object, int] | None = None  # the newest that was begun or refused
         self._at, self._began, self._heard = 0.0, 0.0, 0
 
-    def hold(self, who: object, what: str, refuse: Callable[[str], None]) -> None:
-        """Move the arm for the next 0.1 s as the button says, or tell why not."""
+    def hold(self, who: object, what: str, press: int, refuse: Callable[[str], None]) -> None:
+        """Move the arm for the next 0.1 s as the button says, or tell why not: that press never counts again then."""
         velocities, now = self._velocities(what), monotonic()
         if velocities is None:
             return
         motion, owner = self._state()
-        begins = who is not self._who or what != self._what
         if self._who not in (None, who) and now - self._at < OTHERS:
             refuse("Another page jogs the arm")
-        elif why := self._kept():
+            return
+        begins = self._press != (who, press)
+        if not begins and self._who is None:
+            return  # it was refused, or let go
+        newest = motion.newest if motion is not None else 0
+        why = self._kept() or self._inhibited(motion)
+        if not (why or begins) and motion is not None and newest > self._heard:
+            why = f"it is {motion.inhibits[-1].told}"
+        ours = owner is None or (owner.jogging and owner.owner == self._jogs.doors.person)
+        if not (why or begins or ours) and now - self._began > UNANSWERED:
+            why = f"its controller does not take it; the motion is {owner.told if owner is not None else ''}"
+        if begins:
+            self._press, self._began = (who, press), now
+            if newest != self._heard:  # the executor wants a pause after a stop: else this press would never count
+                self._heard, self._began = newest, now + PAUSE
+        if why:
             self.release(who)
+            self._who = None
             refuse(f"The arm is not jogged: {why}")
-        elif others := self._inhibited(motion):
-            self.release(who)
-            refuse(f"The arm is not jogged: it is {others}")
-        elif not begins and motion is not None and motion.newest > self._heard:
-            self.release(who)
-            refuse(f"The arm is not jogged: it is {motion.inhibits[-1].told if motion.inhibits else 'stopped'}")
-        else:
-            if begins:
-                self._began = now
-                newest = motion.newest if motion is not None else 0
-                if newest != self._heard:  # the executor wants a pause after a stop: else this press would never count
-                    self._heard, self._began = newest, now + PAUSE
-            self._who, self._what, self._at = who, what, now
-            if now >= self._began:
-                self._jogs.jog(self._heard, **velocities)
-            if owner is not None and now - self._began > UNANSWERED and not (
-                owner.jogging and owner.owner == self._jogs.doors.person
-            ):
-                self.release(who)
-                whose = "" if owner.kind == "none" else f"; the motion is {owner.told}"
-                refuse(f"The arm is not jogged: its controller does not take it{whose}")
+            return
+        self._who, self._at = who, now
+        if now >= self._began:
+            self._jogs.jog(self._heard, **velocities)
 
     def _inhibited(self, motion: MotionStatus | None) -> str:
         """Who else stopped the arm, in words."""
         ours = (self._jogs.doors.person, SOMEBODY, *OURSELVES)
-        return "; ".join(one.told for one in (motion.inhibits if motion is not None else ()) if one.by not in ours)
+        inhibits = motion.inhibits if motion is not None else []
+        return "; ".join(f"it is {one.told}" for one in inhibits if one.by not in ours)
 
     def release(self, who: object) -> None:
         """Have the arm come to rest, if that page moved it."""

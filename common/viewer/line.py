@@ -40,7 +40,7 @@ class Said(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     do: Literal["stop", "press", "hold", "release", "page"]
-    n: int = 0  # number of a stop, which comes back in its answer
+    n: int = 0  # number of a stop, which comes back in its answer; or of a press, which is held
     what: str = Field("", max_length=100)  # a button, or the key of the page
     at: float = Field(0.0, allow_inf_nan=False)  # [ms] by the browser's clock
 
@@ -58,15 +58,17 @@ class NewsOfAll:
 
 
 class Delays:
-    """How late words come, reckoned from the promptest of them: nobody's clock has to agree with another's."""
+    """How late words come, reckoned from the promptest of a press: no clock has to agree with another's, nor run on."""
 
     def __init__(self) -> None:
-        self._least: float | None = None
+        self._press: int | None = None
+        self._least = 0.0
 
-    def late(self, said: float, now: float) -> float:
-        """How much later [s] than the promptest one a word comes that was said at a time of the browser's [s]."""
+    def late(self, press: int, said: float, now: float) -> float:
+        """How much later [s] than the promptest of its press a word comes that was said at the browser's time [s]."""
         took = now - said
-        self._least = took if self._least is None else min(self._least, took)
+        self._least = min(self._least, took) if press == self._press else took
+        self._press = press
         return took - self._least
 
 
@@ -153,11 +155,11 @@ class Line:
             answer("the page is still loading: nothing was done", "busy")
         elif said.do == "press":
             desk.press(said.what)
-        elif delays.late(said.at * 1e-3, monotonic()) <= LATE:
+        elif delays.late(said.n, said.at * 1e-3, monotonic()) <= LATE:
             if why := doors.objection(VISITOR.get(), "operate"):
                 answer(why, "bad")  # which has the script let go
             elif doors.admit(VISITOR.get(), HOLD, said.what):
-                desk.put(lambda: self.holder.hold(connection, said.what, lambda line: answer(line, "bad")))
+                desk.put(lambda: self.holder.hold(connection, said.what, said.n, lambda line: answer(line, "bad")))
         return False
 
     async def _stop(self, answer: Callable[[str, str], None]) -> None:
@@ -180,8 +182,8 @@ STOP, HOLD = "line:stop", "line:hold"  # parts of the page that the doors know
 class Holder:
     """Does something while a button is held down; this one does nothing."""
 
-    def hold(self, who: object, what: str, refuse: Callable[[str], None]) -> None:
-        """The button `what` is held down by a page, which says so again at least every 0.1 s."""
+    def hold(self, who: object, what: str, press: int, refuse: Callable[[str], None]) -> None:
+        """The button `what` is held down by a page, which says so again and again; each press has a number."""
 
     def release(self, who: object) -> None:
         """That page holds no button any more, or is gone."""

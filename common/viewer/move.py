@@ -141,7 +141,8 @@ class MovePanel:
             self._html = gui.add_html(_line("Choose a goal, plan, look at the ghost, then execute.", "dim"))
         with gui.add_folder("Taught poses", expand_by_default=False):
             self._taught = TaughtPanel(
-                gui, console, cell, robot.joint_names, self.numbers.joints, self._offer, self._through)
+                gui, console, cell, robot.joint_names, self.numbers.joints, self._offer, self._through,
+                [MARKER, TOOL, JOINTS, *robot.config.named_poses])
         self._offer()
         if marker:
             scene.goal_marker(True)

@@ -8,7 +8,7 @@
   const ANSWER = 3000;  // [ms] for what became of STOP
   const STUCK = 2000;  // [bytes] that wait to be sent: what is held does not get there
 
-  let socket = null, heard = null, page = "", asked = 0, waiting = new Map(), told = 0, held = null;
+  let socket = null, heard = null, page = "", asked = 0, waiting = new Map(), told = 0, held = null, presses = 0;
   const opened = Date.now();
   const bar = document.createElement("div");
   bar.id = "zc-bar";
@@ -147,7 +147,8 @@
   function grab(element, pointer) {
     if (held) return;
     if (off(element)) { say(`${element.getAttribute("aria-label")}: ${element.title}`, "dim"); return; }
-    held = {what: element.dataset.hold, pointer, timer: setInterval(again, AGAIN)};
+    presses += 1;
+    held = {what: element.dataset.hold, n: presses, pointer, timer: setInterval(again, AGAIN)};
     again();
   }
 
@@ -156,7 +157,7 @@
     if (lostSince() !== null || !open() || socket.bufferedAmount > STUCK || document.hidden) { letGo(); return; }
     for (const element of document.querySelectorAll("[data-hold]"))
       element.classList.toggle("held", element.dataset.hold === held.what);
-    send({do: "hold", what: held.what, at: performance.now()});
+    send({do: "hold", what: held.what, n: held.n, at: performance.now()});
   }
 
   function letGo() {

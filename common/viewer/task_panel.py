@@ -151,8 +151,10 @@ class TaskPanel:
             await self.stop()
 
     def _leave(self) -> None:
-        self._console.doors.leave(VISITOR.get())
-        self.tell("Nobody operates now", "good")
+        if self._console.doors.give_back(VISITOR.get()):
+            self.tell("Nobody operates now", "good")
+        else:
+            self.tell("This page does not operate")
 
     async def _own(self, act: Literal["take", "give"]) -> None:
         over, self._refused = self._refused == act, ""

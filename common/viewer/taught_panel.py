@@ -21,7 +21,7 @@ class TaughtPanel:
     def __init__(
         self, gui: viser.GuiApi, desk: Desk, cell: str, joints: Sequence[str],
         where: Callable[[], NDArray[Any] | None], changed: Callable[[], None],
-        through: Callable[[list[str]], Coroutine[Any, Any, None]],
+        through: Callable[[list[str]], Coroutine[Any, Any, None]], taken: Sequence[str] = (),
     ) -> None:
         """Lay the panel out where the GUI stands.
 
@@ -33,9 +33,10 @@ class TaughtPanel:
             where: the joints are now [rad, m].
             changed: called when there are other poses.
             through: has the arm go to poses, one after the other.
+            taken: names that mean something else.
         """
         self._desk, self._joints, self._where = desk, list(joints), where
-        self._changed, self._through = changed, through
+        self._changed, self._through, self._taken = changed, through, taken
         self._name = self._row = ""
         self._problem = ""
         try:
@@ -83,6 +84,8 @@ class TaughtPanel:
         if q is None:
             raise ConfigError("pose", self._name, "cannot be taught: where the arm is is not known")
         pose = {name: round(float(value), 6) for name, value in zip(self._joints, q, strict=True)}
+        if self._name in self._taken:
+            raise ConfigError("pose", self._name, "is a name that means something else already")
         if len(self._taught.poses) >= MOST and self._name not in self._taught.poses:
             raise ConfigError("pose", self._name, f"is one too many: {MOST} are kept")
         self._keep({**self._taught.poses, self._name: pose}, f"{self._name} is taught, kept in")

@@ -526,7 +526,7 @@ async def test_arm_is_jogged_by_each_word_that_a_button_is_held_and_by_nothing_e
     assert not rest.joints and rest.linear == m.Vector3()
     await page.set("Jogged", "tool, its own axes")
     await page.until(lambda: "move:tool:z:+" in page.text)
-    await page.hold("move:tool:z:+")
+    await page.hold("move:tool:z:+", press=2)
     (jog,) = await jogs_of(reader, 1)
     assert jog.frame == "tool" and jog.linear.z == pytest.approx(0.2 * 0.25) and not jog.joints
     for odd in ("move:moon:z:+", "joint:elbow:+", "joint:panda_joint2:", "move:tool:w:-", ""):
@@ -555,16 +555,18 @@ async def test_stop_ends_jogging_until_the_button_is_let_go(panda: Played, page:
     await page.until(lambda: "stopped since" in page.text)
     await page.hold("joint:panda_joint1:+")
     assert not (await jogs_of(reader, 1))[0].joints
+    for _ in range(3):
+        await page.hold("joint:panda_joint1:+")  # goes on: that press never counts again
     await page.until(lambda: page.said and "is not jogged: it is stopped" in page.said[-1][1])
     async with asyncio.timeout(PATIENCE):
         while reader.latest is None or not reader.latest.joints:  # pressed anew: one's own stop
-            await page.hold("joint:panda_joint1:+")
+            await page.hold("joint:panda_joint1:+", press=2)
             await asyncio.sleep(0.04)
     assert reader.latest.heard == 7
     status.put(m.MotionStatus(inhibits=[stop.model_copy(update={"by": "anna", "since": 8})]))
     await page.until(lambda: "by anna" in page.text)
     await page.speak(do="release")
-    await page.hold("joint:panda_joint1:+")
+    await page.hold("joint:panda_joint1:+", press=3)
     await page.until(lambda: "by anna" in page.said[-1][1])
 
 

@@ -77,9 +77,9 @@ class BrowserDouble:
         await asyncio.wait_for(self._known.wait(), PATIENCE)
         await self._line.send(json.dumps(words))
 
-    async def hold(self, what: str) -> None:
-        """Say once that a button of our own is held down."""
-        await self.speak(do="hold", what=what, at=1e3 * time.monotonic())
+    async def hold(self, what: str, press: int = 1) -> None:
+        """Say once that a button of our own is held down, since a press of that number."""
+        await self.speak(do="hold", what=what, n=press, at=1e3 * time.monotonic())
 
     def button(self, label: str) -> tuple[str, str]:
         """Name of the button of our own that is called so, and why it is off."""

@@ -44,6 +44,7 @@ def test_without_the_router_that_is_the_only_news_and_nothing_is_known() -> None
 
 def test_word_that_waited_on_its_way_is_late_whatever_the_clocks_say() -> None:
     delays = Delays()
-    assert [delays.late(1000.0 + at, 5.0 + at) for at in (0.0, 0.04)] == [0.0, 0.0]
-    assert delays.late(1000.08, 5.08 + 0.4) > LATE, "it was held up"
-    assert delays.late(1000.52, 5.53) < LATE
+    assert [delays.late(1, 1000.0 + at, 5.0 + at) for at in (0.0, 0.25)] == [0.0, 0.0]
+    assert delays.late(1, 1000.5, 5.5 + 0.4) > LATE, "it was held up"
+    assert delays.late(1, 1001.0, 6.0625) < LATE
+    assert delays.late(2, 1002.0, 9000.0) == 0.0, "the browser's machine slept meanwhile"
