@@ -49,10 +49,10 @@ async def time_stops(cell: RunningCell, page: BrowserDouble, count: int) -> list
     async with cell.listen() as bus:
         joints, motion = bus.reader(topics.JOINT_STATES), bus.reader(topics.MOTION_STATUS)
         for _ in range(count):
-            await page.click("Start")
+            await page.press("Start")
             await until(joints, lambda state: max(map(abs, state.velocity)) > FAST)
             began = time.monotonic()
-            await page.click("STOP")
+            await page.speak(do="stop", n=1)
             await until(motion, lambda status: status.state == "cancelled")
             told = time.monotonic() - began
             await until(joints, lambda state: max(map(abs, state.velocity)) < REST)
@@ -88,10 +88,10 @@ async def measure(name: str, stops: int, opened_times: int) -> None:
                     await page.until(lambda page=page: 'data-part="health"' in page.text)  # type: ignore[misc]
                 if count == 1:
                     say(f"page filled after {time.monotonic() - began:.2f} s")
-                    await pages[0].click("Start")
+                    await pages[0].press("Start")
                 say(f"{count} pages open: {await share(process):.1f} % of a core")
                 if count == 1:
-                    await pages[0].click("STOP")
+                    await pages[0].speak(do="stop", n=1)
         async with opened(port) as page:
             times = await time_stops(cell, page, stops)
         for what, values in zip(("stop is told", "arm is at rest"), zip(*times, strict=True), strict=True):
