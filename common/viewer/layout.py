@@ -11,6 +11,7 @@ from pydantic import Field
 
 from common.config import Section, check, config_root, read_yaml
 from common.control.record_file import lasting_folder
+from common.errors import ConfigError
 from common.viewer.taught import write_whole
 
 FILE = "viewer.yaml"
@@ -54,17 +55,28 @@ def layout_file(given: str) -> Path:
     return Path(given).expanduser() if given else lasting_folder() / FILE
 
 
+def _own_layout() -> Path | None:
+    """This user's file, if there is one and a folder for it: a container's user may have no home."""
+    try:
+        path = layout_file("")
+        return path if path.is_file() else None
+    except (ConfigError, OSError):
+        return None
+
+
 def load_layout(given: str) -> Layout:
     """The layout in a file; without one this user's own, else the project's.
 
     Raises:
         ConfigError: the file that was given is not there, does not parse, or names something unknown.
     """
-    path = layout_file(given)
-    if not given and not path.is_file():
-        path = config_root() / FILE
-        if not path.is_file():
+    if given:
+        path = layout_file(given)
+    else:
+        own, path = _own_layout(), config_root() / FILE
+        if own is None and not path.is_file():
             return Layout()
+        path = own or path
     return check(Layout, read_yaml(path), str(path))
 
 

@@ -42,7 +42,7 @@ class TaughtPanel:
         try:
             self._file = taught_file(cell)
             self._taught = load_taught(self._file)
-        except ZencellError as error:
+        except (ZencellError, OSError) as error:
             self._taught, self._problem = Taught(), str(error)
         name = gui.add_text("Name", "", hint="of the pose to teach or to forget")
         row = gui.add_text("Waypoints", "", hint="names of taught poses with commas between them: a, b, a")

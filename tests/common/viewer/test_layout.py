@@ -6,6 +6,7 @@ import pytest
 
 from common.application import find_application
 from common.config import config_root
+from common.control.record_file import lasting_folder
 from common.errors import ConfigError
 from common.viewer.layers import find_layers, layers_shown
 from common.viewer.layout import TABS, Layout, Viewpoint, load_layout, save_layout
@@ -16,6 +17,21 @@ def test_layout_of_the_project_can_be_read_and_has_every_panel() -> None:
     assert set(layout.tabs) == set(TABS)
     assert set(layout.viewpoints) == {"panda", "ur5"}
     assert layers_shown(layout.layers, find_layers(find_application("outlining")))["robot"]
+
+
+def test_layout_that_is_saved_is_the_users_own_and_the_projects_stays_as_it_is(tmp_path: Path) -> None:
+    before = (config_root() / "viewer.yaml").read_text()
+    path = save_layout("", Layout(dark=False))
+    assert path.is_relative_to(lasting_folder()) and not load_layout("").dark
+    assert (config_root() / "viewer.yaml").read_text() == before
+
+
+def test_without_a_home_the_projects_layout_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("XDG_STATE_HOME")
+    monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("none")))
+    assert set(load_layout("").viewpoints) == {"panda", "ur5"}
+    with pytest.raises(ConfigError, match="has no home"):
+        save_layout("", Layout())
 
 
 def test_saved_layout_reads_back(tmp_path: Path) -> None:
