@@ -20,6 +20,7 @@ from common.viewer.console import Desk
 from common.viewer.doors import Doors
 from common.viewer.line import Holder
 from common.viewer.markup import block, hold, live, text
+from common.viewer.plots import short_names
 
 UNANSWERED = 1.0  # [s] of asking in vain, after which that is told
 OTHERS = 0.5  # [s] after the last word of a page, in which no other one jogs
@@ -151,8 +152,8 @@ class JogPanel:
 
     def _pad(self) -> str:
         if self._mode == JOINTS:
-            rows = [self._row(name.rpartition("_")[2], f"joint:{name}", f"joint {name}", f"j:{name}")
-                    for name in self._joints]
+            rows = [self._row(short, f"joint:{name}", f"joint {name}", f"j:{name}")
+                    for name, short in zip(self._joints, short_names(self._joints), strict=True)]
         else:
             frame = FRAMES[self._mode]
             rows = [self._row(axis.upper(), f"move:{frame}:{axis}", f"tool along {axis}", f"p:{axis}") for axis in AXES]

@@ -50,7 +50,7 @@ class PlotPanel:
         self._latencies: deque[tuple[float, float]] = deque()
         none = np.full(2, np.nan)
         x = np.array([-SECONDS, 0.0])
-        names = _short(limits.names)
+        names = short_names(limits.names)
         joints = (x, *(none for _ in names))
         self._positions = _plot(gui, joints, names, "Position, % of the way between the limits", (-105.0, 105.0))
         self._speeds = _plot(gui, joints, names, "Speed, % of the limit", (-105.0, 105.0))
@@ -112,7 +112,7 @@ class PlotPanel:
                 self._figures.content = content
 
 
-def _short(joints: Sequence[str]) -> list[str]:
+def short_names(joints: Sequence[str]) -> list[str]:
     """Names without what all of them begin with, as joint1 of arm_joint1, or end with, as elbow of elbow_joint."""
     first = joints[0].partition("_")[0] + "_"
     shared = first if len(joints) > 1 and all(name.startswith(first) for name in joints) else ""
