@@ -32,6 +32,7 @@ from cli import (
     report,
     robot,
     router,
+    scene,
     secure,
     simulate,
     tf,
@@ -117,6 +118,7 @@ app.add_typer(tf.app, name="tf")
 app.command()(graph.graph)
 app.add_typer(commands.task, name="task")
 app.add_typer(commands.world, name="world")
+app.add_typer(scene.app, name="scene")
 of_applications.take_all()
 app.add_typer(robot.app, name="robot")
 app.add_typer(calibrate.app, name="calibrate")

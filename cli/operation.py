@@ -212,7 +212,7 @@ class Operation:
 
         What is simulated stays as it is through restarts, until the end; what persons decided outlives that.
         """
-        from common.control.record_file import lasting_folder
+        from common.kept_file import lasting_folder
         from common.sim.standing import STANDING_VARIABLE, STATE_VARIABLE
         from common.transport.endpoint import DEFAULT_DOMAIN
 

@@ -90,6 +90,18 @@ def number(option: str, text: str) -> float:
     return value
 
 
+def numbers(option: str, text: str, count: int | None = None) -> list[float]:
+    """The numbers that a text says, apart by commas.
+
+    Raises:
+        ConfigError: one is none, or there are others than `count`.
+    """
+    parts = text.split(",")
+    if count is not None and len(parts) != count:
+        raise ConfigError(option, text, f"must be {count} numbers apart by commas")
+    return [number(option, part) for part in parts]
+
+
 def whole(option: str, text: str | None, least: int) -> int | None:
     """The whole number that a text says; None when nothing was said.
 

@@ -123,6 +123,8 @@ GRIPPER_COMMAND = Request("gripper/command", m.GripperCommand, m.GripperState,
                           "move the fingers; the result appears on gripper/state")
 ROBOT_COMMAND = Request("robot/command", m.RobotCommand, m.RobotStatus,
                         "enable, recover, freedrive, payload, output: what the arm's own controller does beside motion")
+SCENE_EDIT = Request("scene/edit", m.SceneEdit, m.SceneEditReply,
+                     "add a solid that nobody perceives to the planning scene, or remove it")
 WORLD_EDIT = Request("world/edit", m.WorldEdit, m.WorldEditReply, "add, move, remove, reset; simulated hardware only")
 TASK_COMMAND = Request("task/command", m.TaskCommand, m.TaskStatus, "start, pause, resume or stop the task")
 PARAMETERS = Request("param/<service>", m.ParameterRequest, m.ParameterReply,

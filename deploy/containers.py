@@ -11,7 +11,7 @@ from common.sim.standing import STATE_VARIABLE
 IMAGE = "zencell"
 ROUTER, ROUTER_PORT = "router", 7447
 VIEWER, VIEWER_PORT = "viewer", 8080
-EXECUTOR = "trajectory_executor"
+KEEPERS = ("trajectory_executor", "scene_manager", "outline_scene")  # of what persons decided, and what is simulated
 CONFIG = "/app/config"
 DATA = "/data"
 # A container's port is published to the loopback of its host only.
@@ -49,7 +49,7 @@ def router() -> Container:
 def containers_of(file: str, cell: Cell) -> list[Container]:
     """The services of a cell, in start order."""
     environment = {"ZENCELL_CONNECT": f"tcp/{ROUTER}:{ROUTER_PORT}", "ZENCELL_CELL": file, KEPT_VARIABLE: DATA}
-    kept = {EXECUTOR: {STATE_VARIABLE: DATA}}  # started again, it finds what it simulates as it was
+    kept = {kind: {STATE_VARIABLE: DATA} for kind in KEEPERS}  # started again, they find it as it was
     return [
         Container(
             entry.name, ["python", "-m", entry.module, *entry.name_option], environment | kept.get(entry.kind, {}),

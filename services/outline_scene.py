@@ -14,6 +14,7 @@ from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Image
 from common.perception.image import ImageError, image_to_array
 from common.perception.intake import Cameras, LeftOut, Unusable
+from common.process.planning_scene import SceneWriter
 from common.process.service import main
 from common.scene.home import HomeWatch
 from common.transport.bus import Bus
@@ -35,12 +36,12 @@ async def run(bus: Bus, config: Config) -> None:
     infos = bus.reader(topics.DEPTH_CAMERA_INFO)
     statics = bus.reader(topics.TF_STATIC)
     joints = bus.reader(topics.JOINT_STATES)
-    out = bus.writer(topics.PLANNING_SCENE)
+    out = SceneWriter(bus)
     home = HomeWatch(config.robot.named_poses["home"])
     cameras = Cameras()
     kept: deque[Image] = deque(maxlen=KEPT)
     left_out = LeftOut(bus.log, "a picture")
-    out.put(planning_scene(config.world, [], 0))
+    await out.begin(planning_scene(config.world, [], 0))
     await bus.ready()
 
     async def watch_arm() -> None:

@@ -14,6 +14,7 @@ from common.applications.pick_place.tracks import SceneParameters
 from common.applications.pick_place.views import Seen, Views, ViewsParameters
 from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError
+from common.process.planning_scene import SceneWriter
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.home import HomeWatch
@@ -34,13 +35,13 @@ async def run(bus: Bus, config: Config) -> None:
     views = Views(bus, config.views, bus.log)
     joints = bus.reader(topics.JOINT_STATES)
     gripper = bus.reader(topics.GRIPPER_STATE)
-    out = bus.writer(topics.PLANNING_SCENE)
+    out = SceneWriter(bus)
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: scene_manager needs a robot with one")
     home = HomeWatch(config.robot.named_poses["home"]) if config.only_at_home else None
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
-    out.put(scene.scene())
+    await out.begin(scene.scene())
     await bus.ready()
 
     def hand() -> NDArray[np.float64] | None:

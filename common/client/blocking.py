@@ -17,13 +17,14 @@ import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from typing import Any, TypeVar
 
-from common.client import arm, cell, hearing, parameters, task
+from common.client import arm, cell, hearing, parameters, scene, task
 from common.errors import ZencellError
 
 T = TypeVar("T")
 
 ENDS = 5.0  # [s] in which what was begun has ended
-WRAPPED = (arm.Arm, arm.Hand, hearing.Camera, parameters.Parameters, task.TaskControl, cell.World)
+WRAPPED = (arm.Arm, arm.Hand, hearing.Camera, parameters.Parameters, task.TaskControl, scene.Scene,
+           cell.World)
 
 
 class Loop:

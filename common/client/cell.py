@@ -18,6 +18,7 @@ from common.client.arm import Arm, Hand
 from common.client.hearing import Camera, Carried, Ear, Frames, NothingHeard, cameras, messages, the_camera, topic_in
 from common.client.joining import cell_clock, joined, person
 from common.client.parameters import Parameters
+from common.client.scene import Scene
 from common.client.starting import Started
 from common.client.task import TaskControl
 from common.config import check
@@ -77,6 +78,7 @@ class Cell:
         gripper: the fingers or cup.
         task: start, pause, resume, stop, and how far it is.
         param: parameters of the services by path.
+        scene: solids that motion keeps away from though nobody perceives them.
         world: the simulated world.
         bus: what all of this stands on.
     """
@@ -85,6 +87,7 @@ class Cell:
     gripper: Hand
     task: TaskControl
     param: Parameters
+    scene: Scene
     world: World
 
     def __init__(
@@ -152,6 +155,7 @@ class Cell:
         self.gripper = Hand(self._ear, self.owner, self.arm)
         self.task = TaskControl(self._ear, self.owner, self._application)
         self.param = Parameters(bus)
+        self.scene = Scene(self._ear, self.owner)
         self.world = World(bus, self._ear)
 
     async def __aenter__(self) -> Cell:
@@ -223,7 +227,7 @@ class Cell:
         return Camera(await the_camera(self.bus, name), self._ear, self.tf)
 
     async def planning_scene(self) -> PlanningScene:
-        """What planners avoid: fixtures, and what was perceived."""
+        """What planners avoid: fixtures, what was perceived, and what persons added."""
         return await self._ear.now(topics.PLANNING_SCENE)
 
     async def objects(self, least: int = 0, *, timeout: float = TIMEOUT) -> list[CollisionObject]:

@@ -96,7 +96,7 @@ def goal_of(to: Where, *, via: Point | None = None, around: Point | None = None)
         return check(JointGoal, {"named": to}, "to")
     if isinstance(to, Pose):
         return PoseGoal(pose=to)
-    values = _numbers("to", to)
+    values = array_of("to", to)
     if values.shape == (4, 4):
         return PoseGoal(pose=_pose(values))
     if values.ndim == 1 and values.size:
@@ -104,7 +104,12 @@ def goal_of(to: Where, *, via: Point | None = None, around: Point | None = None)
     raise ConfigError("to", to, SAYS)
 
 
-def _numbers(name: str, given: object) -> Array:
+def array_of(name: str, given: object) -> Array:
+    """Finite numbers, of any shape.
+
+    Raises:
+        ConfigError: it is something else.
+    """
     try:
         values = np.array(given, dtype=float)
     except (TypeError, ValueError):
@@ -114,15 +119,22 @@ def _numbers(name: str, given: object) -> Array:
     return values
 
 
-def _pose(at: Any) -> Pose:
+def _pose(at: Any, name: str = "to") -> Pose:
     if isinstance(at, Pose):
         return at
-    T = _numbers("to", at)
+    T = array_of(name, at)
     if T.shape != (4, 4):
-        raise ConfigError("to", at, "must be a pose here: a matrix (4, 4) or `Pose`")
+        raise ConfigError(name, at, "must be a pose here: a matrix (4, 4) or `Pose`")
     if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) or np.linalg.det(T[:3, :3]) < 0:
-        raise ConfigError("to", at, "has no rotation in its first three rows and columns")
-    return check(Pose, pose_fields(T), "to")
+        raise ConfigError(name, at, "has no rotation in its first three rows and columns")
+    return check(Pose, pose_fields(T), name)
+
+
+def place(name: str, at: Pose | Point) -> Pose:
+    """The pose that a pose, a matrix (4, 4) or a point (3,) [m] says: turned like world where nothing else is said."""
+    if isinstance(at, Pose) or array_of(name, at).shape != (3,):
+        return _pose(at, name)
+    return Pose(position=_vector(name, at))
 
 
 def numbers(name: str, given: object) -> Array:
@@ -131,7 +143,7 @@ def numbers(name: str, given: object) -> Array:
     Raises:
         ConfigError: it is something else.
     """
-    values = _numbers(name, given)
+    values = array_of(name, given)
     if values.shape != (3,):
         raise ConfigError(name, given, "must be three numbers")
     return values

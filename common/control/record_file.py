@@ -1,49 +1,23 @@
-"""The file in which what persons decided outlives the executor, the supervisor and the machine."""
+"""The file in which what persons decided about motion outlives the executor, the supervisor and the machine."""
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import os
-import stat
 from collections.abc import Mapping
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from common.control.inhibits import Record, damaged
 from common.errors import ConfigError
+from common.kept_file import KeptFile, Unreadable, lasting_folder
 from common.sim.standing import STATE_VARIABLE
 
-LARGEST = 1_000_000  # [bytes]
-ROOM = 128 * 1024  # [bytes] that each file takes: more than the largest record there can be
 
-
-def lasting_folder(environ: Mapping[str, str] = os.environ) -> Path:
-    """The folder for what is kept: ZENCELL_STATE, else one in the person's home.
-
-    Raises:
-        ConfigError: there is no home.
-    """
-    if told := environ.get(STATE_VARIABLE):
-        return Path(told)
-    try:
-        return Path(environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "zencell"
-    except RuntimeError:
-        raise ConfigError(STATE_VARIABLE, ..., "must name a folder to keep stops in: this user has no home") from None
-
-
-class RecordFile:
-    """A record that is always whole: a new file takes the place of the old one, which is the next new one.
-
-    Both have room for any record from the start: a disk that becomes full later still takes what is decided.
-    """
+class RecordFile(KeptFile[Record]):
+    """What is to be known before the robot moves: a file that cannot be read keeps it from moving."""
 
     def __init__(self, path: Path) -> None:
         """Use this file, which need not be there yet."""
-        self.path = path
-        self._new = path.with_name(f"{path.name}.new")
-        self._last = path.with_name(f"{path.name}.last")  # second name of the old file while it is replaced
+        super().__init__(path, Record)
 
     def require_writable(self) -> None:
         """Return when the file can be written, from now on also on a disk that is full.
@@ -56,7 +30,7 @@ class RecordFile:
             record, problem = self.load()
             if not problem:  # else it stays to be looked at
                 self.save(record)
-            self._write(record)
+            self.make_room(record)
         except OSError as error:
             told = f"cannot be written ({error.strerror or error}): stops and holds would not outlive a restart"
             raise ConfigError(STATE_VARIABLE, str(self.path.parent), told) from None
@@ -64,60 +38,9 @@ class RecordFile:
     def load(self) -> tuple[Record, str]:
         """The record, and what is wrong with the file: then the record is one that keeps the robot from moving."""
         try:
-            return Record.model_validate_json(self._text()), ""
-        except FileNotFoundError as error:
-            if not self.path.is_symlink():
-                return Record(), ""
-            why = f"it is a link to nothing ({error.strerror})"
-        except OSError as error:
-            why = error.strerror or str(error)
-        except ValidationError:
-            why = "it is damaged, or of another version"
-        return damaged(f"{self.path}: {why}"), f"{self.path} cannot be read: {why}"
-
-    def _text(self) -> bytes:
-        descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe would have us wait for a writer
-        with open(descriptor, "rb") as file:
-            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise OSError(errno.EINVAL, "it is not a regular file")
-            return file.read(LARGEST)
-
-    def save(self, record: Record) -> None:
-        """Write a record so that it is there, or the one before it, whatever happens to the machine.
-
-        Raises:
-            OSError: it could not be written.
-        """
-        self._write(record)
-        self._last.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # there is none yet, or no second names: then the next one needs new room
-            os.link(self.path, self._last, follow_symlinks=False)
-        self._new.replace(self.path)
-        with contextlib.suppress(FileNotFoundError):
-            self._last.replace(self._new)
-        folder = os.open(self.path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-
-    def _write(self, record: Record) -> None:
-        """Write the new file, over what it holds: a file that is made shorter gives its room away."""
-        with contextlib.suppress(FileNotFoundError):
-            if not os.path.lexists(self._new):
-                self._last.replace(self._new)  # we were ended between the two
-            found = self._new.lstat()
-            if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
-                self._new.unlink()  # writing over it would change something else
-        left = record.model_dump_json(indent=1).encode().ljust(ROOM - 1) + b"\n"
-        descriptor = os.open(self._new, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, 0o600)
-        try:
-            while left:
-                left = left[os.write(descriptor, left):]
-            os.ftruncate(descriptor, os.lseek(descriptor, 0, os.SEEK_CUR))
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+            return self.read(), ""
+        except Unreadable as error:
+            return damaged(f"{error.path}: {error.why}"), str(error)
 
 
 def record_file(cell: str, environ: Mapping[str, str] = os.environ) -> RecordFile:

@@ -55,7 +55,7 @@ from common.messages.processes import (
     SupervisorStatus,
 )
 from common.messages.robot import JointState, JointTrajectory, JointTrajectoryPoint, RobotDescription
-from common.messages.scene import AttachedObject, CollisionObject, PlanningScene
+from common.messages.scene import AttachedObject, CollisionObject, PlanningScene, SceneEdit, SceneEditReply
 from common.messages.task import PlanFigure, TaskCommand, TaskStatus
 from common.messages.world import SceneUpdate, WorldEdit, WorldEditReply, WorldObject, WorldObjects
 from common.moved import moved_to_applications

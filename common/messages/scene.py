@@ -6,10 +6,21 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from common.messages.basics import Header, Label, Message, Name, Positive
+from common.messages.basics import SMALL, Header, Label, Message, Name, Positive
 from common.messages.geometry import Color, Corners, Pose
 
 Pairs = Annotated[list[tuple[Label, Label]], Field(max_length=2000)]
+
+
+Side = Annotated[float, Field(ge=0.001, le=10)]  # [m] of what a person says is there
+FARTHEST = 10.0  # [m] along each axis from the origin of world, of what a person says is there
+MOST_ADDED = 50
+_DIMENSIONS = {"box": 3, "sphere": 1, "cylinder": 2, "prism": 1}
+
+
+def _require_dimensions(shape: str, dimensions: list[float]) -> None:
+    if len(dimensions) != _DIMENSIONS[shape]:
+        raise ValueError(f"a {shape} has {_DIMENSIONS[shape]} dimensions, not {len(dimensions)}")
 
 
 class CollisionObject(Message):
@@ -36,11 +47,9 @@ class CollisionObject(Message):
 
     @model_validator(mode="after")
     def _dimensions_fit_shape(self) -> CollisionObject:
-        wanted = {"box": 3, "sphere": 1, "cylinder": 2, "prism": 1}[self.shape]
         if (self.shape == "prism") != (len(self.outline) >= 3):
             raise ValueError(f"a {self.shape} has {len(self.outline)} points of an outline")
-        if len(self.dimensions) != wanted:
-            raise ValueError(f"a {self.shape} has {wanted} dimensions, not {len(self.dimensions)}")
+        _require_dimensions(self.shape, self.dimensions)
         return self
 
 
@@ -61,3 +70,44 @@ class PlanningScene(Message):
     objects: list[CollisionObject] = Field([], max_length=500)
     attached: list[AttachedObject] = Field([], max_length=50)
     allowed_collisions: Pairs = Field([], description="pairs of link or object names that may touch")
+
+
+class SceneEdit(Message):
+    """Add a solid that nobody perceives to the planning scene, or remove one that was added.
+
+    `id` is a name of one's own: in the scene it stands as `added/NAME`, which nothing else is called.
+    """
+
+    most_bytes: ClassVar[int] = SMALL
+
+    op: Literal["add", "remove"]
+    id: Annotated[Name, Field(max_length=100)]
+    shape: Literal["box", "sphere", "cylinder"] | None = None
+    dimensions: list[Side] = Field([], max_length=3, description="as of a CollisionObject [m]")
+    pose: Pose | None = Field(None, description="in world, at most 10 m from its origin along each axis")
+    color: Color = Color(r=0.9, g=0.6, b=0.1, a=0.8)
+    owner: Label = Field("", description="who says so")
+
+    @model_validator(mode="after")
+    def _says_what_is_added(self) -> SceneEdit:
+        if self.op == "remove":
+            return self
+        if self.shape is None:
+            raise ValueError("what is added has a shape: box, sphere or cylinder")
+        _require_dimensions(self.shape, self.dimensions)
+        if self.pose is None:
+            raise ValueError("what is added has a pose")
+        at = self.pose.position
+        for axis, value in (("x", at.x), ("y", at.y), ("z", at.z)):
+            if abs(value) > FARTHEST:
+                raise ValueError(f"pose.position.{axis} {value:g} is farther than {FARTHEST:g} m from the origin")
+        return self
+
+
+class SceneEditReply(Message):
+    """The id of the solid in the planning scene, and those of all that were added."""
+
+    most_bytes: ClassVar[int] = SMALL
+
+    id: Name
+    ids: list[Name] = Field(max_length=MOST_ADDED)

@@ -13,6 +13,7 @@ from common.applications.outlining.topics import CONTOUR_PATH
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import Header, Pose, Vector3, WorldObject
 from common.process.pace import Pace
+from common.process.planning_scene import SceneWriter
 from common.scene.home import HomeWatch
 from common.transport.bus import Bus
 
@@ -46,9 +47,9 @@ def path(solid: PerceivedSolid, points: int, header: Header) -> OutlinePoints:
 async def run(bus: Bus, config: Config) -> None:
     """While the arm is at home, tell of all that stands there, and of the first one's outline."""
     truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
-    paths, out = bus.writer(CONTOUR_PATH), bus.writer(topics.PLANNING_SCENE)
+    paths, out = bus.writer(CONTOUR_PATH), SceneWriter(bus)
     home = HomeWatch(config.robot.named_poses["home"])
-    out.put(planning_scene(config.world, [], 0))
+    await out.begin(planning_scene(config.world, [], 0))
     await bus.ready()
     pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, 30.0))
     while True:

@@ -13,6 +13,7 @@ from common.errors import ConfigError
 from common.messages import Header, Marker, MarkerArray, Pose, PoseArray, Vector3, WorldObject
 from common.perception.pinhole import Pinhole
 from common.process.pace import Pace
+from common.process.planning_scene import SceneWriter
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 
@@ -39,12 +40,12 @@ async def run(bus: Bus, config: Config) -> None:
     """Keep the planning scene as `scene_manager` does, and offer all that lies on the table to the task."""
     truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
     gripper = bus.reader(topics.GRIPPER_STATE)
-    validated, out = bus.writer(VALIDATED_TARGETS), bus.writer(topics.PLANNING_SCENE)
+    validated, out = bus.writer(VALIDATED_TARGETS), SceneWriter(bus)
     robot, camera = RobotModel.load(config.robot), Pinhole.from_config(config.world.camera)
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: what takes objects needs one")
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
-    out.put(scene.scene())
+    await out.begin(scene.scene())
     await bus.ready()
     pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, 50.0))
     while True:

@@ -15,8 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.control.inhibits import MOST, MOST_GOALS, SLOWEST, Inhibits, Record, Speed, speed_of
-from common.control.record_file import RecordFile, lasting_folder, record_file
+from common.control.record_file import RecordFile, record_file
 from common.errors import ConfigError
+from common.kept_file import lasting_folder
 from common.messages import HoldRequest, MotionStatus, StopRequest
 
 T0 = 1_700_000_000_000_000_000

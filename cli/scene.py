@@ -1,0 +1,69 @@
+"""Solids of the planning scene that nobody perceives: a person says that they are there."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, cast
+
+import typer
+
+from cli import options
+from common.terminal import echo
+
+app = typer.Typer(help="Add solids that motion keeps away from though nobody perceives them.", no_args_is_help=True)
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="of your own; in the scene it is added/NAME")]
+
+
+@app.callback()
+def scene() -> None:
+    """Add solids that motion keeps away from though nobody perceives them."""
+
+
+@app.command("list")
+def list_(
+    cell: options.CellName = None, as_json: options.Json = False, domain: options.Domain = None,
+    connect: options.Connect = None,
+) -> None:
+    """List what was added; `zencell topic echo planning_scene` has all that motion keeps away from."""
+    from cli.inspection import in_cell
+    from cli.schema import to_json
+
+    for solid in in_cell(lambda joined: joined.scene.objects(), cell, domain, connect):
+        at, sides = solid.pose.position, " x ".join(f"{side:g}" for side in solid.dimensions)
+        echo(to_json(solid.model_dump()) if as_json else
+             f"{solid.id}  {solid.shape} {sides} m at {at.x:g}, {at.y:g}, {at.z:g}")
+
+
+@app.command(context_settings={"ignore_unknown_options": True})  # -0.2 is a coordinate, not an option
+def add(
+    name: Name,
+    shape: Annotated[str, typer.Argument(metavar="SHAPE", help="box, sphere or cylinder")],
+    size: Annotated[str, typer.Argument(
+        metavar="SIZE", help="X,Y,Z of a box; radius of a sphere; radius,length of a cylinder [m]")],
+    at: Annotated[str, typer.Argument(metavar="X,Y,Z", help="its middle in world [m]")],
+    rpy: Annotated[str, typer.Option("--rpy", metavar="R,P,Y", help="roll, pitch, yaw [rad]")] = "0,0,0",
+    color: Annotated[str, typer.Option("--color", metavar="R,G,B", help="0 to 1 each")] = "",
+    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+) -> None:
+    """Add a solid, until it is removed: it stays through restarts. An arm on its way into it brakes."""
+    from cli.inspection import in_cell
+    from common.client.goals import pose
+
+    x, y, z = options.numbers("X,Y,Z", at, 3)
+    asked: dict[str, Any] = {"at": pose(x, y, z, rpy=options.numbers("--rpy", rpy, 3))}
+    if color:
+        asked["color"] = options.numbers("--color", color, 3)
+    kind = cast(Literal["box", "sphere", "cylinder"], shape)
+    dimensions = options.numbers("SIZE", size)
+    echo(in_cell(lambda joined: joined.scene.add(name, kind, dimensions, **asked), cell, domain, connect))
+
+
+@app.command()
+def remove(
+    name: Name, cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
+) -> None:
+    """Take out what was added, by whomever."""
+    from cli.inspection import in_cell
+
+    left = in_cell(lambda joined: joined.scene.remove(name), cell, domain, connect)
+    echo(f"still added: {', '.join(left) or 'nothing'}")

@@ -1,0 +1,109 @@
+"""Solids that a person adds, in a whole cell on the virtual clock."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from common import topics
+from common.client.cell import Cell
+from common.client.goals import pose
+from common.errors import ConfigError, RemoteError
+from common.process.operator_motion import MotionFailed
+from common.transport.bus import Bus
+from tests.client.test_cell import Over
+from tests.harness import until
+from tests.simulated.test_inhibits import again
+from tests.simulated.visited import SimulatedCell
+
+pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
+
+LEFT, RIGHT = pose(0.45, 0.25, 0.35), pose(0.45, -0.25, 0.35)
+WALL = ("box", (0.3, 0.02, 0.7))  # between them
+
+
+
+def test_added_solid_is_planned_around_outlives_the_keeper_of_the_scene_and_is_gone_when_it_is_removed() -> None:
+    async def visit(simulated: SimulatedCell, bus: Bus) -> None:
+        async with Cell.on(bus, owner="anna") as cell:
+            await cell.arm.move(LEFT)
+            free = await cell.arm.plan(RIGHT, straight=True)
+            assert free.duration > 0
+            assert await cell.scene.add("wall", *WALL, at=(0.45, 0.0, 0.35)) == "added/wall"
+            assert await cell.scene.add("wall", *WALL, at=(0.45, 0.0, 0.35)) == "added/wall", "said again"
+            (wall,) = await cell.scene.objects()
+            assert (wall.id, wall.shape, wall.dimensions, wall.pose.position.x) == ("added/wall", *WALL[:1],
+                                                                                   list(WALL[1]), 0.45)
+            assert "added/wall" not in [thing.id for thing in await cell.objects()], "it is not perceived"
+            with pytest.raises(MotionFailed, match="added/wall"):
+                await cell.arm.plan(RIGHT, straight=True)
+            with pytest.raises(MotionFailed, match="added/wall"):
+                await cell.arm.plan(pose(0.45, 0.0, 0.35))
+            with pytest.raises(RemoteError, match="is another solid"):
+                await cell.scene.add("wall", *WALL, at=(0.5, 0.0, 0.35))
+
+            await again(simulated, bus, "scene_manager")
+            assert [thing.id for thing in await cell.scene.objects()] == ["added/wall"]
+            with pytest.raises(MotionFailed, match="added/wall"):
+                await cell.arm.plan(RIGHT, straight=True)
+            around = await cell.arm.plan(RIGHT)
+            assert around.duration > free.duration
+            await cell.arm.execute(around)
+
+            assert await cell.scene.remove("wall") == [] == await cell.scene.objects()
+            await cell.arm.move("home")
+            await cell.arm.move(LEFT)
+            await cell.arm.move(RIGHT, straight=True)
+            with pytest.raises(RemoteError, match="nothing was added as added/wall; there are: none"):
+                await cell.scene.remove("wall")
+        raise Over
+
+    with pytest.raises(Over):
+        SimulatedCell("panda", ["autostart=false", "world.count=1"], visit=visit)
+
+
+def test_solid_that_is_added_in_the_way_of_a_motion_has_the_arm_brake_until_it_is_removed() -> None:
+    async def visit(simulated: SimulatedCell, bus: Bus) -> None:
+        motion = bus.reader(topics.MOTION_STATUS)
+        async with Cell.on(bus, owner="anna") as cell:
+            await cell.arm.move(LEFT)
+            moving = asyncio.create_task(cell.arm.move(RIGHT, straight=True, speed=0.2))
+            await until(motion, lambda m: m.state == "active" and m.progress > 0.02)
+            await cell.scene.add("wall", *WALL, at=(0.45, -0.1, 0.35))
+            held = await until(motion, lambda m: "scene_monitor" in m.held_by and m.message.startswith("held"), 2.0)
+            assert "added/wall is in the way of" in held.message
+            await cell.scene.remove("wall")
+            assert (await moving).state == "succeeded"
+        raise Over
+
+    with pytest.raises(Over):
+        SimulatedCell("panda", ["autostart=false", "world.count=1"], visit=visit)
+
+
+def test_what_is_no_solid_is_told_in_one_line_and_nothing_is_added() -> None:
+    async def visit(simulated: SimulatedCell, bus: Bus) -> None:
+        async with Cell.on(bus) as cell:
+            for name, shape, dimensions, at, words in (
+                ("a", "mesh", (1,), (0, 0, 0), "shape"), ("a", "box", (1,), (0, 0, 0), "3 dimensions"),
+                ("a", "box", "big", (0, 0, 0), "dimensions: 'big' must be numbers"),
+                ("a", "sphere", (0,), (0, 0, 0), "0.001"),
+                ("a", "sphere", (1,), (0, 11, 0), "position.y 11"), ("a", "sphere", (1,), "here", "at: 'here'"),
+                ("", "sphere", (1,), (0, 0, 0), "id"), ("a", "sphere", (np.nan,), (0, 0, 0), "finite"),
+                ("a", "sphere", (1,), 2 * np.eye(4), "at"),
+            ):
+                with pytest.raises(ConfigError, match=words) as told:
+                    await cell.scene.add(name, shape, dimensions, at)  # type: ignore[arg-type]
+                assert "\n" not in str(told.value)
+            with pytest.raises(ConfigError, match="color"):
+                await cell.scene.add("a", "sphere", (1,), (0, 0, 0), color=(2, 0, 0))
+            assert await cell.scene.objects() == []
+            await cell.scene.add("a", "sphere", (0.05,), (0.0, 0.6, 0.8))
+            scenes = bus.reader(topics.PLANNING_SCENE)
+            seen = await until(scenes, lambda scene: any(thing.role == "target" for thing in scene.objects))
+            assert "added/a" in [thing.id for thing in seen.objects], "what is perceived does not remove it"
+        raise Over
+
+    with pytest.raises(Over):
+        SimulatedCell("ur5", ["autostart=false"], visit=visit)
