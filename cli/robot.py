@@ -207,11 +207,10 @@ def jog(
 ) -> None:
     """Move the arm by hand for a while: at most 0.25 m/s, and it stands 0.2 s after Ctrl-C or the end of this."""
     from cli.inspection import in_cell
-    from common.client.arm import LONGEST_JOG
+    from common.client.arm import check_seconds
 
     duration = options.number("--seconds", seconds)
-    if not 0 < duration <= LONGEST_JOG:
-        raise ConfigError("--seconds", seconds, f"must be more than 0 and at most {LONGEST_JOG:g} s")
+    check_seconds(duration, "--seconds")
     if not (joint or linear or angular):
         raise ConfigError("jog", ..., "needs --joint NAME=V, --linear X,Y,Z or --angular X,Y,Z")
     joints = {}

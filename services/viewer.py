@@ -9,8 +9,8 @@ import viser
 from pydantic import Field
 
 from common.application import find_application
+from common.client.operator_motion import OperatorMotion
 from common.config import Members, Parameters, RobotConfig, Run, Surroundings
-from common.process.operator_motion import OperatorMotion
 from common.process.service import main
 from common.transport.bus import Bus
 from common.transport.credentials import secure_folder

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from common.client.goals import Plan, any_of, pose, region, through
     from common.client.hearing import NothingHeard
     from common.client.joining import NothingUp
+    from common.client.operator_motion import MotionFailed
     from common.client.starting import NotStarted
     from common.errors import (
         ConfigError,
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
         ZencellError,
     )
     from common.messages import Pose
-    from common.process.operator_motion import MotionFailed
 
 _FROM = {  # imported when they are asked for: the command line starts without them
     "common.client.arm": ("NotJogged",),
@@ -48,7 +48,7 @@ _FROM = {  # imported when they are asked for: the command line starts without t
     "common.errors": ("ConfigError", "NoResponder", "RemoteError", "RequestFailed", "RequestLost", "RequestTimeout",
                       "UnknownName", "ZencellError"),
     "common.messages": ("Pose",),
-    "common.process.operator_motion": ("MotionFailed",),
+    "common.client.operator_motion": ("MotionFailed",),
 }
 _WHERE = {name: module for module, names in _FROM.items() for name in names}
 

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from common import topics
 from common.client.goals import Plan, Point, Through, Where, goal_of, numbers
 from common.client.hearing import Ear, NothingHeard
+from common.client.operator_motion import PATIENCE, MotionFailed, OperatorMotion
+from common.client.part import Part
 from common.config import check
 from common.errors import ConfigError, RequestLost, RequestTimeout, UnknownName, ZencellError
 from common.messages import (
@@ -31,7 +33,6 @@ from common.messages import (
     RobotStatus,
     StopRequest,
 )
-from common.process.operator_motion import PATIENCE, MotionFailed, OperatorMotion
 from common.sources import new_id
 
 Array = NDArray[np.float64]
@@ -58,16 +59,18 @@ class NotJogged(ZencellError):
                          "says more: zencell topic echo log/trajectory_executor")
 
 
-class Arm:
+class Arm(Part):
     """The arm. Lengths in metres, angles in radians; poses are (4, 4), of the tool centre point in world.
 
     Nothing moves while a task has the robot, or somebody else; whoever runs the program can always move what they
     stopped or hold themselves. A motion that is cancelled, also by Ctrl-C, is stopped.
     """
 
+    owner: str  # in whose name it is moved
+
     def __init__(self, ear: Ear, owner: str, tf: Callable[[str, str], Coroutine[Any, Any, Array]]) -> None:
         """The arm of a cell, moved in the name of `owner`."""
-        self.owner = owner
+        self._has(owner=owner)
         self._motion = OperatorMotion(ear.bus, owner=owner)
         self._ear, self._bus, self._tf = ear, ear.bus, tf
         self._moving: set[asyncio.Task[Any]] = set()  # what moves it in this program
@@ -130,6 +133,7 @@ class Arm:
 
         Raises:
             ConfigError: it is no goal.
+            UnknownName: nothing of that name is there to touch; with the choices.
             MotionFailed: there is no way; `code` says which kind of no, the line what is in the way.
             RequestFailed: the planner does not answer.
         """
@@ -139,6 +143,7 @@ class Arm:
             to = to.starting_at(await self.pose())
         goal = goal_of(to, via=via, around=around)
         if names := [touch] if isinstance(touch, str) else list(touch):
+            await self._require_there(names)
             pairs = [(link, name) for link in (await self.description()).fingers for name in names]
             more["allowed_collisions"] = [*more.get("allowed_collisions", ()), *pairs]
         planner = planner or (ARCS if isinstance(goal, ArcGoal) else "")
@@ -147,6 +152,13 @@ class Arm:
         if not response.ok or response.trajectory is None:
             raise MotionFailed(response.error, response.message)
         return Plan.of(response)
+
+    async def _require_there(self, names: Iterable[str]) -> None:
+        scene = await self._ear.now(topics.PLANNING_SCENE)
+        there = [thing.id for thing in scene.objects] + [held.object.id for held in scene.attached]
+        for name in names:
+            if name not in there:
+                raise UnknownName("object to touch", str(name), there)
 
     async def execute(self, plan: Plan, *, timeout: float = PATIENCE) -> MotionStatus:
         """Follow a plan to its end.
@@ -320,7 +332,7 @@ class Arm:
         return await self._bus.client(topics.ROBOT_COMMAND).call(asked, POWER)
 
 
-class Hand:
+class Hand(Part):
     """The fingers, or the suction cup, of which width 0 draws air in."""
 
     def __init__(self, ear: Ear, owner: str, arm: Arm) -> None:
@@ -383,14 +395,14 @@ class Hand:
         return await self.move(0.0, force, **more)
 
 
-def check_seconds(seconds: float) -> None:
-    """Return when an arm may be jogged for so long [s].
+def check_seconds(seconds: float, field: str = "seconds") -> None:
+    """Return when an arm may be jogged for so long [s], as was said in a field.
 
     Raises:
         ConfigError: it may not.
     """
     if not 0 < seconds <= LONGEST_JOG:
-        raise ConfigError("seconds", seconds, f"must be more than 0 and at most {LONGEST_JOG:g} s")
+        raise ConfigError(field, seconds, f"must be more than 0 and at most {LONGEST_JOG:g} s")
 
 
 def _asked(more: dict[str, Any], **given: Any) -> dict[str, Any]:

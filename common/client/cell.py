@@ -16,8 +16,9 @@ from common import topics
 from common.application import all_topics, find_topic
 from common.client.arm import Arm, Hand
 from common.client.hearing import Camera, Carried, Ear, Frames, NothingHeard, cameras, messages, the_camera, topic_in
-from common.client.joining import cell_clock, joined, person
+from common.client.joining import cell_clock, joined, person, supervisor_status
 from common.client.parameters import Parameters
+from common.client.part import Part
 from common.client.scene import Scene
 from common.client.starting import Started
 from common.client.task import TaskControl
@@ -37,7 +38,7 @@ def seen(scene: PlanningScene) -> list[CollisionObject]:
     return [each for each in scene.objects if each.role in ("target", "contained")]
 
 
-class World:
+class World(Part):
     """The simulated world; a real one is not changed by saying so."""
 
     def __init__(self, bus: Bus, ear: Ear) -> None:
@@ -70,10 +71,11 @@ class World:
         return (await self._ear.now(topics.SCENE_OBJECTS)).objects
 
 
-class Cell:
+class Cell(Part):
     """One work cell. Inside `async with` it is joined; many programs may be in one cell at the same time.
 
     Attributes:
+        owner: in whose name it is moved.
         arm: where it is, plans, motions, jogging.
         gripper: the fingers or cup.
         task: start, pause, resume, stop, and how far it is.
@@ -83,6 +85,7 @@ class Cell:
         bus: what all of this stands on.
     """
 
+    owner: str
     arm: Arm
     gripper: Hand
     task: TaskControl
@@ -109,7 +112,7 @@ class Cell:
         """
         self._where: dict[str, Any] = {"domain": domain, "connect": connect, "secure": secure, "remapped": remapped}
         self._name, self._application = name, application
-        self.owner = owner or person()
+        self._has(owner=owner or person())
         self._joined = contextlib.AsyncExitStack()
         self._started: Started | None = None
         self._bus: Bus | None = None
@@ -151,12 +154,11 @@ class Cell:
 
     def _take(self, bus: Bus) -> None:
         self._bus, self._ear = bus, Ear(bus)
-        self.arm = Arm(self._ear, self.owner, self.tf)
-        self.gripper = Hand(self._ear, self.owner, self.arm)
-        self.task = TaskControl(self._ear, self.owner, self._application)
-        self.param = Parameters(bus)
-        self.scene = Scene(self._ear, self.owner)
-        self.world = World(bus, self._ear)
+        arm = Arm(self._ear, self.owner, self.tf)
+        self._has(
+            arm=arm, gripper=Hand(self._ear, self.owner, arm),
+            task=TaskControl(self._ear, self.owner, self._application), param=Parameters(bus),
+            scene=Scene(self._ear, self.owner), world=World(bus, self._ear))
 
     async def __aenter__(self) -> Cell:
         if self._entered:
@@ -210,7 +212,10 @@ class Cell:
 
     async def services(self) -> SupervisorStatus:
         """All processes of the cell, its speed and seed, as its supervisor has them."""
-        return await self._ear.newest(topics.SUPERVISOR_STATUS)
+        status = await supervisor_status(self.bus)
+        if status is None:
+            raise NothingHeard(f"{self.name}/{topics.SUPERVISOR_STATUS.key}")
+        return status
 
     # --- what is seen ---------------------------------------------------------------------------------------------
 

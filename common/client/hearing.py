@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from common import topics
 from common.application import find_topic
+from common.client.part import Part
 from common.errors import DecodeError, RequestFailed, UnknownName, ZencellError
 from common.messages import CameraInfo, Header, Image, Message
 from common.perception.image import image_to_array
@@ -80,7 +81,8 @@ class Ear:
             NothingHeard: nobody has one.
         """
         found: list[M] = []
-        key = f"{self.bus.cell}/{self.reader(topic).topic.key}"
+        self.reader(topic)  # its message can be read from then on
+        key = self.bus.full_key(topic)
         for sample in await self.bus.raw_get(key, PATIENCE):
             with contextlib.suppress(DecodeError):
                 found.append(decode(topic.message, sample.payload))
@@ -190,12 +192,14 @@ class Frames:
         await asyncio.sleep(GATHER)
 
 
-class Camera:
+class Camera(Part):
     """One camera of a cell. Lengths are in metres, pictures are arrays of (height, width) and channels."""
+
+    name: str  # first part of its keys
 
     def __init__(self, name: str, ear: Ear, tf: Callable[[str, str], Coroutine[Any, Any, Array]]) -> None:
         """A camera by the first part of its keys."""
-        self.name = name
+        self._has(name=name)
         self._ear, self._tf = ear, tf
 
     async def image(self) -> NDArray[np.uint8]:

@@ -7,7 +7,7 @@ import contextlib
 import getpass
 import os
 import socket
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Iterable, Mapping
 
 from common import topics
 from common.clock import Clock
@@ -35,6 +35,15 @@ class NothingUp(RequestFailed):
         super().__init__(
             f"{what} at {endpoint}; is a cell up (`zencell up {first}`), and on this --domain or --connect?")
         self.endpoint = endpoint
+
+
+class SeveralUp(UnknownName):
+    """It is not clear which cell is meant."""
+
+    def __init__(self, cells: Iterable[str]) -> None:
+        super().__init__("cell", "", cells)
+        self.args = (f"several cells are up: name one, by Cell(NAME) or --cell NAME; choices: "
+                     f"{', '.join(self.choices)}",)
 
 
 def somebody_listens(endpoint: str) -> bool:
@@ -108,7 +117,7 @@ def _only(cells: set[str], endpoint: str) -> str:
     if not cells:
         raise NothingUp(endpoint, "there is a router and no service")
     if len(cells) > 1:
-        raise UnknownName("cell (name one with --cell)", "", cells)
+        raise SeveralUp(cells)
     return cells.pop()
 
 
@@ -119,7 +128,10 @@ async def alive(bus: Bus) -> list[tuple[str, str]]:
 
 
 async def supervisor_status(bus: Bus, cell: str = "") -> SupervisorStatus | None:
-    """What the supervisor of a cell, or of this one, says now; None without one, as in containers."""
+    """What the supervisor of a cell, or of this one, says now; None without one, as in containers.
+
+    There is one in a cell, whose key nobody renames.
+    """
     for sample in await bus.raw_get(f"{cell or bus.cell}/{topics.SUPERVISOR_STATUS.key}", ASK_TIMEOUT):
         try:
             return decode(SupervisorStatus, sample.payload)
@@ -140,7 +152,7 @@ async def cell_clock(bus: Bus) -> Clock:
 async def newest_heard(bus: Bus) -> int:
     """`since` of the newest stop or hold that can be known now: a start lets go of nothing later, 0 of nothing."""
     newest = 0
-    for sample in await bus.raw_get(f"{bus.cell}/{topics.MOTION_STATUS.key}", ASK_TIMEOUT):
+    for sample in await bus.raw_get(bus.full_key(topics.MOTION_STATUS), ASK_TIMEOUT):
         with contextlib.suppress(DecodeError):
             newest = max(newest, decode(MotionStatus, sample.payload).newest)
     return newest

@@ -11,6 +11,7 @@ from pydantic_core import to_jsonable_python
 
 from common import topics
 from common.client.joining import LOOK_TIMEOUT, person
+from common.client.part import Part
 from common.config import check
 from common.errors import NoResponder, RemoteError, RequestFailed, UnknownName, ZencellError
 from common.messages import Parameter, ParameterRequest
@@ -137,7 +138,7 @@ async def change(bus: Bus, values: Mapping[str, Any]) -> dict[str, tuple[Any, An
     return told
 
 
-class Parameters:
+class Parameters(Part):
     """Parameters of a cell's services by path, as `zencell param list` has them; `services.` may be left out."""
 
     def __init__(self, bus: Bus) -> None:

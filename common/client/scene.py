@@ -8,6 +8,7 @@ from typing import Literal
 from common import topics
 from common.client.goals import Point, array_of, numbers, place
 from common.client.hearing import Ear
+from common.client.part import Part
 from common.config import check
 from common.messages import CollisionObject, Pose, SceneEdit, SceneEditReply
 from common.scene.added import added
@@ -15,7 +16,7 @@ from common.scene.added import added
 TIMEOUT = 5.0  # [s] wall for an answer
 
 
-class Scene:
+class Scene(Part):
     """Solids that motion keeps away from though nobody perceives them; they stay until they are removed."""
 
     def __init__(self, ear: Ear, owner: str) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncGenerator
+from dataclasses import replace
 
 from common import topics
 from common.application import find_application
 from common.client.hearing import Ear, topic_of_owner
 from common.client.joining import newest_heard
+from common.client.part import Part
 from common.errors import RequestFailed, UnknownName, ZencellError
 from common.messages import MotionStatus, StopRequest, TaskCommand, TaskStatus
 from common.topics import Topic
@@ -27,13 +29,13 @@ class ArmOnly(ZencellError):
         super().__init__(f"the arm is stopped and stays so until a start; the task did not hear of it: {error}")
 
 
-class TaskControl:
+class TaskControl(Part):
     """What a person may tell the task. `async for status in cell.task` hears of every change, until it is left."""
 
     def __init__(self, ear: Ear, owner: str, application: str = "") -> None:
         """The task of a cell; of an application of one's own, its dotted module is needed to hear of it."""
         self._ear, self._bus, self._owner, self._application = ear, ear.bus, owner, application
-        self.unkept = ""  # what a stop would not outlive, in words
+        self._unkept = ""
 
     async def start(self, *, override: bool = False) -> TaskStatus:
         """Start it, or start it again; a robot that you hold is let go, with `override` also one that others hold.
@@ -71,8 +73,13 @@ class TaskControl:
             self._note(await arm)
         return told
 
+    @property
+    def unkept(self) -> str:
+        """What the last stop would not outlive, in words."""
+        return self._unkept
+
     def _note(self, answer: MotionStatus) -> None:
-        self.unkept = answer.not_kept
+        self._unkept = answer.not_kept
 
     async def _tell(self, command: str, override: bool = False) -> TaskStatus:
         heard = await newest_heard(self._bus) if command in ("start", "resume") else None
@@ -88,11 +95,18 @@ class TaskControl:
         """
         if self._application:
             return find_application(self._application).status
+        found: dict[str, Topic[TaskStatus]] = {}
         for owner in await self._bus.owners():
             topic = topic_of_owner(owner)
             if isinstance(topic, Topic) and issubclass(topic.message, TaskStatus):
-                return topic
-        raise UnknownName("task (application=MODULE names one of your own)", self._bus.cell, ())
+                meant = replace(topic, key=owner.own)
+                if self._bus.full_key(meant) == f"{self._bus.cell}/{owner.key}":
+                    return meant
+                found[owner.key] = topic
+        if len(found) == 1:
+            return found.popitem()[1]
+        raise UnknownName("task (application=MODULE names one of your own, remapped= one of several)",
+                          self._bus.cell, found)
 
     async def status(self) -> TaskStatus:
         """How far it is: its newest status."""

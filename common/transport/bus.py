@@ -164,6 +164,10 @@ class Bus:
             self._session, self.cell, self.service, asked, servers, loop=self._loop, limit=self._limit
         )
 
+    def full_key(self, topic: Topic[Any] | Request[Any, Any]) -> str:
+        """The key of a topic or request on the wire."""
+        return f"{self.cell}/{self._remapping.key(topic.key)}"
+
     def _in_cell(self, topic: T) -> T:
         """The topic or request under its key in the cell, with its messages ready to be read."""
         for message in (topic.message, *((topic.answer,) if isinstance(topic, Request) else ())):

@@ -17,9 +17,9 @@ from common.application import find_application
 from common.chaos.agent import Chaos
 from common.chaos.plan import Fault as Bad
 from common.chaos.plan import Form
+from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.control.jogging import DEADMAN, STANDS
 from common.errors import RequestFailed
-from common.process.operator_motion import MotionFailed, OperatorMotion
 from common.process.persist import persist
 from common.topics import Topic
 from common.transport.reader import Reader

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -14,10 +15,10 @@ from common.client.arm import NotJogged
 from common.client.cell import Cell
 from common.client.goals import any_of, pose, region, through
 from common.client.hearing import Camera, NothingHeard
+from common.client.operator_motion import MotionFailed
 from common.config import load_cell
 from common.errors import ConfigError, NoResponder, RemoteError, UnknownName, ZencellError
 from common.messages import HoldRequest, JointGoal, StopRequest
-from common.process.operator_motion import MotionFailed
 from common.transport.bus import Bus
 from common.virtual.simulation import Simulation
 
@@ -408,3 +409,25 @@ async def test_a_cell_that_is_not_joined_says_how_to_join_it() -> None:
             getattr(cell, name)
     with pytest.raises(AttributeError, match="amr"):
         _: Any = cell.amr
+
+
+def test_slip_of_the_hand_is_told_and_changes_nothing() -> None:
+    async def program(cell: Cell) -> None:
+        for part, name, words in (
+            (cell, "parm", "Cell.parm is not there: did you mean 'param'?"),
+            (cell, "param", "Cell.param cannot be set"),
+            (cell.arm, "speeed", "Arm.speeed is not there"), (cell.arm, "owner", "Arm.owner cannot be set"),
+            (cell.gripper, "wdith", "Hand.wdith"), (cell.task, "pausse", "did you mean 'pause'"),
+            (cell.world, "ad", "'add'"), (cell.scene, "ad", "'add'"), (cell.param, "sett", "'set'"),
+            (await cell.camera(), "imgae", "'image'"),
+        ):
+            with pytest.raises(ZencellError, match=re.escape(words)) as told:
+                setattr(part, name, 3)
+            assert "\n" not in str(told.value) and isinstance(told.value, AttributeError)
+        assert cell.owner == cell.arm.owner == "program"
+        await cell.objects(least=1)
+        with pytest.raises(UnknownName, match=r"unknown object to touch 'track_l' \(did you mean 'track_\d'\?\)"):
+            await cell.arm.plan("home", touch=["track_l"])
+        await cell.arm.plan("home", touch="track_1")
+
+    run(program)

@@ -10,8 +10,8 @@ import pytest
 from common import topics
 from common.client.cell import Cell
 from common.client.goals import pose
+from common.client.operator_motion import MotionFailed
 from common.errors import ConfigError, RemoteError
-from common.process.operator_motion import MotionFailed
 from common.transport.bus import Bus
 from tests.client.test_cell import Over
 from tests.harness import until

@@ -9,9 +9,9 @@ import pytest
 from common import topics
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.errors import RemoteError
 from common.messages import JointGoal, ParameterRequest, StopRequest, TaskCommand
-from common.process.operator_motion import MotionFailed, OperatorMotion
 from common.transport.bus import Bus, Reader
 from tests.harness import until
 from tests.simulated.test_pausing import assert_still, held, moves

@@ -9,8 +9,8 @@ import pytest
 from common import topics
 from common.applications.outlining.topics import OUTLINE_STATUS
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.messages import JointGoal, JointState, MotionStatus, TaskCommand
-from common.process.operator_motion import MotionFailed, OperatorMotion
 from common.transport.bus import Bus, Reader
 from tests.harness import until
 from tests.simulated.outlined import assert_cube_outlined

@@ -11,7 +11,7 @@ from common import messages as m
 from common import topics
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
-from common.process.operator_motion import MotionFailed, OperatorMotion
+from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.transport.local import LocalNetwork
 
 HOME = m.JointGoal(named="home")
@@ -79,7 +79,7 @@ class Cell:
 @pytest.fixture(autouse=True)
 def _short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     """For the task that most of these cells do not have."""
-    monkeypatch.setattr("common.process.operator_motion.FIRST_WORD", 0.05)
+    monkeypatch.setattr("common.client.operator_motion.FIRST_WORD", 0.05)
 
 
 @pytest.fixture
@@ -183,7 +183,7 @@ async def test_what_is_said_while_a_motion_is_planned_is_not_known_to_who_asked_
 async def test_motion_of_somebody_else_is_not_touched(
     cell: Cell, person: OperatorMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("common.process.operator_motion.COME_TO_REST", 0.05)
+    monkeypatch.setattr("common.client.operator_motion.COME_TO_REST", 0.05)
     cell.say(id="other", state="active", held=True)
     with pytest.raises(MotionFailed, match="follows goal 'other'") as caught:
         await person.move(HOME)
@@ -259,7 +259,7 @@ async def test_motion_that_ends_otherwise_is_told_in_one_line(
 
 
 async def test_cell_without_an_executor_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("common.process.operator_motion.REQUEST_TIMEOUT", 0.05)
+    monkeypatch.setattr("common.client.operator_motion.REQUEST_TIMEOUT", 0.05)
     person = OperatorMotion(LocalNetwork().bus(), [])
     with pytest.raises(MotionFailed, match="does not say how the robot is"):
         await person.move(HOME)

@@ -1,0 +1,150 @@
+"""Which cell, which task and which keys a program means. The network is one without ports."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Mapping
+from typing import Any
+
+import pytest
+
+from common.applications.pick_place.messages import PickPlaceStatus
+from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from common.client import joining
+from common.client.cell import Cell
+from common.client.hearing import NothingHeard
+from common.client.joining import SeveralUp
+from common.clock import Clock
+from common.config import load_cell, service_config
+from common.errors import UnknownName, ZencellError
+from common.messages import Header, TaskStatus
+from common.process.in_process import running_service
+from common.topics import Topic
+from common.transport.bus import Bus
+from common.transport.local import LocalNetwork
+from services import smart_pick_place, trajectory_executor
+
+LEFT = {"*": "left/*"}
+
+
+@pytest.fixture
+def net(monkeypatch: pytest.MonkeyPatch) -> LocalNetwork:
+    """What programs join in place of a router."""
+    network = LocalNetwork()
+
+    async def listens(endpoint: str, seconds: float) -> None:
+        """Somebody does."""
+
+    @contextlib.asynccontextmanager
+    async def connected(
+        *, cell: str, service: str, clock: Clock | None = None, remapped: Mapping[str, str] | None = None, **_: Any
+    ) -> AsyncIterator[Bus]:
+        session = network.session()
+        bus = Bus(session, service=service, cell=cell, clock=clock or Clock(), topics=remapped)
+        try:
+            yield bus
+        finally:
+            await bus.close()
+            session.close()
+
+    monkeypatch.setattr(joining, "until_somebody_listens", listens)
+    monkeypatch.setattr(joining, "connect_to", connected)
+    return network
+
+
+async def stays(bus: Bus, config: None) -> None:
+    """A service that says nothing."""
+    await bus.ready()
+    await asyncio.Event().wait()
+
+
+async def test_the_only_cell_that_is_up_is_meant_and_one_of_several_must_be_named(net: LocalNetwork) -> None:
+    async with running_service(net, stays, None, cell="anna"):
+        async with Cell() as cell:
+            assert cell.name == "anna"
+        async with running_service(net, stays, None, cell="bert"):
+            with pytest.raises(SeveralUp) as told:
+                async with Cell():
+                    pass
+            assert str(told.value) == ("several cells are up: name one, by Cell(NAME) or --cell NAME; "
+                                       "choices: anna, bert")
+            async with Cell("bert") as cell:
+                assert cell.name == "bert"
+
+
+async def test_arm_is_stopped_and_task_started_under_the_keys_that_the_program_means(net: LocalNetwork) -> None:
+    loaded = load_cell("panda", ["autostart=false"])
+    configs = {service: service_config(loaded, service.__name__.rpartition(".")[2], service.Config)
+               for service in (trajectory_executor, smart_pick_place)}
+    async with (
+        running_service(net, trajectory_executor.run, configs[trajectory_executor], name="trajectory_executor",
+                        cell="two_arms", topics=LEFT),
+        running_service(net, smart_pick_place.run, configs[smart_pick_place], name="smart_pick_place",
+                        cell="two_arms", topics=LEFT),
+        Cell("two_arms", remapped=LEFT, owner="anna") as left, Cell("two_arms", owner="anna") as right,
+    ):
+        stopped = await left.arm.stop("smoke")
+        assert [stop.by for stop in (await left.arm.status()).inhibits] == ["anna"]
+        assert await joining.newest_heard(left.bus) == stopped.newest > 0 == await joining.newest_heard(right.bus)
+        assert left.bus.full_key(await left.task.topic()) == "two_arms/left/pick_place_status"
+        await left.task.start()
+        async with asyncio.timeout(5.0):
+            while (await left.arm.status()).stopped:  # noqa: ASYNC110 - the start goes on to the executor
+                await asyncio.sleep(0.01)
+        for asked in (right.arm.status(), right.services(), left.services()):
+            with pytest.raises(NothingHeard, match="two_arms/"):
+                await asked
+
+
+async def test_of_several_tasks_the_one_whose_keys_are_meant_is_the_task(net: LocalNetwork) -> None:
+    async def tells(bus: Bus, config: None) -> None:
+        out = bus.writer(PICK_PLACE_STATUS)
+        out.put(PickPlaceStatus(header=Header(stamp=1), message=bus.service))
+        await bus.ready()
+        await asyncio.Event().wait()
+
+    async with (
+        running_service(net, tells, None, name="one", topics=LEFT),
+        running_service(net, tells, None, name="two", topics={"*": "right/*"}),
+    ):
+        async with Cell("test", remapped=LEFT) as cell:
+            assert (await cell.task.status()).message == "one"
+        async with Cell("test", remapped={"*": "right/*"}) as cell:
+            assert (await cell.task.status()).message == "two"
+        async with Cell("test") as cell:
+            with pytest.raises(UnknownName, match="choices: left/pick_place_status, right/pick_place_status"):
+                await cell.task.status()
+
+
+class OwnStatus(TaskStatus):
+    """Of an application of one's own."""
+
+
+OWN = Topic("own_status", OwnStatus, "state", "how far it is")
+
+
+async def test_task_of_an_application_of_ones_own_is_heard_when_its_module_is_named(
+    net: LocalNetwork, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "application.py").write_text(f"from {__name__} import OWN as STATUS\n")
+
+    async def tells(bus: Bus, config: None) -> None:
+        out = bus.writer(OWN)
+        out.put(OwnStatus(header=Header(stamp=1), message="it goes on"))
+        await bus.ready()
+        await asyncio.Event().wait()
+
+    async with running_service(net, tells, None, name="own"):
+        async with Cell("test", application="own.application") as cell:
+            assert (await cell.task.status()).message == "it goes on"
+        async with Cell("test") as cell:
+            with pytest.raises(UnknownName, match="application=MODULE names one of your own"):
+                await cell.task.status()
+        for name in ("nosuch", "own.nosuch"):
+            async with Cell("test", application=name) as cell:
+                with pytest.raises(ZencellError, match=f"{name}.*") as told:
+                    await cell.task.status()
+                assert "\n" not in str(told.value)
