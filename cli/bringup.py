@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from cli import hosts, options, securing, verbs, viewing
+from cli import options, securing, verbs, viewing
 from cli.operation import Operation, end_with_stdin
+from common.supervision.share import Share
 
 Speed = Annotated[str, typer.Option("--speed", metavar="X", help="cell time per wall time, 0.1 to 10")]
 NoViewer = Annotated[bool, typer.Option("--no-viewer", help="without the operator's page")]
@@ -54,7 +55,7 @@ def _operation(
     """What is asked for with the options of `run` and `up`, which are these."""
     securing.choose(secure)
     operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json,
-                          hosts.Share(listen, link, only, without))
+                          Share(listen, link, only, without))
     if until_stdin_ends:
         end_with_stdin()
     operation.serve_page(viewer_host, viewer_port)

@@ -56,7 +56,7 @@ def call(
 
 
 def _parse(key: str, body: str) -> dict[str, Any]:
-    from cli.schema import from_json
+    from common.messages.schema import from_json
 
     try:
         given = from_json(json.loads(body))
@@ -73,9 +73,9 @@ def send(
 ) -> None:
     """Send a request to a cell that is up and print the answer as JSON."""
     from cli.inspection import in_cell
-    from cli.schema import to_json
     from common.client.joining import newest_heard
     from common.messages import TaskCommand
+    from common.messages.schema import to_json
 
     async def visit(joined: Client) -> Message:
         if isinstance(message, TaskCommand) and message.command in ("start", "resume") and message.heard is None:
@@ -93,7 +93,7 @@ def _task(
     tell: Callable[[TaskControl], Awaitable[Message]], cell: str | None, domain: str | None, connect: str | None
 ) -> None:
     from cli.inspection import in_cell
-    from cli.schema import to_json
+    from common.messages.schema import to_json
 
     async def visit(joined: Client) -> Message:
         try:
@@ -144,7 +144,7 @@ def home(
 ) -> None:
     """Plan a way home and go there, while no task has the robot; Ctrl-C stops the robot."""
     from cli.inspection import in_cell
-    from cli.schema import to_json
+    from common.messages.schema import to_json
 
     done = in_cell(lambda joined: joined.arm.move("home", planner=planner), cell, domain, connect)
     echo(to_json(done.model_dump()))

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from cli.inspection import Presence
-    from cli.wired import Wired
     from common.config import Cell, ServiceEntry
+    from common.graph.wired import Wired
     from common.messages import Parameter, ParameterReply
     from common.topics import Request, Topic
     from common.transport.bus import Bus
@@ -68,7 +68,7 @@ def info(
 ) -> None:
     """Show what a service reads, writes, serves and calls, its parameters, and how it is while a cell is up."""
     from cli.inspection import look
-    from cli.wired import wired
+    from common.graph.wired import wired
 
     cells = look(domain, connect)
     loaded, entry = _find(service, cell, cells)

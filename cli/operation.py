@@ -17,7 +17,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from cli import hosts, options, securing, viewing
+from cli import options, securing, viewing
+from common.supervision.share import Share
 from common.terminal import printable
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class Operation:
     def __init__(
         self, cell: str, overrides: list[str] | None, world: str | None, seed: str | None, speed: str,
         domain: str | None, connect: str | None, no_viewer: bool, summary: str | None = None, log_json: bool = False,
-        share: hosts.Share | None = None,
+        share: Share | None = None,
     ) -> None:
         """Check everything that was asked for; nothing is started yet.
 
@@ -78,7 +79,7 @@ class Operation:
         self.file = Path(summary) if summary else None
         if self.file and not self.file.absolute().parent.is_dir():
             raise ConfigError("--summary", summary, "is in a folder that does not exist")
-        share = share or hosts.Share()
+        share = share or Share()
         number, endpoint = place_of(domain, connect)
         factor = options.number("--speed", speed)
         self.launch = share.linked(Launch(

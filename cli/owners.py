@@ -71,8 +71,8 @@ def _live(cell: str | None, domain: str | None, connect: str | None) -> list[Fou
 
 
 def _of_files(cell: str | None) -> list[Found]:
-    from cli.wired import Unwired, wired
     from common.config import load_cell, names_of
+    from common.graph.wired import Unwired, wired
 
     found: list[Found] = []
     for name in [cell] if cell else names_of("cells"):

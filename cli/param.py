@@ -44,9 +44,9 @@ def list_(
 ) -> None:
     """List parameters: path, value, whether a change needs a restart, range, and what it is."""
     from cli.inspection import inspect
-    from cli.schema import to_json
     from common.client.parameters import listing
     from common.config import yaml_line
+    from common.messages.schema import to_json
 
     async def visit(bus: Bus) -> Listing:
         return await listing(bus, [service] if service else None)
@@ -76,9 +76,9 @@ def get(
 ) -> None:
     """Print the value of a parameter as YAML; with --json everything that is known of it."""
     from cli.inspection import inspect
-    from cli.schema import to_json
     from common.client.parameters import look_up
     from common.config import yaml_line
+    from common.messages.schema import to_json
 
     async def visit(bus: Bus) -> tuple[str, Parameter]:
         return (await look_up(bus, [path]))[path]

@@ -23,7 +23,7 @@ from common.errors import ConfigError
 from common.terminal import echo
 
 if TYPE_CHECKING:
-    from cli.player import Player
+    from common.client.player import Player
     from common.recording.reading import Recording
     from common.recording.selection import Selection
     from common.transport.bus import Bus
@@ -87,7 +87,7 @@ def play(
             raise ConfigError("--loop", ..., f"needs a recording with a length, which {file} has not")
 
         def make() -> Player:
-            from cli.player import Player
+            from common.client.player import Player
 
             return Player(recording, selection.wants, renamed, rate=speed, offset=offset, loop=loop,
                           paused=start_paused, stamp_now=stamp_now)

@@ -88,8 +88,8 @@ def checked(topic: Topic[Any] | None, key: str, body: str) -> Any:
     Raises:
         ConfigError: it is not JSON, or not the key's message; names the field and what would do.
     """
-    from cli.schema import from_json
     from common.config import check
+    from common.messages.schema import from_json
 
     try:
         given = from_json(json.loads(body))

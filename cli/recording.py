@@ -141,7 +141,7 @@ async def _gated(
 
 
 async def _record(bus: Bus, selection: Selection, asked: _Asked) -> None:
-    from cli.capturing import Capture
+    from common.client.capturing import Capture
     from common.recording.files import SplitWriter
     from common.recording.sink import Sink
     from common.supervision.interrupts import Interrupts
@@ -189,8 +189,8 @@ async def _require_heard(bus: Bus, selection: Selection) -> None:
     Raises:
         SilentKey: nothing came on one of them.
     """
-    from cli.foreign import require_heard
     from common.application import find_topic
+    from common.client.foreign import require_heard
 
     for key in selection.keys:
         if find_topic(key) is None and "*" not in key:

@@ -8,7 +8,7 @@ import os
 import typer
 
 from cli import options, securing
-from cli.hosts import Share
+from common.supervision.share import Share
 from common.terminal import echo
 
 app = typer.Typer(help="What a cell's router is told.", no_args_is_help=True)

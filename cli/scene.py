@@ -26,7 +26,7 @@ def list_(
 ) -> None:
     """List what was added; `zencell topic echo planning_scene` has all that motion keeps away from."""
     from cli.inspection import in_cell
-    from cli.schema import to_json
+    from common.messages.schema import to_json
 
     for solid in in_cell(lambda joined: joined.scene.objects(), cell, domain, connect):
         at, sides = solid.pose.position, " x ".join(f"{side:g}" for side in solid.dimensions)

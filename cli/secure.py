@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
-from cli.hosts import Share
 from cli.viewing import VIEWER
-from cli.wired import Unwired
 from common.errors import ZencellError
+from common.graph.wired import Unwired
+from common.supervision.share import Share
 from common.terminal import echo
 
 if TYPE_CHECKING:

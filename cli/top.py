@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-    from cli.watching import ServiceRow, TopicRow, View
+    from common.client.watching import ServiceRow, TopicRow, View
     from common.transport.bus import Bus
 
 PERIOD = 1.0  # [s] between tables
@@ -42,8 +42,8 @@ def top(
     most = 1 if once else options.whole("--count", count, 1)
 
     async def visit(bus: Bus) -> None:
-        from cli.watching import Watch
         from common.client.joining import cell_clock
+        from common.client.watching import Watch
 
         async with Watch(bus, await cell_clock(bus)) as watch:
             await asyncio.sleep(FIRST)

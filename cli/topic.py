@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import completion, delay, options, publishing
+from cli import completion, options, publishing
 from common import terminal
+from common.client import delay
 from common.errors import UnknownName
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def info(
     Who writes or serves it is asked of the cells that are up; while there are none, of those of the configuration.
     """
     from cli.owners import known_keys
-    from cli.schema import example_of, fields_of
+    from common.messages.schema import example_of, fields_of
     from common.topics import general_key
 
     known = known_keys(cell, domain, connect).get(general_key(key))
@@ -117,7 +118,7 @@ def echo(
 
 
 async def _messages(bus: Bus, topic: Topic[Any], as_json: bool) -> AsyncGenerator[str, None]:
-    from cli.schema import one_line, to_json
+    from common.messages.schema import one_line, to_json
 
     async for message in bus.reader(topic):
         yield to_json(message.model_dump()) if as_json else one_line(message.model_dump())
@@ -126,9 +127,9 @@ async def _messages(bus: Bus, topic: Topic[Any], as_json: bool) -> AsyncGenerato
 async def _foreign_messages(bus: Bus, key: str, as_json: bool) -> AsyncGenerator[str, None]:
     import msgpack
 
-    from cli.foreign import samples
-    from cli.schema import to_json
-    from cli.zenoh_codec import decode
+    from common.client.foreign import samples
+    from common.client.zenoh_codec import decode
+    from common.messages.schema import to_json
 
     async with aclosing(samples(bus, key)) as coming:
         async for sample in coming:
@@ -147,8 +148,8 @@ def visit_topic(
         SilentKey: the key is foreign and no cell is up that could know it.
         NothingUp: no cell is up.
     """
-    from cli.foreign import SilentKey
     from cli.inspection import inspect
+    from common.client.foreign import SilentKey
     from common.client.joining import NothingUp
 
     try:
@@ -189,8 +190,8 @@ def _measured(name: str, doc: str, visiting: Callable[[Bus, str, bool], AsyncGen
 
 
 async def _rates(bus: Bus, key: str, foreign: bool, *, in_bytes: bool) -> AsyncGenerator[tuple[Any, str], None]:
-    from cli.foreign import require_heard
-    from cli.measuring import describe, windows
+    from common.client.foreign import require_heard
+    from common.client.measuring import describe, windows
 
     if foreign:
         await require_heard(bus, key)

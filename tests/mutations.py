@@ -10,10 +10,10 @@ from typing import Any
 
 import msgpack
 
-from cli.schema import example_of
 from common import messages as m
 from common.application import all_topics
 from common.messages.basics import Message
+from common.messages.schema import example_of
 
 Strange = list[Any]
 

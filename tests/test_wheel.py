@@ -66,7 +66,7 @@ services: {mine.task: }
 # What the doctor says of the kernel, and who plans around a wall.
 PLAN = """
 import zencell
-from cli.doctor.software import kernel
+from common.doctor.software import kernel
 from common.config import load_cell
 from common.messages import CollisionObject, Header, JointGoal, PlanningScene, PlanRequest, Pose, Vector3
 from common.planning.pipeline import PlanningPipeline

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from cli.capturing import Capture
 from common import messages as m
 from common import topics
+from common.client.capturing import Capture
 from common.clock import Clock
 from common.config import load_cell
 from common.recording.decoding import schema_of

@@ -7,9 +7,9 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from cli.doctor.clocks import Skew, judged, skews_of
 from common.clock import Clock
 from common.config import Parameters
+from common.doctor.clocks import Skew, judged, skews_of
 from common.process.parameters import serve_parameters
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork

@@ -13,10 +13,11 @@ from typing import Any
 import psutil
 import pytest
 
-from cli.doctor import configuration, examine, leftovers, machine, network, software
-from cli.doctor.finding import Finding
-from cli.doctor.leftovers import Seen
 from cli.main import app
+from common.doctor import configuration, leftovers, machine, network, software
+from common.doctor.examining import examine
+from common.doctor.finding import Finding
+from common.doctor.leftovers import Seen
 from common.errors import DecodeError
 from common.transport.local import LocalNetwork
 from tests.harness import Zencell
@@ -55,10 +56,11 @@ def test_this_machine_is_examined_and_what_is_not_well_has_a_remedy() -> None:
 def test_exit_code_is_1_when_something_fails(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("cli.doctor.examine", lambda endpoint: iter([Finding("fail", "the roof", "mend it")]))
+    looks = "common.doctor.examining.examine"
+    monkeypatch.setattr(looks, lambda endpoint: iter([Finding("fail", "the roof", "mend it")]))
     assert app.execute(["doctor"]) == 1
     assert capsys.readouterr().out == "fail  the roof: mend it\n"
-    monkeypatch.setattr("cli.doctor.examine", lambda endpoint: iter([Finding("warn", "the roof", "mend it")]))
+    monkeypatch.setattr(looks, lambda endpoint: iter([Finding("warn", "the roof", "mend it")]))
     assert app.execute(["doctor"]) == 0
 
 

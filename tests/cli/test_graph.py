@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from cli.graph import OUTSIDE, Graph, dot, edges, graph_of, mermaid
-from cli.graph_svg import svg
 from cli.main import app
-from cli.wired import Wired
+from common.graph.drawing import OUTSIDE, Graph, dot, edges, graph_of, mermaid
+from common.graph.svg import svg
+from common.graph.wired import Wired
 
 SERVICES = [
     Wired("planner", "Plans.", writes=["display_trajectory"], serves=["motion/plan"], reads=["joint_states"]),

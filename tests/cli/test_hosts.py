@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from cli.hosts import Share
 from common.clock import EPOCH_VARIABLE
 from common.config import load_cell
 from common.errors import ConfigError, UnknownName
 from common.supervision.launch import Launch
+from common.supervision.share import Share
 from common.transport.credentials import SECURE_VARIABLE
 from common.transport.endpoint import LINK_VARIABLE, LISTEN_VARIABLE
 

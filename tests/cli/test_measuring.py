@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cli.measuring import COVERED, Arrivals, describe
+from common.client.measuring import COVERED, Arrivals, describe
 
 
 @given(st.floats(0.5, 200), st.integers(1, 10**6))

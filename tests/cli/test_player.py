@@ -10,9 +10,9 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from cli.player import Player
 from common import topics
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from common.client.player import Player
 from common.messages import Header, Image
 from common.recording.reading import Recording
 from common.recording.sample import Sample

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cli.measuring import COVERED, Delays, stamp_of
+from common.client.measuring import COVERED, Delays, stamp_of
 from common.messages import Header, Image, JointState, Pose, TFMessage, TransformStamped
 from common.transport.codec import encode
 

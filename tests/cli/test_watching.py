@@ -5,9 +5,9 @@ import pytest
 from rich.console import Console
 
 from cli.top import render
-from cli.watching import Processes, ServiceRow, TopicRow, View, Watch, on_demand, statuses
 from common import topics
 from common.application import all_topics
+from common.client.watching import Processes, ServiceRow, TopicRow, View, Watch, on_demand, statuses
 from common.clock import Clock
 from common.messages import (
     GripperState,

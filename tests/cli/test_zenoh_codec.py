@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cli.zenoh_codec import decode, encode
 from common import topics
 from common.application import all_topics
+from common.client.zenoh_codec import decode, encode
 from common.errors import ConfigError
 from common.messages import Header, Image, JointState, StopRequest
 from common.transport.codec import decode as decode_message
@@ -73,7 +73,7 @@ def test_a_key_that_is_not_ours_takes_any_json() -> None:
 
 @pytest.mark.parametrize("topic", all_topics().values(), ids=str)
 def test_every_topic_has_a_message_that_can_be_shown(topic: topics.AnyTopic) -> None:
-    from cli.schema import example_of, fields_of
+    from common.messages.schema import example_of, fields_of
 
     assert list(fields_of(topic.message))
     if topic.kind == "request" and topic.key != "motion/execute":

@@ -13,7 +13,7 @@ from rich.console import Console
 from cli.live import render
 from cli.screens import Content, PlainScreen
 from cli.top import services_table, topics_table
-from cli.watching import ServiceRow, TopicRow
+from common.client.watching import ServiceRow, TopicRow
 from common.messages import ServiceStatus
 from common.process.log import log_to_stderr
 from common.terminal import echo, printable

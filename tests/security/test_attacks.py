@@ -36,6 +36,7 @@ from common.transport.session import RawSample
 from common.viewer.access import ROLES, tokens_in
 from tests.harness import RunningCell, command_line, environment, until
 from tests.security.holders import REFUSED, Heard, Holder
+from zencell.blocking import Cell
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -113,6 +114,22 @@ def same_processes(secured: Secured) -> Iterator[None]:
     assert {name: process.pid for name, process in secured.cell.processes().items()} == before
     with secured.holder("operator") as operator:
         assert len(operator.tokens("panda/alive/*")) >= SERVICES
+
+
+@pytest.mark.usefixtures("same_processes")
+def test_program_with_the_operators_certificate_does_what_the_camera_may_not(
+    secured: Secured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("ZENCELL_SECURE", raising=False)
+    edit = m.SceneEdit(op="add", id="post", shape="sphere", dimensions=[0.05],
+                       pose=m.Pose(position=m.Vector3(x=-0.5, z=0.5)))
+    with (secured.holder("panda.camera_simulator") as camera,
+          Cell(domain=secured.cell.domain, secure=str(secured.folder), owner="anna") as cell):
+        assert cell.name == "panda" and cell.arm.move("home").state == "succeeded"
+        assert camera.ask("panda/scene/edit", encode(edit), timeout=1.0) == []
+        assert cell.scene.objects() == []
+        assert cell.call("scene/edit", edit).ids == ["added/post"]
+        assert [solid.id for solid in cell.scene.objects()] == ["added/post"] and cell.scene.remove("post") == []
 
 
 # --- who holds no certificate, or a wrong one ------------------------------------------------------------------------

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from cli.doctor.certificates import certificates as findings
 from cli.main import app
+from common.doctor.certificates import certificates as findings
 from common.security.access import Rights, access_control
 from common.security.certificates import Authority
 from common.security.checking import certificate_in, require_valid

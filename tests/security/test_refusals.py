@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from cli.hosts import Share
 from cli.main import app
 from cli.securing import require_secured
 from common.config import load_cell
 from common.errors import ConfigError
 from common.security.certificates import Authority
 from common.supervision.launch import Launch
+from common.supervision.share import Share
 from common.transport.credentials import ACCESS, ROUTER_NAME
 from tests.harness import free_domain
 

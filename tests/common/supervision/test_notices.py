@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from cli.top import render
-from cli.watching import View
 from common import topics
+from common.client.watching import View
 from common.config import load_cell
 from common.messages import Notice, SupervisorStatus
 from common.security.certificates import Authority

@@ -7,9 +7,9 @@ import json
 import msgpack
 from pydantic import BaseModel
 
-from cli.schema import from_json, one_line
 from common.config import check
 from common.errors import ConfigError
+from common.messages.schema import from_json, one_line
 
 SHOWN_BYTES = 16  # of a payload that is not msgpack
 

@@ -7,7 +7,7 @@ import shutil
 import time
 from pathlib import Path
 
-from cli.doctor.finding import Finding, ok, warn
+from common.doctor.finding import Finding, ok, warn
 
 LEAST_MEMORY = 1.0  # [GB]
 LEAST_SHM = 64.0  # [MB]

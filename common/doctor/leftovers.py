@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cli.doctor.finding import Finding, ok, warn
+from common.doctor.finding import Finding, ok, warn
 
 INITS = ("init", "systemd", "docker-init", "tini", "dumb-init", "catatonit")  # who adopts orphans
 STOPPED = ("stopped", "tracing-stop")

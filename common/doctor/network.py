@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from cli.doctor.finding import Finding, fail, ok, warn
+from common.doctor.finding import Finding, fail, ok, warn
 
 ROUTER_MODULE = "services.router"
 VIEWER_MODULE = "services.viewer"

@@ -19,6 +19,8 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "StopRequest": {"reason": "asked to"},
     "GripperCommand": {"id": "open-1", "width": 0.08},
     "WorldEdit": {"op": "add", "position": {"x": 0.45, "y": -0.1, "z": 0.03}},
+    "SceneEdit": {"op": "add", "id": "post", "shape": "cylinder", "dimensions": [0.03, 0.6],
+                  "pose": {"position": {"x": 0.2, "y": 0.5, "z": 0.3}}},
     "TaskCommand": {"command": "pause"},
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 from collections.abc import Iterator
 
-from cli.doctor.finding import Finding, fail, ok, warn
+from common.doctor.finding import Finding, fail, ok, warn
 
 
 def certificates(now: datetime.datetime | None = None) -> Iterator[Finding]:

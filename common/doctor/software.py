@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
-from cli.doctor.finding import Finding, fail, ok, warn
+from common.doctor.finding import Finding, fail, ok, warn
 from common.planning.kernel.library import library_path
 
 INSTALL = "pip install -c constraints.txt -e ."

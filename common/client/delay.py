@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from common.errors import RequestFailed
 
 if TYPE_CHECKING:
-    from cli.measuring import DelayFigures
+    from common.client.measuring import DelayFigures
     from common.transport.bus import Bus
 
 PERIOD = 1.0  # [s] between figures
@@ -30,9 +30,9 @@ async def delays(bus: Bus, key: str, foreign: bool) -> AsyncGenerator[tuple[Dela
         NoStamp: something came that has no stamp.
         SilentKey: nothing came on a foreign key.
     """
-    from cli.foreign import require_heard
-    from cli.measuring import Hearing
+    from common.client.foreign import require_heard
     from common.client.joining import cell_clock
+    from common.client.measuring import Hearing
 
     full = f"{bus.cell}/{key}"
     hearing = Hearing(await cell_clock(bus))

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from cli.measuring import Hearing
 from common.application import all_topics, applications
+from common.client.measuring import Hearing
 
 if TYPE_CHECKING:
     import psutil

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict
 
 import typer
 
 from cli import options
-from cli.doctor.finding import Finding
 from common.terminal import echo
 
 
@@ -17,6 +15,7 @@ def doctor(
     domain: options.Domain = None, connect: options.Connect = None, as_json: options.Json = False
 ) -> None:
     """Check this machine and say what to do about what is not well; exit 1 if something fails."""
+    from common.doctor.examining import examine
     from common.transport.endpoint import endpoint_of
 
     endpoint = endpoint_of(domain, connect)
@@ -29,27 +28,3 @@ def doctor(
         failed |= finding.level == "fail"
     if failed:
         raise typer.Exit(1)
-
-
-def examine(endpoint: str) -> Iterator[Finding]:
-    """All findings, in the order in which they matter."""
-    from cli.doctor import certificates, clocks, configuration, leftovers, machine, network, software
-
-    yield software.python()
-    yield from software.packages()
-    yield software.kernel()
-    yield from configuration.robots()
-    yield from configuration.cells()
-    yield network.router(endpoint)
-    yield from network.versions(endpoint)
-    yield from clocks.clocks(endpoint)
-    yield from certificates.certificates()
-    yield network.page()
-    yield from leftovers.processes()
-    yield machine.shared_memory()
-    yield machine.memory()
-    yield machine.cores()
-    yield machine.disk()
-    yield machine.open_files()
-    yield machine.clock()
-    yield machine.container_engine()

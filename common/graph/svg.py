@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from html import escape
 
-from cli.graph import OUTSIDE, Graph
+from common.graph.drawing import OUTSIDE, Graph
 
 ROW, GAP = 21.0, 13.0  # [px] of a key, and between the services on the left
 LEFT, WIDE = 20.0, 176.0  # [px] where the boxes of services begin, and how wide they are

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from cli.doctor.finding import Finding, fail, ok
+from common.doctor.finding import Finding, fail, ok
 
 
 def robots() -> Iterator[Finding]:

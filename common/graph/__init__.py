@@ -1,0 +1,1 @@
+"""The services of a cell and the keys between them, without running it; and as a picture."""
