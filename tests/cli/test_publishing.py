@@ -1,8 +1,8 @@
 import pytest
 
 from cli.main import app
-from cli.publishing import checked, stamped
 from common import topics
+from common.client.publishing import checked, stamped
 from common.clock import Clock
 from common.errors import ConfigError
 
