@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from common.messages import Image
     from common.perception.calibration import IntrinsicCalibration, ViewResidual
     from common.perception.calibration_board import Board, Picture, Sighting
-    from common.perception.calibration_file import CameraFile
     from common.perception.calibration_pose import PoseCalibration
     from common.transport.bus import Bus
     from common.transport.reader import Reader
@@ -88,6 +87,7 @@ def intrinsics(
     """Find focal lengths, centre and distortion from views of the board all over the picture, tilted to each side."""
     from common.config import check
     from common.perception.calibration import CollectingOptions, ViewCollector, calibrate_intrinsics
+    from common.perception.calibration_record import camera_of
 
     least = options.whole("--views", views, 3) or 3
     settings = check(CollectingOptions, {"least_views": least, "most_views": max(60, least),
@@ -104,7 +104,7 @@ def intrinsics(
             break
     collector.require_enough()
     found = calibrate_intrinsics(collector.views, settings)
-    camera = _camera_of(found, source, str(collector.board.options))
+    camera = camera_of(found, source, str(collector.board.options))
     old = Path(output).expanduser()
     if old.is_file() and "position:" in old.read_text(encoding="utf-8", errors="replace"):
         echo(f"{output} had a pose, which was found with other intrinsics and is gone: calibrate it again")
@@ -143,6 +143,7 @@ def pose(
     from common.perception.calibration import CalibrationFailed
     from common.perception.calibration_file import CameraFile
     from common.perception.calibration_pose import calibrate_pose, sightings_of
+    from common.perception.calibration_record import with_pose
     from common.robot.transforms import rpy_to_matrix, transform
 
     rotations = board_rpy or ["0,0,0"]
@@ -151,8 +152,8 @@ def pose(
     if len(rotations) not in (1, len(sources)):
         raise ConfigError("--board-rpy", len(rotations), f"times for {len(sources)} places; once does for all of them")
     rotations = rotations * len(sources) if len(rotations) == 1 else rotations
-    positions = [_three("--board-position", text) for text in board_position]
-    angles = [_three("--board-rpy", text) for text in rotations]
+    positions = [options.three("--board-position", text) for text in board_position]
+    angles = [options.three("--board-rpy", text) for text in rotations]
     camera, board = CameraFile.load(intrinsics_file), board_of(squares, square, marker, dictionary)
     most, limit = options.whole("--pictures", pictures_of_each, 1) or 1, options.number("--seconds", seconds)
     places: list[tuple[Any, list[Sighting]]] = []
@@ -169,11 +170,8 @@ def pose(
                                     f"{max(set(why), key=why.count)}")
         places.append((transform(rpy_to_matrix(*rpy), position), seen))
     result = calibrate_pose(places, camera)
-    record = _pose_record(result, sources, positions, angles)
-    camera = camera.model_copy(update={"position": result.position, "rpy": result.rpy,
-                                       "calibration": {**camera.calibration, "pose": record}})
     file = output or intrinsics_file
-    camera.save(file)
+    with_pose(camera, result, sources, positions, angles).save(file)
     echo(_pose_told(result))
     echo(f"{file} holds intrinsics and pose; a cell takes both with --set world.camera={file}")
 
@@ -196,6 +194,7 @@ def hand_eye(
     from common.perception.calibration import CalibrationFailed
     from common.perception.calibration_file import CameraFile
     from common.perception.calibration_hand_eye import LEAST_VIEWS, Mount, calibrate_hand_eye
+    from common.perception.calibration_record import with_hand_eye
     from common.perception.hand_eye_views import load_views
 
     if mount not in get_args(Mount):
@@ -205,18 +204,7 @@ def hand_eye(
     if len(views) < LEAST_VIEWS and why:
         raise CalibrationFailed(f"{len(views)} views of the board, {LEAST_VIEWS} are needed; {why[0]}")
     result = calibrate_hand_eye(views, camera, "hand" if mount == "hand" else "beside")
-    record = {
-        "date": _today(), "source": folder, "robot": said.robot, "camera": mount, "views": len(result.pictures),
-        "rms_px": result.rms, "rms_mm": 1e3 * result.rms_at_board, "verdict": result.verdict,
-        "position_std_mm": [1e3 * value for value in result.position_std],
-        "rotation_std_deg": math.degrees(result.rotation_std)}
-    place = {"position": result.position, "rpy": result.rpy}
-    if mount == "hand":
-        found = camera.model_copy(update={"calibration": {**camera.calibration, "hand_eye": {
-            **record, **{name: list(value) for name, value in place.items()}, "in": "the tool centre point"}}})
-    else:
-        found = camera.model_copy(update={**place, "calibration": {**camera.calibration, "hand_eye": record}})
-    found.save(output or intrinsics_file)
+    with_hand_eye(camera, result, folder, said.robot, mount).save(output or intrinsics_file)
     position, rpy = result.position, result.rpy
     echo(f"{len(result.pictures)} views, residual {result.rms:.3f} px rms, {1e3 * result.rms_at_board:.2f} mm at the "
          f"board; {_per_view(result.pictures)}")
@@ -353,29 +341,6 @@ def _two(option: str, text: str, example: str) -> tuple[int, int]:
     return int(first), int(second)
 
 
-def _three(option: str, text: str) -> tuple[float, float, float]:
-    parts = text.split(",")
-    if len(parts) != 3:
-        raise ConfigError(option, text, "must be three numbers, as 0.3,-0.1,0")
-    x, y, z = (options.number(option, part) for part in parts)
-    return x, y, z
-
-
-def _today() -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S")
-
-
-def _camera_of(found: IntrinsicCalibration, source: str, board: str) -> CameraFile:
-    from common.perception.calibration_file import CameraFile
-
-    names = ("fx", "fy", "cx", "cy")
-    camera = CameraFile(width=found.size[0], height=found.size[1], d=found.d, **dict(zip(names, found.k, strict=True)))
-    record = {"date": _today(), "source": source, "board": board, "distortion_model": camera.distortion_model,
-              "views": len(found.views), "corners": found.corners, "rms_px": found.rms,
-              "std_px": dict(zip(names, found.k_std, strict=True)), "coverage": found.coverage}
-    return camera.model_copy(update={"calibration": {"intrinsics": record}})
-
-
 def _told(found: IntrinsicCalibration) -> str:
     lines = [
         f"{len(found.views)} views, {found.corners} corners, {100 * found.coverage:.0f} % of the picture covered",
@@ -390,17 +355,6 @@ def _told(found: IntrinsicCalibration) -> str:
         lines.append(f"no corner was seen in these parts of the picture: {', '.join(found.unseen)}; "
                      "views with the board there make the distortion better")
     return "\n".join(lines)
-
-
-def _pose_record(
-    result: PoseCalibration, sources: list[str], positions: list[tuple[float, float, float]],
-    angles: list[tuple[float, float, float]],
-) -> dict[str, Any]:
-    places = [{"source": source, "board_position": list(position), "board_rpy": list(rpy)}
-              for source, position, rpy in zip(sources, positions, angles, strict=True)]
-    return {"date": _today(), "places": places, "pictures": len(result.pictures), "rms_px": result.rms,
-            "rms_mm": 1e3 * result.rms_on_board, "position_std_mm": [1e3 * value for value in result.position_std],
-            "rotation_std_deg": math.degrees(result.rotation_std), "place_std_mm": 1e3 * result.place_std}
 
 
 def _pose_told(result: PoseCalibration) -> str:

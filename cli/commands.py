@@ -159,10 +159,10 @@ def _position(x: str, y: str) -> dict[str, float]:
 
 def _triple(option: str, text: str, names: str) -> dict[str, float]:
     """Three numbers that stand apart by commas, or one for all of them, by name."""
-    parts = text.split(",")
-    if len(parts) not in (1, 3):
+    found = options.numbers(option, text)
+    if len(found) not in (1, 3):
         raise ConfigError(option, text, "must be three numbers apart by commas, or one")
-    return {name: options.number(option, part) for name, part in zip(names, parts * (3 // len(parts)), strict=True)}
+    return dict(zip(names, found * (3 // len(found)), strict=True))
 
 
 def _edit(values: dict[str, Any], cell: str | None, domain: str | None, connect: str | None) -> None:

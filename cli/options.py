@@ -90,16 +90,25 @@ def number(option: str, text: str) -> float:
     return value
 
 
-def numbers(option: str, text: str, count: int | None = None) -> list[float]:
+def numbers(option: str, text: str) -> list[float]:
     """The numbers that a text says, apart by commas.
 
     Raises:
-        ConfigError: one is none, or there are others than `count`.
+        ConfigError: one is none, or not finite.
     """
-    parts = text.split(",")
-    if count is not None and len(parts) != count:
-        raise ConfigError(option, text, f"must be {count} numbers apart by commas")
-    return [number(option, part) for part in parts]
+    return [number(option, part) for part in text.split(",")]
+
+
+def three(option: str, text: str) -> tuple[float, float, float]:
+    """The three numbers that a text says, apart by commas.
+
+    Raises:
+        ConfigError: it says others.
+    """
+    if text.count(",") != 2:
+        raise ConfigError(option, text, "must be three numbers apart by commas, as 0.3,-0.1,0")
+    x, y, z = numbers(option, text)
+    return x, y, z
 
 
 def whole(option: str, text: str | None, least: int) -> int | None:

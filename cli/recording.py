@@ -8,12 +8,13 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cli import completion, options
 from common.errors import ConfigError
+from common.recording.telling import about, in_bytes, outcome, progress
 from common.terminal import echo, printable
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
     from common.recording.own import Own
     from common.recording.selection import Selection
-    from common.recording.sink import Figures, Sink
+    from common.recording.sink import Sink
     from common.supervision.interrupts import Interrupts
     from common.transport.bus import Bus
 
@@ -222,43 +223,6 @@ async def _until_ended(
         sys.stderr.write("\r\x1b[K")
         sys.stderr.flush()
     return not interrupts.stop.is_set()
-
-
-def progress(now: Figures, before: Figures, missed: int) -> str:
-    """How a recording goes, in one line."""
-    apart = max(1e-3, now.seconds - before.seconds)
-    rate = (now.size - before.size) / apart
-    lost = sum(now.dropped.values()) + missed
-    return (f"{now.seconds:6.1f} s  {now.messages:,} messages  {in_bytes(now.size)}  {in_bytes(rate)}/s  "
-            f"{lost or 'none'} lost")
-
-
-def outcome(files: list[str], figures: Figures, missed: dict[str, int]) -> list[str]:
-    """How a recording went, for the person who made it."""
-    names = files[0] if len(files) == 1 else f"{files[0]} to {files[-1]}"
-    line = f"recorded {figures.messages:,} messages, {in_bytes(figures.size)}, {figures.seconds:.1f} s: {names}"
-    lost = [f"  {key}: {count} dropped, the disk was too slow" for key, count in sorted(figures.dropped.items())]
-    lost += [f"  {key}: {count} lost on the way here" for key, count in sorted(missed.items())]
-    return [line, *(lost or ["nothing was lost"])]
-
-
-def in_bytes(size: float) -> str:
-    """A size for people."""
-    for unit, least in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if size >= least:
-            return f"{size / least:.1f} {unit}"
-    return f"{size:.0f} B"
-
-
-def about(cell: str) -> dict[str, Any]:
-    """What a recording says about its making."""
-    from importlib.metadata import version
-
-    versions = {name: version(name) for name in ("zencell", "eclipse-zenoh", "msgpack", "pydantic", "numpy", "mcap")}
-    return {
-        "cell": cell, "made": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "python": sys.version.split()[0],
-        "versions": versions, "arguments": sys.argv[1:],
-    }
 
 
 def info(file: File, as_json: options.Json = False) -> None:

@@ -128,7 +128,8 @@ def payload(
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Tell the arm's controller what the tool carries."""
-    _order("payload", options.number("KG", mass), cell, domain, connect, com=_vector("--com", com))
+    x, y, z = options.three("--com", com)
+    _order("payload", options.number("KG", mass), cell, domain, connect, com={"x": x, "y": y, "z": z})
 
 
 @app.command()
@@ -218,14 +219,7 @@ def jog(
         name, _, value = each.partition("=")
         joints[name] = options.number("--joint", value)
     asked: dict[str, Any] = {
-        "joints": joints, "linear": tuple(_vector("--linear", linear).values()),
-        "angular": tuple(_vector("--angular", angular).values()), "frame": frame,
+        "joints": joints, "linear": options.three("--linear", linear or "0,0,0"),
+        "angular": options.three("--angular", angular or "0,0,0"), "frame": frame,
         "seconds": duration}
     in_cell(lambda joined: joined.arm.jog(**asked), cell, domain, connect)
-
-
-def _vector(option: str, text: str | None) -> dict[str, float]:
-    parts = (text or "0,0,0").split(",")
-    if len(parts) != 3:
-        raise ConfigError(option, text, "must be three numbers X,Y,Z")
-    return dict(zip("xyz", (options.number(option, part) for part in parts), strict=True))

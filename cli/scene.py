@@ -49,10 +49,10 @@ def add(
     from cli.inspection import in_cell
     from common.client.goals import pose
 
-    x, y, z = options.numbers("X,Y,Z", at, 3)
-    asked: dict[str, Any] = {"at": pose(x, y, z, rpy=options.numbers("--rpy", rpy, 3))}
+    x, y, z = options.three("X,Y,Z", at)
+    asked: dict[str, Any] = {"at": pose(x, y, z, rpy=options.three("--rpy", rpy))}
     if color:
-        asked["color"] = options.numbers("--color", color, 3)
+        asked["color"] = options.three("--color", color)
     kind = cast(Literal["box", "sphere", "cylinder"], shape)
     dimensions = options.numbers("SIZE", size)
     echo(in_cell(lambda joined: joined.scene.add(name, kind, dimensions, **asked), cell, domain, connect))
