@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from common.graph.wired import Wired
 
 FORMATS = (".svg", ".dot", ".mmd")
-VIEWER = "viewer"
 
 
 def graph(
@@ -39,6 +38,7 @@ def graph(
     from cli.inspection import look
     from common.config import load_cell
     from common.graph.drawing import graph_of, names
+    from common.viewer.access import VIEWER
 
     path = Path(output).expanduser() if output else None
     write = _writer_of(path)

@@ -74,6 +74,7 @@ class Operation:
             require_modules,
         )
         from common.transport.endpoint import endpoint_of
+        from common.viewer.access import VIEWER
 
         self.began = process_began()
         self.file = Path(summary) if summary else None
@@ -88,7 +89,7 @@ class Operation:
         ))
         loaded = load_cell(cell, self.launch.overrides, world=world, seed=self.launch.seed)
         if no_viewer:
-            kept = {name: entry for name, entry in loaded.services.items() if entry.kind != viewing.VIEWER}
+            kept = {name: entry for name, entry in loaded.services.items() if entry.kind != VIEWER}
             loaded = loaded.model_copy(update={"services": kept})
         self.cell: Cell = loaded
         self.fold = Fold(loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,

@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from cli import options
-from cli.viewing import VIEWER
 from common.supervision.share import Share
 from common.terminal import echo
 
@@ -43,6 +42,7 @@ def init(
     from common.security.folder import authority_files, make
     from common.security.rights import rights_in
     from common.transport.credentials import ACCESS
+    from common.viewer.access import VIEWER
 
     valid = options.whole("--days", days, 1)
     assert valid is not None

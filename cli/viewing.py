@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from common.config import Cell
     from common.viewer.access import FreePort
 
-VIEWER = "viewer"
 HIGHEST_PORT = 65535
 
 Port = Annotated[
@@ -48,6 +47,7 @@ def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
     from common.transport.credentials import secure_folder
     from common.viewer.access import (
         TOKEN_VARIABLE,
+        VIEWER,
         address_of,
         first_free_port,
         is_loopback,

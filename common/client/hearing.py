@@ -51,6 +51,13 @@ async def topic_in(bus: Bus, key: str) -> Carried | None:
     return next((topic_of_owner(owner) for owner in await bus.owners() if owner.key == key), None)
 
 
+def own_word(bus: Bus, owner: Owner) -> str | None:
+    """The word by which the program knows what somebody says; None where that is not what it means by the word."""
+    topic = topic_of_owner(owner)
+    meant = topic is not None and bus.full_key(replace(topic, key=owner.own)) == f"{bus.cell}/{owner.key}"
+    return owner.own if meant else None
+
+
 class Ear:
     """The newest messages of a cell: subscribed when first asked for, and from then on."""
 
@@ -232,12 +239,12 @@ class Camera(Part):
 
 
 async def cameras(bus: Bus) -> list[str]:
-    """Names of the cameras that are there now, sorted."""
+    """Names of the cameras that are there now, sorted: those that the program means in its own words."""
     found = set()
     for owner in await bus.owners():
         topic = topic_of_owner(owner)
         if topic is not None and owner.own in (topics.CAMERA_INFO.key, topics.DEPTH_CAMERA_INFO.key):
-            found.add(owner.key.removesuffix(f"/{INFO}"))
+            found.add((own_word(bus, owner) or owner.key).removesuffix(f"/{INFO}"))
     return sorted(found)
 
 

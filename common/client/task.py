@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from common import topics
 from common.application import find_application
-from common.client.hearing import Ear, topic_of_owner
+from common.client.hearing import Ear, own_word, topic_of_owner
 from common.client.joining import newest_heard
 from common.client.part import Part
 from common.errors import RequestFailed, UnknownName, ZencellError
@@ -99,9 +99,8 @@ class TaskControl(Part):
         for owner in await self._bus.owners():
             topic = topic_of_owner(owner)
             if isinstance(topic, Topic) and issubclass(topic.message, TaskStatus):
-                meant = replace(topic, key=owner.own)
-                if self._bus.full_key(meant) == f"{self._bus.cell}/{owner.key}":
-                    return meant
+                if own_word(self._bus, owner) is not None:
+                    return replace(topic, key=owner.own)
                 found[owner.key] = topic
         if len(found) == 1:
             return found.popitem()[1]

@@ -12,8 +12,7 @@ from common.process.wiring import Wiring, require_one_owner, wiring_of
 from common.security.access import Rights, rights_of, rights_of_recorder, rights_of_supervisor
 from common.supervision.launch import require_modules
 from common.transport.credentials import RECORDER, SUPERVISOR
-
-VIEWER = "viewer"
+from common.viewer.access import VIEWER
 
 
 def rights_in(cell: Cell, names: Collection[str] | None = None) -> dict[str, Rights]:

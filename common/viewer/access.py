@@ -22,6 +22,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from common.errors import ConfigError
 
+VIEWER = "viewer"  # kind of the service that serves the page
 FIRST_PORT = 8080  # when none is asked for
 LAST_PORT = FIRST_PORT + 99
 TOKEN_VARIABLE = "ZENCELL_VIEWER_TOKEN"  # in the environment, where no list of processes shows it

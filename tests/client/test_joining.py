@@ -18,9 +18,9 @@ from common.client.joining import SeveralUp
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import UnknownName, ZencellError
-from common.messages import Header, TaskStatus
+from common.messages import CameraInfo, Header, TaskStatus
 from common.process.in_process import running_service
-from common.topics import Topic
+from common.topics import CAMERA_INFO, Topic
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import smart_pick_place, trajectory_executor
@@ -95,6 +95,24 @@ async def test_arm_is_stopped_and_task_started_under_the_keys_that_the_program_m
         for asked in (right.arm.status(), right.services(), left.services()):
             with pytest.raises(NothingHeard, match="two_arms/"):
                 await asked
+
+
+async def test_camera_is_named_in_the_words_of_the_program(net: LocalNetwork) -> None:
+    async def films(bus: Bus, config: None) -> None:
+        bus.writer(CAMERA_INFO).put(CameraInfo(
+            header=Header(frame_id=bus.service), width=2, height=1, k=[1.0, 0.0, 1.0, 0.0, 1.0, 0.5, 0.0, 0.0, 1.0]))
+        await bus.ready()
+        await asyncio.Event().wait()
+
+    async with (
+        running_service(net, films, None, name="one", topics=LEFT),
+        running_service(net, films, None, name="two", topics={"camera/*": "right/camera/*"}),
+    ):
+        for remapped, name, others in ((LEFT, "camera", ["right/camera"]), (None, "right/camera", ["left/camera"])):
+            async with Cell("test", remapped=remapped) as cell:
+                assert sorted(await cell.cameras()) == sorted([name, *others])
+                info = await (await cell.camera(name)).info()
+                assert info.header.frame_id == ("one" if remapped else "two")
 
 
 async def test_of_several_tasks_the_one_whose_keys_are_meant_is_the_task(net: LocalNetwork) -> None:
