@@ -16,6 +16,8 @@ What it brings lies in modules of these names within the package, or else in the
     page      (optional) labels and layers of the operator's page
     recording (optional) how its messages are written for other tools, as common/recording/foxglove.py says
     verbs     (optional) verbs of the command line, as common/verbs.py says
+    checks    (optional) what `zencell check` finds beside its own, as generators of findings: `quick(cell)`, from the
+                files alone, and `reach(cell, arm)`, with an arm of common/checking/arm.py
     reach     (optional) for `zencell robot new --cell`:
                 fitted(RobotModel, tree of a cell file) -> that tree with a world in reach of the robot
     double    (optional) a service, with `Config` and `run`, that stands for its perception in `simulate --doubles`:

@@ -143,7 +143,7 @@ class Summary:
 
     @property
     def unexplained(self) -> list[list[float]]:
-        """Where [m] a task that is DONE left something for no reason that it tells, by the truth of a simulated world."""
+        """Where [m] a task that is DONE left what it does not call rejected, by the truth of a simulated world."""
         if not (self.fills and self.state == "DONE"):
             return []
         named = [_xyz(place.position) for place in self._all_rejected().places]
@@ -183,9 +183,9 @@ class Summary:
             "seed": self.seed,
             "speed": self.speed,
             "truth": self.truth.counted(),
+            "figures": dict(self.status.figures),
             "overlooked": self.status.overlooked,
             "unexplained": self.unexplained,
-            "figures": dict(self.status.figures),
             **self.figures.blocks(),
             **({"chaos": list(self.chaos)} if self.chaos is not None else {}),
         }

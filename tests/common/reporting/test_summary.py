@@ -30,7 +30,7 @@ def test_summary_has_the_fields_that_scripts_read() -> None:
     summary = Summary("panda", 3, 5.0).as_dict()
     assert list(summary) == [
         "cell", "state", "placed", "targets", "rejected", "failures", "retries", "seconds", "plans",
-        "frame_to_target_ms", "restarts", "seed", "speed", "truth", "figures",
+        "frame_to_target_ms", "restarts", "seed", "speed", "truth", "figures", "overlooked", "unexplained",
     ]
     assert list(summary["seconds"]) == ["ready", "first_motion", "task", "moving", "planning"]
     assert list(summary["frame_to_target_ms"]) == ["p50", "p99"]

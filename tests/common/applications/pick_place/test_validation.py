@@ -82,3 +82,12 @@ def test_the_pixel_decides_what_is_in_the_container_when_there_is_one():
     seen = frame((float(place[0]), float(place[1])))
     assert np.hypot(*(place - (0.583, 0.283))) > 0.02, "the top layer is seen far from where it is"
     assert validation().judge(seen, camera).inside == 1
+
+
+def test_what_is_no_target_is_told_in_words_as_long_as_it_is_seen():
+    judge = validation()
+    small = frame((0.4, 0.05), (0.4, -0.2)).model_copy(update={"remark": "2 red blobs are smaller than 400"})
+    for _ in range(2):  # the rejection is told once, the remark with each frame
+        verdict = judge.judge_all([(small, camera)])
+        assert verdict.remark == "2 red blobs are smaller than 400, and 1 of 2 was rejected, too far to the right"
+    assert judge.judge_all([(frame((0.4, 0.05)), camera)]).remark == ""

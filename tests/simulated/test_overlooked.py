@@ -1,0 +1,38 @@
+"""An empty result is no success: what was seen and not taken is said, and what was left unsaid is told apart."""
+
+import pytest
+
+from tests.harness import RunningCell
+from tests.simulated.visited import SimulatedCell
+
+LEAST = "services.vision_detector.min_contour_area_px"
+
+
+def test_balls_below_the_least_area_are_told_with_it_and_as_left() -> None:
+    summary = SimulatedCell("panda", ["world.count=2", f"{LEAST}=3000"]).summary
+    assert (summary["state"], summary["placed"]) == ("DONE", 0)
+    assert summary["overlooked"] == ("the table looks empty, but 2 red blobs are smaller than "
+                                     "vision_detector.min_contour_area_px = 3000")
+    assert summary["unexplained"] == [[0.4, -0.3, 0.03], [0.52, -0.3, 0.03]]
+
+
+def test_balls_that_were_rejected_are_explained() -> None:
+    summary = SimulatedCell("panda", ["world.balls=[[0.4,-0.3]]", "services.workspace_validator.max_radius=0.4",
+                                      "services.smart_pick_place.grace=1.0"]).summary
+    assert (summary["state"], summary["placed"], len(summary["rejected"])) == ("DONE", 0, 1)
+    assert "1 of 1 was rejected, too far: 0.500 m" in summary["overlooked"]
+    assert summary["unexplained"] == []
+
+
+def test_run_that_took_everything_overlooked_nothing() -> None:
+    summary = SimulatedCell("panda", ["world.count=1"]).summary
+    assert (summary["placed"], summary["overlooked"], summary["unexplained"]) == (1, "", [])
+
+
+@pytest.mark.slow
+@pytest.mark.cell
+async def test_run_that_left_something_without_a_word_exits_3_and_warns_before(tmp_path) -> None:
+    with RunningCell(tmp_path, "run", "panda", "--set", "world.count=1", "--set", f"{LEAST}=3000") as cell:
+        assert await cell.ended(120.0) == 3
+    assert "error: world.objects: ball_1 appears on" in cell.text
+    assert "left at (0.400, -0.300, 0.030): not among what was rejected" in cell.text
