@@ -58,4 +58,4 @@ class TaskStatus(Message):
     task_seconds: Finite = Field(0.0, description="cell time since the start of the task [s]")
     figures: dict[Name, bool | int | Finite | Text | None] = Field({}, max_length=200)
     message: Text = ""
-    overlooked: Text = Field("", description="that something was seen and not done, in words, as the task ends; or empty")
+    overlooked: Text = Field("", description="what was seen and not done, in words, as the task ends")
