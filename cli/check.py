@@ -60,10 +60,10 @@ def examine(cell: Cell) -> Iterator[Finding]:
 
 def wiring(cell: Cell) -> Iterator[Finding]:
     """What services refuse, and keys that do not fit together."""
-    from cli.wired import Unwired, wired
     from common.checking.finding import error, refusal
     from common.checking.wiring import Keys, check_wiring
     from common.errors import ConfigError, ZencellError
+    from common.graph.wired import Unwired, wired
 
     found, complete = [], True
     for entry in cell.services.values():

@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 import viser
 
+from common.client.operator_motion import OURSELVES, SOMEBODY
 from common.control.jogging import PAUSE
 from common.messages import MotionOwner, MotionStatus
-from common.process.operator_motion import OURSELVES, SOMEBODY
 from common.sources import monotonic
 from common.viewer.console import Desk
 from common.viewer.doors import Doors

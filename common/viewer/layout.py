@@ -10,8 +10,8 @@ import yaml
 from pydantic import Field
 
 from common.config import Section, check, config_root, read_yaml
-from common.control.record_file import lasting_folder
 from common.errors import ConfigError
+from common.kept_file import lasting_folder
 from common.viewer.taught import write_whole
 
 FILE = "viewer.yaml"

@@ -12,8 +12,8 @@ import yaml
 from pydantic import Field
 
 from common.config import Section, check, read_yaml
-from common.control.record_file import lasting_folder
 from common.errors import ConfigError
+from common.kept_file import lasting_folder
 
 HEADER = "# Poses that were taught on the page: joint positions [rad, m] by name.\n"
 MOST = 200

@@ -12,9 +12,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from common.application import Application
+from common.client.operator_motion import AT_REST
 from common.errors import NoResponder, RemoteError, ZencellError
 from common.messages import GripperState, MotionStatus, PlanResponse, RobotStatus, TaskStatus
-from common.process.operator_motion import AT_REST
 from common.viewer.markup import BAD, BUSY, GOOD, OFF
 
 STATES = {"IDLE": "Waiting", "HOMING": "Going home", "DONE": "Done", "ERROR": "Failed"}

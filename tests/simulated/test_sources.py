@@ -11,8 +11,9 @@ SINGLE = (
     "common/transport/requests.py", "common/transport/tokens.py", "common/transport/trace.py",
     "common/supervision/supervisor.py", "common/supervision/operation.py",
 )
-REAL = tuple(f"common/hardware/{name}.py" for name in (  # of real arms, which no simulation has
-    "driver", "driver_process", "driven_gripper", "franka", "ur"))
+REAL = tuple(f"common/{name}.py" for name in (  # of real arms and cameras, which no simulation has
+    "hardware/driver", "hardware/driver_process", "hardware/driven_gripper", "hardware/franka", "hardware/ur",
+    "perception/calibration_record"))
 OF_THE_MACHINE = {"time", "uuid", "secrets", "random", "datetime"}
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from common.application import find_application
 from common.config import config_root
-from common.control.record_file import lasting_folder
+from common.kept_file import lasting_folder
 from common.errors import ConfigError
 from common.viewer.layers import find_layers, layers_shown
 from common.viewer.layout import TABS, Layout, Viewpoint, load_layout, save_layout
