@@ -41,7 +41,7 @@ def fields_of(model: type[BaseModel], indent: int = 0, seen: tuple[type[BaseMode
         if field.description:
             line += f"  # {field.description}"
         yield line
-        for inner in _models_in(field.annotation):
+        for inner in models_in(field.annotation):
             if inner not in seen:
                 yield from fields_of(inner, indent + 1, (*seen, inner))
     for name, computed in model.model_computed_fields.items():
@@ -63,11 +63,12 @@ def type_name(annotation: Any) -> str:
     return "None" if annotation is type(None) else getattr(annotation, "__name__", str(annotation))
 
 
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models that a type is made of."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for argument in typing.get_args(annotation):
-        yield from _models_in(argument)
+        yield from models_in(argument)
 
 
 def _bound(metadata: Any) -> str:

@@ -1,0 +1,42 @@
+"""What `mkdocs build` does beside the pages (mkdocs.yml): GitHub's Markdown and links out of docs/ work in the site, too."""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).resolve().parent.parent
+LINK = re.compile(r"\[([^\]]*)\]\(((?:\.\./)+[^)#\s]+)(?:#[^)]*)?\)")
+FENCE = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """The text of a page as Python-Markdown wants it: what it links to outside of docs/ is part of the site as text."""
+    folder = posixpath.dirname(page.file.src_uri)
+    parts, end = [], 0
+    for fence in FENCE.finditer(markdown):
+        parts += [_prose(markdown[end:fence.start()], folder, config, files), fence[0]]
+        end = fence.end()
+    return "".join([*parts, _prose(markdown[end:], folder, config, files)])
+
+
+def _prose(text: str, folder: str, config: Any, files: Any) -> str:
+    text = re.sub(r"^( +)(?=\S)", r"\1\1", text, flags=re.MULTILINE)  # lists within lists: two blanks, where it wants four
+    return LINK.sub(lambda link: _shown(link, folder, config, files), text)
+
+
+def _shown(link: re.Match[str], folder: str, config: Any, files: Any) -> str:
+    """A link within docs/ as it is, one to a file beside docs/ to a copy of that in the site, one to a folder as text."""
+    target = posixpath.normpath(posixpath.join("docs", folder, link[2]))
+    if target.startswith("docs/") or not (ROOT / target).exists():
+        return link[0]  # mkdocs says that it leads nowhere
+    if (ROOT / target).is_dir():
+        return link[1]
+    uri = f"files/{target}.txt"
+    if files.get_file_from_path(uri) is None:
+        files.append(File.generated(config, uri, content=(ROOT / target).read_text(encoding="utf-8")))
+    return f"[{link[1]}]({posixpath.relpath(uri, folder or '.')})"
