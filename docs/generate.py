@@ -1,4 +1,4 @@
-"""Writes docs/parameters.md and the generated tables of README.md; with --check, tells whether they are current.
+"""Writes the pages and tables of docs/ that are made from the code; with --check, tells whether they are current.
 
 Run as `python -m docs.generate [--check]` from the project's folder.
 """
@@ -9,6 +9,7 @@ import asyncio
 import importlib
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,10 @@ from common.application import all_topics
 from common.config.tunables import bounds_of, is_tunable
 from common.planning.planners import load_planner
 from common.process.wiring import owned_in, wiring, wiring_of
+from docs import reference
 from docs.seed_parameters import CAMERA, CONTROLLER, VALIDATOR, SeedParameter
 
-ROOT = Path(__file__).resolve().parent.parent
+DOCS = Path(__file__).resolve().parent
 
 
 def first_line(text: str | None) -> str:
@@ -155,26 +157,36 @@ def shown_key(topic: topics.AnyTopic) -> str:
     return topics.PARAMETERS.key if topic.key.startswith("param/") else topic.key
 
 
-def readme(text: str) -> str:
-    """The README with its generated tables made anew, between their markers."""
-    for name, table in (("services", service_table("panda")), ("ur5", service_table("ur5")), ("topics", topic_table())):
+TABLES: dict[str, dict[str, Callable[[], str]]] = {  # by page, the tables in it and what makes each
+    "reference/services.md": {"services": lambda: service_table("panda"), "ur5": lambda: service_table("ur5")},
+    "reference/topics.md": {"topics": topic_table},
+}
+PAGES: dict[str, Callable[[], str]] = {
+    "parameters.md": parameters, "reference/commands.md": reference.commands,
+    "reference/messages.md": reference.messages, "reference/python.md": reference.client,
+}
+
+
+def made(page: str) -> str:
+    """The text of a page of docs/: all of it is made, or its tables are made anew between their markers."""
+    if page in PAGES:
+        return PAGES[page]()
+    text = (DOCS / page).read_text(encoding="utf-8")
+    for name, table in TABLES[page].items():
         pattern = re.compile(rf"(<!-- {name}: made by docs/generate.py -->\n).*?(\n<!-- end of {name} -->)", re.DOTALL)
         if not pattern.search(text):
-            raise SystemExit(f"README.md has no place for the table of {name}")
-        text = pattern.sub(lambda match, made=table: f"{match[1]}{made}{match[2]}", text)
+            raise SystemExit(f"docs/{page} has no place for the table of {name}")
+        text = pattern.sub(lambda match, rows=table(): f"{match[1]}{rows}{match[2]}", text)
     return text
 
 
 def main() -> int:
     """Write what is not current, or say that it is not."""
-    files = {
-        ROOT / "docs" / "parameters.md": parameters(),
-        ROOT / "README.md": readme((ROOT / "README.md").read_text(encoding="utf-8")),
-    }
+    files = {DOCS / page: made(page) for page in [*PAGES, *TABLES]}
     old = [path for path, text in files.items() if not path.exists() or path.read_text(encoding="utf-8") != text]
     if "--check" in sys.argv:
         for path in old:
-            sys.stderr.write(f"{path.name} is not current: run `make docs`\n")
+            sys.stderr.write(f"docs/{path.relative_to(DOCS)} is not current: run `make docs`\n")
         return 1 if old else 0
     for path in old:
         path.write_text(files[path], encoding="utf-8")

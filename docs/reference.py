@@ -183,7 +183,7 @@ def arguments_of(function: Any) -> Iterator[str]:
             starred = True
             yield "*"
         starred = starred or parameter.kind is inspect.Parameter.VAR_POSITIONAL
-        told = parameter.kind.description.startswith("variadic") and str(parameter).split(":")[0] or name
+        told = (parameter.kind.description.startswith("variadic") and str(parameter).split(":")[0]) or name
         if parameter.annotation is not inspect.Parameter.empty:
             told += f": {parameter.annotation}"
         yield told if parameter.default is inspect.Parameter.empty else f"{told} = {parameter.default!r}"

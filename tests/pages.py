@@ -1,0 +1,68 @@
+"""What pages tell a person to do: their commands, their files, and what they say is printed then."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
+STARTS = (".venv/bin/", "make ", "zencell ", "python ", "PYTHONPATH=", "xacro ")
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command, and what the page shows below it; `...` stands for anything there."""
+
+    line: str
+    shows: str = ""
+
+    def shown_in(self, text: str) -> bool:
+        """Whether a text is what the page says, or has it in it."""
+        parts = [re.escape(part.strip()) for part in re.split(r"\.\.\.(?!\.)", self.shows)]
+        return re.search(r"[\s\S]*?".join(parts), text) is not None
+
+
+def text_of(page: str) -> str:
+    """The text of a page, by its path in the project."""
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+def blocks(text: str, language: str = r"\w*") -> list[tuple[str, str]]:
+    """(language, text) of the blocks of code of a page."""
+    return re.findall(rf"^```({language})\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+
+
+def files(text: str) -> dict[str, str]:
+    """By name, the files that a page has its reader write."""
+    return dict(re.findall(r"^`([\w./]+)`:\n\n```\w+\n(.*?)^```$", text, re.DOTALL | re.MULTILINE))
+
+
+def steps(text: str, language: str = r"\w*") -> list[Step]:
+    """The commands of a page in their order, without comments; a block `text` below one is what it prints."""
+    found: list[Step] = []
+    for kind, block in blocks(text):
+        if kind == "text" and found:
+            found[-1] = Step(found[-1].line, block.strip())
+        elif re.fullmatch(language, kind):
+            lines = [re.sub(r"\s+# .*$", "", line).strip() for line in block.splitlines()]
+            found += [Step(line) for line in lines if line.startswith(STARTS)]
+    return found
+
+
+def lines(text: str, language: str = r"\w*") -> list[str]:
+    """The commands of a page."""
+    return [step.line for step in steps(text, language)]
+
+
+def prose(text: str) -> str:
+    """A page without its blocks of code."""
+    return re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def anchors(text: str) -> set[str]:
+    """The names of the headings of a page, as links call them."""
+    headings = re.findall(r"^#{1,6} (.*)$", prose(text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
