@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup franka-sim run up test test-all containers check audit bench bench-check chaos fuzz soak docs deploy clean
+.PHONY: setup franka-sim run up test test-all containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
 
 setup: $(STAMP)
 
@@ -73,6 +73,14 @@ soak: setup  ## thirty minutes of work beside a slow and a stuck subscriber: not
 
 docs: setup  ## write the generated tables and pages again
 	$(BIN)/python -m docs.generate
+
+# The site needs an extra that stays, as each of them.
+WITH_SITE := $(if $(filter site,$(subst $(COMMA), ,$(EXTRAS))),$(EXTRAS),$(EXTRAS:%=%$(COMMA))site)
+
+docs-site:  ## the pages as a site with search in build/site, to be read without a network; broken links are errors
+	@$(MAKE) --no-print-directory setup EXTRAS=$(WITH_SITE)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "open $(CURDIR)/build/site/index.html"
 
 deploy: setup  ## write the compose files and Kubernetes manifests again
 	$(BIN)/python -m deploy.generate

@@ -176,7 +176,8 @@ def made(page: str) -> str:
         pattern = re.compile(rf"(<!-- {name}: made by docs/generate.py -->\n).*?(\n<!-- end of {name} -->)", re.DOTALL)
         if not pattern.search(text):
             raise SystemExit(f"docs/{page} has no place for the table of {name}")
-        text = pattern.sub(lambda match, rows=table(): f"{match[1]}{rows}{match[2]}", text)
+        rows = table()
+        text = pattern.sub(lambda match, rows=rows: f"{match[1]}{rows}{match[2]}", text)
     return text
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
-STARTS = (".venv/bin/", "make ", "zencell ", "python ", "PYTHONPATH=", "xacro ")
+STARTS = (".venv/bin/", "make ", "zencell ", "zenoh ", "python ", "PYTHONPATH=", "xacro ")
 
 
 @dataclass(frozen=True)

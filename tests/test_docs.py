@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from docs import generate
 from docs.seed_parameters import CONTROLLER
+from tests import pages
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
-@pytest.mark.parametrize("name", ["docs/parameters.md", "README.md"])
-def test_generated_text_is_current(name: str) -> None:
-    text = (ROOT / name).read_text(encoding="utf-8")
-    made = generate.parameters() if name.startswith("docs") else generate.readme(text)
-    assert text == made, "run `make docs`"
+PAGES = sorted(path.relative_to(ROOT).as_posix() for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"),
+                                                              *ROOT.glob("examples/*.md")])
+
+
+@pytest.mark.parametrize("page", [*generate.PAGES, *generate.TABLES])
+def test_generated_text_is_current(page: str) -> None:
+    assert (generate.DOCS / page).read_text(encoding="utf-8") == generate.made(page), "run `make docs`"
 
 
 def test_every_controller_parameter_of_the_seed_document_has_a_row() -> None:
@@ -30,10 +35,38 @@ def test_every_controller_parameter_of_the_seed_document_has_a_row() -> None:
     }
 
 
-@pytest.mark.parametrize("page", sorted(p.relative_to(ROOT).as_posix() for p in [
-    *ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]))
+@pytest.mark.parametrize("page", PAGES)
 def test_links_within_the_project_lead_somewhere(page: str) -> None:
     path = ROOT / page
-    for link in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text(encoding="utf-8")):
+    for link in re.findall(r"\]\(([^)\s]+)\)", pages.prose(pages.text_of(page))):
         if "://" not in link:
-            assert (path.parent / link).exists(), link
+            target, _, anchor = link.partition("#")
+            found = (path.parent / target).resolve() if target else path
+            assert found.exists() and found.is_relative_to(ROOT), link
+            assert not anchor or anchor in pages.anchors(found.read_text(encoding="utf-8")), link
+
+
+def pages_of(nav: Any) -> list[str]:
+    """The pages of a navigation, in order."""
+    if isinstance(nav, str):
+        return [nav]
+    return [page for part in (nav.values() if isinstance(nav, dict) else nav) for page in pages_of(part)]
+
+
+def test_every_page_is_in_the_navigation_of_the_site_once() -> None:
+    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+    assert sorted(pages_of(site["nav"])) == [page.removeprefix("docs/") for page in PAGES if page.startswith("docs/")]
+    tutorials = [page for page in pages_of(site["nav"]) if page.startswith("tutorials/")]
+    for number, (page, following) in enumerate(zip(tutorials, [*tutorials[1:], None], strict=True), 1):
+        text = pages.text_of(f"docs/{page}")
+        assert text.startswith(f"# {number}. ")
+        assert following is None or f"]({Path(following).name})" in text.rpartition("\nNext: ")[2], page
+
+
+def test_site_is_made_of_nothing_that_another_host_has() -> None:
+    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+    assert site["theme"]["font"] is False and {"search", "offline"} == set(site["plugins"])
+    assert not {"extra_css", "extra_javascript", "repo_url"} & set(site)
+    for page in PAGES:
+        assert "```mermaid" not in pages.text_of(page), "drawn by a script of another host"
+        assert not re.search(r"!\[[^]]*\]\(\w+://|<(?:img|script|iframe)\b", pages.prose(pages.text_of(page))), page

@@ -36,6 +36,7 @@ from common.topics import CAMERA_IMAGE, CAMERA_INFO, GRIPPER_STATE, SCENE_OBJECT
 from common.transport.codec import decode
 from common.transport.local import LocalNetwork
 from common.viewer.guard import close_server, make_server
+from tests import pages
 from tests.common.viewer.scene_cell import Stage
 from tests.harness import ask, free_domain
 from tests.simulated.visited import no_processes
@@ -43,7 +44,7 @@ from tests.simulated.visited import no_processes
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
-FILES = dict(re.findall(r"^`([\w./]+)`:\n\n```\w+\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE))
+FILES = pages.files(PAGE)
 COMMANDS = [
     line for block in re.findall(r"^```sh\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE) for line in block.splitlines()
 ]

@@ -1,4 +1,5 @@
-"""The commands of the README, word for word but for the port, so that tests beside each other do not meet.
+"""The commands of the README and of pages that go on where it ends, word for word but for the port, so that tests beside
+each other do not meet.
 
 Of each application one run is one of processes; what the others change of it happens on the virtual clock.
 """
@@ -16,26 +17,24 @@ from pathlib import Path
 
 import pytest
 
+from tests import pages
 from tests.harness import ask, free_domain
 from tests.simulated.visited import no_processes
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-LINES = [
-    line.partition("#")[0].strip()
-    for block in re.findall(r"^```\w*\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
-    for line in block.splitlines()
-    if line.startswith((".venv/bin/", "make "))
-]
-RUNS = [line for line in LINES if line.startswith(".venv/bin/zencell run")]
-BESIDE = [line for line in LINES if line.startswith(".venv/bin/") and line not in RUNS and " up " not in line]
+PAGES = ("README.md", "docs/tools.md", "docs/outlining.md")
+README = pages.lines(pages.text_of("README.md"))
+LINES = [*dict.fromkeys(line.removeprefix(".venv/bin/") for page in PAGES for line in pages.lines(pages.text_of(page)))]
+RUNS = [line for line in LINES if line.startswith("zencell run")]
+BESIDE = [line for line in LINES if line.startswith("zen") and line not in RUNS and " up " not in line]
 AS_PROCESSES = [next(line for line in RUNS if f" {cell} " in line) for cell in ("panda", "ur5")]
 PATIENCE = 60  # [s]
 
 
 def command(line: str, *more: str) -> list[str]:
-    return [part.replace(".venv/bin/", f"{BIN}/") for part in shlex.split(line)] + list(more)
+    program, *words = shlex.split(line)
+    return [f"{BIN}/{program}", *words, *more]
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +57,7 @@ def cell() -> Iterator[dict[str, str]]:
 
 
 def test_readme_names_the_two_commands_first() -> None:
-    assert [line.split("#")[0].strip() for line in LINES[:2]] == ["make run", "make test"]
+    assert README[:2] == ["make run", "make test"]
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in ("run", "test", "setup", "check", "bench"):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
@@ -112,5 +111,5 @@ def test_command_of_the_readme_answers_beside_a_running_cell(line: str, cell: di
 @pytest.mark.slow
 @pytest.mark.cell
 def test_up_prints_the_line_of_the_readme(cell: dict[str, str]) -> None:
-    line = next(line for line in LINES if "/zenoh " in line).removeprefix(".venv/bin/")
+    line = next(line for line in LINES if line.startswith("zenoh "))
     assert cell["PASTE"] == line.replace("7489", str(7447 + int(cell["ZENCELL_DOMAIN"])))

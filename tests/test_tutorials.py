@@ -24,10 +24,11 @@ CELL = "zencell up panda --set autostart=false --set world.count=3"
 REAL = "real-arm"
 NAMES = [path.stem for path in pages.TUTORIALS]
 TEXTS = {path.stem: path.read_text(encoding="utf-8") for path in pages.TUTORIALS}
-NOT_RUN = {  # they set up the machine, or need an arm
+NOT_RUN = {  # they set up the machine, or need an arm; the double is started by its test
     "first-run": {"make setup"},
     REAL: {"make setup EXTRAS=ur", "zencell up my_cell.yaml --set autostart=false", "zencell robot enable",
-           "zencell task home", "python -m tests.doubles.ur_controller --host 127.0.0.2"},  # that is started below
+           "zencell task home",
+           "python -m tests.doubles.ur_controller --host 127.0.0.2 --off --q 0,-2.36,1.57,-1.57,-1.57,0"},
 }
 
 pytestmark = [pytest.mark.slow, pytest.mark.cell]
