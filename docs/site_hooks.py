@@ -7,11 +7,26 @@ import re
 from pathlib import Path
 from typing import Any
 
+from mkdocs.exceptions import Abort
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).resolve().parent.parent
 LINK = re.compile(r"\[([^\]]*)\]\(((?:\.\./)+[^)#\s]+)(?:#[^)]*)?\)")
 FENCE = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
+
+FOREIGN = re.compile(r"""<(?:script|img|iframe)\b[^>]*\bsrc=["']?(?:https?:)?//[^>]*>"""
+                     r"""|<link\b(?=[^>]*\brel=["']?(?:stylesheet|preload|preconnect|icon))[^>]*\bhref=["']?(?:https?:)?//[^>]*>""")
+
+
+def on_post_build(config: Any) -> None:
+    """Refuse a site of which a page would ask another host for something when it is read.
+
+    Raises:
+        Abort: one would.
+    """
+    for page in sorted(Path(config.site_dir).rglob("*.html")):
+        if found := FOREIGN.search(page.read_text(encoding="utf-8")):
+            raise Abort(f"{page.name} asks another host: {found[0]}")
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:

@@ -1,5 +1,5 @@
-"""The commands of the README and of pages that go on where it ends, word for word but for the port, so that tests beside
-each other do not meet.
+"""The commands of the README and of pages that go on where it ends, word for word but for the port, so that tests
+beside each other do not meet.
 
 Of each application one run is one of processes; what the others change of it happens on the virtual clock.
 """
