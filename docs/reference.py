@@ -23,6 +23,7 @@ from common.config.tunables import bounds_of
 from common.topics import Request
 
 MADE = "Made by `python -m docs.generate`; a test keeps it current."
+WIDTH = 90  # of a line of code that can be read without scrolling
 PARTS = {  # of the client, as a program gets at each
     "Cell": Cell, "cell.arm": Arm, "cell.gripper": Hand, "cell.camera()": Camera, "cell.task": TaskControl,
     "cell.param": Parameters, "cell.world": World,
@@ -79,7 +80,8 @@ def option_row(parameter: Any) -> str:
         if not getattr(parameter, "is_flag", False):
             name += f" {parameter.metavar or parameter.type.name.upper()}"
     default = parameter.default
-    told = "required" if parameter.required else "" if default in (None, False, (), []) or callable(default) else code(str(default))
+    unsaid = default in (None, False, (), []) or callable(default)
+    told = "required" if parameter.required else "" if unsaid else code(str(default))
     return f"| {code(name)} | {told} | {words(parameter.help)} |"
 
 
@@ -167,9 +169,11 @@ def entry(name: str, function: Any, kind: str) -> list[str]:
     """Heading, signature and docstring of a function."""
     lines = ["", f"### {name}", ""]
     if kind != "property":
-        arguments = ", ".join(arguments_of(function))
-        call = f"{name.replace('()', '')}({arguments})"
-        lines += ["```python", f"{'await ' if kind == 'await' else ''}{call}", "```", ""]
+        begin = f"{'await ' if kind == 'await' else ''}{name.replace('()', '')}("
+        arguments = [*arguments_of(function)]
+        short = f"{begin}{', '.join(arguments)})"
+        call = [short] if len(short) <= WIDTH else [begin, *(f"    {each}," for each in arguments), ")"]
+        lines += ["```python", *call, "```", ""]
     return [*lines, *prose(function)]
 
 
