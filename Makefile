@@ -79,7 +79,7 @@ WITH_SITE := $(if $(filter site,$(subst $(COMMA), ,$(EXTRAS))),$(EXTRAS),$(EXTRA
 
 docs-site:  ## the pages as a site with search in build/site, to be read without a network; broken links are errors
 	@$(MAKE) --no-print-directory setup EXTRAS=$(WITH_SITE)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict  # with --quiet it counts no warnings
 	@echo "to read it: $(PYTHON) -m http.server --bind 127.0.0.1 -d build/site"
 
 deploy: setup  ## write the compose files and Kubernetes manifests again

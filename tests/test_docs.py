@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 import yaml
 
-from docs import generate
+from cli.main import app
+from docs import generate, reference
 from docs.seed_parameters import CONTROLLER
 from tests import pages
 
@@ -44,6 +46,26 @@ def test_links_within_the_project_lead_somewhere(page: str) -> None:
             found = (path.parent / target).resolve() if target else path
             assert found.exists() and found.is_relative_to(ROOT), link
             assert not anchor or anchor in pages.anchors(found.read_text(encoding="utf-8")), link
+
+
+NO_VERBS = {"polish": "one that a reader's own application might bring", "VERB": "stands for any"}
+
+
+@pytest.fixture(scope="module")
+def verbs() -> set[str]:
+    return {name.removeprefix("zencell ") for name, _ in reference.verbs_of(typer.main.get_command(app), "zencell")}
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page != "CHANGELOG.md"])
+def test_commands_that_a_page_names_are_there(page: str, verbs: set[str]) -> None:
+    text = pages.text_of(page)
+    code = "".join(block for _, block in pages.blocks(text))
+    for said in [*re.findall(r"`zencell\s+([^`]+)`", pages.prose(text)),
+                 *re.findall(r"^(?:\.venv/bin/)?zencell (.*)$", code, re.MULTILINE)]:
+        verb, *more = said.replace(",", " ").split()
+        group = {name.partition(" ")[2] for name in verbs if name.startswith(f"{verb} ")}
+        names_one = verb in verbs or (group and (not more or more[0] in group))
+        assert names_one or verb in NO_VERBS or verb.startswith("--"), said
 
 
 def pages_of(nav: Any) -> list[str]:
