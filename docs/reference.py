@@ -36,8 +36,10 @@ def words(text: str | None) -> str:
 
 
 def code(text: str) -> str:
-    """A text as code in a table."""
-    return f"`{text.replace('|', chr(92) + '|')}`" if text else ""
+    """A text as code in a table, in which a bar would be the end of a cell."""
+    if "|" in text:
+        return f"<code>{words(text).replace(chr(92) + '|', '&#124;')}</code>"
+    return f"`{text}`" if text else ""
 
 
 # --- the command line -------------------------------------------------------------------------------------------------
@@ -47,8 +49,8 @@ def commands() -> str:
     """The text of docs/reference/commands.md: every verb with its arguments and options."""
     lines = [
         "# Command line", "",
-        f"{MADE} `zencell VERB --help` prints the same. Exit codes: 0 done, 1 it failed,",
-        "2 bad input (one line says what, and the choices), 130 Ctrl-C.",
+        f"{MADE} `zencell VERB --help` prints the same.", "",
+        "Exit codes: 0 done, 1 it failed, 2 bad input (one line says what, and the choices), 130 Ctrl-C.",
     ]
     root: Any = typer.main.get_command(app)
     for name, verb in verbs_of(root, "zencell"):
@@ -74,7 +76,7 @@ def shown_parameters(verb: Any) -> list[Any]:
 def option_row(parameter: Any) -> str:
     """A row of the table of a verb."""
     if parameter.param_type_name == "argument":
-        name = parameter.metavar or parameter.name.upper()
+        name = (parameter.metavar or parameter.name.upper()).strip("[]")  # some have one for two
     else:
         name = ", ".join([*parameter.opts, *parameter.secondary_opts])
         if not getattr(parameter, "is_flag", False):
@@ -92,8 +94,9 @@ def messages() -> str:
     """The text of docs/reference/messages.md: every message that a topic carries, and what is in it."""
     lines = [
         "# Messages", "",
-        f"{MADE} Each is sent as a msgpack map of these names. Lengths are metres, angles radians, times",
-        "seconds unless a unit says otherwise; quaternions are x, y, z, w; a stamp is cell time in ns since the Unix epoch.",
+        MADE, "",
+        "Each is sent as a msgpack map of these names. Lengths are metres, angles radians, times seconds unless a unit says",
+        "otherwise; quaternions are x, y, z, w; a stamp is cell time in ns since the Unix epoch.",
         "`zencell topic info KEY` prints the message of a key with an example; keys: [topics](topics.md).",
     ]
     for model in sorted(models(), key=lambda model: model.__name__):
@@ -130,7 +133,8 @@ def client() -> str:
     """The text of docs/reference/python.md: what `zencell` gives to programs, from its docstrings."""
     lines = [
         "# Python client", "",
-        f"{MADE} With `from zencell import Cell` what says *await* is awaited;",
+        MADE, "",
+        "With `from zencell import Cell` what says `await` is awaited,",
         "`from zencell.blocking import Cell` is the same without. What it is for: [client](../client.md).",
     ]
     for name, part in PARTS.items():
