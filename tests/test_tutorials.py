@@ -31,7 +31,7 @@ NOT_RUN = {  # they set up the machine, or need an arm; the double is started by
            "python -m tests.doubles.ur_controller --host 127.0.0.2 --off --q 0,-2.36,1.57,-1.57,-1.57,0"},
 }
 
-pytestmark = [pytest.mark.slow, pytest.mark.cell]
+pytestmark = [pytest.mark.slow, pytest.mark.cell, pytest.mark.timeout(600)]  # a page is several runs of a cell
 
 
 def test_what_is_not_run_is_known() -> None:
