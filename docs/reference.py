@@ -11,7 +11,6 @@ import typer
 from pydantic import BaseModel
 
 import zencell
-from cli import schema
 from cli.main import app
 from common.application import all_topics
 from common.client.arm import Arm, Hand
@@ -20,6 +19,7 @@ from common.client.hearing import Camera
 from common.client.parameters import Parameters
 from common.client.task import TaskControl
 from common.config.tunables import bounds_of
+from common.messages import schema
 from common.topics import Request
 
 MADE = "Made by `python -m docs.generate`; a test keeps it current."

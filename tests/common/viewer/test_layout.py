@@ -6,8 +6,8 @@ import pytest
 
 from common.application import find_application
 from common.config import config_root
-from common.kept_file import lasting_folder
 from common.errors import ConfigError
+from common.kept_file import lasting_folder
 from common.viewer.layers import find_layers, layers_shown
 from common.viewer.layout import TABS, Layout, Viewpoint, load_layout, save_layout
 
