@@ -104,8 +104,8 @@ def _places(world: World, placed: list[ObjectConfig], solids: dict[str, Solid]) 
             inner = _square(container, container.half_side - container.wall_thickness)
             if low < world.table_height + container.wall_height and _reach_into(
                     outline, _square(container, container.half_side)) and not within(outline, inner):
-                yield error(f"world.objects: {thing.id} at {_at(thing)} stands in a wall of {container.id} at the "
-                            "start", f"move it, or world.containers.{container.id}")
+                yield warning(f"world.objects: {thing.id} at {_at(thing)} stands in a wall of {container.id} at the "
+                              "start", f"move it, or world.containers.{container.id}")
         x, y = (thing.position or (thing.x or 0.0, thing.y or 0.0))[:2]
         table = Table(world, solid.radius)
         # Spheres that lie nowhere are refused by whoever simulates the world.
