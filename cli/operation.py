@@ -109,6 +109,7 @@ class Operation:
         self._watchers: dict[str, list[str]] = {}  # commands by name
         self._disturbance: Disturbance | None = None
         self._chaos: Chaos | None = None
+        self._doubts: asyncio.Task[list[Finding]] | None = None
         self.first: Callable[[Bus], Awaitable[None]] | None = None  # is done at the terminal once the cell is up
 
     def serve_page(self, host: str | None, port: str | None) -> None:
@@ -288,6 +289,7 @@ class Operation:
         from common.supervision.collector import Collector
 
         assert self._screen is not None
+        self._doubts = asyncio.create_task(asyncio.to_thread(_doubts, self.cell))  # while services come up
         self._collector = Collector(bus, self.fold, self.began, self._screen.progress)
 
     async def _until_ended(self, bus: Bus) -> int:
@@ -365,7 +367,7 @@ class Operation:
         self.summary.ready = time.monotonic() - self.began
         if self._page and self._screen:
             self._screen.note(f"Open {self._page.address}")
-        for found in await asyncio.to_thread(_doubts, self.cell):
+        for found in await self._doubts if self._doubts is not None else ():
             self._note(f"{found.severity}: {printable(found.line)}")
         if self._disturbance is not None:
             from common.chaos.setting import chaos_in, keys_of
@@ -400,7 +402,7 @@ def _require_safe(cell: Cell) -> None:
 
 
 def _doubts(cell: Cell) -> list[Finding]:
-    """What else will not work, as far as it is told quickly; once the cell is up, so that nobody waits for it."""
+    """What else will not work, as far as it is told quickly."""
     from common.checking.cell import quick
 
     return [found for found in quick(cell) if not found.refused]
