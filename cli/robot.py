@@ -134,8 +134,8 @@ def payload(
 
 @app.command()
 def io(
-    output: Annotated[str | None, typer.Argument(metavar="[OUTPUT", help="number of a digital output")] = None,
-    state: Annotated[str | None, typer.Argument(metavar="on|off]", help="what it becomes")] = None,
+    output: Annotated[str | None, typer.Argument(metavar="OUTPUT", help="number of a digital output")] = None,
+    state: Annotated[str | None, typer.Argument(metavar="on|off", help="what it becomes")] = None,
     cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
 ) -> None:
     """Print the digital inputs and outputs of the arm's controller, or set an output."""
