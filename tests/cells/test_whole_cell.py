@@ -121,11 +121,11 @@ async def test_it_is_jogged_from_a_terminal_until_that_dies_and_is_nobodys_then(
     (["take"], "the motion is .* \\(operator\\) since .* UTC\n"), (["give"], "the motion is nobody's\n"),
     (["give"], "the motion is nobody's\n"),
     (["jog"], "zencell: jog: needs --joint NAME=V, --linear X,Y,Z or --angular X,Y,Z\n"),
-    (["jog", "--linear", "1,2"], "zencell: --linear: '1,2' must be three numbers X,Y,Z\n"),
+    (["jog", "--linear", "1,2"], "zencell: --linear: '1,2' must be three numbers apart by commas, as 0.3,-0.1,0\n"),
     (["jog", "--joint", "nose=1"], "zencell: unknown joint 'nose'; choices: panda_finger_joint1, .*\n"),
     (["jog", "--linear", "0,0,1", "--frame", "moon"], "zencell: jog.frame: 'moon' must be .*\n"),
     (["jog", "--linear", "0,0,1", "--seconds", "99"],
-     "zencell: --seconds: '99' must be more than 0 and at most 60 s\n"),
+     "zencell: --seconds: 99.0 must be more than 0 and at most 60 s\n"),
 ])
 def test_who_takes_gives_and_jogs_is_told_in_one_line(up: RunningCell, arguments: list[str], wanted: str) -> None:
     said = up.tell("robot", *arguments)

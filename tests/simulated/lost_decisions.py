@@ -10,7 +10,6 @@ from unittest.mock import patch
 from common.config import load_cell
 from common.control.inhibits import Inhibits, Record
 from common.control.record_file import RecordFile
-from common.transport.bus import Bus
 from common.transport.ownership import Ownership
 from common.virtual.doubles import settings_of, with_doubles
 from common.virtual.simulation import Simulation
@@ -35,10 +34,6 @@ def _let_in():
     return patch.object(Ownership, "_require_only", nobody)
 
 
-def _not_held_back():
-    return patch.object(Bus, "hold_back", lambda self: None)
-
-
 def _late_start_counts():
     return patch("common.control.inhibits._lets_go", lambda request, inhibit: (
         request.override or (request.stops if inhibit.kind == "stopped" else True)))
@@ -52,7 +47,6 @@ DECISIONS = {
     "the speed is forgotten": lambda: patch.object(
         trajectory_executor, "speed_of", lambda kept, configured: configured),
     "a second instance is let in": _let_in,
-    "a second instance puts before it is refused": _not_held_back,
     "a start undoes a later stop": _late_start_counts,
 }
 

@@ -33,7 +33,6 @@ def outcome_of(name: str, seed: int, faults: bool = True) -> Outcome:
 @pytest.mark.parametrize(("name", "seed"), [
     ("panda", 1), ("ur5", 1),
     ("panda", 21),  # a start is on its way when the robot is held
-    ("panda", 22),  # a second instance puts what it knows before it is refused
     ("ur5", 31),  # the robot is stopped and started while the next executor waits for the end of another
     ("ur5", 39),  # the arm moves meanwhile
 ])

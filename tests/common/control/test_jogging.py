@@ -162,11 +162,11 @@ def test_whatever_is_asked_for_set_points_keep_the_limits(arm):
 def test_each_joint_comes_to_rest_before_its_end(arm, sign):
     for k, joint in enumerate(arm.robot.joint_names):
         arm.jog(0.2, joints={joint: sign * 9.0})
-        arm.cycle._jogging._kinematics = None  # without the tool's own limit, faster
+        arm.cycle.authority._jogging._kinematics = None  # without the tool's own limit, faster
         arm.jog(12.0, joints={joint: sign * 9.0})
         end = arm.robot.upper[k] if sign > 0 else arm.robot.lower[k]
         assert 0 <= sign * (end - arm.q[k]) < 0.01
-        arm.cycle._jogging._kinematics = arm.robot
+        arm.cycle.authority._jogging._kinematics = arm.robot
     assert max(arm.judge()) <= 1.001
 
 
