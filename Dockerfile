@@ -34,6 +34,7 @@ COPY --from=kernel /src/common/planning/kernel/*.so common/planning/kernel/
 COPY services services
 COPY cli cli
 COPY zencell zencell
+COPY examples examples
 COPY config config
 USER zencell
 HEALTHCHECK --interval=3s --timeout=10s --start-period=90s --retries=5 CMD ["python", "-m", "common.process.health"]
