@@ -198,6 +198,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         if problem := await decisions.keep():
             message = f"{status.message}; {problem}".removeprefix("; ")
             status = status.model_copy(update={"message": message, "inhibits": inhibits.all})
+        if news := cycle.news_of_motion(bus.header("world")):  # who has the answer may ask for the state next
+            motion.put(news)
         return status.model_copy(update={"header": bus.header()})
 
     async def keep_speed() -> None:
@@ -219,6 +221,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
             bus.log.info("%s: the motion was %s, it is %s now", request.owner, before.told, now.told)
         if problem := await decisions.keep():
             bus.log.error("%s", problem)
+        if news := cycle.authority.news(bus.header("world")):
+            owner.put(news)
         return now.model_copy(update={"header": bus.header()})
 
     async def jog() -> None:

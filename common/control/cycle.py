@@ -142,7 +142,7 @@ class ControlCycle:
                                        self._payload.news()))]
         self.authority.look(bool(self._arm.goal) or not self._arm.at_rest or self._fingers_move)
         report.owner = self.authority.news(header)
-        report.motion = self._news_of_motion(header, now)
+        report.motion = self.news_of_motion(header)
         report.gripper = self._news_of_gripper(header, now)
         if self._world is not None and not self.apart:
             report.updates = [update.model_copy(update={"header": header}) for update in self._world.take_events()]
@@ -388,8 +388,9 @@ class ControlCycle:
             velocities += finger_velocities(self._fingers, width, self._width_rate)
         return JointState(header=header, name=names, position=positions, velocity=velocities, effort=[])
 
-    def _news_of_motion(self, header: Header, now: float) -> MotionStatus | None:
-        told, said = self._told_motion, self._arm.said
+    def news_of_motion(self, header: Header) -> MotionStatus | None:
+        """What the motion's status is, if that is new: also ahead of an answer to who changed it."""
+        told, said, now = self._told_motion, self._arm.said, header.stamp * 1e-9
         if told is not None and (
             told.progress == self._arm.progress or now - self._told_motion_at < PROGRESS_PERIOD
         ) and (said == self._said or told.same_but(self._arm.status, "progress")):

@@ -51,6 +51,20 @@ class Deciding(Generic[V]):
     p: TaskConfig
     status: m.TaskStatus
 
+    def __init_subclass__(cls, **given: object) -> None:
+        """Refuse a method that would take the place of one that is not meant for it.
+
+        Raises:
+            TypeError: names it.
+        """
+        super().__init_subclass__(**given)
+        for base in cls.__mro__[1:]:
+            if base.__module__.startswith(f"{__package__}."):
+                for name in vars(cls).keys() & vars(base).keys():
+                    if name.startswith("_") and not name.startswith("__"):
+                        raise TypeError(f"{cls.__name__}.{name}: {base.__name__} has a method of that name for itself; "
+                                        "choose another")
+
     def __init__(self, config: TaskConfig, status: m.TaskStatus, prefix: str, speed: float = 1.0) -> None:
         """Start from nothing known.
 

@@ -44,6 +44,16 @@ async def test_held_arm_stands_still_whoever_asked_for_it_and_goes_on_when_let_g
         assert (await person.see(person.motion, lambda m: m.state != "active")).state == "succeeded"
 
 
+async def test_who_has_the_answer_to_a_stop_or_a_hold_finds_it_in_the_state_already() -> None:
+    async with executor("services.trajectory_executor.joint_state_rate=10", speed=1.0) as person:  # it tells seldom
+        await person.see(person.motion, lambda m: not m.held)
+        for hold in (True, False) * 5:
+            await person.hold.call(HoldRequest(hold=hold, owner="ann"))
+            assert person.motion.latest.held == hold
+        await person.stop.call(StopRequest(owner="ann"))
+        assert [one.by for one in person.motion.latest.inhibits] == ["ann"]
+
+
 async def test_restarted_executor_holds_what_a_person_held_and_not_what_a_watchdog_did() -> None:
     async with executor() as person:
         await person.hold.call(HoldRequest(hold=True, by="watchdog"))

@@ -366,3 +366,10 @@ def test_motion_is_asked_for_with_its_plan_and_the_scene_of_it() -> None:
     cell.until("reach")
     executed = next(c for c in cell.asked if isinstance(c, m.ExecuteRequest))
     assert executed.plan == cell.plans()[0].id and executed.scene_stamp == 7
+
+
+def test_method_that_would_take_the_place_of_the_engines_own_is_refused_by_its_name() -> None:
+    with pytest.raises(TypeError, match=r"Mine\._count: Task has a method of that name for itself; choose another"):
+        class Mine(Task[View]):
+            def _count(self, view: View) -> None:
+                """Of a person who does not know that the engine counts, too."""
