@@ -58,6 +58,7 @@ def found_in(name, bug, seeds, enough=None):
     for seed in seeds:
         with DECISIONS[bug]():
             outcome = Simulation(cell, seed, faults=True, limit=60.0).run()
+        assert not any("TypeError" in crash for crash in outcome.crashes), f"it was put back wrongly: {outcome.crashes}"
         if not outcome.ok or outcome.crashes:
             found.append(seed)
             first = first or f"{outcome.state} {outcome.message}"

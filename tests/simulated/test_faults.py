@@ -10,7 +10,7 @@ from common.virtual.campaign import run_seeds
 from common.virtual.faults import SKEW, SPEEDS, make_plan
 from common.virtual.simulation import LIMIT, Outcome, Simulation
 from common.virtual.watched_arm import with_watched_arm
-from tests.simulated.known_bugs import BUGS, found_within
+from tests.simulated.known_bugs import BUGS, RARE, found_within
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
 
@@ -65,8 +65,7 @@ AT_ONCE = ["what is not newer is read", "the task reads the truth", "a request t
 
 @pytest.mark.parametrize("bug", [bug if bug in AT_ONCE else pytest.param(bug, marks=pytest.mark.slow) for bug in BUGS])
 def test_known_bug_is_found_within_a_few_tens_of_seeds(bug):
-    found = found_within(bug, 30)
-    assert found is not None
+    assert found_within(bug, 400 if bug in RARE else 30) is not None
 
 
 def test_ten_bugs_are_known():
