@@ -32,7 +32,7 @@ STOPPED = "was stopped for safety: `zencell robot recover` lets it move again"
 SILENT = 0.25  # [s] without a word from the process or the arm, after which there is no knowing where it is
 PRIORITY = 20  # real-time priority of the process, where the system grants one
 LEAST = 2e-4  # [s] that are left to others in each cycle
-TOLD = 1.5e-3  # [s] between two readings that are told, at least
+TOLD = 1.5e-3  # [s] between two readings that are told, at least, where nothing happened
 
 
 class Arm(Protocol):
@@ -245,7 +245,7 @@ def _follow(arm: Arm, stream: SetPointStream, pipe: Connection) -> None:
     acts, results = ThreadPoolExecutor(1), deque[tuple[str, int, str]]()
     period, epoch, taken, why = 1 / arm.rate, 0, False, ""
     kept: Vector | None = None  # where the arm is kept; None before the first set-point since it became ready
-    due, told = time.monotonic(), 0.0
+    due, told, said = time.monotonic(), 0.0, ("", "", -1, "")
     while True:
         while pipe.poll():
             match pipe.recv():
@@ -279,9 +279,10 @@ def _follow(arm: Arm, stream: SetPointStream, pipe: Connection) -> None:
             arm.servo(points)  # at rest too, where the motion ended
         else:
             arm.wait()
-        if now - told >= TOLD and select.select([], [pipe], [], 0.0)[1]:  # else nobody takes it: the arm must not wait
-            told = now
-            behind, ceased = (stream.behind, stream.ceased) if taken else (0.0, "")
+        behind, ceased = (stream.behind, stream.ceased) if taken else (0.0, "")
+        says = (state.mode, state.message, epoch, ceased)
+        if (says != said or now - told >= TOLD) and select.select([], [pipe], [], 0.0)[1]:  # else nobody takes it,
+            told, said = now, says  # for whom the arm must not wait; what is new may be all that comes for a while
             pipe.send(Reading(now, state, epoch, why, max(0.0, now - due), behind, ceased))
         due = max(due + period, now)
         time.sleep(LEAST if arm.paces else max(LEAST, due - time.monotonic()))

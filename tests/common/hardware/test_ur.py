@@ -100,12 +100,17 @@ def test_set_points_are_for_when_they_were_made_however_late_they_are_sent(
     assert np.allclose(np.diff(np.array(stamps, dtype=float)), 0.01, atol=1e-6)
 
 
-def test_a_program_that_ended_is_told_at_once_and_begun_again(host: UrHost, rig: Rig) -> None:
+def test_a_program_that_ended_is_told_at_once_and_begun_again(
+    host: UrHost, rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rig.until_it_moves()
     driver = multiprocessing.active_children()
+    heard, hear = list[str](), rig.arm._process._hear
+    monkeypatch.setattr(rig.arm._process, "_hear", lambda told: (heard.append(told.state.message), hear(told)))
     host.tell("end")
-    assert "its program has ended" in rig.wave(2.0)
+    assert rig.wave(2.0) != "", "it comes to rest"
     rig.until_it_moves()
+    assert any("its program has ended" in message for message in heard)
     assert multiprocessing.active_children() == driver, "by the same process"
 
 
