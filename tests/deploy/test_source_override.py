@@ -14,9 +14,7 @@ from tests.deploy.engine import Containers, require_engine
 pytestmark = [pytest.mark.container, pytest.mark.timeout(900)]
 
 SERVICE, OTHER = "panda-vision_detector", "panda-workspace_validator"
-SOURCE = ("common", "services", "cli", "zencell", "config", "deploy")
-FILES = ("compose.yaml", "compose.dev.yaml", "Dockerfile", ".dockerignore", ".env", "pyproject.toml", "setup.py",
-         "constraints.txt")
+FILES = ("compose.yaml", "compose.dev.yaml", "Dockerfile", ".dockerignore", ".env")
 PATIENCE = 120.0  # [s] only ever waited for by a test that fails
 
 
@@ -24,10 +22,11 @@ PATIENCE = 120.0  # [s] only ever waited for by a test that fails
 def cell(tmp_path: Path) -> Iterator[Containers]:
     """The router and two services on a copy of the source, ready."""
     require_engine()
-    for name in SOURCE:
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in FILES:
-        shutil.copy2(ROOT / name, tmp_path / name)
+    for name in (*FILES, *copied()):
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy2(ROOT / name, tmp_path / name)
     files = ("compose.yaml", "compose.dev.yaml")
     with Containers("zencell-test-source", files, tmp_path) as containers:
         containers.compose("build", "router", timeout=800)
@@ -35,6 +34,13 @@ def cell(tmp_path: Path) -> Iterator[Containers]:
         for service in ("router", SERVICE, OTHER):
             containers.wait_for(f"{service} is ready", lambda s=service: containers.is_ready(s), PATIENCE)  # type: ignore[misc]
         yield containers
+
+
+def copied() -> set[str]:
+    """What of the source goes into the image: files and folders at its top."""
+    copies = [line.split() for line in (ROOT / "Dockerfile").read_text(encoding="utf-8").splitlines()
+              if line.startswith("COPY ") and "--from" not in line]
+    return {Path(source).parts[0] for copy in copies for source in copy[1:-1] if not source.startswith("--")}
 
 
 def replace(file: Path, text: str) -> None:
