@@ -48,6 +48,7 @@ class Limiter:
             self._leave_room(position, position)
         self._step = self._period  # duration of the newest step [s]
         self._way = 0.0 * self.position if velocity is None else velocity.copy()  # mean velocity in it
+        self._told = self._way  # velocity at its end
         self._change = 0.0 * self.position  # mean acceleration up to the middle of it
         self._kept: tuple[Vector, Vector] | None = None  # velocity and acceleration where a way back goes on
         self._braked = False
@@ -87,7 +88,7 @@ class Limiter:
         self._kept = None if acceleration is None else (velocity, acceleration)
         way = (target - self.position) / seconds
         self._change = (way - self._way) / ((self._step + seconds) / 2)
-        self.position, self._way, self._step = target, way, seconds
+        self.position, self._way, self._step, self._told = target, way, seconds, velocity
         if self._beyond:
             self._leave_room(np.maximum(self._lowest, target), np.minimum(self._highest, target))
         return target, velocity
@@ -165,8 +166,10 @@ class Limiter:
 
     def _given(self, hardest: Vector) -> ruckig.InputParameter:
         """The state of now, and an acceleration that is not exceeded (dof,) [rad/s^2]."""
-        if self._kept is None:
-            self._kept = self._way + self._change * (self._step / 2), self._change
+        if self._kept is None:  # by an even acceleration in the newest step, which is one that is allowed
+            most = hardest * (self._step / 2)
+            gained = np.clip(self._told - self._way, -most, most)
+            self._kept = self._way + gained, gained / (self._step / 2)
         v0, a0 = self._kept
         given = ruckig.InputParameter(len(v0))
         given.synchronization = ruckig.Synchronization.No
@@ -181,7 +184,11 @@ def _after(given: ruckig.InputParameter, seconds: float) -> tuple[Vector, Vector
     """Positions, velocities and accelerations (dof,) after a step on the fastest way to what is given."""
     dof = len(given.current_position)
     otg, motion = ruckig.Ruckig(dof), ruckig.Trajectory(dof)
-    if otg.calculate(given, motion) not in RUCKIG_OK:
+    try:
+        found = otg.calculate(given, motion) in RUCKIG_OK
+    except ruckig.RuckigError:  # of a way of less than it can compute with
+        found = False
+    if not found:
         given.control_interface = ruckig.ControlInterface.Velocity  # come to rest, which always has a solution
         given.target_velocity = [0.0] * dof
         otg.calculate(given, motion)

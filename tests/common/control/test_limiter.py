@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from common.control.limiter import POSITION_SLACK, Limiter
@@ -63,6 +63,9 @@ def test_full_acceleration_to_full_deceleration_within_a_cycle_passes():
     ), min_size=1, max_size=12),
     share=st.sampled_from([1.0, 0.3, 0.05]),
 )
+@example(  # on the way back of so little ruckig finds no profile
+    jumps=[(27, [0.0, 4.28960194463659e-08], [0.0, -3.0]), (3, [0.0, 0.0], [0.0, -3.0])], share=1.0
+)
 def test_whatever_is_asked_for_what_is_sent_is_within_limits(jumps, share):
     limiter = Limiter(LIMITS, STILL, PERIOD)
     sent = [STILL, STILL, STILL]
@@ -70,6 +73,22 @@ def test_whatever_is_asked_for_what_is_sent_is_within_limits(jumps, share):
         for _ in range(count):
             sent.append(limiter.step(np.array(target), np.array(velocity), PERIOD, share)[0])
     assert_within(sent, share=share)
+
+
+@pytest.mark.parametrize("rested", range(4))
+@pytest.mark.parametrize("begun", [0.0, 0.3, 0.9])
+def test_whoever_comes_to_rest_goes_on_no_faster_than_from_rest(rested, begun):
+    limiter, braking = Limiter(LIMITS, STILL, PERIOD), 0.9 * LIMITS.acceleration
+    for k in range(15):  # up, and down again, at rest within a cycle
+        limiter.step(braking * (k * PERIOD) ** 2 / 2, braking * k * PERIOD, PERIOD)
+    q, dq = limiter.position, braking * 14 * PERIOD
+    ends = (14 - begun) * PERIOD  # from now on
+    for t in np.arange(1, 15 + rested) * PERIOD:
+        u = min(t, ends)
+        asked = q + dq * u - dq / ends * u**2 / 2
+        assert limiter.step(asked, dq * (1 - u / ends), PERIOD, braking=True)[0] is asked
+    _, velocity = limiter.go_at(-LIMITS.velocity, PERIOD)
+    assert np.all(np.abs(velocity) <= LIMITS.acceleration * PERIOD * (2 if rested == 0 else 1) * 1.001)
 
 
 @pytest.mark.parametrize("strange", [np.nan, np.inf, -np.inf])
