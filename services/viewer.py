@@ -92,7 +92,7 @@ async def _visited(page: Page) -> None:
 
 async def run(bus: Bus, config: Config) -> None:
     """Show the cell to whoever looks, until cancelled."""
-    layout = load_layout(config.layout)
+    layout = load_layout(config.layout, bus.log.warning)
     application = find_application(config.members.application) if config.members.application else None
     layers = find_layers(application, config.layers, config.members.keys)
     read = Topics(application, layers.values(), config.members.keys)

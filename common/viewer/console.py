@@ -14,7 +14,7 @@ from pydantic import JsonValue
 
 from common import topics
 from common.config import Members
-from common.errors import RequestFailed, ZencellError
+from common.errors import RequestFailed
 from common.messages import (
     JogCommand,
     Message,
@@ -30,7 +30,7 @@ from common.messages import (
 from common.topics import Request, Topic
 from common.viewer.doors import VISITOR, Doors, Need
 from common.viewer.feeds import Feeds
-from common.viewer.words import problem
+from common.viewer.words import UNDERSTOOD, problem
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -66,6 +66,8 @@ def assign(handle: Field[V], value: V) -> None:
 def can_be_given(handle: object, value: object) -> bool:
     """Whether a browser can give that value: whoever has the page open may send what no field of it takes."""
     if isinstance(value, float) and not math.isfinite(value):
+        return False
+    if isinstance(value, list | tuple) and not all(can_be_given(None, each) for each in value):
         return False
     return not isinstance(handle, viser.GuiDropdownHandle) or value in handle.options
 
@@ -104,7 +106,7 @@ class Desk:
                 act, context = await self._orders.get()
                 try:
                     doing = context.run(act)
-                except ZencellError as error:
+                except UNDERSTOOD as error:
                     self.tell(problem(error))
                     continue
                 if doing is not None:
@@ -113,7 +115,7 @@ class Desk:
     async def _see_through(self, doing: Coroutine[Any, Any, None]) -> None:
         try:
             await doing
-        except ZencellError as error:
+        except UNDERSTOOD as error:
             self.tell(problem(error))
 
     def on_press(self, name: str, act: Act, what: str, need: Need = "operate") -> None:

@@ -69,6 +69,11 @@ class Doors:
         with self._lock:
             return self._pages.get(key)
 
+    def is_in(self, visitor: Visitor | None) -> bool:
+        """Whether the page of a visitor is open, as far as it has told which it is."""
+        with self._lock:
+            return visitor in self._pages.values()
+
     @property
     def person(self) -> str:
         """What to call who asks now: one host is one person, whose own stops and holds are no other's."""

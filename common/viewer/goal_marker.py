@@ -9,7 +9,7 @@ import numpy as np
 import viser
 
 from common.messages import Pose
-from common.robot.transforms import invert
+from common.robot.transforms import invert, matrix_to_pose
 from common.viewer.nodes import FLAT, matrix_wxyz, pose_from, position_of, wxyz_of
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 HAND, REACHED, NOT_REACHED = (255, 170, 60), (60, 200, 100), (240, 60, 60)
 _SIZE = 0.18  # of the marker [m]
+FARTHEST, ROUNDING = 100.0, 1e-3  # [m] from the origin of world; of the length of a quaternion
 
 
 class GoalMarker:
@@ -38,6 +39,7 @@ class GoalMarker:
             name, scale=_SIZE, depth_test=False, opacity=0.9, visible=False, position=T_world_tcp[:3, 3],
             wxyz=matrix_wxyz(T_world_tcp), line_width=3.0,
         )
+        self._kept = matrix_to_pose(T_world_tcp)
         hand = _hand(robot)
         self._scene = scene
         self._drawn: list[viser.MeshHandle] = []
@@ -57,8 +59,13 @@ class GoalMarker:
 
     @property
     def pose(self) -> Pose:
-        """Where it is, in world."""
-        return pose_from(np.array(self._node.position), np.array(self._node.wxyz))
+        """Where it is, in world; put back where a browser gave it a pose that is none, or is nowhere near."""
+        position, wxyz = np.array(self._node.position, float), np.array(self._node.wxyz, float)
+        if np.all(np.abs(position) <= FARTHEST) and abs(np.linalg.norm(wxyz) - 1) < ROUNDING:
+            self._kept = pose_from(position, wxyz)
+        else:
+            self.pose = self._kept
+        return self._kept
 
     @pose.setter
     def pose(self, pose: Pose) -> None:

@@ -13,6 +13,7 @@ import itertools
 import logging
 import os
 import threading
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from functools import partial
 from http import HTTPStatus
@@ -21,10 +22,12 @@ from urllib.parse import urlsplit
 
 import viser
 import websockets.asyncio.server as websocket_server
-from websockets import Headers
+from websockets import Data, Headers
+from websockets.exceptions import WebSocketException
 from websockets.http11 import Request, Response
 
 from common.errors import ConfigError
+from common.sources import monotonic
 from common.viewer.access import (
     SHORTEST_TOKEN,
     TOKEN,
@@ -42,6 +45,8 @@ from common.viewer.viser_inside import LINE, Beside, File, Process, client_files
 log = logging.getLogger(__name__)
 
 MAX_PAGES = 24  # open at once
+MAX_LOOKING = 16  # of them, of those who may not operate: there is room for who may
+WORDS = 100  # from each connection that are read at once, and in each second: a page that is dragged says fewer
 MAX_CONNECTIONS = 96  # among them requests that are still read, and those who send none
 MAX_MESSAGE = 4 * 2**20  # [bytes] from a browser
 OPEN_TIMEOUT = 5.0  # [s] until a connection has sent its request
@@ -130,11 +135,13 @@ class Guard:
         """Hold to these rules, and tell the doors who has gone."""
         self.access = access
         self._numbers = itertools.count(1)
+        self._looking: Counter[bool] = Counter()  # connections of those who may not operate: pages, and lines
         self._doors = doors
         self._waiting: set[asyncio.Task[None]] = set()
 
-    async def _see_off(self, connection: websocket_server.ServerConnection, visitor: Visitor) -> None:
+    async def _see_off(self, connection: websocket_server.ServerConnection, visitor: Visitor, line: bool) -> None:
         await connection.wait_closed()
+        self._looking[line] -= "operate" not in visitor.roles
         if self._doors is not None:
             self._doors.leave(visitor)
 
@@ -147,12 +154,17 @@ class Guard:
             line = urlsplit(request.path).path == LINE
             peer = str((connection.remote_address or ("",))[0])
             answer = self.access.answer(request.path, said, upgrade=upgrade, peer=peer)
-            if answer is None and upgrade and _pages(connection.server.connections, line) >= MAX_PAGES:
-                answer = Answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_PAGES} pages are open already: close one\n")
+            roles = self.access.roles(said["cookie"])
+            looks = "operate" not in roles
+            full = _pages(connection.server.connections, line) >= MAX_PAGES
+            if answer is None and upgrade and (full or (looks and self._looking[line] >= MAX_LOOKING)):
+                most = MAX_PAGES if full else MAX_LOOKING
+                answer = Answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{most} pages are open already: close one\n")
             if upgrade and answer is None:  # from here on this task and all that it starts handle their messages
-                visitor = Visitor(0 if line else next(self._numbers), peer, self.access.roles(said["cookie"]))
+                visitor = Visitor(0 if line else next(self._numbers), peer, roles)
+                self._looking[line] += looks
                 VISITOR.set(visitor)
-                waiting = asyncio.create_task(self._see_off(connection, visitor))
+                waiting = asyncio.create_task(self._see_off(connection, visitor, line))
                 self._waiting.add(waiting)
                 waiting.add_done_callback(self._waiting.discard)
             if answer is not None:
@@ -171,7 +183,18 @@ class Guard:
 
 
 class Bounded(websocket_server.ServerConnection):
-    """A connection that is dropped at once when there are too many."""
+    """A connection that is dropped at once when there are too many, and read no faster than anybody speaks."""
+
+    _left, _since = 0.0, 0.0
+
+    async def recv(self, decode: bool | None = None) -> Data:  # type: ignore[override]
+        """The next message, once it is its turn: who floods the page waits, not who presses STOP."""
+        data = await super().recv(decode)
+        now = monotonic()
+        self._left, self._since = min(self._left + WORDS * (now - self._since), WORDS) - 1, now
+        if self._left < 0:
+            await asyncio.sleep(-self._left / WORDS)
+        return data
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Begin, and end when this is one too many."""
@@ -227,7 +250,11 @@ def _protected(response: Response, hosts: list[str], *, lasts: bool = False) -> 
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    return record.getMessage() != "opening handshake failed"  # who only knocks, or is dropped, is none
+    if record.getMessage() == "opening handshake failed":
+        return False  # who only knocks, or is dropped, is none
+    if record.exc_info and isinstance(error := record.exc_info[1], WebSocketException):
+        record.msg, record.args, record.exc_info = f"{record.getMessage()}: {error}", (), None  # theirs, not ours
+    return True
 
 
 _connection_log = logging.getLogger(f"{__name__}.connections")

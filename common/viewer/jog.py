@@ -122,7 +122,7 @@ class JogPanel:
         self._joints, self._fastest = list(joints), list(fastest)
         self._mode, self._share = JOINTS, SLOW / 100
         mode = gui.add_dropdown("Jogged", [JOINTS, *FRAMES], initial_value=JOINTS)
-        desk.on_change(mode, self._set_mode, "look")
+        desk.on_change(mode, self._set_mode)
         speed = gui.add_slider("Jog speed [%]", 1, 100, 1, SLOW, hint="100: the tool at 250 mm/s, turning at 1 rad/s, "
                                                                        "or a joint as fast as it may be jogged")
         desk.on_change(speed, self._set_speed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -64,19 +65,26 @@ def _own_layout() -> Path | None:
         return None
 
 
-def load_layout(given: str) -> Layout:
+def load_layout(given: str, tell: Callable[[str], None]) -> Layout:
     """The layout in a file; without one this user's own, else the project's.
+
+    One of this user's that cannot be used is told in a line: no cell stays down for how its page looks.
 
     Raises:
         ConfigError: the file that was given is not there, does not parse, or names something unknown.
     """
     if given:
-        path = layout_file(given)
-    else:
-        own, path = _own_layout(), config_root() / FILE
-        if own is None and not path.is_file():
-            return Layout()
-        path = own or path
+        return _read(layout_file(given))
+    if (own := _own_layout()) is not None:
+        try:
+            return _read(own)
+        except ConfigError as error:
+            tell(f"the page opens as the project has it: {error}")
+    path = config_root() / FILE
+    return _read(path) if path.is_file() else Layout()
+
+
+def _read(path: Path) -> Layout:
     return check(Layout, read_yaml(path), str(path))
 
 

@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from websockets.exceptions import ConnectionClosed
 
-from common.errors import ZencellError
 from common.sources import monotonic
 from common.viewer.doors import VISITOR
-from common.viewer.words import problem
+from common.viewer.words import UNDERSTOOD, problem
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -30,7 +29,8 @@ if TYPE_CHECKING:
 
 PERIOD = 0.25  # [s] wall between two words
 SILENT = 2.0  # [s] without news of the service itself, after which it counts as stuck
-LATE = 0.15  # [s] later than the promptest one, a word that something is held counts as one of before
+LATE = 0.15  # [s] later than the promptest one, a word that something is held counts as one of before, and
+LAST_SEEN = 0.8  # [s] after the newest news that who says it had: all words of a press may be late alike
 LONGEST = 1000  # characters that a page may say at once
 
 
@@ -43,6 +43,7 @@ class Said(BaseModel):
     n: int = 0  # number of a stop, which comes back in its answer; or of a press, which is held
     what: str = Field("", max_length=100)  # a button, or the key of the page
     at: float = Field(0.0, allow_inf_nan=False)  # [ms] by the browser's clock
+    seen: float = Field(0.0, allow_inf_nan=False)  # [s] `time` of the newest news that it had
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ class Line:
             number, line, kind = news.note
             try:
                 await connection.send(json.dumps({"news": {
-                    "how": news.how, "kept": self._kept(news.owner), "live": dict(news.live), "lost": lost,
+                    "time": now, "how": news.how, "kept": self._kept(news.owner), "live": dict(news.live), "lost": lost,
                     "unknown": sorted(unknown),
                     "note": {"number": number, "line": line, "kind": kind}}}))
             except ConnectionClosed:
@@ -140,7 +141,7 @@ class Line:
             asyncio.run_coroutine_threadsafe(_send(connection, words), loop)
 
         desk, doors = self._desk, self._desk.doors
-        unknown = doors.guarded and not getattr(VISITOR.get(), "number", 0)  # which page it is: only STOP is for all
+        unknown = doors.guarded and not doors.is_in(VISITOR.get())  # which page it is: only STOP is for all
         if said.do == "page":
             visitor = doors.page_of(said.what)
             if visitor is not None:
@@ -152,10 +153,10 @@ class Line:
         elif said.do == "release":
             desk.put(lambda: self.holder.release(connection))
         elif unknown:
-            answer("the page is still loading: nothing was done", "busy")
+            answer("the page is still loading, or was closed: nothing was done", "busy")
         elif said.do == "press":
             desk.press(said.what)
-        elif delays.late(said.n, said.at * 1e-3, monotonic()) <= LATE:
+        elif delays.late(said.n, said.at * 1e-3, now := monotonic()) <= LATE and now - said.seen <= LAST_SEEN:
             if why := doors.objection(VISITOR.get(), "operate"):
                 answer(why, "bad")  # which has the script let go
             elif doors.admit(VISITOR.get(), HOLD, said.what):
@@ -165,7 +166,7 @@ class Line:
     async def _stop(self, answer: Callable[[str, str], None]) -> None:
         try:
             line = await self.stop()  # type: ignore[misc]
-        except ZencellError as error:
+        except UNDERSTOOD as error:
             answer(f"NOT stopped: {problem(error)}", "bad")
         else:
             answer(line, "good")

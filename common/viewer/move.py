@@ -11,7 +11,6 @@ import numpy as np
 import viser
 
 from common import topics
-from common.errors import ZencellError
 from common.messages import (
     JointGoal,
     JointTrajectory,
@@ -248,7 +247,7 @@ class MovePanel:
         self._tell(line, "busy")
         try:
             await doing
-        except ZencellError as error:
+        except words.UNDERSTOOD as error:
             self._tell(problem(error), "bad")
 
     async def _plan(self, goal: PoseGoal | JointGoal) -> None:

@@ -8,7 +8,7 @@
   const ANSWER = 3000;  // [ms] for what became of STOP
   const STUCK = 2000;  // [bytes] that wait to be sent: what is held does not get there
 
-  let socket = null, heard = null, page = "", asked = 0, waiting = new Map(), told = 0, held = null, presses = 0;
+  let socket = null, heard = null, page = "", asked = 0, waiting = new Map(), told = 0, held = null, presses = 0, seen = 0;
   const opened = Date.now();
   const bar = document.createElement("div");
   bar.id = "zc-bar";
@@ -46,7 +46,7 @@
 
   function take(words) {
     heard = Date.now();
-    if (words.news) show(words.news);
+    if (words.news) { seen = words.news.time; show(words.news); }
     if (words.said !== undefined) {
       clearTimeout(waiting.get(words.n));
       waiting.delete(words.n);
@@ -157,7 +157,7 @@
     if (lostSince() !== null || !open() || socket.bufferedAmount > STUCK || document.hidden) { letGo(); return; }
     for (const element of document.querySelectorAll("[data-hold]"))
       element.classList.toggle("held", element.dataset.hold === held.what);
-    send({do: "hold", what: held.what, n: held.n, at: performance.now()});
+    send({do: "hold", what: held.what, n: held.n, at: performance.now(), seen});
   }
 
   function letGo() {

@@ -9,18 +9,19 @@ from typing import Any
 
 import viser
 import yaml
-from pydantic import JsonValue
+from pydantic import JsonValue, TypeAdapter
 
-from common.errors import ConfigError, ZencellError
+from common.errors import ConfigError
 from common.messages import Parameter
 from common.viewer.console import SLIDING, Console, assign
 from common.viewer.markup import block, span
-from common.viewer.words import problem
+from common.viewer.words import UNDERSTOOD, problem
 
 SLIDER_STEPS = 200  # at least; a slider that moves coarser than a quarter of the value is of no use
 COARSE = 10  # a slider's step about a value of 0
 TYPING = 0.8  # [s] after the last letter a text or number is sent
 
+_JSON: TypeAdapter[JsonValue] = TypeAdapter(JsonValue)
 HINT = "What may change while the cell runs. ● is no longer what the cell was started with."
 
 
@@ -78,7 +79,7 @@ class TuningPanel:
         try:
             given = knob.read(value)
             await self._console.set_parameter(knob.services, path, given)
-        except ZencellError as error:
+        except UNDERSTOOD as error:
             self._tell(problem(error), "bad")
             if turned == knob.turned:
                 knob.pending = False
@@ -150,9 +151,10 @@ class Knob:
         if not self.as_text:
             return given  # type: ignore[no-any-return]
         try:
-            return yaml.safe_load(given)  # type: ignore[no-any-return]
-        except yaml.YAMLError:
+            value: JsonValue = _JSON.validate_python(yaml.safe_load(given))
+        except (yaml.YAMLError, ValueError, RecursionError):  # a date there never was is a ValueError
             raise ConfigError(self.parameter.path, given, "is not a YAML value") from None
+        return value
 
     def show(self, parameter: Parameter) -> None:
         """Show the value that a parameter has now, unless the person is just changing it."""

@@ -166,6 +166,8 @@ def let_in(server: viser.ViserServer, may: Callable[[str, object], bool]) -> Non
 
     async def handle_what_may_be(client_id: Any, message: Any) -> None:
         if not isinstance(message, _OWN):
+            if isinstance(message, GuiUpdateMessage) and set(message.updates) != {"value"}:
+                return  # a browser gives values; viser would set any attribute of ours
             value = message.updates.get("value") if isinstance(message, GuiUpdateMessage) else None
             if not may(getattr(message, "uuid", ""), value):
                 show_again(client_id, getattr(message, "uuid", ""))

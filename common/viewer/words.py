@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from pydantic import ValidationError
+
 from common.application import Application
 from common.client.operator_motion import AT_REST
 from common.errors import NoResponder, RemoteError, ZencellError
@@ -171,8 +173,15 @@ def gripper(state: GripperState | None) -> str:
     return f"fingers {1e3 * state.width:.0f} mm apart" if state.width >= CLOSED else "fingers closed"
 
 
-def problem(error: ZencellError) -> str:
+UNDERSTOOD = (ZencellError, ValidationError)  # what goes wrong by what a person asked for, such as a number too large
+
+
+def problem(error: ZencellError | ValidationError) -> str:
     """An error as a person is told it: without what only programs need."""
+    if isinstance(error, ValidationError):
+        first, *more = error.errors()
+        where = ".".join(map(str, first["loc"])) or error.title
+        return f"{where}: {first['msg']}" + (f" (and {len(more)} more)" if more else "")
     if isinstance(error, RemoteError):
         return error.message
     if isinstance(error, NoResponder):

@@ -343,6 +343,8 @@ async def test_odd_messages_leave_the_page_and_the_service_as_they_are(
         await page.say({"type": "GuiUpdateMessage", "uuid": speed, "updates": {"value": value}})
     await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Planner"), "updates": {"value": "Explode"}})
     await page.say({"type": "GuiUpdateMessage", "uuid": page.label("Show"), "updates": {"value": "nothing"}})
+    for updates in ({"update_cb": []}, {"removed": True}, {"value": 20.0, "label": "Speed"}):
+        await page.say({"type": "GuiUpdateMessage", "uuid": speed, "updates": updates})
     panda.bus.writer(DETECTION_IMAGE).put(m.Image(
         header=m.Header(), height=4, width=4, encoding="bgr8", data=b"short"))
     for words in ({}, {"do": "explode"}, {"do": "press"}, {"do": "press", "what": 2000 * "x"}, {"do": "hold", "at": 1}):
@@ -351,6 +353,16 @@ async def test_odd_messages_leave_the_page_and_the_service_as_they_are(
     await until(lambda: panda.commands)
     assert panda.commands == ["pause"]
     capfd.readouterr()  # viser prints what it could not convert
+
+
+async def test_goal_that_is_nowhere_is_told_and_the_service_goes_on(panda: Played, page: BrowserDouble) -> None:
+    await page.set("Goal", "tool: numbers")
+    await page.until(lambda: page.parts[page.label("Tool at [mm]")]["visible"])
+    await page.set("Tool at [mm]", [1e11, 0.0, 400.0])
+    async with asyncio.timeout(PATIENCE):
+        while "position.x" not in page.news["note"]["line"]:
+            await page.speak(do="press", what="move:plan")  # over another connection than the numbers
+            await asyncio.sleep(0.05)
 
 
 async def test_light_comes_before_what_it_falls_on() -> None:

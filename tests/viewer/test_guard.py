@@ -414,6 +414,46 @@ async def test_second_operator_waits_until_the_first_has_gone(make: Make) -> Non
             assert desk.doors.operator not in ("", holder)
 
 
+async def test_who_may_only_look_leaves_places_for_who_may_operate(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guard, "MAX_LOOKING", 2)
+    async with operated(make) as (server, _desk, _ids, _), asyncio.timeout(PATIENCE):
+        look, operate = cookie_of(server, "look"), cookie_of(server, "operate")
+        async with open_page(server, cookie=look), open_page(server, cookie=look) as second:
+            assert await refused(server, cookie=look) == 503
+            async with open_page(server, cookie=operate):
+                await second.close()
+            while (status := await opened_or_status(server, look)) == 503:  # noqa: ASYNC110
+                await asyncio.sleep(0.005)
+            assert status == 101, "the place is free again"
+
+
+async def opened_or_status(server: viser.ViserServer, cookie: str) -> int:
+    try:
+        async with open_page(server, cookie=cookie):
+            return 101
+    except websockets.InvalidStatus as error:
+        return error.response.status_code
+
+
+async def test_who_floods_the_page_waits_and_stop_does_not(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guard, "WORDS", 4)
+    async with operated(make) as (server, desk, ids, done), asyncio.timeout(PATIENCE):
+        refusals: list[str] = []
+        desk.tell = lambda line, kind="bad": refusals.append(line)
+        async with (
+            open_page(server, cookie=cookie_of(server, "look")) as flood,
+            open_page(server, cookie=cookie_of(server, "operate")) as page,
+        ):
+            for _ in range(40):
+                await click(flood, ids["Start"])
+            await click(page, ids["Stop"])
+            while "Stop" not in done:  # noqa: ASYNC110
+                await asyncio.sleep(0.005)
+            assert len(refusals) < 40
+
+
 async def test_what_somebody_asks_for_is_asked_in_their_name(make: Make) -> None:
     async with operated(make) as (server, desk, _ids, _), asyncio.timeout(PATIENCE):
         persons: asyncio.Queue[str] = asyncio.Queue()

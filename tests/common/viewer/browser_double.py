@@ -79,7 +79,8 @@ class BrowserDouble:
 
     async def hold(self, what: str, press: int = 1) -> None:
         """Say once that a button of our own is held down, since a press of that number."""
-        await self.speak(do="hold", what=what, n=press, at=1e3 * time.monotonic())
+        await self.until(lambda: self.news)
+        await self.speak(do="hold", what=what, n=press, at=1e3 * time.monotonic(), seen=self.news["time"])
 
     def button(self, label: str) -> tuple[str, str]:
         """Name of the button of our own that is called so, and why it is off."""

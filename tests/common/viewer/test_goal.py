@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from common.robot.transforms import matrix_to_pose, pose_to_matrix, rpy_to_matrix, transform
 from tests.common.viewer.scene_cell import Stage, in_world
@@ -34,3 +35,19 @@ def test_gripper_in_the_marker_is_where_it_would_be(panda: Stage) -> None:
     poses = [in_world(panda.server, node) for node in shown]
     assert any(np.allclose(pose, links["panda_hand"], atol=1e-5) for pose in poses)
     assert not any(np.allclose(pose, links["panda_link5"], atol=1e-5) for pose in poses)
+
+
+@pytest.mark.parametrize(
+    ("position", "wxyz"),
+    [((1e9, 0, 0), (1, 0, 0, 0)), ((0, 0, 0.5), (0, 0, 0, 0)), ((np.nan, 0, 0), (1, 0, 0, 0))],
+)
+def test_marker_that_a_browser_gave_no_pose_goes_back(
+    panda: Stage, position: tuple[float, ...], wxyz: tuple[float, ...]
+) -> None:
+    panda.view.goal_marker(True)
+    panda.view.goal.pose = GOAL
+    before = panda.view.goal_pose
+    node = panda.view.goal._node
+    node._impl.position[:], node._impl.wxyz[:] = position, wxyz  # as a message of a browser does
+    assert panda.view.goal_pose == before
+    np.testing.assert_allclose(node.position, (0.5, 0.1, 0.4))
