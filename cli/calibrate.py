@@ -204,7 +204,8 @@ def hand_eye(
     if len(views) < LEAST_VIEWS and why:
         raise CalibrationFailed(f"{len(views)} views of the board, {LEAST_VIEWS} are needed; {why[0]}")
     result = calibrate_hand_eye(views, camera, "hand" if mount == "hand" else "beside")
-    with_hand_eye(camera, result, folder, said.robot, mount).save(output or intrinsics_file)
+    file = output or intrinsics_file
+    with_hand_eye(camera, result, folder, said.robot, mount).save(file)
     position, rpy = result.position, result.rpy
     echo(f"{len(result.pictures)} views, residual {result.rms:.3f} px rms, {1e3 * result.rms_at_board:.2f} mm at the "
          f"board; {_per_view(result.pictures)}")
@@ -213,6 +214,8 @@ def hand_eye(
     echo(f"rpy      {rpy[0]:.5f}, {rpy[1]:.5f}, {rpy[2]:.5f} rad +- {math.degrees(result.rotation_std):.3f} degrees")
     if result.dropped:
         echo(f"dropped, since they do not fit: {_per_view(result.dropped)}")
+    echo(f"{file} holds intrinsics and {'the place on the hand' if mount == 'hand' else 'pose'}; a cell takes both with "
+         f"--set world.camera={file}")
     echo(result.verdict)
 
 

@@ -10,11 +10,13 @@ import cv2
 
 from common import topics
 from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE
+from common.config import Surroundings
 from common.messages import Color, Header, Image, Marker, MarkerArray, Pose, Quaternion, Vector3
 from common.perception.boxes import BoxDetector, BoxOptions, SeenBox, outlined
 from common.perception.depth import DepthError, check_depth
 from common.perception.image import ImageError, array_to_image, image_to_array
-from common.perception.intake import Cameras, LeftOut, Unusable, picture_of
+from common.perception.intake import LeftOut, Unusable, picture_of
+from common.process.camera_reader import CameraReader
 from common.process.service import main
 from common.transport.bus import Bus
 
@@ -24,6 +26,8 @@ WORLD = "world"
 
 class Config(BoxOptions):
     """Which boxes are looked for."""
+
+    world: Surroundings = Surroundings()
 
 
 def markers(found: list[SeenBox], config: Config, stamp: int) -> MarkerArray:
@@ -47,10 +51,10 @@ def _marker(index: int, box: SeenBox, config: Config) -> Marker:
 async def run(bus: Bus, config: Config) -> None:
     """Look at every picture once its depth is here; what cannot be looked at is dropped, counted and told once."""
     images, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
-    infos, statics = bus.reader(topics.DEPTH_CAMERA_INFO), bus.reader(topics.TF_STATIC)
+    cameras = CameraReader(bus, config.world, topics.DEPTH_CAMERA_INFO)
     found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
     cv2.setNumThreads(1)  # the other cores have other services
-    detector, cameras = BoxDetector(config), Cameras()
+    detector = BoxDetector(config)
     left_out = LeftOut(bus.log, "a picture")
     kept: deque[Image] = deque(maxlen=KEPT)
     newest, turn = 0, asyncio.Lock()
@@ -63,7 +67,7 @@ async def run(bus: Bus, config: Config) -> None:
             return
         newest = image.header.stamp
         try:
-            camera = cameras.of(infos.latest, statics.latest, image.header.frame_id)
+            camera = await cameras.of(image.header)
             picture, metres = picture_of(image, camera), image_to_array(depth)
             check_depth(metres, camera.width, camera.height)
         except (Unusable, ImageError) as error:
@@ -90,6 +94,7 @@ async def run(bus: Bus, config: Config) -> None:
                 await look(image)
 
     async with asyncio.TaskGroup() as group:
+        group.create_task(cameras.follow())
         group.create_task(watch_depths())
         group.create_task(watch_images())
 

@@ -50,7 +50,8 @@ def calibrated(config: Config) -> CameraFile:
     if not config.intrinsics:
         return world
     camera = CameraFile.load(config.intrinsics)
-    if (camera.position or world.position, camera.rpy or world.rpy) != (world.position, world.rpy):
+    if camera.position is not None and (camera.mount or "", camera.position, camera.rpy or world.rpy) != (
+            world.mount or "", world.position, world.rpy):
         raise ConfigError("intrinsics", config.intrinsics, "holds another pose than the world's camera has: "
                           f"let world.camera be the file, as in --set world.camera={config.intrinsics}")
     return camera

@@ -8,11 +8,13 @@ import numpy as np
 from pydantic import Field
 
 from common import topics
-from common.config import Parameters, Run, Surroundings, Tunable
+from common.config import Parameters, RobotConfig, Run, Surroundings, Tunable
 from common.messages import Image, WorldObjects
 from common.perception.image import array_to_image
+from common.perception.mounted import Mounted
 from common.process.pace import Pace
 from common.process.service import main
+from common.robot.model import RobotModel
 from common.sim.rendering import Picture, Renderer, disturbed
 from common.transport.bus import Bus
 
@@ -21,6 +23,7 @@ class Config(Parameters):
     """Rate and quality of the picture."""
 
     world: Surroundings
+    robot: RobotConfig
     run: Run
     rate: Tunable[float] = Field(10.0, gt=0, le=250, description="frames per second of cell time [Hz]")
     max_rate: Tunable[float] = Field(50.0, gt=0, le=250, description="frames per second of wall time at most [Hz]")
@@ -29,14 +32,22 @@ class Config(Parameters):
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Send a picture at the rate, from the first time on that the world says where everything is."""
+    """Send a picture at the rate, from the first time on that the world says where everything is.
+
+    A camera on the robot is where the joints have it, and its pictures have the time at which they were there.
+    """
     truth = bus.reader(topics.SCENE_OBJECTS)
     images, infos = bus.writer(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_INFO)
     frame = config.world.camera.frame
-    renderer = Renderer(config.world, plain=True)
+    robot = RobotModel.load(config.robot) if config.world.camera.mount else None
+    joints = bus.reader(topics.JOINT_STATES) if robot is not None else None
+    mounted = Mounted(config.world.camera, robot)
+    renderer = Renderer(config.world, plain=True, camera=mounted.at())
     rng = np.random.default_rng(config.run.seed)
     await bus.ready()
     await truth.next()
+    if joints is not None:
+        await joints.next()
     infos.put(renderer.camera.info(bus.header(frame)))
     pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
     sent: Image | None = None
@@ -44,6 +55,11 @@ async def run(bus: Bus, config: Config) -> None:
     while True:
         header = bus.header(frame)  # the instant of exposure: what is drawn is where everything is now
         objects = (truth.latest or WorldObjects()).objects
+        state = joints.latest if joints is not None else None
+        q = robot.order(state.name, state.position) if robot is not None and state is not None else None
+        if state is not None and q is not None:
+            header = header.model_copy(update={"stamp": state.header.stamp})
+            renderer.look_from(mounted.at(q))
         view = await asyncio.to_thread(renderer.see, objects) if renderer.takes_long(objects) else renderer.see(objects)
         picture = disturbed(view.colour, config.noise_std, config.brightness, rng)
         if sent is None or picture is not shown:

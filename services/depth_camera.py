@@ -12,6 +12,7 @@ from common.config import Parameters, RobotConfig, Run, Surroundings, Tunable
 from common.messages import WorldObjects
 from common.perception.depth import point_cloud
 from common.perception.image import array_to_image
+from common.perception.mounted import Mounted
 from common.process.pace import Pace
 from common.process.service import main
 from common.robot.model import RobotModel
@@ -34,13 +35,18 @@ class Config(Parameters):
 
 
 async def run(bus: Bus, config: Config) -> None:
-    """Send pictures at the rate, from the first time on that the world says what is in it and the arm where it is."""
+    """Send pictures at the rate, from the first time on that the world says what is in it and the arm where it is.
+
+    Those of a camera on the robot have the time at which the joints were where it is then.
+    """
     truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
     images, depths = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
     points, infos = bus.writer(topics.DEPTH_CAMERA_POINTS), bus.writer(topics.DEPTH_CAMERA_INFO)
     frame = config.world.camera.frame
     rng = np.random.default_rng(config.run.seed)
-    view = await asyncio.to_thread(lambda: Renderer(config.world, RobotModel.load(config.robot)))
+    robot = await asyncio.to_thread(RobotModel.load, config.robot)
+    mounted = Mounted(config.world.camera, robot)
+    view = await asyncio.to_thread(lambda: Renderer(config.world, robot, camera=mounted.at()))
     await bus.ready()
     await truth.next()
     await joints.next()
@@ -49,7 +55,12 @@ async def run(bus: Bus, config: Config) -> None:
     while True:
         header = bus.header(frame)  # the instant of exposure: of picture, depth and points alike
         objects = (truth.latest or WorldObjects()).objects
-        seen = await asyncio.to_thread(view.see, objects, joints.latest)
+        state = joints.latest
+        q = robot.order(state.name, state.position) if mounted.moves and state is not None else None
+        if state is not None and q is not None:
+            header = header.model_copy(update={"stamp": state.header.stamp})
+            await asyncio.to_thread(view.look_from, mounted.at(q))
+        seen = await asyncio.to_thread(view.see, objects, state)
         depth = seen.depth_within(config.nearest, config.farthest)
         depth = disturbed_depth(depth, rng, config.depth_noise_std, config.depth_dropout)
         depths.put(array_to_image(depth, "32FC1", header))  # first: who has the picture has its depth

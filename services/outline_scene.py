@@ -13,7 +13,8 @@ from common.applications.outlining.topics import CONTOURS
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Image
 from common.perception.image import ImageError, image_to_array
-from common.perception.intake import Cameras, LeftOut, Unusable
+from common.perception.intake import LeftOut, Unusable
+from common.process.camera_reader import CameraReader
 from common.process.planning_scene import SceneWriter
 from common.process.service import main
 from common.scene.home import HomeWatch
@@ -33,12 +34,10 @@ async def run(bus: Bus, config: Config) -> None:
     """Publish the planning scene for every picture that was taken with the arm at home."""
     contours = bus.reader(CONTOURS)
     depths = bus.reader(topics.DEPTH_CAMERA_DEPTH)
-    infos = bus.reader(topics.DEPTH_CAMERA_INFO)
-    statics = bus.reader(topics.TF_STATIC)
+    cameras = CameraReader(bus, config.world, topics.DEPTH_CAMERA_INFO)
     joints = bus.reader(topics.JOINT_STATES)
     out = SceneWriter(bus)
     home = HomeWatch(config.robot.named_poses["home"])
-    cameras = Cameras()
     kept: deque[Image] = deque(maxlen=KEPT)
     left_out = LeftOut(bus.log, "a picture")
     await out.begin(planning_scene(config.world, [], 0))
@@ -71,7 +70,7 @@ async def run(bus: Bus, config: Config) -> None:
             return
         newest = found.header.stamp
         try:
-            camera = cameras.of(infos.latest, statics.latest, depth.header.frame_id)
+            camera = await cameras.of(depth.header)
             solids = await asyncio.to_thread(perceived_solids, found.contours, image_to_array(depth), camera)
         except (Unusable, ImageError) as error:
             left_out.note(error)
@@ -79,7 +78,7 @@ async def run(bus: Bus, config: Config) -> None:
         out.put(planning_scene(config.world, solids, found.header.stamp))
 
     async with asyncio.TaskGroup() as group:
-        for watch in (watch_arm(), watch_depth(), watch_contours()):
+        for watch in (cameras.follow(), watch_arm(), watch_depth(), watch_contours()):
             group.create_task(watch)
 
 

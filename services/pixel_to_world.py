@@ -10,11 +10,12 @@ from common.applications.outlining.contours import is_hole
 from common.applications.outlining.messages import Contours, OutlinePoints
 from common.applications.outlining.top_face import TopFace, TopFaceOptions, top_face
 from common.applications.outlining.topics import CONTOUR_POINTS, CONTOURS
+from common.config import Surroundings
 from common.errors import ZencellError
 from common.messages import Header, Image, Pose, Vector3
 from common.perception.depth import check_depth, depth_of
-from common.perception.intake import camera_of
 from common.perception.pinhole import Pinhole
+from common.process.camera_reader import CameraReader
 from common.process.service import main
 from common.transport.bus import Bus
 
@@ -24,6 +25,8 @@ KEPT = 4  # depth images that wait for the contours of their picture
 
 class Config(TopFaceOptions):
     """How the top face is found."""
+
+    world: Surroundings = Surroundings()
 
 
 def outline(contours: Contours, image: Image, camera: Pinhole, config: Config) -> TopFace:
@@ -41,7 +44,7 @@ def outline(contours: Contours, image: Image, camera: Pinhole, config: Config) -
 async def run(bus: Bus, config: Config) -> None:
     """Answer the contours of each picture with an outline, or with why there is none."""
     contours, depths = bus.reader(CONTOURS), bus.reader(topics.DEPTH_CAMERA_DEPTH)
-    infos, statics = bus.reader(topics.DEPTH_CAMERA_INFO), bus.reader(topics.TF_STATIC)
+    cameras = CameraReader(bus, config.world, topics.DEPTH_CAMERA_INFO)
     out = bus.writer(CONTOUR_POINTS)
     images: OrderedDict[int, Image] = OrderedDict()
     waiting: Contours | None = None  # contours whose depth image has not come yet
@@ -59,7 +62,7 @@ async def run(bus: Bus, config: Config) -> None:
             image = images[now.header.stamp]
             label = now.contours[now.selected].label
             try:
-                camera = camera_of(infos.latest, statics.latest, image.header.frame_id)
+                camera = await cameras.of(image.header)
                 face = await asyncio.to_thread(outline, now, image, camera, config.model_copy())
             except ZencellError as error:
                 points = points.model_copy(update={"object": label, "message": f"{label}: {error}"})
@@ -86,6 +89,7 @@ async def run(bus: Bus, config: Config) -> None:
             await answer()
 
     async with asyncio.TaskGroup() as group:
+        group.create_task(cameras.follow())
         group.create_task(collect())
         group.create_task(follow())
 

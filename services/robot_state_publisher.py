@@ -11,9 +11,10 @@ from pydantic import Field
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import JointState, RobotDescription, TFMessage, TransformStamped
+from common.perception.mounted import in_mount, mount_link
 from common.process.service import main
 from common.robot.model import RobotModel
-from common.robot.transforms import pose_fields, rpy_to_matrix, transform
+from common.robot.transforms import pose_fields
 from common.transport.bus import Bus
 
 MOST_MESSAGES = 250.0  # per second of wall time
@@ -100,7 +101,7 @@ async def run(bus: Bus, config: Config) -> None:
     told_once.put(description(robot, stamp))
     base = stamped(WORLD, frames.root, frames.T_world_root, stamp)
     cameras = [
-        stamped(WORLD, camera.frame, transform(rpy_to_matrix(*camera.rpy), camera.position), stamp)
+        stamped(mount_link(camera, robot) if camera.mount else WORLD, camera.frame, in_mount(camera), stamp)
         for camera in config.surroundings.cameras.values()
     ]
     fixed = [base, *cameras, *frames.fixed(stamp)]

@@ -17,7 +17,6 @@ from common.errors import ConfigError
 from common.process.planning_scene import SceneWriter
 from common.process.service import main
 from common.robot.model import RobotModel
-from common.scene.home import HomeWatch
 from common.transport.bus import Bus
 
 
@@ -32,14 +31,13 @@ class Config(ViewsParameters, SceneParameters):
 
 async def run(bus: Bus, config: Config) -> None:
     """Publish the planning scene whenever a frame was looked at or the hand closed or opened."""
-    views = Views(bus, config.views, bus.log)
+    views = Views(bus, config.views, config.world, config.robot, bus.log, only_at_home=config.only_at_home)
     joints = bus.reader(topics.JOINT_STATES)
     gripper = bus.reader(topics.GRIPPER_STATE)
     out = SceneWriter(bus)
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
         raise ConfigError("robot.gripper", ..., "is missing: scene_manager needs a robot with one")
-    home = HomeWatch(config.robot.named_poses["home"]) if config.only_at_home else None
     scene = PerceivedScene(config, config.world, config.robot.gripper, config.robot.tcp_link)
     await out.begin(scene.scene())
     await bus.ready()
@@ -61,22 +59,12 @@ async def run(bus: Bus, config: Config) -> None:
                 hand()
                 out.put(scene.scene())
 
-    async def watch_arm(home: HomeWatch) -> None:
-        async for measured in joints:
-            q = robot.order(measured.name, measured.position)
-            if q is not None:
-                home.note(q.tolist(), measured.header.stamp)
-
     async def look(view: int, seen: Seen) -> None:
-        if home is not None and not home.covers(seen.frame.header.stamp):
-            return
-        scene.see(seen.frame, seen.camera, hand(), view)
+        scene.see(seen.frame, seen.camera, hand(), view, seen.since)
         out.put(scene.scene())
 
     async with asyncio.TaskGroup() as group:
         group.create_task(watch_hand())
-        if home is not None:
-            group.create_task(watch_arm(home))
         group.create_task(views.watch(look))
 
 

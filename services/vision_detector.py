@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from functools import lru_cache
 
 import cv2
@@ -15,7 +16,8 @@ from common.config import Surroundings
 from common.config.basics import Rgb
 from common.messages import Color, Header, Marker, MarkerArray, Pose, Vector3
 from common.perception.image import array_to_image
-from common.perception.intake import Cameras, LeftOut, Unusable, picture_of
+from common.perception.intake import LeftOut, Unusable, picture_of
+from common.process.camera_reader import CameraReader
 from common.process.service import main
 from common.transport.bus import Bus
 
@@ -63,24 +65,29 @@ def _remark(detector: Detector, service: str) -> str:
 async def run(bus: Bus, config: Config) -> None:
     """Look at every picture as it comes; what cannot be looked at is dropped, counted and told once."""
     images = bus.reader(topics.CAMERA_IMAGE)
-    infos, statics = bus.reader(topics.CAMERA_INFO), bus.reader(topics.TF_STATIC)
+    cameras = CameraReader(bus, config.world)
     found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
     cv2.setNumThreads(1)  # the other cores have other services
     detector = Detector(config.world, config)
     left_out = LeftOut(bus.log, "a picture")
-    cameras = Cameras()
     await bus.ready()
-    async for image in images:
-        try:
-            camera = cameras.of(infos.latest, statics.latest, image.header.frame_id)
-            picture = picture_of(image, camera)
-        except Unusable as error:
-            left_out.note(error)
-            continue
-        detections = detector.detect(picture, camera)
-        found.put(markers(detections, config.world, image.header.stamp, _remark(detector, bus.service)))
-        if shown.matched:
-            shown.put(array_to_image(annotate(picture, detections), "bgr8", image.header))
+
+    async def look() -> None:
+        async for image in images:
+            try:
+                camera = await cameras.of(image.header)
+                picture = picture_of(image, camera)
+            except Unusable as error:
+                left_out.note(error)
+                continue
+            detections = detector.detect(picture, camera)
+            found.put(markers(detections, config.world, image.header.stamp, _remark(detector, bus.service)))
+            if shown.matched:
+                shown.put(array_to_image(annotate(picture, detections), "bgr8", image.header))
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(cameras.follow())
+        group.create_task(look())
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ def shells(config: Config, header: Header) -> MarkerArray:
 
 async def run(bus: Bus, config: Config) -> None:
     """Judge every frame with what is known; the inverse kinematics of new places is worked out beside that."""
-    views = Views(bus, config.views, bus.log)
+    views = Views(bus, config.views, config.world, config.robot, bus.log)
     validated, rejected = bus.writer(VALIDATED_TARGETS), bus.writer(REJECTED_TARGETS)
     markers = bus.writer(WORKSPACE_MARKERS)
     reach = ReachCache(RobotModel.load(config.robot), config.grasp, config)

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 from common.application import find_application
 from common.checking.finding import Finding, refusal
 from common.config import Cell, Surroundings
 from common.errors import ConfigError
+
+if TYPE_CHECKING:
+    from common.robot.model import RobotModel
 
 
 def refused(cell: Cell) -> list[Finding]:
@@ -25,12 +29,31 @@ def refused(cell: Cell) -> list[Finding]:
 
 
 def quick(cell: Cell) -> list[Finding]:
-    """What the files tell without a model of the robot."""
+    """What the files tell; a model of the robot is loaded only to see where a camera on it looks from home."""
     from common.checking.robot_file import check_robot_file
     from common.checking.world import check_world
 
-    return [*_each(lambda: check_robot_file(cell.robot)),
-            *_each(lambda: check_world(cell, find_application(cell.application))), *_of_application(cell, "quick")]
+    of_robot = _each(lambda: check_robot_file(cell.robot))
+    try:
+        seen = seen_from_home(cell)
+    except ConfigError as told:
+        return [*of_robot, refusal(told)]
+    return [*of_robot, *_each(lambda: check_world(seen, find_application(cell.application))),
+            *_of_application(seen, "quick")]
+
+
+def seen_from_home(cell: Cell, robot: RobotModel | None = None) -> Cell:
+    """The cell with cameras on the robot fixed where they are at home.
+
+    Raises:
+        ConfigError: the robot file does not fit its description, or has no such link.
+    """
+    if not cell.world.on_hand:
+        return cell
+    from common.perception.mounted import from_home
+    from common.robot.model import RobotModel
+
+    return cell.model_copy(update={"world": from_home(cell.world, robot or RobotModel.load(cell.robot))})
 
 
 def thorough(cell: Cell) -> Iterator[Finding]:
@@ -45,7 +68,7 @@ def thorough(cell: Cell) -> Iterator[Finding]:
     yield from arm.check_poses()
     found = find_application(cell.application).find("checks", "reach")
     if found is not None:
-        yield from _each(lambda: found(cell, arm))
+        yield from _each(lambda: found(seen_from_home(cell, arm.robot), arm))
 
 
 def _of_application(cell: Cell, name: str) -> list[Finding]:

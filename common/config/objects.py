@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from common.config.basics import Coordinate, Length, Number, Point, Rgb, Section
 
 CAMERA = "camera"  # the name of a single one
+TCP = "tcp"  # as a mount stands for the link of the tool centre point, whatever that is called
 
 Shape = Literal["sphere", "box", "cylinder", "prism", "ring", "mesh"]
 NEEDS = {"sphere": ["radius"], "box": ["size", "height"], "cylinder": ["radius", "height"],
@@ -45,7 +46,8 @@ class Container(Section):
 class CameraConfig(Section):
     """A pinhole camera. +Z looks forward, +X is to the right in the picture, +Y is down.
 
-    A world may name a file of `zencell calibrate` in its place.
+    A world may name a file of `zencell calibrate` in its place. One with a `mount` sits on the robot and moves with it:
+    its pictures count while the arm is at home.
     """
 
     frame: str = f"{CAMERA}_optical_frame"
@@ -58,10 +60,18 @@ class CameraConfig(Section):
     d: list[Number] = Field(
         [], max_length=8, description="distortion of a real lens: k1, k2, p1, p2, k3, ...; camera_opencv takes it out"
     )
-    position: Point = Field((0.40, 0.0, 0.80), description="optical centre in world [m]")
+    mount: str = Field("", max_length=100, description="link of the robot that it sits on, or tcp; empty: fixed in "
+                                                       "world")
+    position: Point = Field((0.40, 0.0, 0.80), description="optical centre in world, or in its mount [m]")
     rpy: tuple[Number, Number, Number] = Field(
-        (math.pi, 0.0, -math.pi / 2), description="of the optical frame in world [rad], R = Rz Ry Rx"
+        (math.pi, 0.0, -math.pi / 2), description="of the optical frame in world, or in its mount [rad], R = Rz Ry Rx"
     )
+
+    @model_validator(mode="after")
+    def _is_somewhere_on_its_mount(self) -> CameraConfig:
+        if self.mount and not {"position", "rpy"} <= self.model_fields_set:
+            raise ValueError(f"a camera with a mount needs position and rpy: where it sits on {self.mount}")
+        return self
 
 
 class ObjectConfig(Section):

@@ -92,6 +92,11 @@ class KnownShort(Section):
             raise UnknownName("camera", name, self.cameras)
         return self.cameras[name] if name is not None else next(iter(self.cameras.values()))
 
+    @property
+    def on_hand(self) -> bool:
+        """Whether a camera sits on the robot, and looks from home only."""
+        return any(camera.mount for camera in self.cameras.values())
+
     @model_validator(mode="after")
     def _several_containers(self) -> Self:
         """The first of several is *the* container."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pydantic import Field
 
 from common.config.basics import Coordinate, Length
-from common.config.objects import CAMERA, CameraConfig, Container, Fixture, ObjectConfig
+from common.config.objects import CAMERA, TCP, CameraConfig, Container, Fixture, ObjectConfig
 from common.config.short_forms import KnownShort, WorldShort
 
-__all__ = ["CAMERA", "CameraConfig", "Container", "Fixture", "ObjectConfig", "Surroundings", "World"]
+__all__ = ["CAMERA", "TCP", "CameraConfig", "Container", "Fixture", "ObjectConfig", "Surroundings", "World"]
 
 
 class Surroundings(KnownShort):

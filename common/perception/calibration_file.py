@@ -35,9 +35,10 @@ class CameraFile(Parameters):
     d: list[Number] = Field([], max_length=8, description="distortion k1, k2, p1, p2, k3, ... as OpenCV's plumb bob; "
                                                           "eight are the rational model")
     frame: str | None = Field(None, description="name of the optical frame; none: that of the world's camera")
-    position: Point | None = Field(None, description="optical centre in world [m]")
+    mount: str | None = Field(None, description="link of the robot that it sits on, or tcp; none: fixed in world")
+    position: Point | None = Field(None, description="optical centre in world, or in its mount [m]")
     rpy: tuple[Number, Number, Number] | None = Field(
-        None, description="of the optical frame in world [rad], R = Rz Ry Rx"
+        None, description="of the optical frame in world, or in its mount [rad], R = Rz Ry Rx"
     )
     calibration: dict[str, Any] = Field({}, description="how it came about: residuals, date, source")
 

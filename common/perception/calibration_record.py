@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from common.config.world import TCP
 from common.perception.calibration import IntrinsicCalibration
 from common.perception.calibration_file import CameraFile
 from common.perception.calibration_hand_eye import HandEyeCalibration
@@ -32,19 +33,16 @@ def with_pose(
               for source, position, rpy in zip(sources, positions, angles, strict=True)]
     record = {"date": _today(), "places": places, "pictures": len(found.pictures), "rms_px": found.rms,
               "rms_mm": 1e3 * found.rms_on_board, **_deviations(found), "place_std_mm": 1e3 * found.place_std}
-    return camera.model_copy(update={"position": found.position, "rpy": found.rpy,
+    return camera.model_copy(update={"mount": None, "position": found.position, "rpy": found.rpy,
                                      "calibration": {**camera.calibration, "pose": record}})
 
 
 def with_hand_eye(camera: CameraFile, found: HandEyeCalibration, source: str, robot: str, mount: str) -> CameraFile:
-    """The camera with where it sits on the hand, as a record alone; or with its pose in world, beside the arm."""
+    """The camera with where it sits on the hand, or with its pose in world, beside the arm."""
     record: dict[str, Any] = {
         "date": _today(), "source": source, "robot": robot, "camera": mount, "views": len(found.pictures),
         "rms_px": found.rms, "rms_mm": 1e3 * found.rms_at_board, "verdict": found.verdict, **_deviations(found)}
-    place = {"position": found.position, "rpy": found.rpy}
-    if mount == "hand":
-        record |= {**{name: list(value) for name, value in place.items()}, "in": "the tool centre point"}
-        place = {}
+    place = {"mount": TCP if mount == "hand" else None, "position": found.position, "rpy": found.rpy}
     return camera.model_copy(update={**place, "calibration": {**camera.calibration, "hand_eye": record}})
 
 

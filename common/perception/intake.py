@@ -13,7 +13,7 @@ from common.errors import ZencellError
 from common.messages import CameraInfo, Image, TFMessage
 from common.perception.image import ImageError, image_to_array
 from common.perception.pinhole import CameraError, Pinhole
-from common.robot.transforms import pose_to_matrix
+from common.robot.transform_history import NoTransform, TransformHistory
 
 Picture = npt.NDArray[np.uint8]
 
@@ -43,46 +43,57 @@ class LeftOut:
             self._log.warning("%s left out: %s (told once; further ones are counted)", self._what, error)
 
 
-def camera_of(info: CameraInfo | None, transforms: TFMessage | None, frame_id: str = "") -> Pinhole:
-    """The camera that camera_info and tf describe.
+def camera_of(
+    info: CameraInfo | None, fixed: TFMessage | None, frame_id: str = "", *, moving: TransformHistory | None = None,
+    stamp: int = 0,
+) -> Pinhole:
+    """The camera that camera_info and tf describe, where it was when a picture was taken.
 
     Args:
         info: intrinsics.
-        transforms: of which the one with the camera's frame as its child is taken; its parent is the world.
+        fixed: tf_static.
         frame_id: of the picture; that of `info` when empty.
+        moving: tf, for a camera that hangs on what moves.
+        stamp: of the picture [ns].
 
     Raises:
-        Unusable: one of them is missing or says something that no pinhole camera does.
+        Unusable: one of them is missing or says something that no pinhole camera does. Of kind `early` it may help to
+            wait: the next message of tf may say where the camera was.
     """
-    if info is None or transforms is None:
+    if info is None or fixed is None:
         missing = "camera_info" if info is None else "tf_static"
         raise Unusable(UNKNOWN_CAMERA, f"no {missing} came yet")
-    frame = frame_id or info.header.frame_id
-    pose = next((t.transform for t in transforms.transforms if t.child_frame_id == frame), None)
-    if pose is None:
-        known = ", ".join(t.child_frame_id for t in transforms.transforms)
-        raise Unusable("unknown_frame", f"tf_static has no frame {frame!r}; it has: {known or 'none'}")
+    history = moving if moving is not None else TransformHistory()
     try:
-        return Pinhole.from_info(info, pose_to_matrix(pose))
+        return Pinhole.from_info(info, history.pose(frame_id or info.header.frame_id, fixed, stamp))
+    except NoTransform as error:
+        raise Unusable(error.kind, str(error)) from None
     except CameraError as error:
         raise Unusable("camera", str(error)) from None
 
 
 class Cameras:
-    """`camera_of` that works the camera out again only for other messages than the last time."""
+    """`camera_of` that gives the same camera for the same messages, and for one that has not moved meanwhile."""
 
     def __init__(self) -> None:
         """Nothing is known yet."""
+        self.moving = TransformHistory()
         self._last: tuple[CameraInfo, TFMessage, str, Pinhole] | None = None
 
-    def of(self, info: CameraInfo | None, transforms: TFMessage | None, frame_id: str = "") -> Pinhole:
-        """The camera; the same object for the same messages."""
+    def of(
+        self, info: CameraInfo | None, fixed: TFMessage | None, frame_id: str = "", stamp: int = 0, *,
+        moves: bool = False,
+    ) -> Pinhole:
+        """The camera of a picture; one that `moves` is looked for in `moving` as well, at the time of the picture."""
         last = self._last
-        if last is not None and last[0] is info and last[1] is transforms and last[2] == frame_id:
+        same = last is not None and last[0] is info and last[1] is fixed and last[2] == frame_id
+        if last is not None and same and not moves:
             return last[3]
-        camera = camera_of(info, transforms, frame_id)
-        assert info is not None and transforms is not None
-        self._last = (info, transforms, frame_id, camera)
+        camera = camera_of(info, fixed, frame_id, moving=self.moving, stamp=stamp)
+        if last is not None and same and np.array_equal(camera.T_world_optical, last[3].T_world_optical):
+            return last[3]
+        assert info is not None and fixed is not None
+        self._last = (info, fixed, frame_id, camera)
         return camera
 
 

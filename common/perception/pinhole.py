@@ -50,7 +50,13 @@ class Pinhole:
 
     @classmethod
     def from_config(cls, camera: CameraConfig) -> Pinhole:
-        """The camera of the surroundings."""
+        """A camera of the surroundings that is fixed in world.
+
+        Raises:
+            CameraError: it is mounted on the robot; `common/perception/mounted.py` says where it is then.
+        """
+        if camera.mount:
+            raise CameraError(f"{camera.frame} sits on {camera.mount}: where the camera is follows from the joints")
         T = transform(rpy_to_matrix(*camera.rpy), camera.position)
         return cls(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, T)
 

@@ -35,6 +35,7 @@ GROUND = (178 / 255, 178 / 255, 178 / 255)  # of a full picture
 ARM = (0.55, 0.55, 0.55)
 FEW = 32  # spheres that are drawn at once
 STILL = 1e-4  # joints that moved by less [rad] leave the picture as it is
+STILL_POSE = 1e-6  # [m, and of a rotation] a camera that moved by less sees the same
 BASE = 128  # of a plain picture: all three channels
 GRID = 108
 GRID_SPACING = 40  # [px]
@@ -63,17 +64,28 @@ class Renderer:
             ConfigError: a mesh of the robot is not there.
         """
         self.camera = camera if camera is not None else Pinhole.from_config(around.camera)
-        self._plain, self._rim_width, self._robot = plain, rim_width, robot
+        self._plain, self._rim_width, self._robot, self._around = plain, rim_width, robot, around
         self._shapes = robot_shapes(robot) if robot is not None and not plain else {}
         self._meshes: dict[tuple[object, ...], Array] = {}  # triangles of what was seen, in its own frame
         self._solid = [] if plain else _solid(around)
-        self._behind = self._plain_background(around) if plain else empty_view(self.camera, GROUND)
-        self._deep = bool(np.isfinite(self._behind.depth).any())  # something in the background may hide a sphere
         self._asked: Sequence[WorldObject] | None = None
         self._objects: list[WorldObject] | None = None
         self._joints: Array | None = None
-        self._still = self._seen = self._behind
         self._spheres: dict[tuple[float, ...], _Sphere | None] = {}  # of the last plain picture, by centre and radius
+        self._draw_behind()
+
+    def look_from(self, camera: Pinhole) -> None:
+        """Take the camera elsewhere: from there all is seen anew."""
+        if camera.T_world_optical is self.camera.T_world_optical or np.allclose(
+                camera.T_world_optical, self.camera.T_world_optical, rtol=0, atol=STILL_POSE):
+            return
+        self.camera, self._asked, self._objects, self._joints, self._spheres = camera, None, None, None, {}
+        self._draw_behind()
+
+    def _draw_behind(self) -> None:
+        self._behind = self._plain_background(self._around) if self._plain else empty_view(self.camera, GROUND)
+        self._deep = bool(np.isfinite(self._behind.depth).any())  # something in the background may hide a sphere
+        self._still = self._seen = self._behind
 
     def takes_long(self, objects: Sequence[WorldObject]) -> bool:
         """Whether to `see` the objects may take longer than a moment: rays are cast at all but a few spheres."""

@@ -94,7 +94,8 @@ class Transforms:
 
     def __init__(self, cameras: Iterable[CameraConfig]) -> None:
         """Know only what the surroundings say: the poses of cameras, of which the first stands for unknown frames."""
-        self._fixed = {camera.frame: transform(rpy_to_matrix(*camera.rpy), camera.position) for camera in cameras}
+        self._fixed = {camera.frame: transform(rpy_to_matrix(*camera.rpy), camera.position) for camera in cameras
+                       if not camera.mount}
         self.newest: dict[str, TransformStamped] = {}  # by frame
 
     def update(self, m: TFMessage) -> None:
@@ -107,7 +108,7 @@ class Transforms:
         while frame not in ("", "world"):
             each = self.newest.get(frame)
             if each is None or frame in seen:
-                return self._fixed.get(frame, next(iter(self._fixed.values())))
+                return self._fixed.get(frame, next(iter(self._fixed.values()), np.eye(4)))
             seen.add(frame)
             T = pose_to_matrix(each.transform) @ T
             frame = each.header.frame_id

@@ -11,6 +11,7 @@ from common.checking.cell import quick, refused, thorough
 from common.checking.finding import Finding
 from common.checking.wiring import Keys, check_wiring
 from common.config import Cell, load_cell, names_of
+from common.errors import ConfigError
 from tests.harness import ask
 
 ONE = "world.count=1"
@@ -47,6 +48,11 @@ QUICK = [
     ("panda", ["world.objects=[{id: cube, shape: box, size: [0.04,0.04,0.04], x: 0.5, y: -0.1}]"], "warning",
      "cube is a box, vision_detector looks for spheres", False),
 ]
+HAND = "tests/data/hand_camera.yaml"  # what is seen is seen from home
+QUICK += [
+    (HAND, ["world.camera.position=[1.06,0,-0.1]"], "warning", "ball_1 at (0.4, -0.3) is wholly outside", False),
+    (HAND, ["services.vision_detector.min_contour_area_px=3000"], "error", "ball_1 appears on", False),
+]
 THOROUGH = [
     ("panda", ["world.balls=[[0.9,0.0]]"], "error", "ball_1 at (0.900, 0.000, 0.030) cannot be taken, too far", False),
     ("panda", ["robot.base_position=[0,0,1.0]"], "error", "cannot be taken", False),
@@ -67,6 +73,15 @@ def test_mistake_is_told_without_a_model_of_the_robot(name, overrides, severity,
     assert [(each.severity, each.refused) for each in found[:1]] == [(severity, is_refused)], quick(cell)
     assert found[0].remedy and "\n" not in found[0].line
     assert bool(refused(cell)) == is_refused
+
+
+def test_link_that_a_camera_sits_on_and_that_the_robot_has_not_is_told_with_the_choices():
+    assert found_in(load_cell(HAND)) == []
+    found = quick(load_cell(HAND, ["world.camera.mount=hand"]))
+    assert [(each.severity, each.refused) for each in found] == [("error", True)]
+    assert found[0].what.startswith("world.camera.mount: 'hand' is no link of panda; choices: tcp, panda_link0")
+    with pytest.raises(ConfigError, match="needs position and rpy: where it sits on tcp"):
+        load_cell("panda", ["world.camera={mount: tcp}"])
 
 
 @pytest.mark.parametrize(("name", "overrides", "severity", "what", "is_refused"), THOROUGH)

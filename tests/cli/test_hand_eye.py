@@ -82,7 +82,8 @@ def test_camera_on_the_hand_is_found_from_a_folder_and_written(
     code, (told, problem) = app.execute([*asked, "--camera", "hand"]), capsys.readouterr()
     assert (code, problem) == (0, "")
     assert "10 views, residual 0.0" in told and told.splitlines()[-1].startswith("good: places are right to about")
-    found = yaml.safe_load(Path(file).read_text())["calibration"]["hand_eye"]
+    found = yaml.safe_load(Path(file).read_text())
+    assert found["mount"] == "tcp" and f"a cell takes both with --set world.camera={file}" in told
     assert np.allclose(found["position"], T_TCP_CAMERA[:3, 3], atol=5e-4)
     assert np.allclose(rpy_to_matrix(*found["rpy"]), T_TCP_CAMERA[:3, :3], atol=1e-3)
     for more, wanted in (

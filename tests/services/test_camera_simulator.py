@@ -18,7 +18,7 @@ from services.camera_simulator import Config, run
 from tests.common.sim.spheres import spheres
 
 around = Surroundings()
-config = Config(world=around, run=Run(cell="test", seed=4))
+config = Config(world=around, robot=load_cell("panda").robot, run=Run(cell="test", seed=4))
 
 
 def balls(*places, states=()):

@@ -33,7 +33,7 @@ def tf():
 
 
 async def start(stack, net, clock, **camera_parameters):
-    config = camera_simulator.Config(world=around, run=Run(cell="test"), **camera_parameters)
+    config = camera_simulator.Config(world=around, robot=cell.robot, run=Run(cell="test"), **camera_parameters)
     camera = running_service(net, camera_simulator.run, config, name="camera_simulator", clock=clock)
     await stack.enter_async_context(camera)
     for module in (vision_detector, workspace_validator):

@@ -48,17 +48,20 @@ class PerceivedScene:
             for k, (x, y, z) in enumerate(self._slots.tolist(), 1)
         ]
         self._occupied: dict[int, tuple[int, set[int]]] = {}  # stamp and slots by view
+        self._lasts: set[int] = set()  # views of cameras on the robot
         self._free: set[int] = set()  # slots in which nothing was when the hand took something, nor was seen since
         self._beside_slots: dict[int, list[Sighting]] = {}  # what else lies in the container, by view
         self._held: m.AttachedObject | None = None
         self._changed_hands_at = 0
         self._stamp = 0
 
-    def see(self, detections: m.MarkerArray, camera: Pinhole, T_world_tcp: Array | None, view: int = 0) -> None:
+    def see(self, detections: m.MarkerArray, camera: Pinhole, T_world_tcp: Array | None, view: int = 0,
+            since: int | None = None) -> None:
         """Take in the detections of one frame, of one of several views.
 
         A frame that was taken before the hand last closed or opened still shows what is in the hand now on the table:
-        it is left out. So is anything seen where the hand holds a ball.
+        it is left out. So is anything seen where the hand holds a ball. A camera on the robot has been looking `since`
+        [ns]: what it showed is what is known until it looks again.
         """
         stamp = detections.header.stamp
         if stamp <= self._changed_hands_at:
@@ -83,10 +86,11 @@ class PerceivedScene:
             elif hand is None or math.dist(hand, thing.position) > max(thing.size) / 2:
                 on_table.append(thing)
         self._beside_slots[view] = beside_slots
-        self._tracks.update(on_table, stamp * 1e-9)
+        self._tracks.update(on_table, stamp * 1e-9, view, None if since is None else since * 1e-9)
         seen = occupied_slots(in_container, camera, self._slots, self.around.ball_radius, self._free)
         self._free -= seen
         self._occupied[view] = stamp, seen
+        self._lasts = self._lasts | {view} if since is not None else self._lasts - {view}
 
     def feel(self, gripper: m.GripperState, T_world_tcp: Array | None) -> None:
         """Take in whether the hand holds something: the nearest ball moves into it with its id, or leaves it."""
@@ -155,8 +159,8 @@ class PerceivedScene:
 
     def _occupied_slots(self) -> set[int]:
         """Slots in which any view shows something now."""
-        return {slot for stamp, slots in self._occupied.values() for slot in slots
-                if (self._stamp - stamp) * 1e-9 <= self.p.forget_after}
+        return {slot for view, (stamp, slots) in self._occupied.items() for slot in slots
+                if view in self._lasts or (self._stamp - stamp) * 1e-9 <= self.p.forget_after}
 
     def _ball(self, name: str, role: str, pose: m.Pose) -> m.CollisionObject:
         return m.CollisionObject.model_validate({

@@ -31,7 +31,7 @@ class Rows:
         above = self._region((x, y, low + self.p.grasp.approach_clearance), yaw)
         approach: list[Stage] = [
             Move("pre-grasp", "GRASPING", cycle, whole=True, fresh=True, goal=above),
-            Move("descend", "GRASPING", cycle, goal=grasp, straight=True, fresh=True),
+            Move("descend", "GRASPING", cycle, goal=grasp, straight=True, fresh=not self.p.world.on_hand),
         ]
         lifted = self._region((x, y, low + self.p.grasp.lift_height), yaw)
         carry: list[Stage] = [Move("lift", "GRASPING", cycle, goal=lifted, carries=True), self._across(cycle, yaw)]

@@ -12,6 +12,7 @@ from common.applications.pick_place.choice import Choice, Pick, PickPlaceView, S
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.parameters import Config
 from common.applications.pick_place.rows import Rows
+from common.scene.home import is_home
 from common.tasks.engine import Task
 from common.tasks.stages import MISSES, Cycle, Grip, Look, Move, Stage
 from common.tasks.watchdogs import Patience
@@ -47,14 +48,24 @@ class PickPlace(Task[PickPlaceView]):
                 held = Pick(target=Target(view.attached, view.tool))
                 held.begun = True
                 self.row += self._rows.place_held(held, view.tool)
+        elif self._looks_elsewhere(view):
+            self.row += [self.home(view), Look()]
         elif not self._queue_next(view):
             self._wait_for_the_end(view)
 
     def decide_ahead(self, running: Stage, view: PickPlaceView) -> None:
-        """While one ball is carried across, the way to the next is planned."""
+        """While one ball is carried across, the way to the next is planned, or to where a camera on the hand looks."""
         waiting = any(stage.cycle is not None and not stage.cycle.begun for stage in self.row)
-        if running.name == "across" and not waiting:
+        if running.name == "across" and self._around.on_hand:
+            if not any(isinstance(stage, Look) for stage in self.row):
+                self.row += [self.home(view.let_go()), Look()]
+        elif running.name == "across" and not waiting:
             self._queue_next(view)
+
+    def _looks_elsewhere(self, view: PickPlaceView) -> bool:
+        """Whether a camera on the hand is away from where it looks; at the end nobody asked to move any more."""
+        at_home = view.q is not None and is_home(view.q, self.p.robot.named_poses["home"])
+        return self._around.on_hand and self.status.state != "DONE" and not at_home
 
     def _queue_next(self, view: PickPlaceView) -> bool:
         """Append the stages for the nearest ball that can be taken; whether there is one."""
@@ -111,7 +122,8 @@ class PickPlace(Task[PickPlaceView]):
             self._contained.reset()
         elif self._contained.lasts(contained, view.scene_stamp) >= min(CONTAINED_FOR, self.p.empty):
             status.done = max(status.done, contained)
-        if status.stage not in ("close", "lift", "across", "release"):
+        looked = not self._around.on_hand or min(view.stamps) > self.look_after
+        if status.stage not in ("close", "lift", "across", "release") and looked:
             status.total = status.done + len(view.targets)
 
     def succeeded(self, stage: Stage, view: PickPlaceView) -> None:
@@ -119,6 +131,8 @@ class PickPlace(Task[PickPlaceView]):
         pick = _pick_of(stage)
         if stage.name == "release" and pick is not None:
             self.status.done += 1
+            if self._around.on_hand:
+                self.look_after = view.now
             self._choice.released(pick.target, view)
 
     def missed(self, stage: Grip, view: PickPlaceView) -> None:
@@ -172,6 +186,8 @@ class PickPlace(Task[PickPlaceView]):
         """On the way to a ball and down to it in one motion it is looked at as long as the hand is above."""
         pick = _pick_of(stage)
         if pick is None or not (isinstance(stage, Move) and stage.fresh and isinstance(stage.goal, m.SequenceGoal)):
+            return ""
+        if self._around.on_hand:  # what it was shown from home is what is known
             return ""
         above = self.p.grasp.approach_clearance + self.p.grasp_pos_tol
         if math.dist(view.tool, pick.target.position) < above:

@@ -71,13 +71,14 @@ class Sighting:
 
 @dataclass
 class Track:
-    """One object: where it is, in world [m], how often it was seen, when last [s], and what was seen then."""
+    """One object: where it is, in world [m], how often it was seen, when last [s] and in which view, and what then."""
 
     id: str
     position: Place
     seen: int
     last_seen: float
     sighting: Sighting = Sighting((0.0, 0.0, 0.0))
+    view: int = 0
 
 
 class Tracks:
@@ -88,9 +89,22 @@ class Tracks:
         self.p = parameters
         self._tracks: list[Track] = []
         self._count = 0
+        self._looks: dict[int, tuple[float, float]] = {}  # of views that look at times: when last, since when [s]
 
-    def update(self, sightings: Sequence[Sighting], now: float) -> None:
-        """Take in all detections of one frame, taken at `now` [s]."""
+    def update(self, sightings: Sequence[Sighting], now: float, view: int = 0, since: float | None = None) -> None:
+        """Take in all detections of one frame.
+
+        Args:
+            sightings: of the frame.
+            now: when it was taken [s].
+            view: which of several views it is of.
+            since: since when that one has been looking [s], if it looks at times only: nothing is forgotten because
+                it looks elsewhere. None: it looks always.
+        """
+        if since is None:
+            self._looks.pop(view, None)
+        else:
+            self._looks[view] = now, since
         pairs = sorted(
             (math.dist(t.position, s.position), i, j)
             for i, t in enumerate(self._tracks)
@@ -108,12 +122,17 @@ class Tracks:
             track, weight = self._tracks[i], self.p.smoothing if distance < self.p.still else 1.0
             x, y, z = (a + weight * (b - a) for a, b in zip(track.position, sightings[j].position, strict=True))
             track.position, track.seen, track.last_seen = (x, y, z), track.seen + 1, now
-            track.sighting = sightings[j]
-        self._tracks = [t for t in self._tracks if now - t.last_seen <= self.p.forget_after]
+            track.sighting, track.view = sightings[j], view
+        self._tracks = [t for t in self._tracks if self._unseen_for(t, now) <= self.p.forget_after]
         for j, sighting in enumerate(sightings):
             if j not in matched:
                 self._count += 1
-                self._tracks.append(Track(f"track_{self._count}", sighting.position, 1, now, sighting))
+                self._tracks.append(Track(f"track_{self._count}", sighting.position, 1, now, sighting, view))
+
+    def _unseen_for(self, track: Track, now: float) -> float:
+        """For how long it was looked for in vain [s]."""
+        now, since = self._looks.get(track.view, (now, track.last_seen))
+        return now - max(track.last_seen, since)
 
     def confirmed(self) -> list[Track]:
         """Objects that were seen often enough to be believed."""

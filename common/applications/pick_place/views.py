@@ -13,10 +13,12 @@ from pydantic import Field
 
 from common import topics
 from common.applications.pick_place.topics import DETECTED_OBJECTS
-from common.config import Parameters
+from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Marker, MarkerArray
-from common.perception.intake import Cameras, LeftOut, Unusable
+from common.perception.intake import LeftOut, Unusable
 from common.perception.pinhole import Pinhole
+from common.process.camera_reader import CameraReader
+from common.scene.home import HomeWatch
 from common.transport.bus import Bus
 
 OLDEST = 0.5  # [s, cell time] behind the newest: a camera that is so late says nothing of how things are now
@@ -33,28 +35,42 @@ class ViewsParameters(Parameters):
 
 @dataclass(frozen=True)
 class Seen:
-    """A frame of detections and the camera that took the picture."""
+    """A frame of detections and the camera that took the picture.
+
+    `since` is since when a camera on the robot has been looking from home without a break [ns]; None for one that is
+    fixed, and looks always.
+    """
 
     frame: MarkerArray
     camera: Pinhole
+    since: int | None = None
 
 
 class Views:
     """Readers for each view: what was detected, and the camera. A view called left has its keys under `left/`."""
 
-    def __init__(self, bus: Bus, names: Sequence[str], log: logging.Logger) -> None:
+    def __init__(
+        self, bus: Bus, names: Sequence[str], around: Surroundings, robot: RobotConfig, log: logging.Logger, *,
+        only_at_home: bool = False,
+    ) -> None:
         """Declare the readers.
 
         Args:
             bus: of the service.
             names: of the views; none stands for a single one, whose keys begin with nothing.
+            around: which cameras sit on the robot: of those only frames count that were taken from home.
+            robot: where home is.
+            only_at_home: that holds for all cameras.
             log: is told once for each reason why a frame is left out.
         """
         keys = [f"{name}/" for name in names] or [""]
-        self._statics = bus.reader(topics.TF_STATIC)
         self._frames = [bus.reader(replace(DETECTED_OBJECTS, key=f"{at}{DETECTED_OBJECTS.key}")) for at in keys]
-        self._infos = [bus.reader(replace(topics.CAMERA_INFO, key=f"{at}{topics.CAMERA_INFO.key}")) for at in keys]
-        self._cameras = [Cameras() for _ in keys]
+        self._cameras = [
+            CameraReader(bus, around, replace(topics.CAMERA_INFO, key=f"{at}{topics.CAMERA_INFO.key}")) for at in keys
+        ]
+        self._joints = bus.reader(topics.JOINT_STATES) if only_at_home or around.on_hand else None
+        self._names, self._home = robot.joints, HomeWatch(robot.named_poses["home"])
+        self._only_at_home = only_at_home
         self._newest: list[Seen | None] = [None for _ in keys]
         self._left_out = LeftOut(log, "a frame of detections")
 
@@ -64,24 +80,41 @@ class Views:
 
         async def follow(number: int) -> None:
             async for frame in self._frames[number]:
+                cameras, stamp = self._cameras[number], frame.header.stamp
+                moves = cameras.moves()
+                if (moves or self._only_at_home) and not self._home.covers(stamp):
+                    continue
                 try:
-                    camera = self._cameras[number].of(self._infos[number].latest, self._statics.latest)
+                    camera = await cameras.of(frame.header, own_frame=False)
                 except Unusable as error:
                     self._left_out.note(error)
                     continue
-                seen = self._newest[number] = Seen(self._without_cut_off(number, frame), camera)
+                seen = self._newest[number] = Seen(
+                    self._without_cut_off(number, frame), camera, self._home.since if moves else None)
                 async with turn:
                     await look(number, seen)
 
         async with asyncio.TaskGroup() as group:
+            group.create_task(self._watch_arm())
+            for cameras in self._cameras:
+                group.create_task(cameras.follow())
             for number in range(len(self._frames)):
                 group.create_task(follow(number))
 
     def newest(self) -> list[Seen]:
-        """The newest frame of each view that tells of now."""
+        """The newest frame of each view that tells of now; what a camera on the robot saw last does until it looks again."""
         found = [seen for seen in self._newest if seen is not None]
         latest = max((seen.frame.header.stamp for seen in found), default=0)
-        return [seen for seen in found if latest - seen.frame.header.stamp <= OLDEST * 1e9]
+        return [seen for seen in found
+                if seen.since is not None or latest - seen.frame.header.stamp <= OLDEST * 1e9]
+
+    async def _watch_arm(self) -> None:
+        if self._joints is None:
+            return
+        async for state in self._joints:
+            found = dict(zip(state.name, state.position, strict=True))
+            if all(name in found for name in self._names):
+                self._home.note([found[name] for name in self._names], state.header.stamp)
 
     def _without_cut_off(self, number: int, frame: MarkerArray) -> MarkerArray:
         """The frame without what is cut off by the border of its picture and whole in another one."""

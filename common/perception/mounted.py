@@ -1,0 +1,74 @@
+"""Cameras that sit on the robot: where they are follows from its joints. They look from home."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from common.config.world import TCP, CameraConfig, Surroundings
+from common.errors import ConfigError
+from common.perception.pinhole import Pinhole
+from common.robot.model import RobotModel
+from common.robot.transforms import matrix_to_rpy, rpy_to_matrix, transform
+
+Array = npt.NDArray[np.float64]
+S = TypeVar("S", bound=Surroundings)
+
+
+def in_mount(camera: CameraConfig) -> Array:
+    """(4, 4) pose of the optical frame in the link that it sits on, or in world where it has no mount."""
+    return transform(rpy_to_matrix(*camera.rpy), camera.position)
+
+
+def mount_link(camera: CameraConfig, robot: RobotModel) -> str:
+    """The link that a camera sits on.
+
+    Raises:
+        ConfigError: the robot has no such link; with the choices.
+    """
+    link = robot.config.tcp_link if camera.mount == TCP else camera.mount
+    if link not in robot.link_names:
+        raise ConfigError("world.camera.mount", camera.mount, f"is no link of {robot.config.name}; choices: "
+                                                              f"{', '.join([TCP, *robot.link_names])}")
+    return link
+
+
+class Mounted:
+    """One camera, fixed in world or on the robot."""
+
+    def __init__(self, camera: CameraConfig, robot: RobotModel | None = None) -> None:
+        """Take the camera, and the robot where it has a mount.
+
+        Raises:
+            ConfigError: the robot has no such link.
+        """
+        self.moves = bool(camera.mount)
+        self._camera, self._robot = camera, robot
+        self._link = mount_link(camera, robot) if self.moves and robot is not None else ""
+        self._T_link_optical = in_mount(camera)
+
+    def at(self, q: npt.ArrayLike | None = None) -> Pinhole:
+        """The camera at joint positions (dof,) [rad]; without them where the robot is at home."""
+        c, T = self._camera, self._T_link_optical
+        if self._link and self._robot is not None:
+            T = self._robot.link_poses(self._robot.named("home") if q is None else q)[self._link] @ T
+        return Pinhole(c.fx, c.fy, c.cx, c.cy, c.width, c.height, T)
+
+
+def from_home(world: S, robot: RobotModel) -> S:
+    """The world with cameras on the robot fixed where they are while it is at home.
+
+    Raises:
+        ConfigError: the robot has no link of that name.
+    """
+    def fixed(camera: CameraConfig) -> CameraConfig:
+        if not camera.mount:
+            return camera
+        T = Mounted(camera, robot).at().T_world_optical
+        x, y, z = T[:3, 3].tolist()
+        return camera.model_copy(update={"mount": "", "position": (x, y, z), "rpy": matrix_to_rpy(T[:3, :3])})
+
+    cameras = {name: fixed(camera) for name, camera in world.cameras.items()}
+    return world.model_copy(update={"cameras": cameras, "camera": fixed(world.camera)})

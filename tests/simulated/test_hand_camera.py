@@ -1,0 +1,98 @@
+"""A camera on the hand: it sees the table from home, says where things are from wherever it is, and loses nothing."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from common import topics
+from common.applications.pick_place.topics import DETECTED_OBJECTS, PICK_PLACE_STATUS, VALIDATED_TARGETS
+from common.config import load_cell
+from common.messages import WorldEdit
+from common.transport.bus import Bus
+from common.virtual.simulation import Simulation
+from tests.simulated.visited import SimulatedCell
+
+DATA = Path(__file__).parents[1] / "data"
+HAND, BOTH = str(DATA / "hand_camera.yaml"), str(DATA / "hand_and_fixed.yaml")
+
+
+def test_table_is_cleared_and_pictures_taken_in_motion_say_where_things_are() -> None:
+    off: list[float] = []  # of detections in pictures that were taken while the arm moved [m]
+
+    async def visit(cell: SimulatedCell, bus: Bus) -> None:
+        spots = [tuple(spot) for spot in cell.cell.world.spots]
+        detected, arm = bus.reader(DETECTED_OBJECTS), bus.reader(topics.JOINT_STATES)
+        status = bus.reader(PICK_PLACE_STATUS)
+        async for frame in detected:
+            if status.latest is not None and status.latest.stage not in ("", "pre-grasp"):
+                return  # from here on they are no longer where they were
+            moving = arm.latest is not None and max(map(abs, arm.latest.velocity), default=0.0) > 0.3
+            off.extend(min(math.dist(spot, (p.x, p.y)) for spot in spots) for one in frame.markers
+                       if moving and not one.partial and (p := one.pose.position))
+
+    cell = SimulatedCell(HAND, ["world.count=2"], visit=visit)
+    outcome, summary = cell.outcome, cell.summary
+    assert (outcome.state, outcome.done, summary["failures"], summary["retries"]) == ("DONE", 2, 0, 0), outcome
+    assert len(off) >= 10 and max(off) < 0.005, off
+
+
+def test_objects_keep_their_ids_while_the_camera_looks_elsewhere_and_are_not_counted_twice() -> None:
+    ids: set[str] = set()
+    totals: set[int] = set()
+
+    async def visit(cell: SimulatedCell, bus: Bus) -> None:
+        scenes, status = bus.reader(topics.PLANNING_SCENE), bus.reader(PICK_PLACE_STATUS)
+        async for told in status:
+            if scenes.latest is not None:
+                ids.update(o.id for o in scenes.latest.objects if o.role == "target")
+            totals.update({told.total} if told.stage else ())
+            if told.state == "DONE":
+                return
+
+    outcome = SimulatedCell(HAND, ["world.count=2"], visit=visit, seed=2).outcome
+    assert (outcome.state, outcome.done) == ("DONE", 2), outcome
+    assert len(ids) == 2 and totals == {2}, (ids, totals)
+
+
+@pytest.mark.slow
+def test_what_was_moved_while_the_camera_looked_elsewhere_is_taken_from_where_it_is_then() -> None:
+    async def visit(cell: SimulatedCell, bus: Bus) -> None:
+        status = bus.reader(PICK_PLACE_STATUS)
+        async for told in status:
+            if told.stage == "across":
+                break
+        lying = {o.id for o in (await bus.reader(topics.SCENE_OBJECTS).next()).objects if o.state == "table"}
+        await bus.client(topics.WORLD_EDIT).call(WorldEdit.model_validate(
+            {"op": "move", "id": lying.pop(), "position": {"x": 0.5, "y": -0.15, "z": 0.03}}))
+
+    outcome = SimulatedCell(HAND, ["world.count=2"], visit=visit, seed=3).outcome
+    assert (outcome.state, outcome.done) == ("DONE", 2), outcome
+
+
+@pytest.mark.slow
+def test_a_fixed_camera_and_one_on_the_hand_feed_one_scene() -> None:
+    seen: set[int] = set()
+
+    async def visit(cell: SimulatedCell, bus: Bus) -> None:
+        offered = bus.reader(VALIDATED_TARGETS)
+        seen.add(len((await offered.next()).poses))
+
+    outcome = SimulatedCell(BOTH, visit=visit).outcome
+    assert (outcome.state, outcome.done, outcome.total) == ("DONE", 3, 3), outcome
+
+
+@pytest.mark.slow
+def test_the_fixed_camera_alone_leaves_what_only_the_hand_sees() -> None:
+    blind = [f"services.{name}.views=[fixed]" for name in ("scene_manager", "workspace_validator")]
+    outcome = Simulation(load_cell(BOTH, blind), 1).run()
+    assert (outcome.state, outcome.done) == ("DONE", 2), outcome
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_it_holds_with_everything_going_wrong(seed: int) -> None:
+    outcome = Simulation(load_cell(HAND, ["world.count=2"]), seed, faults=True).run()
+    assert outcome.ok and not outcome.broken, outcome
