@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -48,7 +49,7 @@ QUICK = [
     ("panda", ["world.objects=[{id: cube, shape: box, size: [0.04,0.04,0.04], x: 0.5, y: -0.1}]"], "warning",
      "cube is a box, vision_detector looks for spheres", False),
 ]
-HAND = "tests/data/hand_camera.yaml"  # what is seen is seen from home
+HAND = str(Path(__file__).parents[1] / "data" / "hand_camera.yaml")  # what is seen is seen from home
 QUICK += [
     (HAND, ["world.camera.position=[1.06,0,-0.1]"], "warning", "ball_1 at (0.4, -0.3) is wholly outside", False),
     (HAND, ["services.vision_detector.min_contour_area_px=3000"], "error", "ball_1 appears on", False),
