@@ -214,8 +214,8 @@ def hand_eye(
     echo(f"rpy      {rpy[0]:.5f}, {rpy[1]:.5f}, {rpy[2]:.5f} rad +- {math.degrees(result.rotation_std):.3f} degrees")
     if result.dropped:
         echo(f"dropped, since they do not fit: {_per_view(result.dropped)}")
-    echo(f"{file} holds intrinsics and {'the place on the hand' if mount == 'hand' else 'pose'}; a cell takes both with "
-         f"--set world.camera={file}")
+    place = "the place on the hand" if mount == "hand" else "pose"
+    echo(f"{file} holds intrinsics and {place}; a cell takes both with --set world.camera={file}")
     echo(result.verdict)
 
 

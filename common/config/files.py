@@ -106,7 +106,7 @@ def read_camera(path: Path) -> dict[str, Any]:
         missing = [field for field in fields if field not in camera]
         if missing:
             raise ConfigError("world.camera", str(path), f"has no {missing[0]}: `zencell calibrate {verb}` writes it")
-    return camera
+    return {"mount": "", **camera}  # of a camera in whose place it comes, the mount is not meant
 
 
 def made_absolute(robot: dict[str, Any], folder: Path) -> dict[str, Any]:

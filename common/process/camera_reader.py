@@ -1,4 +1,4 @@
-"""The camera of each picture: intrinsics from camera_info, where it was then from tf_static, and from tf if it moves."""
+"""The camera of each picture: intrinsics from camera_info, where it was then from tf_static, and tf if it moves."""
 
 from __future__ import annotations
 

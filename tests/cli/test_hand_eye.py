@@ -84,6 +84,10 @@ def test_camera_on_the_hand_is_found_from_a_folder_and_written(
     assert "10 views, residual 0.0" in told and told.splitlines()[-1].startswith("good: places are right to about")
     found = yaml.safe_load(Path(file).read_text())
     assert found["mount"] == "tcp" and f"a cell takes both with --set world.camera={file}" in told
+    on_hand = f"world.camera={file}"
+    assert load_cell("panda", [on_hand]).world.camera.mount == "tcp"
+    CameraFile.load(file).model_copy(update={"mount": None}).save(str(tmp_path / "fixed.yaml"))
+    assert load_cell("panda", [on_hand, f"world.camera={tmp_path / 'fixed.yaml'}"]).world.camera.mount == ""
     assert np.allclose(found["position"], T_TCP_CAMERA[:3, 3], atol=5e-4)
     assert np.allclose(rpy_to_matrix(*found["rpy"]), T_TCP_CAMERA[:3, :3], atol=1e-3)
     for more, wanted in (

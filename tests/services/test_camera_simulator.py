@@ -6,7 +6,7 @@ import pytest
 
 from common import topics
 from common.clock import Clock
-from common.config import Run, Surroundings
+from common.config import Run, Surroundings, load_cell
 from common.messages import Header, Pose, Vector3, WorldObject, WorldObjects
 from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
@@ -100,7 +100,7 @@ async def test_noise_comes_from_the_seed_of_the_run():
         tester = net.bus()
         images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_OBJECTS)
         truth.put(balls())
-        noisy = Config(world=Surroundings(), run=Run(cell="test", seed=seed), noise_std=8, brightness=-20)
+        noisy = Config(world=Surroundings(), robot=config.robot, run=Run(cell="test", seed=seed), noise_std=8, brightness=-20)
         async with running_service(net, run, noisy):
             return image_to_array(await next_of(images))
 

@@ -102,7 +102,7 @@ class Views:
                 group.create_task(follow(number))
 
     def newest(self) -> list[Seen]:
-        """The newest frame of each view that tells of now; what a camera on the robot saw last does until it looks again."""
+        """The newest frame of each view that tells of now; that of a camera on the robot does until it looks again."""
         found = [seen for seen in self._newest if seen is not None]
         latest = max((seen.frame.header.stamp for seen in found), default=0)
         return [seen for seen in found

@@ -68,7 +68,7 @@ def test_what_is_not_newer_is_left_out_and_unknown_and_circular_frames_are_named
     assert link is not None
     history.note(TFMessage.model_validate({"transforms": link.transforms}))  # of time 0
     np.testing.assert_array_equal(history.pose("lens", FIXED, 10 * MS), before)
-    with pytest.raises(NoTransform, match="tf_static has no frame 'elsewhere'; it has: .*lens"):
+    with pytest.raises(NoTransform, match=r"tf_static has no frame 'elsewhere'; it has: .*lens"):
         history.pose("elsewhere", FIXED, 0)
     pose = matrix_to_pose(np.eye(4))
     ring = [TransformStamped(header=Header(frame_id=a), child_frame_id=b, transform=pose) for a, b in ("ab", "ba")]
