@@ -8,20 +8,19 @@ import math
 from pydantic import Field
 
 from common import topics
-from common.config import Parameters, Surroundings, Tunable
+from common.config import Surroundings, Tunable
 from common.errors import ConfigError
 from common.messages import CameraInfo
 from common.perception.calibration_file import CameraFile, Rectifier, require_size
 from common.perception.image import array_to_image
 from common.perception.sources import Source, open_source
 from common.process.pace import Pace
+from common.process.reopening import Gone, Reopening, keep_open
 from common.process.service import main
 from common.transport.bus import Bus
 
-MOST_DOUBLINGS = 30  # of a wait, which has long reached its limit then
 
-
-class Config(Parameters):
+class Config(Reopening):
     """Where pictures come from. The pose of the camera is that of the world's camera."""
 
     world: Surroundings
@@ -34,10 +33,6 @@ class Config(Parameters):
                                             "and d in camera_info, for recording: the detectors refuse them")
     rate: Tunable[float] = Field(10.0, gt=0, le=250, description="pictures per second of wall time at most [Hz]")
     loop: bool = Field(True, description="begin a file or folder again at its end")
-    reopen_after: Tunable[float] = Field(
-        0.5, gt=0, le=60, description="wait before a device that is gone is opened again, doubled each time [s]"
-    )
-    reopen_at_most: Tunable[float] = Field(10.0, gt=0, le=600, description="longest of these waits [s]")
 
 
 def calibrated(config: Config) -> CameraFile:
@@ -89,20 +84,18 @@ async def run(bus: Bus, config: Config) -> None:
                 await pace.wait()
         return count
 
-    misses = 0  # in a row
-    while True:
+    async def use() -> Gone | None:
         source = await asyncio.to_thread(open_source, config.source, (i.width, i.height), config.rate, loop=config.loop)
+        sent = 0
         if source is not None:
             # Not closed when this is cancelled: a thread may still be waiting for a picture in there.
             sent = await send(source)
             source.close()
             if not source.live:
-                break
-            misses = 0 if sent else misses
-        wait = min(config.reopen_after * 2 ** min(misses, MOST_DOUBLINGS), config.reopen_at_most)
-        bus.log.error("camera %s gives no picture; it is opened again in %g s", config.source, wait)
-        await asyncio.sleep(wait)
-        misses += 1
+                return None
+        return Gone(f"camera {config.source} gives no picture", sent)
+
+    await keep_open(use, config, bus.log)
     bus.log.info("%s has come to its end", config.source)
     await asyncio.Event().wait()  # other services still look at the last picture
 

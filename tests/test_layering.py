@@ -107,7 +107,7 @@ def test_no_tracked_file_holds_a_path_of_one_machine() -> None:
 
 PLATFORM_SERVICES = (
     "motion_planner", "robot_state_publisher", "trajectory_executor", "viewer", "camera_simulator", "depth_camera",
-    "camera_opencv", "router",
+    "camera_opencv", "real_depth_camera", "router",
 )
 APPLICATIONS = [path.parent.name for path in sorted((ROOT / "common" / "applications").glob("*/__init__.py"))]
 PARTS_ALL_LOOK_FOR = ("STATUS", "DECIDED_BY", "REJECTED", "ANNOTATED", "VIEWS")

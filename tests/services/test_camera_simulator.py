@@ -100,7 +100,8 @@ async def test_noise_comes_from_the_seed_of_the_run():
         tester = net.bus()
         images, truth = tester.reader(topics.CAMERA_IMAGE), tester.writer(topics.SCENE_OBJECTS)
         truth.put(balls())
-        noisy = Config(world=Surroundings(), robot=config.robot, run=Run(cell="test", seed=seed), noise_std=8, brightness=-20)
+        noisy = Config(world=Surroundings(), robot=config.robot, run=Run(cell="test", seed=seed), noise_std=8,
+                       brightness=-20)
         async with running_service(net, run, noisy):
             return image_to_array(await next_of(images))
 

@@ -1,0 +1,263 @@
+"""docs/depth_camera.md: its driver, word for word, in the service that it is for, with a camera that is not there."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import sys
+import time
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from common import topics
+from common.config import check, load_cell, service_config
+from common.config.world import Surroundings
+from common.errors import ConfigError
+from common.messages import LogLine
+from common.perception.depth import depth_of
+from common.perception.depth_sources import Shot
+from common.perception.image import image_to_array
+from common.planning.seeing import cloud_points
+from common.process.in_process import running_service
+from common.process.wiring import wiring
+from common.transport.local import LocalNetwork
+from common.transport.reader import Reader
+from services import depth_camera, real_depth_camera
+from tests import pages
+
+PAGE = pages.text_of("docs/depth_camera.md")
+DRIVER = "my_pkg.realsense"
+WIDTH, HEIGHT = 64, 48
+SCALE = 0.00025  # [m] of one step: other than the usual one
+STEPS = 4000
+
+
+class FakeCamera:
+    """What pyrealsense2 knows of cameras: it may be unplugged. Its colour lens is not its depth lens."""
+
+    def __init__(self) -> None:
+        self.plugged, self.coeffs, self.opened, self.stopped = True, [0.0] * 5, 0, 0
+        self.streams: dict[str, tuple[Any, ...]] = {}
+        self.lenses = {"color": (40.0, 41.0, 31.0, 23.0), "depth": (35.0, 35.0, 30.0, 22.0)}
+
+    def module(self) -> types.ModuleType:
+        """A module with as much of pyrealsense2 as the page uses."""
+        fake = self
+        space = types.SimpleNamespace
+
+        def require() -> None:
+            if not fake.plugged:
+                raise RuntimeError("Frame didn't arrive within 1000")
+
+        class Frame:
+            def __init__(self, data: np.ndarray, lens: str) -> None:
+                self.data, self.lens = data, lens
+
+            def get_data(self) -> np.ndarray:
+                return self.data
+
+            def get_timestamp(self) -> float:
+                return 1e3 * (time.time() - 0.2)
+
+            def get_frame_timestamp_domain(self) -> str:
+                return "global"
+
+        class Frames:
+            """Depth has a column without a measurement, and the first set no colour."""
+
+            def __init__(self, number: int, aligned: str = "") -> None:
+                self.number, self.aligned = number, aligned
+
+            def get_depth_frame(self) -> Frame:
+                steps = np.full((HEIGHT, WIDTH), STEPS if self.aligned else 1, np.uint16)
+                steps[:, 5] = 0
+                return Frame(steps, self.aligned)
+
+            def get_color_frame(self) -> Frame | None:
+                picture = np.full((HEIGHT, WIDTH, 3), (10, 20, 200), np.uint8)
+                return Frame(picture, "color") if self.number > 1 else None
+
+        class Align:
+            def __init__(self, stream: str) -> None:
+                self.stream = stream
+
+            def process(self, frames: Frames) -> Frames:
+                return Frames(frames.number, self.stream)
+
+        class Config:
+            def __init__(self) -> None:
+                self.asked: dict[str, tuple[Any, ...]] = {}
+
+            def enable_device(self, serial: str) -> None:
+                self.asked["device"] = (serial,)
+
+            def enable_stream(self, stream: str, *mode: Any) -> None:
+                self.asked[stream] = mode
+
+        class Profile:
+            def get_device(self) -> Any:
+                return space(first_depth_sensor=lambda: space(get_depth_scale=lambda: SCALE))
+
+            def get_stream(self, stream: str) -> Any:
+                fx, fy, ppx, ppy = fake.lenses[stream]
+                found = space(width=WIDTH, height=HEIGHT, fx=fx, fy=fy, ppx=ppx, ppy=ppy,
+                              coeffs=fake.coeffs if stream == "color" else [0.0] * 5)
+                return space(as_video_stream_profile=lambda: space(get_intrinsics=lambda: found))
+
+        class Pipeline:
+            def __init__(self) -> None:
+                self.count, self.running = 0, False
+
+            def start(self, config: Config) -> Profile:
+                if config.asked["color"][0] != WIDTH:
+                    raise RuntimeError("Couldn't resolve requests")
+                fake.opened, fake.streams, self.running = fake.opened + 1, config.asked, True
+                return Profile()
+
+            def wait_for_frames(self, patience: int) -> Frames:
+                require()
+                time.sleep(0.002)
+                self.count += 1
+                return Frames(self.count)
+
+            def stop(self) -> None:
+                fake.stopped += 1
+                require()
+
+        module: Any = types.ModuleType("pyrealsense2")
+        module.stream, module.format = space(color="color", depth="depth"), space(z16="z16", bgr8="bgr8")
+        module.camera_info, module.timestamp_domain = space(serial_number="serial"), space(global_time="global")
+        module.config, module.pipeline, module.align = Config, Pipeline, Align
+        device = space(get_info=lambda what: "0123" if what == "serial" else "")
+        module.context = lambda: space(query_devices=lambda: [device] if fake.plugged else [])
+        return module
+
+
+@pytest.fixture
+def camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeCamera]:
+    """A camera that is plugged in, and the page's driver where the service finds it."""
+    for name, text in pages.files(PAGE).items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    fake = FakeCamera()
+    monkeypatch.setitem(sys.modules, "pyrealsense2", fake.module())
+    monkeypatch.syspath_prepend(tmp_path)
+    yield fake
+    for name in ("my_pkg", DRIVER):
+        sys.modules.pop(name, None)
+
+
+def config_of(size: tuple[int, int] = (WIDTH, HEIGHT), **more: Any) -> real_depth_camera.Config:
+    """As the page's cell says it, for small pictures."""
+    said = next(yaml.safe_load(text) for kind, text in pages.blocks(PAGE) if kind == "yaml")
+    around = check(Surroundings, said["world"] | {"camera": {**said["world"]["camera"], "width": size[0],
+                                                             "height": size[1]}}, "world")
+    quick = {"rate": 90.0, "reopen_after": 0.01, "reopen_at_most": 0.02}
+    given = {**said["services"]["real_depth_camera"], **quick, **more}
+    return check(real_depth_camera.Config, {**given, "world": around}, "services.real_depth_camera")
+
+
+async def test_colour_depth_in_metres_points_and_the_cameras_own_lens_are_sent_in_its_frame(camera: FakeCamera) -> None:
+    net = LocalNetwork()
+    bus = net.bus()
+    images, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
+    infos, clouds = bus.reader(topics.DEPTH_CAMERA_INFO), bus.reader(topics.DEPTH_CAMERA_POINTS)
+    async with running_service(net, real_depth_camera.run, config_of(), name="camera"), asyncio.timeout(30):
+        info, image, depth, cloud = (await infos.next(), await images.next(), await depths.next(), await clouds.next())
+        age = (bus.clock.now_ns() - image.header.stamp) * 1e-9
+    assert camera.streams == {"device": ("0123",), "depth": (WIDTH, HEIGHT, "z16", 30),
+                              "color": (WIDTH, HEIGHT, "bgr8", 30)}
+    assert (info.k[0], info.k[4], info.k[2], info.k[5]) == camera.lenses["color"] and not any(info.d)
+    assert (info.width, info.height) == (WIDTH, HEIGHT)
+    assert {one.header.frame_id for one in (info, image, depth, cloud)} == {"depth_camera_optical_frame"}
+    assert image_to_array(image)[3, 4].tolist() == [10, 20, 200]
+    metres = depth_of(depth)
+    assert np.isnan(metres[:, 5]).all() and np.allclose(np.delete(metres, 5, axis=1), STEPS * SCALE)
+    points = cloud_points(cloud)
+    assert len(points) == (WIDTH - 1) * HEIGHT and np.allclose(points[:, 2], STEPS * SCALE)
+    assert np.isclose(points[:, 0].min(), -31.0 / 40.0 * STEPS * SCALE)
+    assert age >= 0.2  # it was exposed before it came
+
+
+async def told(log: Reader[LogLine], line: str) -> None:
+    """Return when a line of the log begins so."""
+    async for message in log:
+        if message.message.startswith(line):
+            return
+
+
+async def test_a_camera_that_is_unplugged_is_told_and_comes_back(camera: FakeCamera) -> None:
+    net = LocalNetwork()
+    bus = net.bus()
+    images, log = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.LOG)
+    camera.plugged = False
+    async with running_service(net, real_depth_camera.run, config_of(), name="camera"), asyncio.timeout(30):
+        await told(log, f"camera {DRIVER}: no RealSense is plugged in; it is opened again in 0.01 s")
+        camera.plugged = True
+        first = await images.next()
+        camera.plugged = False
+        await told(log, f"camera {DRIVER}: Frame didn't arrive within 1000; it is opened again in 0.01 s")
+        camera.plugged = True
+        again = await images.next()
+        while camera.opened < 2:  # the newest picture from before may not have been read yet
+            again = await images.next()
+    assert again.header.stamp > first.header.stamp and (camera.opened, camera.stopped) == (2, 1)
+
+
+async def test_lens_that_is_distorted_is_refused_and_that_of_depth_taken_where_asked_for(camera: FakeCamera) -> None:
+    camera.coeffs = [0.1, 0.0, 0.0, 0.0, 0.0]
+    with pytest.raises(ConfigError, match=r"options\.align: 'color' has distortion .* cannot have: depth"):
+        async with running_service(LocalNetwork(), real_depth_camera.run, config_of(), name="camera"):
+            await asyncio.sleep(10)
+    net = LocalNetwork()
+    infos = net.bus().reader(topics.DEPTH_CAMERA_INFO)
+    aligned = config_of(options={"align": "depth"})
+    async with running_service(net, real_depth_camera.run, aligned, name="camera"), asyncio.timeout(30):
+        assert (await infos.next()).k[0] == camera.lenses["depth"][0]
+
+
+async def test_mode_that_the_camera_does_not_have_is_told_with_what_was_asked(camera: FakeCamera) -> None:
+    net = LocalNetwork()
+    log = net.bus().reader(topics.LOG)
+    asked = config_of((128, 96))
+    async with running_service(net, real_depth_camera.run, asked, name="camera"), asyncio.timeout(30):
+        await told(log, f"camera {DRIVER}: 128x96 at 30 Hz: Couldn't resolve requests; it is opened again in")
+
+
+@pytest.mark.parametrize(("given", "told"), [
+    ({"driver": ""}, "services.camera.driver: '' must be the dotted name of a module of yours"),
+    ({"driver": "my_pkg.nothing"}, "services.camera.driver: 'my_pkg.nothing' cannot be imported: No module named"),
+    ({"driver": "common.errors"}, "'common.errors' opens no cameras: it has no Options, open_camera"),
+    ({"options": {"fps": 900}}, "services.camera.options.fps: 900 must be less than or equal to 90"),
+    ({"options": {"speed": 3}}, "services.camera.options.speed: "),
+])
+async def test_driver_or_option_that_there_is_not_ends_the_start_with_one_line(
+    camera: FakeCamera, given: dict[str, Any], told: str,
+) -> None:
+    with pytest.raises(ConfigError) as refused:
+        async with running_service(LocalNetwork(), real_depth_camera.run, config_of(**given), name="camera"):
+            await asyncio.sleep(10)
+    assert told in str(refused.value) and "\n" not in str(refused.value)
+
+
+async def test_pictures_that_are_not_as_the_lens_says_end_the_service_with_one_line(
+    camera: FakeCamera, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    driver = importlib.import_module(DRIVER)
+    monkeypatch.setattr(driver, "Shot", lambda colour, depth, age: Shot(colour, depth.astype(np.float64), age))
+    with pytest.raises(ConfigError, match=r"my_pkg\.realsense' gives depth of shape \(48, 64\) and type float64"):
+        async with running_service(LocalNetwork(), real_depth_camera.run, config_of(), name="camera"):
+            await asyncio.sleep(10)
+
+
+async def test_it_writes_what_the_simulated_camera_writes_and_reads_nothing(camera: FakeCamera) -> None:
+    ur5 = load_cell("ur5")
+    simulated = await wiring(depth_camera.run, service_config(ur5, "depth_camera", depth_camera.Config))
+    real = await wiring(real_depth_camera.run, config_of())
+    assert real.writes == simulated.writes and not real.reads
