@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from contextlib import aclosing
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,7 +15,7 @@ import typer
 from cli import completion, options, publishing
 from common import terminal
 from common.client import delay
-from common.errors import UnknownName
+from common.errors import ConfigError, UnknownName
 
 if TYPE_CHECKING:
     from common.topics import AnyTopic, Topic
@@ -93,12 +95,17 @@ def echo(
     cell: options.CellName = None,
     count: options.Count = None,
     as_json: options.Json = False,
+    save: Annotated[
+        str, typer.Option("--save", metavar="FILE.png", help="keep the newest picture there")
+    ] = "",
     domain: options.Domain = None,
     connect: options.Connect = None,
 ) -> None:
     """Show what comes, until Ctrl-C or N messages; pictures as one line. A key of your own services will do too."""
     most = options.whole("--count", count, 1)
     topic = published_or_foreign(key)
+    if save:
+        require_pictures(topic, key, save)
 
     async def visit(bus: Bus) -> None:
         from common.client.hearing import topic_in
@@ -106,7 +113,12 @@ def echo(
 
         shown = 0
         found = topic or await topic_in(bus, key)
-        lines = _messages(bus, found, as_json) if isinstance(found, Topic) else _foreign_messages(bus, key, as_json)
+        if save and found is None:
+            raise ConfigError("--save", save, f"is for pictures: nobody says what {key} carries")
+        if save:
+            require_pictures(found, key, save)
+        lines = _messages(bus, found, as_json, save) if isinstance(found, Topic) else _foreign_messages(
+            bus, key, as_json)
         async with aclosing(lines):
             async for line in lines:
                 terminal.echo(line)
@@ -117,10 +129,26 @@ def echo(
     visit_topic(visit, topic, key, cell, domain, connect)
 
 
-async def _messages(bus: Bus, topic: Topic[Any], as_json: bool) -> AsyncGenerator[str, None]:
+def require_pictures(topic: AnyTopic | None, key: str, save: str) -> None:
+    """Return when pictures of a topic, if that is known, can be kept in a file of that name.
+
+    Raises:
+        ConfigError: they cannot.
+    """
+    if not save.lower().endswith(".png") or not Path(save).parent.is_dir():
+        raise ConfigError("--save", save, "must be the name of a .png file in a folder that is there")
+    if topic is not None and topic.message.__name__ != "Image":
+        raise ConfigError("--save", save, f"is for pictures: {key} carries {topic.message.__name__}")
+
+
+async def _messages(bus: Bus, topic: Topic[Any], as_json: bool, save: str = "") -> AsyncGenerator[str, None]:
     from common.messages.schema import one_line, to_json
 
     async for message in bus.reader(topic):
+        if save:
+            from common.recording.pictures import save_picture
+
+            await asyncio.to_thread(save_picture, message, Path(save))
         yield to_json(message.model_dump()) if as_json else one_line(message.model_dump())
 
 

@@ -9,7 +9,7 @@ from collections import deque
 import cv2
 
 from common import topics
-from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE
+from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common.config import Surroundings
 from common.messages import Color, Header, Image, Marker, MarkerArray, Pose, Quaternion, Vector3
 from common.perception.boxes import BoxDetector, BoxOptions, SeenBox, outlined
@@ -53,6 +53,7 @@ async def run(bus: Bus, config: Config) -> None:
     images, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
     cameras = CameraReader(bus, config.world, topics.DEPTH_CAMERA_INFO)
     found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
+    masks = bus.writer(DETECTION_MASK)
     cv2.setNumThreads(1)  # the other cores have other services
     detector = BoxDetector(config)
     left_out = LeftOut(bus.log, "a picture")
@@ -81,6 +82,8 @@ async def run(bus: Bus, config: Config) -> None:
         found.put(markers(boxes, config, image.header.stamp))
         if shown.matched:
             shown.put(array_to_image(outlined(picture, boxes), "bgr8", image.header))
+        if masks.matched:
+            masks.put(array_to_image(detector.mask(picture), "mono8", image.header))
 
     async def watch_depths() -> None:
         async for depth in depths:

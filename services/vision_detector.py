@@ -10,7 +10,7 @@ import cv2
 from common import topics
 from common.applications.pick_place.annotation import annotate
 from common.applications.pick_place.detector import Detection, Detector, DetectorOptions
-from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE
+from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common.applications.pick_place.tracks import Place
 from common.config import Surroundings
 from common.config.basics import Rgb
@@ -67,6 +67,7 @@ async def run(bus: Bus, config: Config) -> None:
     images = bus.reader(topics.CAMERA_IMAGE)
     cameras = CameraReader(bus, config.world)
     found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
+    masks = bus.writer(DETECTION_MASK)
     cv2.setNumThreads(1)  # the other cores have other services
     detector = Detector(config.world, config)
     left_out = LeftOut(bus.log, "a picture")
@@ -84,6 +85,8 @@ async def run(bus: Bus, config: Config) -> None:
             found.put(markers(detections, config.world, image.header.stamp, _remark(detector, bus.service)))
             if shown.matched:
                 shown.put(array_to_image(annotate(picture, detections), "bgr8", image.header))
+            if masks.matched:
+                masks.put(array_to_image(detector.masks(picture)[1], "mono8", image.header))
 
     async with asyncio.TaskGroup() as group:
         group.create_task(cameras.follow())

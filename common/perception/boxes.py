@@ -76,14 +76,11 @@ class BoxDetector:
         if self._rays is None or self._rays[0] is not camera:
             pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
             self._rays = camera, Rays.through(camera, pixels)
-        rays, o = self._rays[1], self.options
-        hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV).astype(np.int16)
-        coloured = (hsv[..., 1] >= o.min_saturation) & (hsv[..., 2] >= o.min_value) & is_valid(depth)
+        rays, o, measured = self._rays[1], self.options, is_valid(depth)
         found: list[SeenBox] = []
-        for name, kind in o.kinds.items():
-            away = np.abs(hsv[..., 0] - self._hues[name])
-            mask = coloured & (np.minimum(away, 180 - away) <= o.hue_tolerance)
-            for left, top, inside in _patches(mask):
+        for name, coloured in self._coloured(picture):
+            kind = o.kinds[name]
+            for left, top, inside in _patches(coloured & measured):
                 height, width = inside.shape
                 cut = (slice(top, top + height), slice(left, left + width))
                 points = rays.origin + depth[cut][..., None].astype(float) * rays.directions[cut]
@@ -91,6 +88,22 @@ class BoxDetector:
                 for face in _faces(inside, points[..., 2], o.level):
                     found += self._boxes(name, kind, points[face], camera, border)
         return found
+
+    def mask(self, picture: Picture) -> Picture:
+        """(height, width) 255 where a bgr8 picture has the colour of a kind, with depth or without."""
+        union = np.zeros(picture.shape[:2], bool)
+        for _, coloured in self._coloured(picture):
+            union |= coloured
+        return np.where(union, 255, 0).astype(np.uint8)
+
+    def _coloured(self, picture: Picture) -> Iterator[tuple[str, Bools]]:
+        """Each kind, and (height, width) where the picture has its colour."""
+        o = self.options
+        hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV).astype(np.int16)
+        bright = (hsv[..., 1] >= o.min_saturation) & (hsv[..., 2] >= o.min_value)
+        for name in o.kinds:
+            away = np.abs(hsv[..., 0] - self._hues[name])
+            yield name, bright & (np.minimum(away, 180 - away) <= o.hue_tolerance)
 
     def _boxes(self, name: str, kind: BoxKind, face: Array, camera: Pinhole, border: bool) -> Iterator[SeenBox]:
         """The boxes with that top face (n, 3) [m]."""

@@ -55,6 +55,24 @@ def export_images(recording: Recording, folder: Path, wants: Wanted, decoder: De
     return dict(counts)
 
 
+def save_picture(message: Any, path: Path) -> None:
+    """Write the picture of a message as a PNG file that is always whole; depth as in `export_images`.
+
+    Raises:
+        RecordingError: the message has no picture that can be shown, or the file cannot be written.
+    """
+    pixels = _pixels(message)
+    written, data = cv2.imencode(".png", pixels) if pixels is not None else (False, None)
+    if not written or data is None:
+        raise RecordingError(f"{path}: what came is no picture that can be written")
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_bytes(data.tobytes())
+        part.replace(path)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
+
+
 def _pixels(message: Any) -> npt.NDArray[Any] | None:
     if not isinstance(message, Image):
         return None

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import pytest
 
 from common.transport.endpoint import endpoint_of
@@ -48,6 +49,13 @@ def test_echo_shows_a_picture_in_one_line(place: Place) -> None:
 def test_echo_as_json_is_one_object_a_line_without_bytes(place: Place) -> None:
     (line,) = place.say("topic", "echo", "camera/image_raw", "--count", "1", "--json")
     assert json.loads(line)["data"] == "<36 bytes>"
+
+
+def test_echo_keeps_the_newest_picture_as_a_file(place: Place) -> None:
+    assert len(place.say("topic", "echo", "camera/image_raw", "--count", "2", "--save", "seen.png")) == 2
+    picture = cv2.imread(str(place.folder / "seen.png"))
+    assert picture is not None and picture.shape == (3, 4, 3)
+    assert [path.name for path in place.folder.glob("*seen*")] == ["seen.png"]
 
 
 def test_echo_shows_a_state_that_was_said_long_ago(place: Place) -> None:
@@ -93,6 +101,9 @@ def test_call_prints_the_answer_as_json(place: Place) -> None:
         (["call", "gripper/command", '{"id": "a"}'], 2, "gripper/command.width: is missing"),
         (["call", "joint_states", "{}"], 2, "unknown request 'joint_states'"),
         (["topic", "echo", "motion/plan"], 2, "unknown published key 'motion/plan'"),
+        (["topic", "echo", "tf", "--save", "tf.png"], 2, "--save: 'tf.png' is for pictures: tf carries TFMessage"),
+        (["topic", "echo", "camera/image_raw", "--save", "seen.jpg"], 2, "'seen.jpg' must be the name of a .png file"),
+        (["topic", "echo", "camera/image_raw", "--save", "no/seen.png"], 2, "in a folder that is there"),
         (["topic", "hz", "camera/image"], 2, "unknown key 'camera/image' (did you mean 'camera/image_raw'?)"),
         (["world", "add", "0.4", "nan"], 2, "Y: 'nan' must be a number"),
     ],

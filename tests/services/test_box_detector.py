@@ -6,11 +6,11 @@ import numpy as np
 
 from common import messages as m
 from common import topics
-from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE
+from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common.clock import Clock
 from common.config import CameraConfig
 from common.perception.boxes import BoxKind
-from common.perception.image import array_to_image
+from common.perception.image import array_to_image, image_to_array
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.robot.transforms import matrix_to_pose
@@ -30,6 +30,7 @@ class Camera:
         bus = net.bus("tester", cell="test", clock=Clock())
         self.images, self.depths = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
         self.found, self.shown = bus.reader(DETECTED_OBJECTS), bus.reader(DETECTION_IMAGE)
+        self.masks = bus.reader(DETECTION_MASK)
         bus.writer(topics.DEPTH_CAMERA_INFO).put(CAMERA.info(m.Header(frame_id=FRAME)))
         bus.writer(topics.TF_STATIC).put(m.TFMessage(transforms=[m.TransformStamped(
             header=m.Header(frame_id="world"), child_frame_id=FRAME, transform=matrix_to_pose(CAMERA.T_world_optical),
@@ -62,6 +63,8 @@ async def test_cube_is_told_with_kind_size_place_and_the_stamp_of_its_picture_wh
             assert marker.pixel is not None and math.dist(marker.pixel, (159.5, 119.5)) < 1
         shown = await camera.shown.next()
         assert (shown.width, shown.height) == (320, 240)
+        mask = image_to_array(await camera.masks.next())
+        assert (mask[110:130, 150:170] == 255).all() and (mask == 255).sum() == 400
 
 
 async def test_picture_with_the_depth_of_another_one_or_of_another_size_is_left_out() -> None:

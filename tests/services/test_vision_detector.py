@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from common import topics
-from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE
+from common.applications.pick_place.detector import Detector
+from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common.config import Surroundings, check
 from common.errors import ConfigError
 from common.messages import Header, Image, TFMessage, TransformStamped
@@ -170,6 +171,33 @@ async def test_annotated_picture_is_drawn_for_whoever_listens():
     assert (image_to_array(image) != draw_spheres(PLACES, camera, around)).any()
 
 
+async def test_mask_shows_what_the_colour_windows_let_through_as_they_are_now_and_only_to_who_listens(monkeypatch):
+    net, asked = LocalNetwork(), []
+    rig = Rig(net)
+    rig.calibrate()
+    tuned = config.model_copy()
+    look = Detector.masks
+    monkeypatch.setattr(Detector, "masks", lambda self, pixels: asked.append(1) or look(self, pixels))
+    async with running_service(net, run, tuned, name="vision_detector"):
+        rig.images.put(picture(stamp=1))
+        await rig.next()
+        assert len(asked) == 1  # to find what there is
+        masks = rig.bus.reader(DETECTION_MASK)
+        rig.images.put(picture(stamp=2))
+        image = await asyncio.wait_for(masks.next(), 10)
+        mask = image_to_array(image)
+        assert image.header == Header(stamp=2, frame_id=FRAME) and mask.shape == (camera.height, camera.width)
+        for place in PLACES:
+            u, v = np.rint(camera.project(place)).astype(int)
+            assert mask[v, u] == 255
+        assert set(np.unique(mask)) == {0, 255} and (mask == 255).mean() < 0.1
+        tuned.hsv_red_hi1 = tuned.hsv_red_hi2 = (0, 0, 0)  # lets nothing through
+        rig.images.put(picture(stamp=3))
+        while image.header.stamp < 3:
+            image = await asyncio.wait_for(masks.next(), 10)
+        assert not image_to_array(image).any()
+
+
 async def test_an_rgb_picture_is_understood():
     net = LocalNetwork()
     rig = Rig(net)
@@ -183,7 +211,7 @@ async def test_an_rgb_picture_is_understood():
 async def test_it_reads_no_truth():
     found = await wiring(run, config)
     assert found.reads == {topics.CAMERA_IMAGE, topics.CAMERA_INFO, topics.TF_STATIC}
-    assert found.writes == {DETECTED_OBJECTS, DETECTION_IMAGE}
+    assert found.writes == {DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK}
 
 
 @pytest.mark.parametrize(
