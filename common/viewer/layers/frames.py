@@ -20,6 +20,7 @@ _AXIS = 0.08  # length [m]
 _WIDTH = 0.14  # of the picture in the scene [m]
 _PIXELS = 320  # at most so many across: it is small on the page
 _PICTURES = 0.5  # [s] between pictures
+_MOVES = 0.1  # [s] between places of a camera that moves
 _COLOR = (120, 170, 255)
 
 
@@ -27,21 +28,28 @@ class Camera(Layer):
     """A frustum where a camera is, with what it sees."""
 
     LABEL = "Camera"
-    TOPICS = (topics.CAMERA_INFO, topics.DEPTH_CAMERA_INFO, topics.TF_STATIC)
+    TOPICS = (topics.CAMERA_INFO, topics.DEPTH_CAMERA_INFO, topics.TF_STATIC, topics.TF)
 
     def build(self) -> None:
         """Start without one."""
         self.nodes: dict[str, viser.CameraFrustumHandle] = {}  # by the beginning of the camera's keys
         self._infos: dict[str, CameraInfo] = {}
         self._last: dict[str, float] = {}
+        self._moved = -math.inf
 
     def show(self, topic: Topic[Any], message: Any) -> None:
-        """Show a camera where its frame is."""
+        """Show a camera where its frame is; one on the hand ten times a second at most."""
         if isinstance(message, CameraInfo):
             self._show(topic.key.rpartition("/")[0], message)
+        elif topic.key == topics.TF.key:
+            if self.stage.clock() - self._moved < _MOVES:
+                return
+            self._moved = self.stage.clock()
         for name, info in self._infos.items():
             T = self.stage.transforms.pose(info.header.frame_id)
-            self.nodes[name].position, self.nodes[name].wxyz = T[:3, 3], matrix_wxyz(T)
+            node, position, turn = self.nodes[name], T[:3, 3], matrix_wxyz(T)
+            if not (np.array_equal(node.position, position) and np.array_equal(node.wxyz, turn)):
+                node.position, node.wxyz = position, turn
 
     def _show(self, name: str, m: CameraInfo) -> None:
         known = self._infos.get(name)

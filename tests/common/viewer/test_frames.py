@@ -82,6 +82,9 @@ def test_camera_is_where_its_frame_is_on_a_moving_hand(panda: Stage) -> None:
     wanted = pose_to_matrix(at(0.5, 0, 0.5)) @ pose_to_matrix(TURNED)
     node = panda.layer("camera").nodes["camera"]
     np.testing.assert_allclose(in_world(panda.server, node), wanted, atol=1e-9)
+    for seconds, x in ((1.0, 0.6), (0.05, 0.7)):  # the second one too soon to be shown
+        panda.say(topics.TF, tf("world", "hand", at(x, 0, 0.5)), seconds)
+        np.testing.assert_allclose(in_world(panda.server, node)[0, 3], wanted[0, 3] + 0.1, atol=1e-6)
 
 
 def test_each_of_two_cameras_has_a_frustum_where_it_is(server: viser.ViserServer) -> None:
