@@ -27,6 +27,22 @@ def test_ball_exists_after_two_frames_and_is_forgotten_after_a_while() -> None:
     assert t.confirmed() == []
 
 
+def test_what_a_view_that_looks_at_times_showed_is_forgotten_only_when_it_looks_in_vain() -> None:
+    t = tracks()
+    for now in (1.0, 1.1):
+        t.update([at(0.4, 0.0)], now, 1, 0.0)  # of the hand
+    for now in (1.2, 5.0, 9.0):
+        t.update([at(0.6, 0.0)], now, 0)  # of a fixed camera, which does not see the first one
+    assert {b.id for b in t.confirmed()} == {"track_1", "track_2"}
+    t.update([], 9.1, 1, 9.0)  # the hand looks again since 9.0 s
+    assert len(t.confirmed()) == 2
+    t.update([at(0.42, 0.0)], 9.3, 1, 9.0)
+    assert {b.position[0] for b in t.confirmed() if b.id == "track_1"} == {0.42}
+    t.update([at(0.6, 0.0)], 9.8, 0)
+    t.update([], 9.9, 1, 9.0)
+    assert {b.id for b in t.confirmed()} == {"track_2"}
+
+
 def test_touching_balls_keep_their_ids_when_one_is_taken_away() -> None:
     t = tracks()
     a, b = at(0.40, 0.0), at(0.46, 0.0)
