@@ -22,17 +22,28 @@ def in_mount(camera: CameraConfig) -> Array:
     return transform(rpy_to_matrix(*camera.rpy), camera.position)
 
 
-def mount_link(camera: CameraConfig, robot: RobotModel) -> str:
-    """The link that a camera sits on.
+def mount_link(camera: CameraConfig, robot: RobotModel, field: str = "world.camera") -> str:
+    """The link that a camera, which stands in a field of the cell, sits on.
 
     Raises:
         ConfigError: the robot has no such link; with the choices.
     """
     link = robot.config.tcp_link if camera.mount == TCP else camera.mount
     if link not in robot.link_names:
-        raise ConfigError("world.camera.mount", camera.mount, f"is no link of {robot.config.name}; choices: "
-                                                              f"{', '.join([TCP, *robot.link_names])}")
+        raise ConfigError(f"{field}.mount", camera.mount, f"is no link of {robot.config.name}; choices: "
+                                                          f"{', '.join([TCP, *robot.link_names])}")
     return link
+
+
+def mount_links(around: Surroundings, robot: RobotModel) -> dict[str, str]:
+    """By name of the camera, the link that it sits on; only those that do.
+
+    Raises:
+        ConfigError: the robot has no such link; with the choices.
+    """
+    single = len(around.cameras) == 1
+    return {name: mount_link(camera, robot, "world.camera" if single else f"world.cameras.{name}")
+            for name, camera in around.cameras.items() if camera.mount}
 
 
 class Mounted:
@@ -47,13 +58,17 @@ class Mounted:
         self.moves = bool(camera.mount)
         self._camera, self._robot = camera, robot
         self._link = mount_link(camera, robot) if self.moves and robot is not None else ""
-        self._T_link_optical = in_mount(camera)
 
     def at(self, q: npt.ArrayLike | None = None) -> Pinhole:
-        """The camera at joint positions (dof,) [rad]; without them where the robot is at home."""
-        c, T = self._camera, self._T_link_optical
-        if self._link and self._robot is not None:
-            T = self._robot.link_poses(self._robot.named("home") if q is None else q)[self._link] @ T
+        """The camera at joint positions (dof,) [rad]; without them where the robot is at home.
+
+        Raises:
+            CameraError: it has a mount, and no robot was given.
+        """
+        c = self._camera
+        if self._robot is None or not self._link:
+            return Pinhole.from_config(c)
+        T = self._robot.link_poses(self._robot.named("home") if q is None else q)[self._link] @ in_mount(c)
         return Pinhole(c.fx, c.fy, c.cx, c.cy, c.width, c.height, T)
 
 
@@ -63,6 +78,8 @@ def from_home(world: S, robot: RobotModel) -> S:
     Raises:
         ConfigError: the robot has no link of that name.
     """
+    mount_links(world, robot)
+
     def fixed(camera: CameraConfig) -> CameraConfig:
         if not camera.mount:
             return camera

@@ -81,6 +81,8 @@ def test_link_that_a_camera_sits_on_and_that_the_robot_has_not_is_told_with_the_
     found = quick(load_cell(HAND, ["world.camera.mount=hand"]))
     assert [(each.severity, each.refused) for each in found] == [("error", True)]
     assert found[0].what.startswith("world.camera.mount: 'hand' is no link of panda; choices: tcp, panda_link0")
+    both = str(Path(HAND).with_name("hand_and_fixed.yaml"))
+    assert quick(load_cell(both, ["world.cameras.hand.mount=x"]))[0].what.startswith("world.cameras.hand.mount: 'x' is")
     with pytest.raises(ConfigError, match="needs position and rpy: where it sits on tcp"):
         load_cell("panda", ["world.camera={mount: tcp}"])
 
