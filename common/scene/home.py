@@ -38,11 +38,6 @@ class HomeWatch:
             self._since, self._until = stamp, None
         self._known = True
 
-    @property
-    def since(self) -> int | None:
-        """Since when the arm is at home, or was when it left [ns]; None as long as it never was."""
-        return self._since
-
     def covers(self, stamp: int) -> bool:
         """Whether the arm was at home at a time [ns]."""
         return self._since is not None and self._since <= stamp and (self._until is None or stamp < self._until)

@@ -48,7 +48,7 @@ class PerceivedScene:
             for k, (x, y, z) in enumerate(self._slots.tolist(), 1)
         ]
         self._occupied: dict[int, tuple[int, set[int]]] = {}  # stamp and slots by view
-        self._lasts: set[int] = set()  # views of cameras on the robot
+        self._lasts: set[int] = set()  # views that look at times
         self._free: set[int] = set()  # slots in which nothing was when the hand took something, nor was seen since
         self._beside_slots: dict[int, list[Sighting]] = {}  # what else lies in the container, by view
         self._held: m.AttachedObject | None = None
@@ -56,12 +56,12 @@ class PerceivedScene:
         self._stamp = 0
 
     def see(self, detections: m.MarkerArray, camera: Pinhole, T_world_tcp: Array | None, view: int = 0,
-            since: int | None = None) -> None:
+            at_times: bool = False) -> None:
         """Take in the detections of one frame, of one of several views.
 
         A frame that was taken before the hand last closed or opened still shows what is in the hand now on the table:
-        it is left out. So is anything seen where the hand holds a ball. A camera on the robot has been looking `since`
-        [ns]: what it showed is what is known until it looks again.
+        it is left out. So is anything seen where the hand holds a ball. What a camera showed that looks `at_times` is
+        known until it looks again.
         """
         stamp = detections.header.stamp
         if stamp <= self._changed_hands_at:
@@ -86,11 +86,12 @@ class PerceivedScene:
             elif hand is None or math.dist(hand, thing.position) > max(thing.size) / 2:
                 on_table.append(thing)
         self._beside_slots[view] = beside_slots
-        self._tracks.update(on_table, stamp * 1e-9, view, None if since is None else since * 1e-9)
+        self._tracks.update(on_table, stamp * 1e-9, view, at_times)
         seen = occupied_slots(in_container, camera, self._slots, self.around.ball_radius, self._free)
         self._free -= seen
         self._occupied[view] = stamp, seen
-        self._lasts = self._lasts | {view} if since is not None else self._lasts - {view}
+        if at_times:
+            self._lasts.add(view)
 
     def feel(self, gripper: m.GripperState, T_world_tcp: Array | None) -> None:
         """Take in whether the hand holds something: the nearest ball moves into it with its id, or leaves it."""

@@ -89,22 +89,19 @@ class Tracks:
         self.p = parameters
         self._tracks: list[Track] = []
         self._count = 0
-        self._looks: dict[int, tuple[float, float]] = {}  # of views that look at times: when last, since when [s]
+        self._looked: dict[int, float] = {}  # of views that look at times: when last [s]
 
-    def update(self, sightings: Sequence[Sighting], now: float, view: int = 0, since: float | None = None) -> None:
+    def update(self, sightings: Sequence[Sighting], now: float, view: int = 0, at_times: bool = False) -> None:
         """Take in all detections of one frame.
 
         Args:
             sightings: of the frame.
             now: when it was taken [s].
             view: which of several views it is of.
-            since: since when that one has been looking [s], if it looks at times only: nothing is forgotten because
-                it looks elsewhere. None: it looks always.
+            at_times: that one looks at times only: what it showed is known until it looks again.
         """
-        if since is None:
-            self._looks.pop(view, None)
-        else:
-            self._looks[view] = now, since
+        if at_times:
+            self._looked[view] = now
         pairs = sorted(
             (math.dist(t.position, s.position), i, j)
             for i, t in enumerate(self._tracks)
@@ -130,9 +127,8 @@ class Tracks:
                 self._tracks.append(Track(f"track_{self._count}", sighting.position, 1, now, sighting, view))
 
     def _unseen_for(self, track: Track, now: float) -> float:
-        """For how long it was looked for in vain [s]."""
-        now, since = self._looks.get(track.view, (now, track.last_seen))
-        return now - max(track.last_seen, since)
+        """For how long nobody has seen it who looked [s]."""
+        return self._looked.get(track.view, now) - track.last_seen
 
     def confirmed(self) -> list[Track]:
         """Objects that were seen often enough to be believed."""

@@ -37,13 +37,12 @@ class ViewsParameters(Parameters):
 class Seen:
     """A frame of detections and the camera that took the picture.
 
-    `since` is since when a camera on the robot has been looking from home without a break [ns]; None for one that is
-    fixed, and looks always.
+    A camera on the robot looks `at_times`, from home: its frame is what is known until it looks again.
     """
 
     frame: MarkerArray
     camera: Pinhole
-    since: int | None = None
+    at_times: bool = False
 
 
 class Views:
@@ -89,8 +88,7 @@ class Views:
                 except Unusable as error:
                     self._left_out.note(error)
                     continue
-                seen = self._newest[number] = Seen(
-                    self._without_cut_off(number, frame), camera, self._home.since if moves else None)
+                seen = self._newest[number] = Seen(self._without_cut_off(number, frame), camera, moves)
                 async with turn:
                     await look(number, seen)
 
@@ -106,7 +104,7 @@ class Views:
         found = [seen for seen in self._newest if seen is not None]
         latest = max((seen.frame.header.stamp for seen in found), default=0)
         return [seen for seen in found
-                if seen.since is not None or latest - seen.frame.header.stamp <= OLDEST * 1e9]
+                if seen.at_times or latest - seen.frame.header.stamp <= OLDEST * 1e9]
 
     async def _watch_arm(self) -> None:
         if self._joints is None:

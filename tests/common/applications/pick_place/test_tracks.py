@@ -27,19 +27,18 @@ def test_ball_exists_after_two_frames_and_is_forgotten_after_a_while() -> None:
     assert t.confirmed() == []
 
 
-def test_what_a_view_that_looks_at_times_showed_is_forgotten_only_when_it_looks_in_vain() -> None:
+def test_what_a_view_that_looks_at_times_showed_is_forgotten_when_it_looks_in_vain_and_not_before() -> None:
     t = tracks()
     for now in (1.0, 1.1):
-        t.update([at(0.4, 0.0)], now, 1, 0.0)  # of the hand
+        t.update([at(0.4, 0.0)], now, 1, True)  # of the hand
     for now in (1.2, 5.0, 9.0):
         t.update([at(0.6, 0.0)], now, 0)  # of a fixed camera, which does not see the first one
     assert {b.id for b in t.confirmed()} == {"track_1", "track_2"}
-    t.update([], 9.1, 1, 9.0)  # the hand looks again since 9.0 s
-    assert len(t.confirmed()) == 2
-    t.update([at(0.42, 0.0)], 9.3, 1, 9.0)
+    t.update([at(0.42, 0.0)], 9.1, 1, True)  # it was moved meanwhile
     assert {b.position[0] for b in t.confirmed() if b.id == "track_1"} == {0.42}
-    t.update([at(0.6, 0.0)], 9.8, 0)
-    t.update([], 9.9, 1, 9.0)
+    for now in (9.2, 14.9):
+        t.update([at(0.6, 0.0)], now, 0)
+    t.update([], 15.0, 1, True)  # the first picture from there for long is as good as any
     assert {b.id for b in t.confirmed()} == {"track_2"}
 
 
