@@ -38,7 +38,8 @@ def quick(cell: Cell) -> list[Finding]:
         seen = seen_from_home(cell)
     except ConfigError as told:
         return [*of_robot, refusal(told)]
-    return [*of_robot, *_each(lambda: check_world(seen, find_application(cell.application))),
+    place = " from home" if cell.world.on_hand else ""
+    return [*of_robot, *_each(lambda: check_world(seen, find_application(cell.application), place)),
             *_of_application(seen, "quick")]
 
 

@@ -28,8 +28,13 @@ INTO = 5e-4  # [m] things may reach into each other by rounding
 THINNEST = 2e-3  # [m] of what fingers hold: less cannot be told from fingers that closed on nothing
 
 
-def check_world(cell: Cell, application: Application) -> Iterator[Finding]:
+def check_world(cell: Cell, application: Application, seen_from: str = "") -> Iterator[Finding]:
     """What does not fit in the world of a cell.
+
+    Args:
+        cell: whose cameras are all fixed.
+        application: what it is for.
+        seen_from: where the robot is for that, in words such as ` from home`, if one of them sits on it.
 
     Raises:
         ConfigError: a mesh cannot be read.
@@ -37,7 +42,7 @@ def check_world(cell: Cell, application: Application) -> Iterator[Finding]:
     world = cell.world
     placed = [thing for thing in world.objects if thing.placed] if is_simulated(cell.robot) else []
     solids = {thing.id: solid_of(thing) for thing in placed}
-    yield from _pictures(world, placed, solids)
+    yield from _pictures(world, placed, solids, seen_from)
     yield from _places(world, placed, solids)
     if application.grasps and cell.robot.gripper is not None and cell.robot.gripper.cup is None:
         for thing in placed:
@@ -47,7 +52,9 @@ def check_world(cell: Cell, application: Application) -> Iterator[Finding]:
 # --- what the cameras see -----------------------------------------------------------------------------------------
 
 
-def _pictures(world: World, placed: list[ObjectConfig], solids: dict[str, Solid]) -> Iterator[Finding]:
+def _pictures(
+    world: World, placed: list[ObjectConfig], solids: dict[str, Solid], seen_from: str,
+) -> Iterator[Finding]:
     cameras = {name: Pinhole.from_config(camera) for name, camera in world.cameras.items()}
     field = "world.camera" if len(cameras) == 1 else "world.cameras"
     for table in tables(world):
@@ -61,7 +68,7 @@ def _pictures(world: World, placed: list[ObjectConfig], solids: dict[str, Solid]
         seen = np.any([_seen(camera, points) for camera in cameras.values()], axis=0)
         if seen.mean() < LEAST_SEEN:
             yield warning(f"{field}: {100 * (1 - seen.mean()):.0f} % of the top of {table.id} is outside of "
-                          f"{'the picture' if len(cameras) == 1 else 'all pictures'}",
+                          f"{'the picture' if len(cameras) == 1 else 'all pictures'}{seen_from}",
                           f"correct position, rpy or fx, fy of {field}")
     for thing in placed:
         corners = _corners(thing, solids[thing.id])
@@ -70,7 +77,7 @@ def _pictures(world: World, placed: list[ObjectConfig], solids: dict[str, Solid]
         if best < 1:
             outside = "wholly" if best == 0 else f"to {100 * (1 - best):.0f} %"
             yield warning(f"world.objects: {thing.id} at {_at(thing)} is {outside} outside of "
-                          f"{'the picture' if len(cameras) == 1 else 'every picture'}",
+                          f"{'the picture' if len(cameras) == 1 else 'every picture'}{seen_from}",
                           f"move it, or correct {field}")
 
 

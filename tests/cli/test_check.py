@@ -51,7 +51,8 @@ QUICK = [
 ]
 HAND = str(Path(__file__).parents[1] / "data" / "hand_camera.yaml")  # what is seen is seen from home
 QUICK += [
-    (HAND, ["world.camera.position=[1.06,0,-0.1]"], "warning", "ball_1 at (0.4, -0.3) is wholly outside", False),
+    (HAND, ["world.camera.position=[1.06,0,-0.1]"], "warning",
+     "ball_1 at (0.4, -0.3) is wholly outside of the picture from home", False),
     (HAND, ["services.vision_detector.min_contour_area_px=3000"], "error", "ball_1 appears on", False),
 ]
 THOROUGH = [

@@ -41,6 +41,7 @@ def test_table_is_cleared_and_pictures_taken_in_motion_say_where_things_are() ->
     assert len(off) >= 10 and max(off) < 0.005, off
 
 
+@pytest.mark.slow
 def test_objects_keep_their_ids_while_the_camera_looks_elsewhere_and_are_not_counted_twice() -> None:
     ids: set[str] = set()
     totals: set[int] = set()
