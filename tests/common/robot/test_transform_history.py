@@ -64,7 +64,7 @@ def test_an_arm_that_rests_may_be_told_of_seldom() -> None:
 def test_what_is_not_newer_is_left_out_and_unknown_and_circular_frames_are_named() -> None:
     history = told([0, 20 * MS])
     before = history.pose("lens", FIXED, 10 * MS)
-    link = FRAMES.moving(JointState(name=ROBOT.joint_names, position=(HOME + 1).tolist()))
+    link = FRAMES.moving(JointState(header=Header(), name=ROBOT.joint_names, position=(HOME + 1).tolist()))
     assert link is not None
     history.note(TFMessage.model_validate({"transforms": link.transforms}))  # of time 0
     np.testing.assert_array_equal(history.pose("lens", FIXED, 10 * MS), before)
