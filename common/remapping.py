@@ -1,7 +1,8 @@
 """Keys that a service knows by words of its own, under other names in the cell: how one service serves several times.
 
 `{"camera/*": "left_camera/*", "tf": "left/tf"}`: a key is looked up as it is, then under the longest of the beginnings
-that end in `*`, which stands for all that follows. What everybody says under the same key is never renamed.
+that end in `*`, which stands for all that follows; what lies under a key goes where that goes. What everybody says
+under the same key is never renamed.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ class Remapping:
         self._asked.add(own)
         found = _pattern(self._table, own)
         if found is None:
-            return own
+            above, _, name = own.rpartition("/")
+            return f"{self.key(above)}/{name}" if above in self._table else own
         self._used.add(found)
         return self._table[found].replace("*", own[len(found) - 1:]) if found.endswith("*") else self._table[found]
 

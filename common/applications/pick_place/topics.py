@@ -9,7 +9,7 @@ from common.topics import Topic
 SCENE_BALLS = Topic("scene_balls", m.PoseArray, "state", "the truth: where every ball is; simulated hardware only")
 DETECTED_OBJECTS = Topic("detected_objects", m.MarkerArray, "stream", "balls found in the picture, in world")
 DETECTION_IMAGE = Topic("detection_image", m.Image, "stream", "the picture with what was found")
-DETECTION_MASK = Topic("detection_mask", m.Image, "stream",
+DETECTION_MASK = Topic("detection_image/mask", m.Image, "stream",
                        "white where the picture has a colour that is looked for; sent only while someone listens")
 VALIDATED_TARGETS = Topic("validated_targets", m.PoseArray, "stream", "detections that the arm can take, in world")
 REJECTED_TARGETS = Topic("rejected_targets", m.Rejections, "event",

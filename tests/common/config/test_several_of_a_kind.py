@@ -103,6 +103,12 @@ def test_longest_beginning_that_fits_renames_a_key_and_shared_keys_stay() -> Non
         "left/image_raw", "left/depth/a", "t", "tf_static", "x/motion/plan", "log", "counters", "param/viewer"]
 
 
+def test_what_lies_under_a_key_goes_where_that_goes() -> None:
+    remapping = Remapping(checked_table("topics", {"seen": "left/seen", "other": "left/other"}))
+    assert [remapping.key(key) for key in ("seen/mask", "seen", "other/a/b")] == [
+        "left/seen/mask", "left/seen", "other/a/b"]
+
+
 def test_entry_that_renames_nothing_is_told_with_the_keys_that_there_are() -> None:
     remapping = Remapping({"camra/*": "left/*"})
     assert remapping.key("camera/image_raw") == "camera/image_raw"
