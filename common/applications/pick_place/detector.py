@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from common.applications.pick_place.blobs import Blob, Mask, find_blobs, small_blobs
 from common.applications.pick_place.fit import fit_each, fit_spheres
+from common.applications.pick_place.masks import Colours, Masks
 from common.applications.pick_place.resting import Resting
 from common.applications.pick_place.separation import separate
 from common.config import Parameters, Surroundings, Tunable
@@ -93,34 +93,30 @@ class Detector:
         """
         self.options = options or DetectorOptions()
         self.resting = Resting.of(surroundings)
+        self._masks = Masks()
         self.too_small = 0  # blobs in the last picture that were not looked at, but for those in the container
-        self._last: tuple[Picture, Pinhole, DetectorOptions, list[Detection]] | None = None
+        self._last: tuple[Mask, Pinhole, DetectorOptions, list[Detection]] | None = None
 
     def masks(self, picture: Picture) -> tuple[Mask, Mask]:
-        """What is red in a bgr8 picture: opened, and then closed; 255 where it is."""
-        o, size = self.options, self.options.morph_kernel_px
-        hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
-        low = cv2.inRange(hsv, np.array(o.hsv_red_lo1), np.array(o.hsv_red_hi1))
-        high = cv2.inRange(hsv, np.array(o.hsv_red_lo2), np.array(o.hsv_red_hi2))
-        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-        opened = cv2.morphologyEx(cv2.bitwise_or(low, high), cv2.MORPH_OPEN, kernel)
-        closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel)
-        return np.asarray(opened, np.uint8), np.asarray(closed, np.uint8)
+        """What is red in a bgr8 picture: opened, and then closed; 255 where it is. They are not to be written to."""
+        o = self.options
+        windows = (o.hsv_red_lo1, o.hsv_red_hi1), (o.hsv_red_lo2, o.hsv_red_hi2)
+        return self._masks.of(picture, Colours(windows, o.morph_kernel_px))
 
     def detect(self, picture: Picture, camera: Pinhole) -> list[Detection]:
         """Balls in a bgr8 picture (height, width, 3), nearest to the upper left corner first.
 
         A picture that is the last one again, as drawn ones without noise often are, is not looked at again.
         """
+        fine, closed = self.masks(picture)
         last = self._last
-        if last and camera is last[1] and self.options == last[2] and np.array_equal(picture, last[0]):
+        if last and closed is last[0] and camera is last[1] and self.options == last[2]:
             return list(last[3])
-        found = self._look_at(picture, camera)
-        self._last = (picture.copy(), camera, self.options.model_copy(), found)
+        found = self._look_at(fine, closed, camera)
+        self._last = (closed, camera, self.options.model_copy(), found)
         return list(found)
 
-    def _look_at(self, picture: Picture, camera: Pinhole) -> list[Detection]:
-        fine, closed = self.masks(picture)
+    def _look_at(self, fine: Mask, closed: Mask, camera: Pinhole) -> list[Detection]:
         blobs = find_blobs(closed, fine, camera, self.options.min_contour_area_px)
         small = small_blobs(closed, self.options.min_contour_area_px)
         # What shows of a ball below others in the container is small, too.

@@ -1,0 +1,106 @@
+"""What is red in a picture; of one that is like the one before only what has changed is looked at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from common.applications.pick_place.blobs import Mask
+
+Picture = npt.NDArray[np.uint8]
+Window = tuple[tuple[int, int, int], tuple[int, int, int]]  # lower and upper end: hue, saturation, value
+Part = tuple[slice, slice]  # rows and columns
+
+_MOST = 0.5  # of a picture: where more has changed, all of it is looked at
+
+
+@dataclass(frozen=True)
+class Colours:
+    """What counts as red: windows in OpenCV's HSV, and the width of the ellipse for opening and closing [px]."""
+
+    windows: tuple[Window, ...]
+    kernel_px: int
+
+
+@dataclass(frozen=True)
+class _Known:
+    picture: Picture
+    colours: Colours
+    opened: Mask
+    closed: Mask
+
+
+class Masks:
+    """Masks of one picture after the other: for each the same as if it were the first."""
+
+    def __init__(self) -> None:
+        """Nothing was seen yet."""
+        self._known: _Known | None = None
+
+    def of(self, picture: Picture, colours: Colours) -> tuple[Mask, Mask]:
+        """What is red in a bgr8 picture: opened, and then closed; 255 where it is. They are not to be written to."""
+        known, part = self._known, None
+        if known is not None and known.colours == colours and known.picture.shape == picture.shape:
+            part = changed(known.picture, picture)
+            if part is None:
+                return known.opened, known.closed
+        if known is None or part is None or _share(part, picture) > _MOST:
+            opened, closed = _masks(picture, colours)
+            self._known = _Known(picture.copy(), colours, opened, closed)
+            return opened, closed
+        reach = 4 * (colours.kernel_px // 2)  # erosion and dilation, twice: so far a pixel acts on the masks
+        inner, outer = _grown(part, reach, picture), _grown(part, 2 * reach, picture)
+        new = known.picture, known.opened.copy(), known.closed.copy()
+        new[0][part] = picture[part]
+        offset = inner[0].start - outer[0].start, inner[1].start - outer[1].start
+        size = inner[0].stop - inner[0].start, inner[1].stop - inner[1].start
+        within = slice(offset[0], offset[0] + size[0]), slice(offset[1], offset[1] + size[1])
+        for whole, fresh in zip(new[1:], _masks(picture[outer], colours), strict=True):
+            whole[inner] = fresh[within]
+        self._known = _Known(new[0], colours, new[1], new[2])
+        return new[1], new[2]
+
+
+def changed(before: Picture, after: Picture) -> Part | None:
+    """The rectangle in which two pictures of one shape differ; None where they do not."""
+    other = _words(before) != _words(after)
+    rows = np.flatnonzero(other.any(axis=1))
+    if not len(rows):
+        return None
+    top, bottom = int(rows[0]), int(rows[-1]) + 1
+    columns = np.flatnonzero(other[top:bottom].any(axis=0))
+    width, words = before.shape[1], other.shape[1]
+    left, right = int(columns[0]) * width // words, -(-(int(columns[-1]) + 1) * width // words)
+    return slice(top, bottom), slice(left, right)
+
+
+def _words(picture: Picture) -> npt.NDArray[np.unsignedinteger]:
+    """The rows of a picture as long words, which are compared sooner than bytes; their last axis is its width."""
+    flat = np.ascontiguousarray(picture).reshape(len(picture), -1)
+    return flat.view(np.uint64) if flat.shape[1] % 8 == 0 else flat
+
+
+def _share(part: Part, picture: Picture) -> float:
+    return float(picture[part].size / picture.size)
+
+
+def _grown(part: Part, by: int, picture: Picture) -> Part:
+    rows, columns = (
+        slice(max(0, side.start - by), min(size, side.stop + by))
+        for side, size in zip(part, picture.shape[:2], strict=True)
+    )
+    return rows, columns
+
+
+def _masks(picture: Picture, colours: Colours) -> tuple[Mask, Mask]:
+    hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
+    red = np.zeros(picture.shape[:2], np.uint8)
+    for low, high in colours.windows:
+        red = np.asarray(cv2.bitwise_or(red, cv2.inRange(hsv, np.array(low), np.array(high))), np.uint8)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (colours.kernel_px, colours.kernel_px))
+    opened = cv2.morphologyEx(red, cv2.MORPH_OPEN, kernel)
+    closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel)
+    return np.asarray(opened, np.uint8), np.asarray(closed, np.uint8)
