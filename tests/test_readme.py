@@ -101,10 +101,11 @@ def test_command_of_the_readme_answers_beside_a_running_cell(line: str, cell: di
             process.communicate(timeout=PATIENCE)
         finally:
             process.kill()
+            (ROOT / "mask.png").unlink(missing_ok=True)
     wanted = {"hz": "Hz", "status": '"state"', "targets": '"poses"', "list": "panda/", "zenoh": "panda/",
               "add": '"ids"', "pause": '"paused": true', " top ": "panda at speed", " tf ": "position",
               "param set": "400.0 -> 350.0", "param dump": "# Parameters of panda",
-              "owner": "the motion is", "record": ""}
+              "owner": "the motion is", "record": "", "--save mask.png": "mono8"}
     assert next(text for word, text in wanted.items() if word in line) in first
 
 
