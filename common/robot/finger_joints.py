@@ -42,7 +42,7 @@ def measured_width(gripper: GripperConfig | None, names: Sequence[str], position
 def finger_positions(gripper: GripperConfig, width: float) -> list[float]:
     """Positions [rad or m] of the gripper's joints, in their order, at a width [m]."""
     driven = driven_position(gripper, width)
-    return [factor * driven for factor in _factors(gripper)]
+    return [factor * driven for factor in finger_factors(gripper)]
 
 
 def finger_velocities(gripper: GripperConfig, width: float, rate: float) -> list[float]:
@@ -51,7 +51,7 @@ def finger_velocities(gripper: GripperConfig, width: float, rate: float) -> list
     if gripper.linkage is not None:
         bars = gripper.linkage
         driven = -rate / (2 * bars.length * math.cos(bars.open_angle - driven_position(gripper, width)))
-    return [factor * driven for factor in _factors(gripper)]
+    return [factor * driven for factor in finger_factors(gripper)]
 
 
 def closing_frame(gripper: GripperConfig) -> NDArray[np.float64]:
@@ -62,5 +62,6 @@ def closing_frame(gripper: GripperConfig) -> NDArray[np.float64]:
     return T_tcp_closing
 
 
-def _factors(gripper: GripperConfig) -> list[float]:
+def finger_factors(gripper: GripperConfig) -> list[float]:
+    """What each joint does per driven joint, which is the first of them."""
     return list(gripper.mimic) or [1.0] * len(gripper.joints)

@@ -13,7 +13,7 @@ from common.config import CameraConfig
 from common.messages import TFMessage, TransformStamped
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix, rpy_to_matrix, transform
-from common.viewer.robot_meshes import Piece, Rgb
+from common.robot.visual_meshes import Piece, Rgb
 
 Array = NDArray[np.float64]
 

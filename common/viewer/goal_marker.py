@@ -14,7 +14,7 @@ from common.viewer.nodes import FLAT, matrix_wxyz, pose_from, position_of, wxyz_
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
-    from common.viewer.robot_meshes import Piece
+    from common.robot.visual_meshes import Piece
 
 HAND, REACHED, NOT_REACHED = (255, 170, 60), (60, 200, 100), (240, 60, 60)
 _SIZE = 0.18  # of the marker [m]

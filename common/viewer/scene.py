@@ -13,6 +13,7 @@ from common.config import Surroundings
 from common.messages import JointTrajectory, Pose
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
+from common.robot.visual_meshes import coarse, visual_pieces
 from common.topics import Topic
 from common.viewer.console import Console
 from common.viewer.feeds import Latest, News
@@ -20,7 +21,6 @@ from common.viewer.figure import LinkPoses, Transforms
 from common.viewer.goal_marker import GoalMarker
 from common.viewer.layers import Layers, layers_shown
 from common.viewer.pictures import Picture
-from common.viewer.robot_meshes import coarse, visual_pieces
 from common.viewer.stage import Stage
 
 GHOST = 0.3  # share of the robot's triangles that its ghost has

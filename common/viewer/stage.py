@@ -11,10 +11,10 @@ if TYPE_CHECKING:
 
     from common.config import Surroundings
     from common.robot.model import RobotModel
+    from common.robot.visual_meshes import Piece
     from common.viewer.console import Console
     from common.viewer.feeds import Latest
     from common.viewer.figure import LinkPoses, Transforms
-    from common.viewer.robot_meshes import Piece
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from common.application import find_application
 from common.config import Cell, Surroundings, load_cell
 from common.robot.model import RobotModel
 from common.robot.transforms import quaternion_to_matrix
+from common.robot.visual_meshes import Piece, coarse, visual_pieces
 from common.topics import Topic
 from common.viewer.layers import find_layers
-from common.viewer.robot_meshes import Piece, coarse, visual_pieces
 from common.viewer.scene import Scene
 
 WORLD = m.Header(stamp=1, frame_id="world")

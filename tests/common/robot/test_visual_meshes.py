@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from common.config import RobotConfig
 from common.errors import ConfigError
 from common.robot.model import RobotModel
-from common.viewer.robot_meshes import _groups, _parts, _piece, coarse, visual_pieces
+from common.robot.visual_meshes import _groups, _parts, _piece, coarse, visual_pieces
 from tests.common.viewer.scene_cell import pieces_of, robot_of
 
 URDF = """<robot name="post">

@@ -1,0 +1,1 @@
+"""A world with physics, by MuJoCo (extra `physics`)."""
