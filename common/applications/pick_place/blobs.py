@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,6 +15,7 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.uint8]
 Contour = npt.NDArray[np.int32]
 Part = tuple[Contour, bool]  # a contour, and whether it is that of a hole
+Traced = tuple[tuple[bytes, bool], ...]  # the parts of an outline
 
 _REACH = 3  # contour points to either side from which the direction of the outline is taken
 _LEAST_POINTS = 16  # shorter contours are specks or pin holes
@@ -51,18 +52,30 @@ class Blob:
         centroid: (2,) of its area [px].
         outline: of the regions of the finer mask within it, holes included.
         border: (m, 2) its pixels at the border of the picture [px].
+        traced: the pixels of its outline, as they were followed.
     """
 
     area: float
     centroid: Array
     outline: Outline
     border: Array
+    traced: Traced = ()
 
 
-def find_blobs(closed: Mask, fine: Mask, camera: Pinhole, min_area: float) -> list[Blob]:
+def find_blobs(
+    closed: Mask, fine: Mask, camera: Pinhole, min_area: float, known: Mapping[Traced, Outline] | None = None
+) -> list[Blob]:
     """Blobs of the closed mask of at least `min_area` [px^2], outlined by the finer mask from before closing.
 
     Closing bridges the gaps between near neighbours and fills notches: what a ball looks like is in the finer mask.
+
+    Args:
+        closed: what is red, closed.
+        fine: what is red, before closing.
+        camera: the camera.
+        min_area: smaller blobs are left out [px^2].
+        known: outlines of the same camera's last picture by what was traced: that of a blob which is there again is
+            the very same one.
     """
     outer, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     large = [(np.asarray(c, np.int32), area) for c in outer if (area := cv2.contourArea(c)) >= min_area]
@@ -79,12 +92,16 @@ def find_blobs(closed: Mask, fine: Mask, camera: Pinhole, min_area: float) -> li
                 within[index].append((np.asarray(contour, np.int32), bool(links[3] >= 0)))
                 break
     blobs = []
-    for (contour, area), outline in zip(large, _outlines(within, camera), strict=True):
+    traced = [tuple((part.tobytes(), is_hole) for part, is_hole in parts) for parts in within]
+    again = known or {}
+    anew = iter(_outlines([parts for parts, key in zip(within, traced, strict=True) if key not in again], camera))
+    outlines = [again[key] if key in again else next(anew) for key in traced]
+    for (contour, area), outline, key in zip(large, outlines, traced, strict=True):
         moments = cv2.moments(contour)
         centroid = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
         flat = contour.reshape(-1, 2).astype(float)
         border = flat[~_off_border(flat, camera)]
-        blobs.append(Blob(area, centroid, outline, border))
+        blobs.append(Blob(area, centroid, outline, border, key))
     return blobs
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from common.applications.pick_place.blobs import Blob, Mask, find_blobs, small_blobs
+from common.applications.pick_place.blobs import Blob, Mask, Outline, Traced, find_blobs, small_blobs
 from common.applications.pick_place.fit import fit_each, fit_spheres
 from common.applications.pick_place.masks import Colours, Masks
 from common.applications.pick_place.resting import Resting
@@ -26,6 +26,7 @@ _ROUND = 0.96  # part of an outline that must fit for a blob to be one ball
 Hue = Annotated[int, Field(ge=0, le=180)]
 Byte = Annotated[int, Field(ge=0, le=255)]
 Hsv = tuple[Hue, Byte, Byte]
+_Key = tuple[Traced, tuple[float, float], float]  # of a blob: its outline, its centre [px], the offset expected [m]
 
 
 class DetectorOptions(Parameters):
@@ -81,6 +82,14 @@ class _Seen:
     border: Array  # (m, 2) pixels of its blob at the border of the picture
 
 
+class _Round(NamedTuple):
+    """How well one sphere fits a blob: where it is relative to the optical centre [m], off by so much [m]."""
+
+    center: Array
+    offset: float
+    close: float  # part of the outline that fits
+
+
 class Detector:
     """Finds balls: the same picture always gives the same detections."""
 
@@ -94,6 +103,8 @@ class Detector:
         self.options = options or DetectorOptions()
         self.resting = Resting.of(surroundings)
         self._masks = Masks()
+        self._outlines: dict[Traced, Outline] = {}  # of the last picture: what is there again is not worked out again
+        self._fits: dict[_Key, list[_Round]] = {}
         self.too_small = 0  # blobs in the last picture that were not looked at, but for those in the container
         self._last: tuple[Mask, Pinhole, DetectorOptions, list[Detection]] | None = None
 
@@ -117,7 +128,11 @@ class Detector:
         return list(found)
 
     def _look_at(self, fine: Mask, closed: Mask, camera: Pinhole) -> list[Detection]:
-        blobs = find_blobs(closed, fine, camera, self.options.min_contour_area_px)
+        if self._last is None or camera is not self._last[1]:
+            self._outlines.clear()
+            self._fits.clear()
+        blobs = find_blobs(closed, fine, camera, self.options.min_contour_area_px, self._outlines)
+        self._outlines = {blob.traced: blob.outline for blob in blobs}
         small = small_blobs(closed, self.options.min_contour_area_px)
         # What shows of a ball below others in the container is small, too.
         self.too_small = sum(not self.resting.shows_container(camera, pixel) for pixel in small)
@@ -144,33 +159,44 @@ class Detector:
 
         What is round but as large as no ball looks where it can lie is left out: it is something else, or falling.
         """
-        crowded, tried, starts = [], [], []
-        for index, blob in enumerate(blobs):
+        crowded: list[Blob] = []
+        tried: list[tuple[Blob, _Key]] = []
+        starts: dict[_Key, list[Array]] = {}  # of what was not in the last picture
+        fits: dict[_Key, list[_Round]] = {}
+        for blob in blobs:
             center = camera.on_plane(blob.centroid, self.resting.plane)
             if len(blob.border) or len(blob.outline) < 12 or not np.isfinite(center).all():
                 crowded.append(blob)
                 continue
-            ray = np.append(center, self.resting.plane) - camera.position
-            for z in self.resting.heights(camera, blob.centroid):
-                tried.append(index)
-                starts.append(ray * ((z - camera.position[2]) / ray[2]))
-        if not tried:
-            return [], crowded, []
-        centers, offsets, close = fit_each(
-            [blobs[index].outline for index in tried], np.array(starts), self.resting.radius, offset=offset,
-            gates=(self.resting.radius, 4 * pixel_size, 3 * pixel_size), close=1.3 * pixel_size,
-        )
-        alone, found = [], []
-        for index in dict.fromkeys(tried):
-            mine = [k for k, other in enumerate(tried) if other == index]
-            if min(close[mine]) < _ROUND:
-                crowded.append(blobs[index])
+            key = blob.traced, (float(blob.centroid[0]), float(blob.centroid[1])), offset
+            if key in self._fits:
+                fits[key] = self._fits[key]
+            else:
+                ray = np.append(center, self.resting.plane) - camera.position
+                heights = self.resting.heights(camera, blob.centroid)
+                starts[key], fits[key] = [ray * ((z - camera.position[2]) / ray[2]) for z in heights], []
+            tried.append((blob, key))
+        fitted = [(blob.outline, key, start) for blob, key in tried for start in starts.get(key, ())]
+        if fitted:
+            found = fit_each(
+                [outline for outline, _, _ in fitted], np.array([start for _, _, start in fitted]), self.resting.radius,
+                offset=offset, gates=(self.resting.radius, 4 * pixel_size, 3 * pixel_size), close=1.3 * pixel_size,
+            )
+            for (_, key, _), center, off, close in zip(fitted, *found, strict=True):
+                fits[key].append(_Round(center, float(off), float(close)))
+        self._fits = fits
+        alone, offsets = [], []
+        for blob, key in tried:
+            if not (tries := fits[key]):
                 continue
-            best = min(mine, key=lambda k: abs(offsets[k] - offset))
-            if abs(offsets[best] - offset) <= self.options.max_offset_px * pixel_size:
-                alone.append(_Seen(centers[best], blobs[index].area, blobs[index].border))
-                found.append(float(offsets[best]))
-        return alone, crowded, found
+            if min(one.close for one in tries) < _ROUND:
+                crowded.append(blob)
+                continue
+            best = min(tries, key=lambda one: abs(one.offset - offset))
+            if abs(best.offset - offset) <= self.options.max_offset_px * pixel_size:
+                alone.append(_Seen(best.center, blob.area, blob.border))
+                offsets.append(best.offset)
+        return alone, crowded, offsets
 
     def _detections(self, seen: list[_Seen], camera: Pinhole) -> list[Detection]:
         if not seen:

@@ -311,3 +311,22 @@ def test_caller_that_draws_into_the_picture_or_the_list_spoils_nothing():
     mine[:] = 0
     assert remembering.detect(mine, camera) == []
     assert len(remembering.detect(picture, camera)) == 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_was_found_in_a_picture_does_not_depend_on_the_pictures_before(seed):
+    rng = np.random.default_rng(seed)
+    one_after_the_other = Detector(around)
+    balls = random_layout(rng)
+    looked_at = 0
+    for _ in range(12):
+        kept = balls[rng.random(len(balls)) < 0.8]  # some are taken, others come, some of those touch
+        new = random_layout(rng)[: rng.integers(0, 3)]
+        balls = np.concatenate([kept, new])
+        picture = draw_spheres(balls, camera, around)
+        found = one_after_the_other.detect(picture, camera)
+        alone = Detector(around).detect(picture, camera)
+        assert [one.position for one in found] == [one.position for one in alone]
+        assert [one.area for one in found] == [one.area for one in alone]
+        looked_at += len(found)
+    assert looked_at > 12
