@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -49,7 +50,7 @@ from common.perception.mounted import from_home
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.workspace import WorkspaceBounds, bounds_told, reach_reason
-from common.sim.interface import GraspTolerances, load_world
+from common.sim.interface import GraspTolerances, PhysicalWorld, load_world
 from common.sim.layout import layout
 from common.sim.standing import SavedBeside, Standing, state_file
 from common.transport.bus import Bus
@@ -113,7 +114,9 @@ def make_cycle(
             kept = None
         if kept is not None:
             start = np.array(kept.q)
-    hardware = load_hardware(config.robot, limits, start)
+    physical = world if isinstance(world, PhysicalWorld) else None
+    arm = partial(physical.hardware, robot, limits, start) if physical is not None else None
+    hardware = load_hardware(config.robot, limits, start, arm)
     if isinstance(hardware, ControlledArm) and speed != 1.0:
         hardware.close()
         raise ConfigError("speed", speed, "must be 1: the arm has a controller with a clock of its own")

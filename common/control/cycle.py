@@ -20,7 +20,15 @@ from common.control.inhibits import Inhibits
 from common.control.jogging import Jogging, ToolKinematics
 from common.control.payload import Payload
 from common.errors import ConfigError, Refused
-from common.hardware.interface import ControlledArm, Hardware, HardwareFault, Limits, SimulatedGripper, Vector
+from common.hardware.interface import (
+    ControlledArm,
+    Hardware,
+    HardwareFault,
+    Limits,
+    PlacedGripper,
+    SimulatedGripper,
+    Vector,
+)
 from common.messages import (
     ExecuteRequest,
     GripperCommand,
@@ -38,7 +46,7 @@ from common.messages import (
     WorldObjects,
 )
 from common.robot.finger_joints import finger_positions, finger_velocities
-from common.sim.interface import SimulatedWorld, StandingObject
+from common.sim.interface import FeltWorld, SimulatedWorld, StandingObject
 from common.sim.standing import Standing
 
 PROGRESS_PERIOD = 0.1  # cell time between reports of progress [s]
@@ -85,6 +93,7 @@ class ControlCycle:
         """
         self._hardware, self._limits = hardware, limits
         self._kinematics, self._world = kinematics, world
+        self._felt = world if isinstance(world, FeltWorld) else None
         self._arm = TrajectoryController(limits, start, tolerances, name=controller, period=period)
         self._gripper: GripperController | None = None
         self._fingers = gripper
@@ -93,7 +102,7 @@ class ControlCycle:
             backend = type(hardware).__name__
             if hardware.gripper is None:
                 raise ConfigError("robot.hardware.backend", backend, "has no gripper, but the robot has one")
-            if world is not None:
+            if self._felt is not None:
                 if not isinstance(hardware.gripper, SimulatedGripper):
                     raise ConfigError("robot.hardware.backend", backend, "is simulated: its gripper needs obstruct()")
                 self._obstructible = hardware.gripper
@@ -208,13 +217,15 @@ class ControlCycle:
         """Find fingers and world as they were; the arm was begun where it stood."""
         assert self._world is not None
         self._world.restore(state.objects)
-        if self._gripper is None or self._obstructible is None or self._kinematics is None or state.width is None:
+        fingers = self._hardware.gripper
+        if self._gripper is None or not isinstance(fingers, PlacedGripper) or state.width is None:
             return
-        self._obstructible.place(state.width)
-        self._obstructible.obstruct(self._world.obstruction(self._kinematics.fk(self._q), state.width))
+        fingers.place(state.width)
+        if self._felt is not None and self._obstructible is not None and self._kinematics is not None:
+            self._obstructible.obstruct(self._felt.obstruction(self._kinematics.fk(self._q), state.width))
         if state.told_width is not None:
             self._gripper.resume(state.told_width, now, state.told_effort)
-        self._gripper.update(self._obstructible.read(now), now)
+        self._gripper.update(fingers.read(now), now)
 
     def takes_long(self, request: ExecuteRequest) -> bool:
         """Whether to `judge` the request takes longer than there is time for between two cycles."""
@@ -363,14 +374,14 @@ class ControlCycle:
         gripper = self._hardware.gripper
         if self._gripper is None or gripper is None or self._hand_fault.waits(now):
             return
-        if self._world is None or self._kinematics is None or self._obstructible is None or self.apart:
+        if self._felt is None or self._kinematics is None or self._obstructible is None or self.apart:
             reading = asked("reading the gripper", gripper.read, now)
         else:
             T_world_tcp = self._kinematics.fk(self._q)
-            self._obstructible.obstruct(self._world.obstruction(T_world_tcp, self._gripper.state.width))
+            self._obstructible.obstruct(self._felt.obstruction(T_world_tcp, self._gripper.state.width))
             reading = asked("reading the gripper", gripper.read, now)
-            tick = partial(self._world.tick, now, T_world_tcp, reading.width, reading.holding)
-            takes_long = getattr(self._world, "takes_long", None)
+            tick = partial(self._felt.tick, now, T_world_tcp, reading.width, reading.holding)
+            takes_long = getattr(self._felt, "takes_long", None)
             if self.beside and takes_long is not None and takes_long(reading.width, reading.holding):
                 self.due, self.apart = tick, True
             else:

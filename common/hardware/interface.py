@@ -97,14 +97,19 @@ class Gripper(Protocol):
 
 
 @runtime_checkable
-class SimulatedGripper(Gripper, Protocol):
-    """Fingers that the simulated world can be in the way of."""
-
-    def obstruct(self, width: float) -> None:
-        """Let the fingers close no further than a width [m]; 0 when nothing is between them."""
+class PlacedGripper(Gripper, Protocol):
+    """Simulated fingers."""
 
     def place(self, width: float) -> None:
         """Be at rest at a width [m]: where the fingers stood when the process before this one ended."""
+
+
+@runtime_checkable
+class SimulatedGripper(PlacedGripper, Protocol):
+    """Fingers that a simulated world without forces can be in the way of."""
+
+    def obstruct(self, width: float) -> None:
+        """Let the fingers close no further than a width [m]; 0 when nothing is between them."""
 
 
 class Hardware(Protocol):

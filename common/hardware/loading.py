@@ -12,6 +12,8 @@ from common.errors import ConfigError, UnknownName
 from common.hardware.interface import Hardware, Limits, Vector
 
 PACKAGE = "common.hardware"
+WORLDS = ("mujoco",)  # simulators that are looked for here
+STANDS_IN = "mock"  # for the arm of a simulated world, where that has one
 
 
 def backend_names() -> list[str]:
@@ -39,6 +41,9 @@ def find_backend(robot: RobotConfig) -> Backend:
         ConfigError: a module that cannot be imported, or is no backend.
     """
     name = robot.hardware.backend
+    if name in WORLDS:
+        raise ConfigError("robot.hardware.backend", name, "is a simulated world with an arm in it: leave the "
+                          f"backend at {STANDS_IN} and say world.simulator: {name} in the cell")
     if "." not in name and name not in backend_names():
         raise UnknownName("hardware backend", name, backend_names())
     try:
@@ -63,12 +68,25 @@ def is_simulated(robot: RobotConfig) -> bool:
     return backend.simulated
 
 
-def load_hardware(robot: RobotConfig, limits: Limits, start: Vector) -> Hardware:
+def load_hardware(
+    robot: RobotConfig, limits: Limits, start: Vector, arm: Callable[[], Hardware] | None = None
+) -> Hardware:
     """The robot's hardware, created with the options of the robot file.
 
+    A simulated world with forces has an `arm` of its own, which takes the place of `mock`: what looks on at a backend
+    has `around(robot, limits, start, options, arm)` to look on at that.
+
     Raises:
-        UnknownName, ConfigError: no such backend, or an option that does not fit.
+        UnknownName, ConfigError: no such backend, an option that does not fit, or a backend that moves the joints
+            itself in a world that does.
     """
     backend = find_backend(robot)
     options = check(backend.Options, robot.hardware.options, "robot.hardware.options")
-    return backend.create(robot, limits, start, options)
+    if arm is None:
+        return backend.create(robot, limits, start, options)
+    if hasattr(backend, "around"):
+        return cast(Hardware, backend.around(robot, limits, start, options, arm))
+    if robot.hardware.backend != STANDS_IN:
+        raise ConfigError("robot.hardware.backend", robot.hardware.backend, f"moves the joints itself, and so does "
+                          f"world.simulator: use {STANDS_IN} here, or kinematic there")
+    return arm()

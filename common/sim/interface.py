@@ -5,7 +5,8 @@ A simulator is a module (of this folder, or a dotted one of the user's own) that
     def create(world: World, objects: Sequence[ObjectConfig], tolerances: GraspTolerances,
                gripper: GripperConfig | None) -> SimulatedWorld
 
-where `objects` are those of the world, each with a place, and `tolerances` tell when the fingers catch something.
+where `objects` are those of the world, each with a place, and `tolerances` tell when the fingers catch something. What
+it gives is a `FeltWorld`, or a `PhysicalWorld` that brings an arm of its own for robot files with the backend `mock`.
 Times are cell time [s], passed in.
 """
 
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +22,15 @@ from pydantic import BaseModel, Field
 
 from common.config import GripperConfig, ObjectConfig, Parameters, Tunable, World
 from common.errors import ConfigError, UnknownName
+from common.hardware.interface import Hardware, Limits
 from common.messages import Header, SceneUpdate, WorldEdit, WorldObject, WorldObjects
+from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
 
 PACKAGE = "common.sim"
-SIMULATORS = ("kinematic",)
+SIMULATORS = ("kinematic", "mujoco")
 
 
 class StandingObject(BaseModel):
@@ -47,24 +50,6 @@ class SimulatedWorld(Protocol):
     """What is asked of a simulated world: the truth. `version` grows whenever something has changed."""
 
     version: int
-
-    def obstruction(self, T_world_tcp: Array, width: float) -> float:
-        """The width [m] that the fingers cannot close below: what is between them now, or 0.
-
-        Args:
-            T_world_tcp: (4, 4) pose of the tool centre point.
-            width: between the inner faces of the fingers, or the valve of a cup [m].
-        """
-
-    def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
-        """Move on to a time: grasp what the fingers press on, carry it, let it go, let it fall.
-
-        Args:
-            now: cell time [s].
-            T_world_tcp: (4, 4) pose of the hand.
-            width: between the fingers [m].
-            gripping: whether the fingers press on something.
-        """
 
     def edit(self, request: WorldEdit, now: float) -> str:
         """Change the world as a person asks; the id of what was changed, empty for a reset.
@@ -92,6 +77,41 @@ class SimulatedWorld(Protocol):
 
     def restore(self, objects: Mapping[str, StandingObject]) -> None:
         """Put everything where it was."""
+
+
+@runtime_checkable
+class FeltWorld(SimulatedWorld, Protocol):
+    """A world without forces: the hand, which others move, is asked for, and told what is in its way."""
+
+    def obstruction(self, T_world_tcp: Array, width: float) -> float:
+        """The width [m] that the fingers cannot close below: what is between them now, or 0.
+
+        Args:
+            T_world_tcp: (4, 4) pose of the tool centre point.
+            width: between the inner faces of the fingers, or the valve of a cup [m].
+        """
+
+    def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
+        """Move on to a time: grasp what the fingers press on, carry it, let it go, let it fall.
+
+        Args:
+            now: cell time [s].
+            T_world_tcp: (4, 4) pose of the hand.
+            width: between the fingers [m].
+            gripping: whether the fingers press on something.
+        """
+
+
+@runtime_checkable
+class PhysicalWorld(SimulatedWorld, Protocol):
+    """A world with forces, which has an arm of its own: time passes in it when that is read."""
+
+    def hardware(self, robot: RobotModel, limits: Limits, start: Array) -> Hardware:
+        """The arm in this world, at rest at `start` (dof,) [rad]. Called once, before anything else but `layout`.
+
+        Raises:
+            ConfigError: the robot cannot be simulated.
+        """
 
 
 class GraspTolerances(Parameters):

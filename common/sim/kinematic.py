@@ -330,6 +330,11 @@ class KinematicWorld:
         return list(self._bodies)
 
     @property
+    def bodies(self) -> dict[str, Body]:
+        """Everything by id, for a world that moves it by other laws."""
+        return self._bodies
+
+    @property
     def held(self) -> str:
         """The id of what is between the fingers, or an empty string."""
         return next((name for name, body in self._bodies.items() if body.state == "held"), "")

@@ -59,6 +59,14 @@ def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) 
     return WatchedArm(load_hardware(below, limits, start), limits)
 
 
+def around(
+    robot: RobotConfig, limits: Limits, start: Vector, options: Options, arm: Callable[[], Hardware]
+) -> WatchedArm:
+    """The arm of a simulated world, which takes the place of the backend below."""
+    below = robot.model_copy(update={"hardware": HardwareConfig(backend=options.backend, options=options.options)})
+    return WatchedArm(load_hardware(below, limits, start, arm), limits)
+
+
 def with_watched_arm(cell: Cell) -> Cell:
     """The cell with its arm being watched.
 
