@@ -8,6 +8,7 @@ What it brings lies in modules of these names within the package, or else in the
                 DECIDED_BY (optional) a stream whose stamp is that of the picture by which the task decides
                 REJECTED   (optional) a `Topic` of `Rejections`: what the task is not offered, and why
                 ANNOTATED  (optional) a `Topic` of `Image`: the picture with what was found in it
+                MASK       (optional) a `Topic` of `Image`: white where that was looked for
                 VIEWS      (optional) {Topic: function(WorldObjects) -> message}: truth as the application calls it,
                            published by whoever simulates the world
     figures   (optional) what the summary, the report and the recheck say of a run

@@ -1,4 +1,4 @@
-"""The robot's visual shapes as triangles: one piece for each link and colour, in the frame of the link.
+"""The robot's shapes as triangles: one piece for each link and colour, in the frame of the link.
 
 The URDF is read here and not by pinocchio, which would load every mesh without its colours, all in one call that lets
 nothing else of the process run for half a second, on a busy machine for many.
@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import fast_simplification
 import numpy as np
@@ -49,17 +49,31 @@ class Piece:
 
 
 def visual_pieces(robot: RobotModel, triangles: int = 25_000) -> list[Piece]:
-    """The visual shapes of all links with about so many triangles in all, in the order of the links.
+    """What is seen of all links with about so many triangles in all, in the order of the links.
 
-    Descriptions come with 100 000 and more, which a browser without a graphics card draws once a second.
+    Descriptions come with 100 000 and more, which a browser without a graphics card draws once a second. Links that are
+    described by collision shapes alone are seen as these.
 
     Raises:
         ConfigError: a mesh is not there or cannot be read.
     """
+    return _pieces(seen_shapes(robot), triangles)
+
+
+def collision_pieces(robot: RobotModel, triangles: int = 12_000) -> list[Piece]:
+    """The collision shapes of all links, with about so many triangles in all.
+
+    Raises:
+        ConfigError: a mesh is not there or cannot be read.
+    """
+    return _pieces(shapes_of(robot, "collision"), triangles)
+
+
+def _pieces(shapes: Iterable[Shape], triangles: int) -> list[Piece]:
     found: dict[tuple[str, Rgb], list[trimesh.Trimesh]] = defaultdict(list)
-    for visual in visuals_of(robot):
-        for color, mesh in _coloured(visual):
-            found[visual.link, color].append(mesh.apply_transform(visual.T_link_shape))
+    for shape in shapes:
+        for color, mesh in _coloured(shape):
+            found[shape.link, color].append(mesh.apply_transform(shape.T_link_shape))
     joined = [_merged(trimesh.util.concatenate(meshes)) for meshes in found.values()]
     kept = triangles / max(1, sum(len(mesh.faces) for mesh in joined))
     return [_piece(link, color, _simplified(mesh, kept)) for (link, color), mesh in zip(found, joined, strict=True)]
@@ -143,19 +157,19 @@ def _piece(link: str, color: Rgb, mesh: trimesh.Trimesh) -> Piece:
                  index.reshape(-1, 3).astype(np.uint32))
 
 
-def _coloured(visual: Visual) -> list[tuple[Rgb, trimesh.Trimesh]]:
-    """The triangles of a visual by colour; that of the URDF counts more than that of the file."""
-    if visual.path is None:
-        return [(visual.color or _PLAIN, _merged(visual.primitive))]
+def _coloured(shape: Shape) -> list[tuple[Rgb, trimesh.Trimesh]]:
+    """The triangles of a shape by colour; that of the URDF counts more than that of the file."""
+    if shape.path is None:
+        return [(shape.color or _PLAIN, _merged(shape.primitive))]
     try:
-        scene = trimesh.load_scene(visual.path)
+        scene = trimesh.load_scene(shape.path)
     except (ValueError, OSError, NotImplementedError) as error:
-        raise ConfigError("robot.urdf", str(visual.path), f"is a mesh that cannot be read: {error}") from None
+        raise ConfigError("robot.urdf", str(shape.path), f"is a mesh that cannot be read: {error}") from None
     meshes = []
     for mesh in scene.dump():
         if isinstance(mesh, trimesh.Trimesh):
-            color = visual.color or _own_color(mesh) or _PLAIN
-            mesh.vertices = mesh.vertices * np.array(visual.scale)
+            color = shape.color or _own_color(mesh) or _PLAIN
+            mesh.vertices = mesh.vertices * np.array(shape.scale)
             meshes.append((color, _merged(mesh)))
     return meshes
 
@@ -175,7 +189,7 @@ def _rgb(values: Iterable[float]) -> Rgb:
 
 
 @dataclass(frozen=True, eq=False)
-class Visual:
+class Shape:
     """A shape of a link: a file with its scale, or a mesh that was made from dimensions."""
 
     link: str
@@ -186,8 +200,23 @@ class Visual:
     primitive: trimesh.Trimesh | None = None
 
 
-def visuals_of(robot: RobotModel) -> Iterator[Visual]:
-    """Every visual of the robot, in the order of its URDF.
+def seen_shapes(robot: RobotModel) -> list[Shape]:
+    """The visuals of the robot, and the collision shapes of links that would not be seen otherwise.
+
+    A link without visuals that hangs on one with some is left as it is: descriptions have such for coarse shapes, about
+    what is seen already.
+    """
+    visuals = list(shapes_of(robot, "visual"))
+    seen = {shape.link for shape in visuals}
+    above = {str(joint.find("child").get("link")): str(joint.find("parent").get("link"))  # type: ignore[union-attr]
+             for joint in ET.fromstring(robot.urdf).iter("joint")
+             if joint.get("type") == "fixed" and joint.find("child") is not None and joint.find("parent") is not None}
+    return visuals + [shape for shape in shapes_of(robot, "collision")
+                      if shape.link not in seen and above.get(shape.link) not in seen]
+
+
+def shapes_of(robot: RobotModel, kind: Literal["visual", "collision"]) -> Iterator[Shape]:
+    """Every shape of a kind, in the order of the robot's URDF.
 
     Raises:
         ConfigError: a mesh is not there, or a shape is not known.
@@ -195,8 +224,8 @@ def visuals_of(robot: RobotModel) -> Iterator[Visual]:
     root = ET.fromstring(robot.urdf)
     named = {str(m.get("name")): rgb for m in root.iter("material") if (rgb := _given(m)) is not None}
     for link in root.findall("link"):
-        for visual in link.findall("visual"):
-            origin, material, shape = visual.find("origin"), visual.find("material"), visual.find("geometry/*")
+        for part in link.findall(kind):
+            origin, material, shape = part.find("origin"), part.find("material"), part.find("geometry/*")
             if shape is None:
                 continue
             color = named.get(str(material.get("name"))) if material is not None else None
@@ -207,9 +236,9 @@ def visuals_of(robot: RobotModel) -> Iterator[Visual]:
             name = str(link.get("name"))
             if shape.tag == "mesh":
                 path = find_description("robot.urdf", str(shape.get("filename")), robot.config.package_dirs)
-                yield Visual(name, T, color, path, _numbers(shape, "scale", "1 1 1"))
+                yield Shape(name, T, color, path, _numbers(shape, "scale", "1 1 1"))
             else:
-                yield Visual(name, T, color, primitive=_primitive(shape))
+                yield Shape(name, T, color, primitive=_primitive(shape))
 
 
 def _primitive(shape: ET.Element) -> trimesh.Trimesh:
@@ -235,8 +264,7 @@ def _given(material: ET.Element) -> Rgb | None:
     color = material.find("color")
     if color is None:
         return None
-    r, g, b = (round(255 * value) for value in _numbers(color, "rgba", "1 1 1 1")[:3])
-    return r, g, b
+    return _rgb(255 * value for value in _numbers(color, "rgba", "1 1 1 1")[:3])
 
 
 def _numbers(element: ET.Element | None, name: str, usual: str) -> tuple[float, ...]:

@@ -242,6 +242,10 @@ class Console(Desk):
         """Whether somebody serves a request now."""
         return self._clients[request.key].available
 
+    async def written(self) -> frozenset[str]:
+        """The keys that are written or served in the cell now."""
+        return frozenset(owner.key for owner in await self._bus.owners())
+
     async def move(self, object_id: str, x: float, y: float) -> None:
         """Put an object of the simulated world somewhere [m]."""
         await self.ask(topics.WORLD_EDIT, WorldEdit(op="move", id=object_id, position=Vector3(x=x, y=y)))

@@ -22,7 +22,7 @@ ALWAYS: tuple[Topic[Any], ...] = (
     topics.JOINT_STATES, topics.MOTION_STATUS, topics.MOTION_OWNER, topics.ROBOT_STATUS, topics.GRIPPER_STATE,
     topics.SUPERVISOR_STATUS, topics.COUNTERS, topics.LOG,
 )
-LIVE, ANNOTATED = "live", "annotated"  # pictures
+LIVE, ANNOTATED, MASK, DEPTH = "live", "annotated", "mask", "depth"  # pictures
 _LOG_SIZE = 2000  # lines that may wait
 
 
@@ -100,7 +100,7 @@ class Topics:
 
     Attributes:
         status, rejected, decided_by: of the application, if it has them.
-        images: pictures as the cameras send them, and with what was found in them.
+        images: pictures as the cameras send them, with what was found in them, what was looked at, and depth.
         requests: what the application asks.
         on_demand: what is read while somebody looks at it.
     """
@@ -123,11 +123,14 @@ class Topics:
         self.images: dict[str, list[Topic[Image]]] = {
             LIVE: everywhere(topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
             ANNOTATED: everywhere(named("topics", "ANNOTATED")),
+            MASK: everywhere(named("topics", "MASK")),
+            DEPTH: everywhere(topics.DEPTH_CAMERA_DEPTH),
         }
         self.requests: Sequence[Request[Any, Any]] = named("page", "REQUESTS") or ()
         controls = getattr(named("page", "Controls"), "TOPICS", ())
         shown = [topic for part in parts for topic in part.TOPICS]
-        self.on_demand: list[Topic[Any]] = [*self.images[LIVE], *self.images[ANNOTATED], *controls, *shown]
+        pictures = [topic for each in self.images.values() for topic in each]
+        self.on_demand: list[Topic[Any]] = [*pictures, *controls, *shown]
 
     @property
     def always(self) -> list[Topic[Any]]:

@@ -14,6 +14,7 @@ from common.messages import TFMessage, TransformStamped
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix, rpy_to_matrix, transform
 from common.robot.visual_meshes import Piece, Rgb
+from common.viewer.nodes import brightened
 
 Array = NDArray[np.float64]
 
@@ -185,7 +186,8 @@ class Figure:
         for number, piece in enumerate(self._undrawn):
             self._scene.add_mesh_simple(
                 f"{self.links[piece.link].name}/{number}", piece.vertices, piece.faces,
-                color=self._color or piece.color, opacity=self._opacity, cast_shadow=False, receive_shadow=False,
+                color=self._color or brightened(piece.color), opacity=self._opacity, cast_shadow=self._opacity is None,
+                receive_shadow=self._opacity is None,
             )
         self._undrawn.clear()
 

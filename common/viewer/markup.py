@@ -22,6 +22,7 @@ STYLE = """<style>
 .zc .big { font-size: 1.3em; font-weight: 600; }
 .zc .good { color: #2fb344; } .zc .busy { color: #f59f00; } .zc .bad { color: #fa5252; } .zc .off { color: #868e96; }
 .zc .dot { font-size: 1.1em; }
+.zc .swatch { display: inline-block; width: 0.8em; height: 0.8em; border-radius: 0.15em; margin-right: 0.2em; }
 .zc .small { font-size: 0.875em; }
 .zc .small td, .zc .small th { padding: 0.2em 0.3em; }
 .zc .tight { white-space: nowrap; }
@@ -59,6 +60,11 @@ def text(value: object) -> str:
 def span(value: object, kind: str) -> str:
     """Text of a kind: dim, big, good, busy, bad or off."""
     return f'<span class="{text(kind)}">{text(value)}</span>'
+
+
+def swatch(color: tuple[int, int, int]) -> str:
+    """A small square of a colour, red, green and blue from 0 to 255."""
+    return f'<span class="swatch" style="background: rgb{color}"></span>'
 
 
 def block(inner: str, name: str, **data: object) -> str:

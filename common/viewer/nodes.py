@@ -24,13 +24,14 @@ Rgb = tuple[int, int, int]
 Solid = viser.BoxHandle | viser.IcosphereHandle | viser.CylinderHandle | viser.MeshHandle
 
 
-class _Flat(TypedDict):
+class _Shade(TypedDict):
     cast_shadow: bool
     receive_shadow: bool
 
 
-FLAT: _Flat = {"cast_shadow": False, "receive_shadow": False}
-_DARKEST = 36
+FLAT: _Shade = {"cast_shadow": False, "receive_shadow": False}  # signs, and what is seen through
+REAL: _Shade = {"cast_shadow": True, "receive_shadow": True}  # things; without shadows on the page it costs nothing
+_DARKEST, _DARK = 36, 64  # of 255
 _SIDES = 72  # of a cylinder
 
 
@@ -71,6 +72,13 @@ def rgb_of(color: Color) -> Rgb:
     return _seen(color.r), _seen(color.g), _seen(color.b)
 
 
+def brightened(color: Rgb) -> Rgb:
+    """A colour of a robot as it is drawn: what is dark throughout is lighter, so as to be seen before a dark ground."""
+    r, g, b = color
+    lighter = max(0, _DARK - max(color))
+    return r + lighter, g + lighter, b + lighter
+
+
 def _seen(value: float) -> int:
     return max(_DARKEST, round(255 * value))
 
@@ -85,22 +93,23 @@ def add_solid(scene: viser.SceneApi, name: str, solid: CollisionObject) -> Solid
 
     color, opacity = rgb_of(solid.color), solid.color.a if solid.color.a < 1 else None
     place: dict[str, Any] = {"opacity": opacity, "position": position_of(solid.pose), "wxyz": wxyz_of(solid.pose)}
-    sizes = solid.dimensions
+    sizes, shade = solid.dimensions, REAL if opacity is None else FLAT
     if solid.shape == "box":  # its sides are flat, with one shader less
-        return scene.add_box(name, color, (sizes[0], sizes[1], sizes[2]), flat_shading=False, **place, **FLAT)
+        return scene.add_box(name, color, (sizes[0], sizes[1], sizes[2]), flat_shading=False, **place, **shade)
     if solid.shape == "sphere":
-        return scene.add_icosphere(name, sizes[0], color, **place, **FLAT)
+        return scene.add_icosphere(name, sizes[0], color, **place, **shade)
     if solid.shape == "cylinder":
-        return scene.add_cylinder(name, sizes[0], sizes[1], color, **place, **FLAT)
+        return scene.add_cylinder(name, sizes[0], sizes[1], color, **place, **shade)
     hull = convex_hull(np.array(solid.outline))
     triangles = upright(hull, np.empty((0, 2)), -sizes[0] / 2, sizes[0] / 2)
-    return add_triangles(scene, name, triangles, color, **place)
+    return add_triangles(scene, name, triangles, color, **place, **shade)
 
 
 def add_triangles(scene: viser.SceneApi, name: str, triangles: Array, color: Rgb, **options: Any) -> viser.MeshHandle:
     """A node of triangles (n, 3, 3) [m], seen from both sides; `options` are those of viser's `add_mesh_simple`."""
     faces = np.arange(3 * len(triangles)).reshape(-1, 3)
-    return scene.add_mesh_simple(name, triangles.reshape(-1, 3), faces, color=color, side="double", **options, **FLAT)
+    shade: dict[str, Any] = {**FLAT, **options}
+    return scene.add_mesh_simple(name, triangles.reshape(-1, 3), faces, color=color, side="double", **shade)
 
 
 def add_line(

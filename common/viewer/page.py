@@ -29,7 +29,7 @@ from common.viewer import words
 from common.viewer.arm_panel import ArmPanel
 from common.viewer.console import Console
 from common.viewer.doors import VISITOR
-from common.viewer.feeds import ANNOTATED, LIVE, Feeds, News, Periods, Topics
+from common.viewer.feeds import ANNOTATED, DEPTH, LIVE, MASK, Feeds, News, Periods, Topics
 from common.viewer.health import HealthPanel, LogPanel
 from common.viewer.layers import Layers, layers_shown
 from common.viewer.layout import TABS, Layout, Tab, Viewpoint, save_layout
@@ -41,12 +41,15 @@ from common.viewer.pictures import PicturePanel
 from common.viewer.plots import Limits, PlotPanel
 from common.viewer.task_panel import TaskPanel
 from common.viewer.tuning import TuningPanel
+from common.viewer.view_panel import ViewPanel
 from common.viewer.viser_inside import introduce
 from common.viewer.words import TaskWords, gripper
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
     from common.viewer.scene import Scene
+
+OFFER_PERIOD = 3.0  # [s] between two looks at what the cell has
 
 
 class Page:
@@ -93,7 +96,7 @@ class Page:
         self._move: MovePanel | None = None
         self.pages = 0
         self.visited = asyncio.Event()
-        _furnish(server)
+        _furnish(server, shadows=layout.shadows)
         gui = server.gui
         gui.configure_theme(dark_mode=layout.dark, show_logo=False, show_share_button=False)
         gui.set_panel_label(f"zencell · {cell}")
@@ -115,7 +118,8 @@ class Page:
         self._place = place
         with place["Cameras"]:
             self._pictures = PicturePanel(
-                gui, console, {LIVE: layout.live_image, ANNOTATED: layout.annotated_image}, self._listen)
+                gui, console, {LIVE: layout.live_image, ANNOTATED: layout.annotated_image, MASK: layout.mask_image,
+                               DEPTH: layout.depth_image}, self._listen)
         with place["Health"]:
             self._health = HealthPanel(gui, members.services)
         with place["Log"]:
@@ -140,9 +144,9 @@ class Page:
 
     def _lay_out_view(self, gui: viser.GuiApi) -> None:
         """Ticks for the layers, one for editing the simulated world, and a button that saves the layout."""
-        for name, kind in self._kinds.items():
-            self.console.on_change(gui.add_checkbox(kind.LABEL or name, self._shown[name]),
-                                   partial(self._set_layer, name), "look")
+        self._view = ViewPanel(
+            gui, self.console, self._kinds, self._shown, shadows=self._layout.shadows, on_layer=self._set_layer,
+            on_shadows=lambda on: self._server.scene.configure_default_lights(cast_shadow=on))
         gui.add_divider()
         edit = gui.add_checkbox("Edit the simulated world", self._editing, hint="drag objects to other places")
         self.console.on_change(edit, self._set_editing)
@@ -279,7 +283,8 @@ class Page:
             acts.setdefault(topic, []).append(reject)
         for topic in {topic for kind in self._kinds.values() for topic in kind.TOPICS if topic.kind == "event"}:
             acts.setdefault(topic, []).append(partial(self._happen, topic))
-        return [self.console.run(), self._follow_parameters(), *(self._follow(*each) for each in acts.items())]
+        others = (self._follow(*each) for each in acts.items())
+        return [self.console.run(), self._follow_parameters(), self._offer(), *others]
 
     async def _follow(self, topic: Topic[Any], acts: list[Callable[[Any], None]]) -> None:
         if (reader := self._feeds.reader(topic)) is not None:
@@ -292,6 +297,17 @@ class Page:
             self._scene.happened(topic, event)
         else:
             self._happened.append((topic, event))
+
+    async def _offer(self) -> None:
+        """Have ticks for those layers and pictures only that the cell has anything for."""
+        there: set[str] = set()  # also what is restarting
+        while True:
+            if self.pages and not there >= (now := await self.console.written()):
+                there |= now
+                self._view.offer(there)
+                self._pictures.offer({name for name, sources in self._topics.images.items()
+                                      if any(topic.key in there for topic in sources)})
+            await asyncio.sleep(OFFER_PERIOD)
 
     async def _follow_parameters(self) -> None:
         while True:
@@ -350,7 +366,8 @@ class Page:
             layout = self._layout.model_copy(update={
                 "layers": elsewhere | {name: on for name, on in self._shown.items() if on != usual[name]},
                 "viewpoints": viewpoints, "live_image": self._pictures.shown[LIVE],
-                "annotated_image": self._pictures.shown[ANNOTATED], "log_level": self._log.level,
+                "annotated_image": self._pictures.shown[ANNOTATED], "mask_image": self._pictures.shown[MASK],
+                "depth_image": self._pictures.shown[DEPTH], "shadows": self._view.shadows, "log_level": self._log.level,
                 "edit_world": self._editing, **motion,
             })
             path = save_layout(self._layout_file, layout)
@@ -367,11 +384,11 @@ class Page:
         self._note.content = block(span(line, kind), "layout", kind=kind)
 
 
-def _furnish(server: viser.ViserServer) -> None:
+def _furnish(server: viser.ViserServer, *, shadows: bool) -> None:
     """Set light and lens. Before anything else is sent: what was drawn in another light has to get new shaders."""
     scene, view = server.scene, server.initial_camera
     scene.set_up_direction("+z")
-    scene.configure_default_lights(cast_shadow=False)
+    scene.configure_default_lights(cast_shadow=shadows)
     scene.configure_environment_map(hdri=None)  # a browser without a graphics card needs seconds to prepare one
     scene.add_light_hemisphere("/sky", sky_color=(255, 255, 255), ground_color=(120, 115, 110), intensity=2.0)
     scene.world_axes.visible = False

@@ -1,8 +1,9 @@
-"""The panel with the pictures of the camera: as it sends them, and with what was found in them."""
+"""The panel with the pictures of the camera: as it sends them, with what was found in them, and what is behind that."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any
 
@@ -12,13 +13,15 @@ from numpy.typing import NDArray
 
 from common.messages import Image
 from common.perception.image import ImageError, image_to_array
+from common.perception.intake import Unusable
 from common.viewer.console import Desk
-from common.viewer.feeds import ANNOTATED, LIVE
+from common.viewer.feeds import ANNOTATED, DEPTH, LIVE, MASK
 from common.viewer.markup import block, span
 
 WIDEST = 640  # [px] that are sent: more than the panel shows
 QUALITY = 75
-LABELS = {ANNOTATED: "With what was found", LIVE: "As it comes"}
+LABELS = {ANNOTATED: "With what was found", LIVE: "As it comes", MASK: "What its colours let through", DEPTH: "Depth"}
+NEAREST, FARTHEST = 2, 98  # [%] of the depths between which colours are spread: a single wrong one says nothing
 
 Picture = NDArray[np.uint8]
 
@@ -42,8 +45,31 @@ def rgb_picture(image: Image, widest: int = WIDEST) -> Picture:
     return np.asarray(array[:, :, ::-1] if image.encoding == "bgr8" else array, np.uint8)
 
 
+def depth_picture(image: Image, widest: int = WIDEST) -> tuple[Picture, str]:
+    """Depths as colours, (height, width, 3) RGB, near ones red, far ones blue, none black; and in words from where to
+    where.
+
+    Raises:
+        Unusable: the message is no depth image.
+    """
+    import cv2
+
+    from common.perception.depth import depth_of, is_valid
+
+    step = max(1, math.ceil(image.width / widest))
+    depth = depth_of(image)[::step, ::step]
+    valid = is_valid(depth)
+    if not valid.any():
+        return np.zeros((*depth.shape, 3), np.uint8), "nothing within range"
+    near, far = (float(value) for value in np.percentile(depth[valid], (NEAREST, FARTHEST)))
+    share = (far - np.where(valid, depth, far)) / max(far - near, 1e-6)
+    colours = cv2.applyColorMap((255 * np.clip(share, 0, 1)).astype(np.uint8), cv2.COLORMAP_TURBO)
+    colours[~valid] = 0
+    return np.ascontiguousarray(colours[:, :, ::-1]), f"red {near:.3f} m, blue {far:.3f} m and farther"
+
+
 class PicturePanel:
-    """Two pictures, each with a tick: what is not ticked is not even asked for."""
+    """Pictures of several kinds, each with a tick: what is not ticked is not even asked for."""
 
     def __init__(
         self, gui: viser.GuiApi, desk: Desk, shown: dict[str, bool], on_shown: Callable[[], None]
@@ -53,14 +79,14 @@ class PicturePanel:
         Args:
             gui: of the server.
             desk: takes changes of the ticks.
-            shown: whether the live and the annotated picture are ticked.
+            shown: whether each kind is ticked; one that is not named is not.
             on_shown: called when that has changed.
         """
         self._gui = gui
-        self.shown = dict(shown)
+        self.shown = dict.fromkeys(LABELS, False) | shown
         self._on_shown = on_shown
-        self._ticks = {name: gui.add_checkbox(label, shown[name]) for name, label in LABELS.items()}
-        self._folders = {name: gui.add_folder(None) for name in LABELS}
+        self._ticks = {name: gui.add_checkbox(label, self.shown[name]) for name, label in LABELS.items()}
+        self._folders = {name: gui.add_folder(None, visible=self.shown[name]) for name in LABELS}
         self._images: dict[str, dict[str, viser.GuiImageHandle]] = {name: {} for name in LABELS}  # each by its source
         self._notes: dict[str, viser.GuiHtmlHandle] = {}
         for name, tick in self._ticks.items():
@@ -69,25 +95,38 @@ class PicturePanel:
                 self._notes[name] = gui.add_html(block(span("No picture yet", "dim"), f"{name} picture", pictures=0))
         self._count = dict.fromkeys(LABELS, 0)
 
+    def offer(self, there: Collection[str]) -> None:
+        """Have ticks for those kinds only that are there."""
+        for name, tick in self._ticks.items():
+            if tick.visible is not (has := name in there):
+                tick.visible = has
+                self._folders[name].visible = self.shown[name] and has
+
     def show(self, name: str, image: Image, source: str) -> Picture | None:
-        """Show a message as a live or an annotated picture; the picture, or None when it is none.
+        """Show a message as a picture of a kind; the picture, or None when it is none.
 
         Args:
-            name: live or annotated.
+            name: of the kind.
             image: the message.
             source: the key under which it came; several stand below one another, with their keys.
         """
+        said = ""
         try:
-            rgb = rgb_picture(image)
-        except ImageError as error:
+            if name == DEPTH:
+                rgb, said = depth_picture(image)
+            else:
+                rgb = rgb_picture(image)
+        except (ImageError, Unusable) as error:
             self._notes[name].content = block(span(error, "bad"), f"{name} picture", pictures=self._count[name])
             return None
         self._count[name] += 1
         images = self._images[name]
+        note = block(span(said, "dim"), f"{name} picture", pictures=self._count[name]) if said else ""
+        if self._notes[name].content != note:
+            self._notes[name].content = note
         if source in images:
             images[source].image = rgb
             return rgb
-        self._notes[name].content = ""
         with self._folders[name]:
             images[source] = self._gui.add_image(rgb, format="jpeg", jpeg_quality=QUALITY, visible=self.shown[name])
         if len(images) > 1:

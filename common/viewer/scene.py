@@ -19,6 +19,7 @@ from common.viewer.console import Console
 from common.viewer.feeds import Latest, News
 from common.viewer.figure import LinkPoses, Transforms
 from common.viewer.goal_marker import GoalMarker
+from common.viewer.labels import View, view_of
 from common.viewer.layers import Layers, layers_shown
 from common.viewer.pictures import Picture
 from common.viewer.stage import Stage
@@ -69,12 +70,19 @@ class Scene:
         self._server, self._editing = server, False
         pieces = visual_pieces(robot)
         self.stage = Stage(server.scene, robot, around, console, latest, clock, LinkPoses(robot),
-                           Transforms(around.cameras.values()), pieces, coarse(pieces, GHOST))
+                           Transforms(around.cameras.values()), pieces, coarse(pieces, GHOST), self._view)
         self._roots = {name: server.scene.add_frame(f"/{name}", show_axes=False, visible=self._shown[name])
                        for name in layers}
         self.layers = {name: kind(self.stage, f"/{name}") for name, kind in layers.items()}
         self._news = {name: News(layer, latest) for name, layer in self.layers.items()}
         self.goal = GoalMarker(server.scene, "/goal", robot, self.stage.rough)
+
+    def _view(self) -> View | None:
+        """How the scene is seen by who has it open longest: words are placed for them."""
+        for client in self._server.get_clients().values():
+            if client.camera.image_height > 0:
+                return view_of(client.camera)
+        return None
 
     # --- layers ---
 

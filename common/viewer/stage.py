@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from common.viewer.console import Console
     from common.viewer.feeds import Latest
     from common.viewer.figure import LinkPoses, Transforms
+    from common.viewer.labels import View
 
 
 @dataclass(frozen=True)
@@ -31,3 +32,4 @@ class Stage:
     transforms: Transforms  # where frames are now
     pieces: list[Piece]  # meshes of the robot
     rough: list[Piece]  # fewer triangles of the same
+    view: Callable[[], View | None] = lambda: None  # how who looks first sees the scene

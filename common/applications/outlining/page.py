@@ -101,6 +101,7 @@ class Outline(Layer):
     """The outline of the chosen object as a closed line."""
 
     LABEL = "Outline"
+    LEGEND = (("outline that is traced", OUTLINE),)
     TOPICS = (CONTOUR_PATH,)
 
     def build(self) -> None:
@@ -127,6 +128,7 @@ class ContourChoice(Layer):
 
     NAME = "contours"
     LABEL = "Contours to choose from"
+    LEGEND = (("contour that is chosen", CHOSEN),)
     TOPICS = (CONTOURS, topics.DEPTH_CAMERA_INFO, topics.PLANNING_SCENE, topics.TF_STATIC)
     PERIOD = 0.5
 

@@ -15,8 +15,8 @@ from common.applications.pick_place.topics import (
     WORKSPACE_MARKERS,
 )
 from common.messages import MarkerArray, PoseArray, Rejections, TaskStatus
-from common.terminal import printable
 from common.topics import Topic
+from common.viewer.labels import Labels
 from common.viewer.layers import Layer
 from common.viewer.nodes import FLAT, Markers, Position, points_of, position_of, ring
 
@@ -45,6 +45,7 @@ class Targets(Layer):
     """A ring about each target."""
 
     LABEL = "Targets"
+    LEGEND = (("target", TARGET),)
     TOPICS = (VALIDATED_TARGETS,)
 
     def build(self) -> None:
@@ -73,13 +74,15 @@ class _Known:
     reason: str
     since: int  # stamp of the rejection [ns]
     seen: int  # newest time [ns] at which something was detected there
-    nodes: list[viser.MeshHandle | viser.LabelHandle]
+    name: str  # of its label
+    node: viser.MeshHandle
 
 
 class Rejected(Layer):
     """A ring and the reason at each place from which something was rejected, until nothing is there any more."""
 
     LABEL = "Rejected, with the reason"
+    LEGEND = (("rejected", REJECTED),)
     TOPICS = (REJECTED_TARGETS, VALIDATED_TARGETS, DETECTED_OBJECTS)
     PERIOD = 0.5
 
@@ -88,6 +91,7 @@ class Rejected(Layer):
         self._ring = ring(_WIDER * self.stage.around.ball_radius)
         self.known: list[_Known] = []
         self._count = 0
+        self.labels = Labels(self.scene, self.root, scale=0.75)
 
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Add rejections; forget those where a target is, or where nothing has been detected for a while."""
@@ -102,6 +106,7 @@ class Rejected(Layer):
                 if _near(known.at, places):
                     known.seen = max(known.seen, message.header.stamp)
             self._drop([known for known in self.known if message.header.stamp - known.seen > _FORGET_AFTER])
+        self.labels.show({known.name: (known.reason, np.array(known.at)) for known in self.known}, self.stage.view())
 
     @property
     def reasons(self) -> list[str]:
@@ -115,23 +120,15 @@ class Rejected(Layer):
             self._drop([known for known in self.known if _near(known.at, [at])])
             self._drop(self.known[: max(0, len(self.known) - _MOST + 1)])
             stamp = m.header.stamp
-            self.known.append(_Known(at, each.reason, stamp, stamp, self._nodes(at, each.reason)))
-
-    def _nodes(self, at: Position, reason: str) -> list[viser.MeshHandle | viser.LabelHandle]:
-        self._count += 1
-        name = f"{self.root}/{self._count}"
-        return [
-            self.scene.add_mesh_simple(f"{name}_ring", *self._ring, color=REJECTED, position=at, **FLAT),
-            self.scene.add_label(
-                f"{name}_reason", printable(reason), position=at, anchor="bottom-center", font_screen_scale=0.75
-            ),
-        ]
+            self._count += 1
+            ring_node = self.scene.add_mesh_simple(
+                f"{self.root}/{self._count}_ring", *self._ring, color=REJECTED, position=at, **FLAT)
+            self.known.append(_Known(at, each.reason, stamp, stamp, str(self._count), ring_node))
 
     def _drop(self, gone: list[_Known]) -> None:
         for known in gone:
             self.known.remove(known)
-            for node in known.nodes:
-                node.remove()
+            known.node.remove()
 
 
 def _near(at: Position, places: list[Position]) -> bool:

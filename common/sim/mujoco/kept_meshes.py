@@ -51,10 +51,10 @@ def hull_points(path: Path) -> NDArray[np.float64]:
 
 
 def visual_arrays(robot: RobotModel, triangles: int) -> list[Piece]:
-    """The visual shapes of all links with about so many triangles: see `common.robot.visual_meshes`."""
-    from common.robot.visual_meshes import Piece, visual_pieces, visuals_of  # brings trimesh
+    """What is seen of all links with about so many triangles: see `common.robot.visual_meshes`."""
+    from common.robot.visual_meshes import Piece, seen_shapes, visual_pieces  # brings trimesh
 
-    files = [visual.path.read_bytes() for visual in visuals_of(robot) if visual.path is not None]
+    files = [shape.path.read_bytes() for shape in seen_shapes(robot) if shape.path is not None]
 
     def make() -> Arrays:
         made: Arrays = {}

@@ -7,6 +7,7 @@ itself:
     LABEL = "Height of the tool"     # of the tick
     ON = True                        # (optional) whether it is shown when the page opens for the first time
     PERIOD = 0.0                     # (optional) least time between two looks at what is new [s]
+    LEGEND = (("the tool", (255, 0, 0)),)  # (optional) what its colours mean, red, green and blue from 0 to 255
     TOPICS = (TF,)                   # the newest message of each comes to `show`, while somebody looks
 
     def show(layer: Layer, topic: Topic[Any], message: Any) -> None:
@@ -17,10 +18,11 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from common import topics
 from common.application import Application, applications
 from common.errors import ConfigError, UnknownName
 from common.messages import JointTrajectory
@@ -33,9 +35,13 @@ if TYPE_CHECKING:
     from common.viewer.pictures import Picture
     from common.viewer.stage import Stage
 
+Rgb = tuple[int, int, int]
+
 FIELD = "services.viewer.layers"
-SAYS = ("LABEL", "ON", "PERIOD", "TOPICS", "show")  # of a module that is a layer
-FIRST, LAST = ("robot", "planning_scene"), ("truth", "frames")  # modules here; an application's own stand between them
+SAYS = ("LABEL", "ON", "PERIOD", "LEGEND", "TOPICS", "show")  # of a module that is a layer
+# Modules here; an application's own stand between them.
+FIRST, LAST = ("robot", "reach", "planning_scene"), ("points", "truth", "frames")
+_WHERE = {topics.TF.key, topics.TF_STATIC.key, topics.JOINT_STATES.key}
 
 
 class Layer:
@@ -53,6 +59,7 @@ class Layer:
     ON: ClassVar[bool] = True
     TOPICS: ClassVar[Sequence[Topic[Any]]] = ()
     PERIOD: ClassVar[float] = 0.0  # [s] wall: least time between two looks at what is new
+    LEGEND: ClassVar[Sequence[tuple[str, Rgb]]] = ()  # what its colours mean
     EDITS: ClassVar[bool] = False  # also shown, and told, while the simulated world is edited
 
     def __init__(self, stage: Stage, root: str) -> None:
@@ -79,6 +86,15 @@ class Layer:
 
 
 Layers = Mapping[str, type[Layer]]
+
+
+def has_something(kind: type[Layer], written: Collection[str]) -> bool:
+    """Whether a layer has anything to show in a cell in which these keys are written.
+
+    Where things are is written in every cell: what else a layer is about counts, if there is anything else.
+    """
+    about = [topic.key for topic in kind.TOPICS if topic.key not in _WHERE] or [topic.key for topic in kind.TOPICS]
+    return not about or any(key in written for key in about)
 
 
 def find_layers(

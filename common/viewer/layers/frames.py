@@ -10,8 +10,8 @@ import viser
 
 from common import topics
 from common.messages import CameraInfo, TransformStamped
-from common.terminal import printable
 from common.topics import Topic
+from common.viewer.labels import Labels
 from common.viewer.layers import Layer
 from common.viewer.nodes import FLAT, matrix_wxyz, position_of, wxyz_of
 from common.viewer.pictures import Picture
@@ -28,6 +28,7 @@ class Camera(Layer):
     """A frustum where a camera is, with what it sees."""
 
     LABEL = "Camera"
+    LEGEND = (("camera", _COLOR),)
     TOPICS = (topics.CAMERA_INFO, topics.DEPTH_CAMERA_INFO, topics.TF_STATIC, topics.TF)
 
     def build(self) -> None:
@@ -77,6 +78,7 @@ class Frames(Layer):
     """Axes and a name for each frame, below the frame that it hangs on: moving one moves what hangs on it."""
 
     LABEL = "Frames"
+    LEGEND = (("x of a frame", (255, 0, 0)), ("y", (0, 255, 0)), ("z", (0, 0, 255)))
     ON = False
     TOPICS = (topics.TF_STATIC, topics.TF)
     PERIOD = 0.1
@@ -86,11 +88,14 @@ class Frames(Layer):
         self._waiting: dict[str, TransformStamped] = {}  # frames whose parent is not known yet
         self._parents: dict[str, str] = {}
         self._nodes: dict[str, viser.FrameHandle] = {}
+        self.labels = Labels(self.scene, self.root, scale=0.6)
 
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Move all frames to where they are now, also those that hang on what moved."""
         for each in self.stage.transforms.newest.values():
             self._place(each)
+        self.labels.show({name: (name, self.stage.transforms.pose(name)[:3, 3]) for name in self._nodes},
+                         self.stage.view())
 
     def node(self, frame: str) -> viser.FrameHandle | None:
         """The node of a frame."""
@@ -118,7 +123,6 @@ class Frames(Layer):
             self._forget(name)
         node = f"{above}/{name.replace('/', '_')}"
         self._nodes[name] = self.scene.add_frame(node, axes_length=_AXIS, axes_radius=0.04 * _AXIS)
-        self.scene.add_label(f"{node}/name of {len(self._nodes)}", printable(name), font_screen_scale=0.6)
         self._parents[name] = parent
         for waiting in [w for w in self._waiting.values() if w.header.frame_id == name]:
             if self._waiting.pop(waiting.child_frame_id, None) is not None:

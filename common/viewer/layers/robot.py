@@ -1,8 +1,11 @@
-"""The robot as it is; as a ghost where the newest plan ends, or moving along it; and the path of its tool."""
+"""The robot as it is, and the shapes that collisions are looked for with; where the newest plan ends, or a ghost moving
+along it; and the path of its tool.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import asyncio
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
@@ -14,10 +17,14 @@ from common.topics import Topic
 from common.viewer.layers import Layer
 from common.viewer.nodes import add_line
 
+if TYPE_CHECKING:
+    from common.viewer.figure import Figure
+
 Array = NDArray[np.float64]
 
 GHOST = (90, 200, 255)
 PATH = (255, 200, 60)
+COLLISION = (255, 120, 90)
 _SAMPLES = 120  # points of the line
 _THERE = 0.01  # [rad] the robot is where the plan ends, or has left where it stood
 _APART = 0.01  # [m] links no farther than this from the robot's, nor turned by more than 0.03 rad, lie in them
@@ -42,10 +49,40 @@ class Robot(Layer):
         self.figure.follow()
 
 
+class CollisionShapes(Layer):
+    """What collisions are looked for with."""
+
+    LABEL = "Robot: collision shapes"
+    ON = False
+    TOPICS = (topics.JOINT_STATES,)
+    LEGEND = (("collision shape of the robot", COLLISION),)
+
+    def build(self) -> None:
+        """Start without: reading them takes a while, and few look at them."""
+        self.figure: Figure | None = None
+        self._begun = False
+
+    def show(self, topic: Topic[Any], message: Any) -> None:
+        """Be where the stage says."""
+        if self.figure is not None:
+            self.figure.follow()
+        elif not self._begun:
+            self._begun = True
+            self.stage.console.put(self._load)
+
+    async def _load(self) -> None:
+        from common.viewer.figure import Figure
+        from common.robot.visual_meshes import collision_pieces
+
+        pieces = await asyncio.to_thread(collision_pieces, self.stage.robot)
+        self.figure = Figure(self.scene, f"{self.root}/links", pieces, self.stage.poses, color=COLLISION, opacity=0.5)
+
+
 class Plan(Layer):
     """A ghost of the robot."""
 
     LABEL = "Planned: where the arm will be"
+    LEGEND = (("where the planned motion ends", GHOST),)
     TOPICS = (topics.DISPLAY_TRAJECTORY, topics.JOINT_STATES)
 
     def build(self) -> None:
@@ -127,6 +164,7 @@ class ToolPath(Layer):
     """The path of the tool centre point as a line."""
 
     LABEL = "Planned: path of the tool"
+    LEGEND = (("planned path of the tool", PATH),)
     TOPICS = (topics.DISPLAY_TRAJECTORY,)
 
     def build(self) -> None:

@@ -31,6 +31,7 @@ class Truth(Layer):
     LABEL = "Truth (simulated hardware)"
     ON = False
     TOPICS = (topics.SCENE_OBJECTS,)
+    LEGEND = (("where it really is", TRUTH), ("the same, to be dragged", EDITED))
     EDITS = True
 
     def build(self) -> None:

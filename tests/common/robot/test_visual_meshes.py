@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pinocchio as pin
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from common.config import RobotConfig
 from common.errors import ConfigError
 from common.robot.model import RobotModel
-from common.robot.visual_meshes import _groups, _parts, _piece, coarse, visual_pieces
+from common.robot.visual_meshes import _groups, _parts, _piece, coarse, collision_pieces, visual_pieces
 from tests.common.viewer.scene_cell import pieces_of, robot_of
 
 URDF = """<robot name="post">
@@ -51,6 +52,29 @@ def corners(geometry: Any) -> NDArray[np.float64]:
     geometry.computeLocalAABB()
     low, high = np.array(geometry.aabb_local.min_), np.array(geometry.aabb_local.max_)
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+
+
+COARSE = """<robot name="post">
+  <link name="foot"><collision><geometry><box size="0.2 0.4 1.0"/></geometry></collision></link>
+  <joint name="hinge" type="revolute">
+    <parent link="foot"/><child link="arm"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/>
+  </joint>
+  <link name="arm">{visual}<collision><geometry><sphere radius="0.25"/></geometry></collision></link>
+  <joint name="fixed" type="fixed"><parent link="arm"/><child link="arm_coarse"/></joint>
+  <link name="arm_coarse"><collision><geometry><sphere radius="0.5"/></geometry></collision></link>
+</robot>"""
+
+
+@pytest.mark.parametrize(
+    ("visual", "links"),
+    [("", ["arm", "arm_coarse", "foot"]),
+     ('<visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual>', ["arm", "foot"])],
+)
+def test_links_with_collision_shapes_alone_are_seen_as_these(tmp_path: Path, visual: str, links: list[str]) -> None:
+    with patch(f"{__name__}.URDF", COARSE.replace("{visual}", visual)):
+        robot = post(tmp_path)
+    assert sorted({piece.link for piece in visual_pieces(robot)}) == links
+    assert {piece.link for piece in collision_pieces(robot)} == {"foot", "arm", "arm_coarse"}
 
 
 @pytest.mark.parametrize("cell", ["panda", "ur5"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -72,7 +73,8 @@ class ConsoleDouble:
 
     def put(self, act: Any) -> None:
         self.put_acts.append(act)
-        act()
+        if (doing := act()) is not None:
+            asyncio.run(doing)
 
     def move(self, name: str, x: float, y: float) -> None:
         self.moved.append((name, round(x, 6), round(y, 6)))

@@ -10,7 +10,7 @@ import viser
 from common import messages as m
 from common.application import find_application, find_topic
 from common.errors import ConfigError, UnknownName
-from common.viewer.layers import find_layers, layers_shown
+from common.viewer.layers import find_layers, has_something, layers_shown
 from common.viewer.scene import Scene
 from tests.common.viewer.scene_cell import Clock, ConsoleDouble, around_of, robot_of
 
@@ -44,7 +44,8 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_cell_has_the_layers_of_the_platform_and_of_its_application() -> None:
     panda, ur5 = find_layers(PANDA), find_layers(find_application("outlining"))
-    everywhere = {"robot", "fixtures", "objects", "plan", "tool_path", "camera", "frames", "truth", "grid"}
+    everywhere = {"robot", "fixtures", "objects", "plan", "tool_path", "camera", "frames", "truth", "grid",
+                  "collision_shapes", "reach", "points"}
     assert {*panda} & {*ur5} == everywhere
     assert {*panda} - {*ur5} == {"targets", "rejected", "workspace"}
     assert {*ur5} - {*panda} == {"outline", "contours"}
@@ -90,6 +91,17 @@ def test_layout_may_speak_of_layers_of_other_cells() -> None:
     assert "outline" not in shown and "their.layer" not in shown and not shown["robot"]
     with pytest.raises(UnknownName, match="layer 'outlien'"):
         layers_shown({"outlien": False}, find_layers(PANDA))
+
+
+def test_layer_is_offered_where_something_is_written_that_it_is_about() -> None:
+    layers = find_layers(PANDA)
+    def offered(*keys: str) -> set[str]:
+        return {name for name, kind in layers.items() if has_something(kind, keys)}
+    assert offered() == {"grid"}
+    assert offered("tf", "tf_static", "joint_states") == {"grid", "robot", "collision_shapes", "reach", "frames"}
+    assert offered("depth_camera/points") - offered() == {"points"}
+    assert offered("camera/camera_info") - offered() == {"camera"}
+    assert offered("scene_objects") - offered() == {"truth"}
 
 
 def test_topics_of_all_layers_are_known() -> None:

@@ -122,7 +122,7 @@ def test_layers_begin_as_wanted_and_unknown_ones_are_refused(server: viser.Viser
     assert view.shows("truth") and not view.shows("workspace") and view.shows("robot")
     with pytest.raises(UnknownName, match=r"layer 'truht'.*'truth'"):
         view.set_shown("truht", True)
-    with pytest.raises(UnknownName, match="choices: camera, fixtures"):
+    with pytest.raises(UnknownName, match="choices: camera, collision_shapes, fixtures"):
         Stage(server, "panda", shown={"roboter": True})
 
 
@@ -198,6 +198,7 @@ def test_messages_without_content_do_no_harm(server: viser.ViserServer, cell: st
         m.JointTrajectory: m.JointTrajectory(joint_names=["a"], points=[]), m.TFMessage: m.TFMessage(transforms=[]),
         Contours: Contours(header=WORLD, width=64, height=48), m.PoseArray: m.PoseArray(),
         OutlinePoints: OutlinePoints(), m.WorldObjects: m.WorldObjects(),
+        m.PointCloud2: m.PointCloud2(header=WORLD, height=1, width=1, row_step=16, data=b""),
     }
     topics_shown = {topic for layer in stage.view.layers.values() for topic in layer.TOPICS}
     for topic in topics_shown:
