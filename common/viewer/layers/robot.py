@@ -71,8 +71,8 @@ class CollisionShapes(Layer):
             self.stage.console.put(self._load)
 
     async def _load(self) -> None:
-        from common.viewer.figure import Figure
         from common.robot.visual_meshes import collision_pieces
+        from common.viewer.figure import Figure
 
         pieces = await asyncio.to_thread(collision_pieces, self.stage.robot)
         self.figure = Figure(self.scene, f"{self.root}/links", pieces, self.stage.poses, color=COLLISION, opacity=0.5)
