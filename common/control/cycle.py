@@ -50,6 +50,7 @@ from common.sim.interface import FeltWorld, SimulatedWorld, StandingObject
 from common.sim.standing import Standing
 
 PROGRESS_PERIOD = 0.1  # cell time between reports of progress [s]
+FINGERS_PERIOD = 0.02  # cell time between reports of fingers that move [s]: by their width one goes on
 WORLD_PERIOD = 0.05  # cell time between reports of an object that moves [s]
 
 
@@ -424,7 +425,7 @@ class ControlCycle:
         if told is state:
             return None
         if told is not None and told.same_but(state, "width", "position") and (
-            told.width == state.width or now - self._told_gripper_at < PROGRESS_PERIOD
+            told.width == state.width or now - self._told_gripper_at < FINGERS_PERIOD
         ):
             return None
         self._told_gripper, self._told_gripper_at = state, now

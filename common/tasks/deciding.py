@@ -78,6 +78,7 @@ class Deciding(Generic[V]):
         self.status.started = config.run.autostart
         self.row: deque[Stage] = deque()
         self.running: Execution | None = None
+        self._opening: Execution | None = None  # what was let go is free of the fingers, which open on
         self.patience = Patience()
         self.look_after = 0.0  # only a picture that is later decides [s]
         self._frames = FrameAge(speed)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 from common import messages as m
 from common.tasks.deciding import Deciding, V
@@ -24,6 +25,7 @@ BLOCKED_BY = "scene_monitor"  # holds the arm while something is in the way
 NO_ARM = "the arm cannot be moved: "
 FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] by which fingers may stand elsewhere than a motion was planned with
+OPENED_BY = 0.5  # of a motion that began while the fingers opened: then they have
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 
 
@@ -155,13 +157,17 @@ class Task(Deciding[V]):
     def _watch(self, view: V) -> list[Command]:
         """Follow the stage that runs: its end, its failure, and what falls out of the hand."""
         if self.running is None:
-            return []
+            return self._watch_opening(view)
         assert view.motion is not None and view.gripper is not None
         running, stage = self.running, self.running.stage
         running.count(view.now, view.motion)
         outcome = running.outcome(view.motion, view.gripper)
         limit = self.time_limit(stage)
-        if outcome == "ended":
+        if running.let_go(view.gripper):  # the arm may leave while they open on
+            self.running, self._opening = None, running
+            self.status.moving_seconds += running.moving
+            self.succeeded(stage, view)
+        elif outcome == "ended":
             self.running = None
             self.status.moving_seconds += running.moving
             self._ended(stage, running.report(view.motion, view.gripper), view)
@@ -187,7 +193,33 @@ class Task(Deciding[V]):
             return stop
         elif stage.carries and view.gripper.outcome == "slipping":  # it may still arrive
             self.status.message = f"{stage.name}: {view.gripper.message}"
-        return []
+        return self._watch_opening(view)
+
+    def _watch_opening(self, view: V) -> list[Command]:
+        """Follow fingers that open while the arm leaves already; one that they would not let through is stopped."""
+        opening, running = self._opening, self.running
+        if opening is None:
+            return []
+        assert view.motion is not None and view.gripper is not None
+        state = view.gripper.state if view.gripper.id == opening.command.id else "cancelled"
+        if state == "active":
+            ours = running is not None and running.moves_arm and view.motion.id == running.command.id
+            if not ours or view.motion.progress < OPENED_BY:
+                return []
+            why = "the fingers have not opened yet"
+        else:
+            self._opening, why = None, f"the fingers did not open: {view.gripper.message}"
+        if state in ("succeeded", "cancelled"):  # by whom the fingers were told something else, that one answers for it
+            return []
+        stop = self.stop(view, why)
+        self._opening = None
+        if state == "active" and self.running is None:  # as a stage of its own, which takes as long as one may
+            assert isinstance(opening.stage, Grip)
+            self.running = replace(opening, stage=Grip("open", opening.stage.state, width=opening.stage.width))
+            self.status.message = why
+        else:
+            self.fail(why, view)
+        return stop
 
     def _blocked(self, view: V) -> str:
         """What stays in the way of the motion that runs; empty while nothing does, or it may still go away."""
@@ -277,11 +309,14 @@ class Task(Deciding[V]):
         yield self._begin(stage, view)
 
     def _width(self, view: V) -> float | None:
-        """Between the fingers now [m]; None without any."""
+        """Between the fingers now, or soon where they are opening [m]; None without any."""
         gripper = self.p.robot.gripper
         if gripper is None or not gripper.joints or view.gripper is None:
             return None
-        return min(max(view.gripper.width, 0.0), gripper.max_width)
+        width = view.gripper.width
+        if self._opening is not None and isinstance(self._opening.stage, Grip):
+            width = max(width, self._opening.stage.width)
+        return min(max(width, 0.0), gripper.max_width)
 
     def _fingers_differ(self, move: Move, view: V) -> bool:
         """Whether the fingers stand elsewhere than planned; about what they hold they may be closer."""
@@ -306,6 +341,9 @@ class Task(Deciding[V]):
             stage.cycle.begun = True
         self.running = Execution(stage, command, view.now)
         assert view.motion is not None and view.gripper is not None
+        if isinstance(stage, Grip):
+            self._opening = None  # it replaces that
+            self.running.held = view.gripper.width if view.holding else None
         self.running.before = self.running.report(view.motion, view.gripper).id
         self.status.state, self.status.stage = stage.state, stage.name
         self.status.subject = stage.cycle.subject if stage.cycle else ""

@@ -15,6 +15,7 @@ Report = m.MotionStatus | m.GripperState
 
 OVER = ("succeeded", "aborted", "cancelled")
 MISSES = ("too_wide", "too_narrow", "empty")  # outcomes of a grasp that did not take what was expected
+FREE = 0.006  # [m] by which fingers are further apart than about what they held, from when on they do not carry it
 
 
 @dataclass(eq=False)
@@ -110,6 +111,7 @@ class Execution:
     moving: float = 0.0  # in motion so far
     spent: float = 0.0  # as if the motion were at full speed: what time-outs go by
     accepted: int | None = None  # stamp of the answer that accepted it
+    held: float | None = None  # between the fingers as it began, where they held something [m]
     over: Report | None = None  # the answer, when it told of the end already: it was asked for more than once
 
     @property
@@ -140,6 +142,12 @@ class Execution:
             return "ended" if reported.state in OVER else "running"
         later = self.accepted is not None and reported.header.stamp > self.accepted
         return "forgotten" if later else "running"
+
+    def let_go(self, gripper: m.GripperState) -> bool:
+        """Whether fingers that go on opening are clear of what they held already."""
+        if self.held is None or gripper.id != self.command.id or gripper.state != "active" or gripper.holding:
+            return False
+        return isinstance(self.stage, Grip) and self.stage.holds is False and gripper.width >= self.held + FREE
 
     def report(self, motion: m.MotionStatus, gripper: m.GripperState) -> Report:
         """The report of the controller that the command went to; its answer, when it tells of a later goal already."""
