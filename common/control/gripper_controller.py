@@ -30,6 +30,8 @@ class GripperController:
         self._target: float | None = None  # [m]; of whoever asked last
         self._asked: GripperCommand | None = None
         self._began = self._moved = -math.inf  # the newest command, the newest reading of fingers that move [s]
+        self._from = 0.0  # width at the newest command [m]
+        self._went = False  # whether fingers were seen on their way since
         self._held: float | None = None  # width of what was grasped [m]
         self._effort = config.effort
         self.state = GripperState(source=config.controller)
@@ -101,11 +103,13 @@ class GripperController:
         asked("moving the gripper", self._gripper.command, width, now, effort)
         self._effort = effort
         self._target, self._began, self._held = width, now, None
+        self._from, self._went = self.state.width, False
 
     def update(self, reading: GripperReading, now: float) -> GripperState:
         """The state with the newest reading, at a time [s]: a goal is over when the fingers have stopped."""
         state = self.state
         self._moved = now if reading.moving else self._moved
+        self._went = self._went or (self._target is not None and reading.moving and self._on_the_way(reading.width))
         over = state.state == "active" and self._has_stopped(reading, now)
         changes: dict[str, object] = {
             "width": reading.width, "position": driven_position(self._config, reading.width),
@@ -125,13 +129,18 @@ class GripperController:
             self._memory.put(self.state.id, self.state)
         return self.state
 
+    def _on_the_way(self, width: float) -> bool:
+        """Whether fingers that are so far apart [m] have moved to where they were told last."""
+        assert self._target is not None
+        return (width - self._from) * math.copysign(1.0, self._target - self._from) > SETTLED
+
     def _has_stopped(self, reading: GripperReading, now: float) -> bool:
         """Whether the fingers have done what they could; readings may be of before the command, or say late that they
-        press on something."""
+        press on something. Those of fingers that were seen on their way are of after it."""
         assert self._target is not None
         if reading.moving:
             return False
-        if abs(reading.width - self._target) <= SETTLED:
+        if abs(reading.width - self._target) <= SETTLED or (reading.holding and self._went):
             return True
         since = self._began if reading.holding else max(self._began, self._moved)
         return now - since >= self._config.latency

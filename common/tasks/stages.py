@@ -15,7 +15,7 @@ Report = m.MotionStatus | m.GripperState
 
 OVER = ("succeeded", "aborted", "cancelled")
 MISSES = ("too_wide", "too_narrow", "empty")  # outcomes of a grasp that did not take what was expected
-FREE = 0.006  # [m] by which fingers are further apart than about what they held, from when on they do not carry it
+FREE = 0.01  # [m] by which fingers are further apart than about what they held, when it falls as if they stood still
 
 
 @dataclass(eq=False)

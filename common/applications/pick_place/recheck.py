@@ -76,8 +76,9 @@ class _Window:
 class Recheck:
     """Checks recordings of one cell."""
 
-    def __init__(self, cell: Cell) -> None:
-        """Load the robot's hulls."""
+    def __init__(self, cell: Cell, step: float = STEP) -> None:
+        """Load the robot's hulls; positions are checked every `step` [rad]."""
+        self._step = step
         self.robot = RobotModel.load(cell.robot)
         self.cache = ObstacleCache(RobotGeometry(self.robot))
         self.around = Surroundings.model_validate(cell.section(Surroundings).model_dump())
@@ -113,7 +114,7 @@ class Recheck:
 
     def _touching(self, world: CollisionWorld, states: Array) -> Iterator[tuple[int, Pair]]:
         """Index of the state after which something touches, and what, once for each time."""
-        pieces = [interpolate([a, b], STEP)[1:] for a, b in pairwise(states)]
+        pieces = [interpolate([a, b], self._step)[1:] for a, b in pairwise(states)]
         fine = np.concatenate([states[:1], *pieces])
         owners = np.concatenate([[0], *(np.full(len(piece), i) for i, piece in enumerate(pieces))]).astype(int)
         self.checked += len(fine)

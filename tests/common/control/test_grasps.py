@@ -178,3 +178,20 @@ def test_on_the_wire_only_what_says_something_is_new():
         assert decode(type(message), encode(message)) == message
     scene = PlanningScene(header=Header(), objects=[says[2]])
     assert decode(PlanningScene, encode(scene)) == scene
+
+
+def test_grasp_is_over_as_soon_as_fingers_that_were_seen_to_move_press_on_something() -> None:
+    rig = Rig()
+    rig.between(0.06)
+    began = rig.now
+    assert rig.told(expected_width=0.06).outcome == "grasped"
+    there = rig.hand.read(rig.now)
+    assert not there.moving and rig.now - began < CONFIG.latency, "readings say it already"
+
+
+def test_fingers_that_need_not_move_to_press_on_something_are_waited_for() -> None:
+    rig = Rig(width=0.06)
+    rig.between(0.06)
+    began = rig.now
+    assert rig.told(expected_width=0.06).outcome == "grasped"
+    assert rig.now - began >= CONFIG.latency - 1e-6, "readings may be of before"

@@ -373,3 +373,77 @@ def test_method_that_would_take_the_place_of_the_engines_own_is_refused_by_its_n
         class Mine(Task[View]):
             def _count(self, view: View) -> None:
                 """Of a person who does not know that the engine counts, too."""
+
+
+class Drop(Task[View]):
+    """Lets go of what is in the hand, and leaves."""
+
+    def decide(self, view: View) -> None:
+        if view.holding:
+            self.row += [Grip("release", "DROPPING", width=0.08, carries=True, holds=False),
+                         Move("leave", "LEAVING", goal=THERE), Grip("close", "LEAVING", width=0.0, holds=True)]
+
+
+def opening(width: float = 0.0705) -> Cell:
+    """Fingers that were about 6 cm are so far apart, and open on."""
+    cell = Cell()
+    cell.task = Drop(cell.task.p, m.TaskStatus(), "t")
+    cell.gripper = m.GripperState(width=0.06, holding=True)
+    cell.step()
+    assert cell.task.running is not None and cell.task.running.stage.name == "release"
+    cell.step()  # the way is planned meanwhile
+    cell.gripper = cell.gripper.model_copy(update={"holding": False, "width": width})
+    cell.step()
+    return cell
+
+
+def running(cell: Cell) -> str:
+    return cell.task.running.stage.name if cell.task.running else ""
+
+
+def test_arm_leaves_as_soon_as_what_it_let_go_is_clear_of_the_fingers_and_not_before() -> None:
+    assert running(opening(0.0695)) == "release"
+    cell = opening(0.0705)
+    assert running(cell) == "leave" and cell.motion.state == "active" and cell.gripper.state == "active"
+    assert [p.gripper_width for p in cell.plans()] == [0.08], "with the fingers as they will stand, once"
+    cell.gripper = cell.gripper.model_copy(update={"state": "succeeded", "moving": False, "width": 0.08})
+    cell.motion = cell.motion.model_copy(update={"progress": 0.9})
+    cell.until("close")
+    assert cell.task.status.failures == 0 and not any(isinstance(c, m.StopRequest) for c in cell.asked)
+
+
+def test_what_still_holds_while_the_fingers_open_is_not_left() -> None:
+    cell = opening(0.0695)
+    cell.gripper = cell.gripper.model_copy(update={"holding": True, "width": 0.075})
+    cell.step()
+    assert running(cell) == "release"
+
+
+def test_arm_waits_on_its_way_for_fingers_that_have_not_opened_by_half_of_it() -> None:
+    cell = opening()
+    cell.motion = cell.motion.model_copy(update={"progress": 0.49})
+    assert not any(isinstance(c, m.StopRequest) for c in cell.step())
+    cell.motion = cell.motion.model_copy(update={"progress": 0.5})
+    (stop,) = cell.step()
+    assert isinstance(stop, m.StopRequest) and stop.id == cell.motion.id and not cell.task.row
+    cell.motion = cell.motion.model_copy(update={"state": "cancelled"})
+    cell.step()
+    assert running(cell) == "open" and cell.task.status.message == "the fingers have not opened yet"
+    cell.finish()
+    cell.step()
+    assert running(cell) == "" and cell.task.status.failures == 0
+
+
+def test_arm_stops_for_fingers_that_stick_on_its_way() -> None:
+    cell = opening()
+    cell.gripper = cell.gripper.model_copy(update={"state": "aborted", "moving": False, "message": "they stopped"})
+    (stop,) = [c for c in cell.step() if isinstance(c, m.StopRequest)]
+    assert stop.id == cell.motion.id
+    assert cell.task.status.failures == 1 and cell.task.status.message == "the fingers did not open: they stopped"
+
+
+def test_fingers_that_somebody_told_something_else_on_the_way_stop_nobody() -> None:
+    cell = opening()
+    cell.gripper = m.GripperState(id="another's", state="active", moving=True, width=0.07)
+    cell.motion = cell.motion.model_copy(update={"progress": 0.9})
+    assert not any(isinstance(c, m.StopRequest) for c in cell.step()) and running(cell) == "leave"
