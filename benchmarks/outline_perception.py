@@ -19,7 +19,7 @@ import numpy.typing as npt
 from common.applications.outlining.contours import ContourOptions, find_contours, is_hole
 from common.applications.outlining.duplicates import simplified, without_duplicates
 from common.applications.outlining.top_face import TopFaceOptions, top_face
-from common.config import RobotConfig, Surroundings, World, check, config_root, find_file, read_robot, read_yaml
+from common.config import Surroundings, World, check, config_root, load_robot, read_yaml
 from common.messages import Header, JointState, WorldObject
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
@@ -94,7 +94,7 @@ def outlines(view: View, camera: Pinhole, objects: Sequence[WorldObject], repeat
 def arm(repeat: int) -> None:
     """Print how long the arm takes, which is all that is cast anew while it moves."""
     world, objects, meshes = load("w5")
-    robot = RobotModel.load(check(RobotConfig, read_robot(find_file("robots", "ur5"))))
+    robot = RobotModel.load(load_robot("ur5"))
     around = Surroundings.model_validate({f: getattr(world, f) for f in Surroundings.model_fields})
     camera = Renderer(around, robot)
     positions = np.array(OVER)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import options
+from cli.inspection import UP, Place, Verbs
 from common.errors import ConfigError, UnknownName, ZencellError
 from common.terminal import echo
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from common.transport.bus import Bus
     from common.transport.reader import Reader
 
-app = typer.Typer(help="Calibrate a real camera with a ChArUco board.", no_args_is_help=True)
+app = Verbs("Calibrate a real camera with a ChArUco board.")
 
 BOARD_FORMATS = (".png", ".pdf")
 FIRST_PICTURE = 5.0  # [s] of wall time in which one comes
@@ -43,11 +44,6 @@ class NoPicture(ZencellError):
     """Nobody sends pictures."""
 
     exit_code = 1
-
-
-@app.callback()
-def calibrate() -> None:
-    """Calibrate a real camera with a ChArUco board."""
 
 
 @app.command(name="board")
@@ -226,7 +222,7 @@ def collect(
     key: Annotated[str, typer.Option("--key", metavar="KEY", help="of the camera's pictures")] = "camera/image_raw",
     views: Annotated[str, typer.Option("--views", metavar="N", help="that are wanted")] = "15",
     squares: Squares = "7x5", square: Square = "0.036", marker: Marker = "0", dictionary: Dictionary = "4x4_50",
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+    at: Place = UP,
 ) -> None:
     """Keep pictures of the board, with the joints, of a cell that is up: whenever the arm rests in a new pose.
 
@@ -236,14 +232,13 @@ def collect(
 
     import numpy as np
 
-    from cli.inspection import inspect
     from common import topics
-    from common.config import RobotConfig, check, find_file, read_robot
+    from common.config import load_robot
     from common.perception.hand_eye_views import ViewCollector
     from common.perception.image import image_to_array
     from common.robot.model import RobotModel
 
-    model = RobotModel.load(check(RobotConfig, read_robot(find_file("robots", robot)), "robot"))
+    model = RobotModel.load(load_robot(robot))
     board, wanted = board_of(squares, square, marker, dictionary), options.whole("--views", views, 1) or 1
     collector = ViewCollector(Path(folder).expanduser(), model, robot, board)
 
@@ -268,7 +263,7 @@ def collect(
         finally:
             noting.cancel()
 
-    inspect(visit, cell=cell, domain=domain, connect=connect)
+    at.visit(visit)
     echo(f"{folder} holds {collector.count} views; next: zencell calibrate hand-eye {folder} --intrinsics FILE "
          "--camera hand|beside")
 

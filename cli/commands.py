@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from cli import completion, options
+from cli.inspection import UP, Place, Verbs
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from common.messages import Message, WorldEdit
     from common.topics import Request
 
-task = typer.Typer(help="Tell the task what to do.", no_args_is_help=True)
-world = typer.Typer(help="Change the simulated world.", no_args_is_help=True)
+task = Verbs("Tell the task what to do.")
+world = Verbs("Change the simulated world.")
 
 TIMEOUT = 5.0  # [s]
 X = Annotated[str, typer.Argument(metavar="X", help="[m] in world")]
@@ -34,48 +34,29 @@ def call(
                             autocompletion=completion.requests)
     ],
     body: Annotated[str, typer.Argument(metavar="JSON", help="its fields; `zencell topic info KEY` has an example")],
-    cell: options.CellName = None,
+    at: Place = UP,
     timeout: Annotated[str, typer.Option("--timeout", metavar="S", help="[s]")] = f"{TIMEOUT:g}",
-    domain: options.Domain = None,
-    connect: options.Connect = None,
 ) -> None:
     """Send a request and print the answer as JSON; exit 1 with one line if there is none."""
     from common.application import all_topics, find_topic
-    from common.config import check
+    from common.client.publishing import checked
     from common.topics import Request
 
     request = find_topic(key)
     if not isinstance(request, Request):
         requests = [name for name, topic in all_topics().items() if isinstance(topic, Request)]
         raise UnknownName("request", key, requests)
-    message = check(request.message, _parse(key, body), key)
+    message = checked(request, key, body)
     seconds = options.number("--timeout", timeout)
     if seconds <= 0:
         raise ConfigError("--timeout", timeout, "must be more than 0")
-    send(request, message, seconds, cell, domain, connect)
+    send(at, request, message, seconds)
 
 
-def _parse(key: str, body: str) -> dict[str, Any]:
-    from common.messages.schema import from_json
-
-    try:
-        given = from_json(json.loads(body))
-    except ValueError as error:
-        raise ConfigError(key, body, f"is not JSON: {error}") from None
-    if not isinstance(given, dict):
-        raise ConfigError(key, body, "must be a JSON object")
-    return given
-
-
-def send(
-    request: Request[Any, Any], message: Message, timeout: float, cell: str | None, domain: str | None,
-    connect: str | None,
-) -> None:
+def send(at: Place, request: Request[Any, Any], message: Message, timeout: float = TIMEOUT) -> None:
     """Send a request to a cell that is up and print the answer as JSON."""
-    from cli.inspection import in_cell
     from common.client.joining import newest_heard
     from common.messages import TaskCommand
-    from common.messages.schema import to_json
 
     async def visit(joined: Client) -> Message:
         if isinstance(message, TaskCommand) and message.command in ("start", "resume") and message.heard is None:
@@ -83,18 +64,13 @@ def send(
         answer: Message = await joined.call(request, message, timeout=timeout)
         return answer
 
-    echo(to_json(in_cell(visit, cell, domain, connect).model_dump()))
+    at.answer(visit)
 
 
 # --- task -------------------------------------------------------------------------------------------------------
 
 
-def _task(
-    tell: Callable[[TaskControl], Awaitable[Message]], cell: str | None, domain: str | None, connect: str | None
-) -> None:
-    from cli.inspection import in_cell
-    from common.messages.schema import to_json
-
+def _task(at: Place, tell: Callable[[TaskControl], Awaitable[Message]]) -> None:
     async def visit(joined: Client) -> Message:
         try:
             return await tell(joined.task)
@@ -102,37 +78,31 @@ def _task(
             if joined.task.unkept:
                 echo(f"zencell: {joined.task.unkept}", err=True)
 
-    echo(to_json(in_cell(visit, cell, domain, connect).model_dump()))
+    at.answer(visit)
 
 
 @task.command()
-def start(
-    override: options.Override = False,
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
-) -> None:
+def start(override: options.Override = False, at: Place = UP) -> None:
     """Start the task of a cell that waits or was stopped, or start it again; a robot that you hold is let go."""
-    _task(lambda task: task.start(override=override), cell, domain, connect)
+    _task(at, lambda task: task.start(override=override))
 
 
 @task.command()
-def pause(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
+def pause(at: Place = UP) -> None:
     """Bring the robot to rest on its path at once and hold it there."""
-    _task(lambda task: task.pause(), cell, domain, connect)
+    _task(at, lambda task: task.pause())
 
 
 @task.command()
-def resume(
-    override: options.Override = False,
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
-) -> None:
+def resume(override: options.Override = False, at: Place = UP) -> None:
     """Let the robot go on along its path after a pause of yours."""
-    _task(lambda task: task.resume(override=override), cell, domain, connect)
+    _task(at, lambda task: task.resume(override=override))
 
 
 @task.command()
-def stop(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
+def stop(at: Place = UP) -> None:
     """Stop the robot, give up its motion, and wait for a start, also if the task does not answer."""
-    _task(lambda task: task.stop(), cell, domain, connect)
+    _task(at, lambda task: task.stop())
 
 
 @task.command()
@@ -140,14 +110,10 @@ def home(
     planner: Annotated[
         str, typer.Option("--planner", metavar="NAME", help="use only this one", autocompletion=completion.planners)
     ] = "",
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+    at: Place = UP,
 ) -> None:
     """Plan a way home and go there, while no task has the robot; Ctrl-C stops the robot."""
-    from cli.inspection import in_cell
-    from common.messages.schema import to_json
-
-    done = in_cell(lambda joined: joined.arm.move("home", planner=planner), cell, domain, connect)
-    echo(to_json(done.model_dump()))
+    at.answer(lambda cell: cell.arm.move("home", planner=planner))
 
 
 # --- world ------------------------------------------------------------------------------------------------------
@@ -165,13 +131,13 @@ def _triple(option: str, text: str, names: str) -> dict[str, float]:
     return dict(zip(names, found * (3 // len(found)), strict=True))
 
 
-def _edit(values: dict[str, Any], cell: str | None, domain: str | None, connect: str | None) -> None:
+def _edit(at: Place, values: dict[str, Any]) -> None:
     from common import topics
     from common.config import check
     from common.messages import WorldEdit
 
     message: WorldEdit = check(WorldEdit, values, "world")
-    send(topics.WORLD_EDIT, message, TIMEOUT, cell, domain, connect)
+    send(at, topics.WORLD_EDIT, message)
 
 
 @world.command(context_settings=NEGATIVE_NUMBERS)
@@ -186,7 +152,7 @@ def add(
         "--size", metavar="X,Y,Z", help="of the box about it [m]; one number for all three")] = "",
     color: Annotated[str, typer.Option("--color", metavar="R,G,B", help="0 to 1 each")] = "",
     yaw: Annotated[str, typer.Option("--yaw", metavar="RAD", help="[rad]")] = "",
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+    at: Place = UP,
 ) -> None:
     """Put one more object on the table."""
     values: dict[str, Any] = {"op": "add", "id": name, "position": _position(x, y), "like": like}
@@ -198,27 +164,22 @@ def add(
         values["color"] = _triple("--color", color, "rgb")
     if yaw:
         values["yaw"] = options.number("--yaw", yaw)
-    _edit(values, cell, domain, connect)
+    _edit(at, values)
 
 
 @world.command(context_settings=NEGATIVE_NUMBERS)
-def move(
-    name: Id, x: X, y: Y,
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
-) -> None:
+def move(name: Id, x: X, y: Y, at: Place = UP) -> None:
     """Put an object elsewhere."""
-    _edit({"op": "move", "id": name, "position": _position(x, y)}, cell, domain, connect)
+    _edit(at, {"op": "move", "id": name, "position": _position(x, y)})
 
 
 @world.command()
-def remove(
-    name: Id, cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
-) -> None:
+def remove(name: Id, at: Place = UP) -> None:
     """Take an object away."""
-    _edit({"op": "remove", "id": name}, cell, domain, connect)
+    _edit(at, {"op": "remove", "id": name})
 
 
 @world.command()
-def reset(cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None) -> None:
+def reset(at: Place = UP) -> None:
     """Bring the first layout back."""
-    _edit({"op": "reset"}, cell, domain, connect)
+    _edit(at, {"op": "reset"})

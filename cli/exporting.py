@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.recording import Exclude, File, require_new
+from cli.recording import Exclude, File
 from common.errors import ConfigError
-from common.recording.telling import in_bytes
+from common.recording.telling import in_bytes, require_new
 from common.terminal import echo, printable
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import completion, options
+from cli.inspection import Place
 from common.errors import ConfigError
 from common.terminal import echo
 
@@ -35,7 +36,6 @@ def graph(
     connect: options.Connect = None,
 ) -> None:
     """Draw services and topics of a cell, up or not; while it is up, what is not alive is dashed."""
-    from cli.inspection import look
     from common.config import load_cell
     from common.graph.drawing import graph_of, names
     from common.viewer.access import VIEWER
@@ -43,17 +43,14 @@ def graph(
     path = Path(output).expanduser() if output else None
     write = _writer_of(path)
     loaded = load_cell(cell, overrides or ())
-    presence = look(domain, connect).get(loaded.name)
+    presence = Place(domain=domain, connect=connect).look().get(loaded.name)
     services = [each for each in _wired_services(loaded) if not (no_viewer and each.name == VIEWER)]
     made = graph_of(loaded.name, services, presence.ready if presence else None)
     text = write(made)
     if path is None:
         echo(text, nl=False)
         return
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError("--output", output, f"cannot be written: {error.strerror or error}") from None
+    options.write_text(output, text)
     echo(f"{path}: {len(made.services)} services, {len(made.kinds)} keys"
                f"{'' if made.alive is None else f', {sum(map(made.is_lit, names(made)))} services alive'}")
 

@@ -40,13 +40,14 @@ from cli import (
     topic,
     verbs,
 )
+from cli.inspection import Verbs
 from common.errors import RequestFailed, ZencellError
 from common.terminal import echo, printable
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 
-class CommandLine(typer.Typer):
+class CommandLine(Verbs):
     """Verbs whose errors come out as one line: exit code 1 for what failed, 2 for bad input, 130 for Ctrl-C."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> None:
@@ -95,8 +96,7 @@ def _leave(code: int) -> NoReturn:
 
 
 app = CommandLine(
-    help="Robot work cells as a mesh of processes over Zenoh.",
-    no_args_is_help=True,
+    "Robot work cells as a mesh of processes over Zenoh.",
     add_completion=False,  # our own options below take the name of the shell
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -122,7 +122,7 @@ app.add_typer(scene.app, name="scene")
 of_applications.take_all()
 app.add_typer(robot.app, name="robot")
 app.add_typer(calibrate.app, name="calibrate")
-app.command()(recording.record)
+app.command("record")(recording.record_)
 app.command()(recording.info)
 app.command()(playing.play)
 app.command()(recording.recover)

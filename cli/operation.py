@@ -131,15 +131,16 @@ class Operation:
         """
         if file is None:
             return
-        from cli.recording import NAME, require_new
         from common.recording.own import Own
+        from common.recording.telling import require_new
         from common.supervision.launch import python_module
+        from common.transport.credentials import RECORDER
 
         path = Path(file).absolute()
         require_new(path, "--record")
         securing.require_recorder(self.launch, self.cell)
         place = ["--connect", self.launch.connect] if self.launch.connect else ["--domain", str(self.launch.domain)]
-        self._watchers[NAME] = [
+        self._watchers[RECORDER] = [
             *python_module("cli.main"), "record", "--cell", self.cell.name, "-o", str(path), *place, "--gate",
             "--own", str(Own.of(self.cell)),
         ]

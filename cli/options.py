@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -70,6 +71,18 @@ WorldName = Annotated[
                              autocompletion=completion.worlds)
 ]
 Seed = Annotated[str | None, typer.Option("--seed", metavar="N", help="of everything random")]
+
+
+def write_text(output: str, text: str) -> None:
+    """Write a file that --output names.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    try:
+        Path(output).expanduser().write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError("--output", output, f"cannot be written: {error.strerror or error}") from None
 
 
 # Numbers are read here and not by typer, whose errors do not show what was given.

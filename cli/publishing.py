@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import options
+from cli.inspection import UP, Place
 from common.errors import ConfigError
 from common.terminal import echo
 
@@ -26,15 +27,12 @@ def pub(
     rate: Rate = DEFAULT_RATE,
     once: Once = False,
     count: options.Count = None,
-    cell: options.CellName = None,
-    domain: options.Domain = None,
-    connect: options.Connect = None,
+    at: Place = UP,
 ) -> None:
     """Publish a message until Ctrl-C, N times or once; a stamp that is left out is the cell's time of each message.
 
     A state can be asked for while this runs. A key of your own services takes any JSON; {"base64": "..."} is bytes.
     """
-    from cli.inspection import inspect
     from common.client.publishing import checked, publish
     from common.transport.credentials import refuse_to_publish
 
@@ -55,7 +53,7 @@ def pub(
         _warn_of_writers(await _others(bus, under), under)
         await publish(bus, written, under, message, period, most)
 
-    inspect(visit, cell=cell, domain=domain, connect=connect)
+    at.visit(visit)
 
 
 def _publishable(key: str) -> Topic[Any] | None:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from cli import options
 from cli.recording import File
 from common.errors import ConfigError
 from common.terminal import echo
@@ -41,8 +42,5 @@ def report(
             raise RecordingError(f"{path}: has values that cannot be shown: {type(error).__name__}: {error}") from error
         if not recording.finished:
             echo(f"zencell: {cut(recording)}", err=True)
-    try:
-        page_path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError("--output", str(page_path), f"cannot be written: {error.strerror}") from None
+    options.write_text(str(page_path), text)
     echo(f"{page_path}: {len(text) / 1e6:.1f} MB")

@@ -3,26 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from cli import completion, options, robot_new
+from cli.inspection import UP, Place, Verbs
 from common.errors import ConfigError
 from common.terminal import echo
 
-if TYPE_CHECKING:
-    from common.messages import RobotStatus
-
-app = typer.Typer(help="Prepare a robot, ask its controller, jog it.", no_args_is_help=True)
-
-
-@app.callback()
-def robot() -> None:
-    """Prepare a robot, ask its controller, jog it."""
-
-
+app = Verbs("Prepare a robot, ask its controller, jog it.")
 app.command()(robot_new.new)
 app.command()(robot_new.check)
 
@@ -42,7 +32,7 @@ def collisions(
     """Compute an SRDF: groups, named poses, and the pairs of links that need no collision check."""
     import numpy as np
 
-    from common.config import RobotConfig, check, find_file, read_robot
+    from common.config import load_robot
     from common.planning.disabled_collisions import disabled_pairs, srdf
     from common.robot.model import RobotModel
 
@@ -50,74 +40,54 @@ def collisions(
     distance = options.number("--margin", margin)
     if distance < 0:
         raise ConfigError("--margin", margin, "must be 0 or more")
-    config = check(RobotConfig, read_robot(find_file("robots", name)), "robot")
     # The SRDF that the robot file names may be the one that is still to be made.
-    model = RobotModel.load(config.model_copy(update={"srdf": ""}))
+    model = RobotModel.load(load_robot(name).model_copy(update={"srdf": ""}))
     pairs = disabled_pairs(model, samples=count or 1, margin=distance, rng=np.random.default_rng(number))
     text = srdf(model, pairs)
     if not output:
         echo(text, nl=False)
         return
-    try:
-        Path(output).expanduser().write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError("--output", output, f"cannot be written: {error.strerror}") from None
+    options.write_text(output, text)
     found = Counter(pair.reason for pair in pairs)
     echo(f"{output}: {len(pairs)} pairs need no check "
                f"({', '.join(f'{found[reason]} {reason.lower()}' for reason in sorted(found))})")
 
 
-def _status(cell: str | None, domain: str | None, connect: str | None) -> RobotStatus:
-    from cli.inspection import in_cell
-
-    return in_cell(lambda joined: joined.arm.robot(), cell, domain, connect)
-
-
 @app.command()
-def status(
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
-) -> None:
+def status(at: Place = UP) -> None:
     """Print what the arm's own controller says: mode, why it cannot be moved, speed slider."""
-    told = _status(cell, domain, connect)
+    told = at.join(lambda cell: cell.arm.robot())
     echo(f"{told.mode}{f': {told.message}' if told.message else ''}")
     echo(f"speed slider {told.speed:.0%}, latest cycle {told.late * 1e3:.1f} ms late, "
          f"inputs {told.inputs:#b}, outputs {told.outputs:#b}")
 
 
-def _order(
-    act: str, value: float, cell: str | None, domain: str | None, connect: str | None, **more: Any
-) -> None:
-    from cli.inspection import in_cell
-
-    told = in_cell(lambda joined: joined.arm.order(act, value, **more), cell, domain, connect)
+def _order(at: Place, act: str, value: float = 0.0, **more: Any) -> None:
+    told = at.join(lambda cell: cell.arm.order(act, value, **more))
     echo(f"{told.mode}{f': {told.message}' if told.message else ''}")
 
 
 @app.command()
-def enable(
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
-) -> None:
+def enable(at: Place = UP) -> None:
     """Power the joints and release the brakes."""
-    _order("enable", 0.0, cell, domain, connect)
+    _order(at, "enable")
 
 
 @app.command()
-def recover(
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
-) -> None:
+def recover(at: Place = UP) -> None:
     """Let the arm be moved again after it has stopped to protect somebody or itself."""
-    _order("recover", 0.0, cell, domain, connect)
+    _order(at, "recover")
 
 
 @app.command()
 def freedrive(
     state: Annotated[str, typer.Argument(metavar="on|off", help="whether it is moved by hand")],
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+    at: Place = UP,
 ) -> None:
     """Have the arm be moved by hand, or end that."""
     if state not in ("on", "off"):
         raise ConfigError("freedrive", state, "must be on or off")
-    _order("freedrive", float(state == "on"), cell, domain, connect)
+    _order(at, "freedrive", float(state == "on"))
 
 
 @app.command()
@@ -125,27 +95,27 @@ def payload(
     mass: Annotated[str, typer.Argument(metavar="KG", help="mass of what the tool carries, with its fingers")],
     com: Annotated[
         str, typer.Option("--com", metavar="X,Y,Z", help="its centre of mass, from the flange [m]")] = "0,0,0",
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+    at: Place = UP,
 ) -> None:
     """Tell the arm's controller what the tool carries."""
     x, y, z = options.three("--com", com)
-    _order("payload", options.number("KG", mass), cell, domain, connect, com={"x": x, "y": y, "z": z})
+    _order(at, "payload", options.number("KG", mass), com={"x": x, "y": y, "z": z})
 
 
 @app.command()
 def io(
     output: Annotated[str | None, typer.Argument(metavar="OUTPUT", help="number of a digital output")] = None,
     state: Annotated[str | None, typer.Argument(metavar="on|off", help="what it becomes")] = None,
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+    at: Place = UP,
 ) -> None:
     """Print the digital inputs and outputs of the arm's controller, or set an output."""
     if output is None:
-        told = _status(cell, domain, connect)
+        told = at.join(lambda cell: cell.arm.robot())
         echo(f"inputs on: {_numbers(told.inputs)}\noutputs on: {_numbers(told.outputs)}")
         return
     if state not in ("on", "off"):
         raise ConfigError("io", state or "", "must be on or off")
-    _order("output", float(state == "on"), cell, domain, connect, output=options.whole("OUTPUT", output, 0))
+    _order(at, "output", float(state == "on"), output=options.whole("OUTPUT", output, 0))
 
 
 def _numbers(bits: int) -> str:
@@ -157,22 +127,14 @@ def _numbers(bits: int) -> str:
 
 
 @app.command()
-def owner(
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
-) -> None:
+def owner(at: Place = UP) -> None:
     """Print whose the motion is: nobody else's begins. Stops and holds are everybody's."""
-    from cli.inspection import in_cell
-
-    told = in_cell(lambda joined: joined.arm.owner_now(), cell, domain, connect)
+    told = at.join(lambda cell: cell.arm.owner_now())
     echo(f"the motion is {told.told}{', who jogs the arm' if told.jogging else ''}")
 
 
-def _own(
-    act: Literal["take", "give"], over: bool, cell: str | None, domain: str | None, connect: str | None
-) -> None:
-    from cli.inspection import in_cell
-
-    told = in_cell(lambda joined: joined.arm.own(act, over=over, kind="operator"), cell, domain, connect)
+def _own(at: Place, act: Literal["take", "give"], *, over: bool = False) -> None:
+    told = at.join(lambda cell: cell.arm.own(act, over=over, kind="operator"))
     echo(f"the motion is {told.told}")
 
 
@@ -180,18 +142,16 @@ def _own(
 def take(
     over: Annotated[bool, typer.Option("--over", help="from whoever has it: what they move comes to rest, and a task "
                                                       "waits for `zencell task start`")] = False,
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+    at: Place = UP,
 ) -> None:
     """Have the motion until you give it back: neither a task nor anybody else moves the robot meanwhile."""
-    _own("take", over, cell, domain, connect)
+    _own(at, "take", over=over)
 
 
 @app.command()
-def give(
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
-) -> None:
+def give(at: Place = UP) -> None:
     """Give the motion back. Nothing moves by that."""
-    _own("give", False, cell, domain, connect)
+    _own(at, "give")
 
 
 @app.command()
@@ -204,10 +164,9 @@ def jog(
     ] = None,
     frame: Annotated[str, typer.Option("--frame", metavar="base|tool|world", help="whose axes those are")] = "base",
     seconds: Annotated[str, typer.Option("--seconds", metavar="S", help="for so long, at most a minute")] = "1",
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+    at: Place = UP,
 ) -> None:
     """Move the arm by hand for a while: at most 0.25 m/s, and it stands 0.2 s after Ctrl-C or the end of this."""
-    from cli.inspection import in_cell
     from common.client.arm import check_seconds
 
     duration = options.number("--seconds", seconds)
@@ -222,4 +181,4 @@ def jog(
         "joints": joints, "linear": options.three("--linear", linear or "0,0,0"),
         "angular": options.three("--angular", angular or "0,0,0"), "frame": frame,
         "seconds": duration}
-    in_cell(lambda joined: joined.arm.jog(**asked), cell, domain, connect)
+    at.join(lambda cell: cell.arm.jog(**asked))

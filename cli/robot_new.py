@@ -95,14 +95,13 @@ def check(
     ],
 ) -> None:
     """Check what a robot file says of the tool on the robot's model; exit code 1 with a line for all that is not so."""
-    from common.config import RobotConfig, find_file, read_robot
-    from common.config import check as checked
+    from common.config import load_robot
     from common.planning.robot_geometry import RobotGeometry
     from common.robot.model import RobotModel
     from common.setup.fingers import tool_complaints
     from common.setup.home import hits
 
-    robot = RobotModel.load(checked(RobotConfig, read_robot(find_file("robots", name)), "robot"))
+    robot = RobotModel.load(load_robot(name))
     complaints = tool_complaints(robot)
     touching = hits(robot, RobotGeometry(robot), robot.named("home"))
     complaints += [f"named_poses.home: {pair} touch" for pair in touching]
@@ -169,11 +168,10 @@ def _write_cell(path: Path, template: str, robot_path: Path, layout: Layout) -> 
     """A cell like another, with this robot and a world in its reach."""
     import yaml
 
-    from common.config import RobotConfig, find_file, read_robot, read_yaml
-    from common.config import check as checked
+    from common.config import find_file, load_robot, read_yaml
     from common.robot.model import RobotModel
 
-    robot = RobotModel.load(checked(RobotConfig, read_robot(robot_path), "robot"))
+    robot = RobotModel.load(load_robot(robot_path))
     tree = layout(robot, read_yaml(find_file("cells", template)))
     tree |= {"cell": path.stem, "robot": os.path.relpath(robot_path.resolve(), path.parent.resolve())}
     head = f"# As {template}, for {robot.config.name}: its world was laid out in reach by `zencell robot new`.\n"

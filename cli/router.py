@@ -5,20 +5,14 @@ from __future__ import annotations
 import json
 import os
 
-import typer
-
 from cli import options, securing
+from cli.inspection import Verbs
 from common.supervision.share import Share
 from common.terminal import echo
 
-app = typer.Typer(help="What a cell's router is told.", no_args_is_help=True)
+app = Verbs("What a cell's router is told.")
 
 HEAD = "// A router for work cells, as `zencell up` would start it: zenohd --config THIS_FILE\n"
-
-
-@app.callback()
-def router() -> None:
-    """What a cell's router is told."""
 
 
 @app.command()

@@ -7,31 +7,23 @@ from typing import Annotated, Any, Literal, cast
 import typer
 
 from cli import options
+from cli.inspection import UP, Place, Verbs
 from common.terminal import echo
 
-app = typer.Typer(help="Add solids that motion keeps away from though nobody perceives them.", no_args_is_help=True)
+app = Verbs("Add solids that motion keeps away from though nobody perceives them.")
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="of your own; in the scene it is added/NAME")]
 
 
-@app.callback()
-def scene() -> None:
-    """Add solids that motion keeps away from though nobody perceives them."""
-
-
 @app.command("list")
-def list_(
-    cell: options.CellName = None, as_json: options.Json = False, domain: options.Domain = None,
-    connect: options.Connect = None,
-) -> None:
+def list_(at: Place = UP, as_json: options.Json = False) -> None:
     """List what was added; `zencell topic echo planning_scene` has all that motion keeps away from."""
-    from cli.inspection import in_cell
     from common.messages.schema import to_json
 
-    for solid in in_cell(lambda joined: joined.scene.objects(), cell, domain, connect):
-        at, sides = solid.pose.position, " x ".join(f"{side:g}" for side in solid.dimensions)
+    for solid in at.join(lambda cell: cell.scene.objects()):
+        middle, sides = solid.pose.position, " x ".join(f"{side:g}" for side in solid.dimensions)
         echo(to_json(solid.model_dump()) if as_json else
-             f"{solid.id}  {solid.shape} {sides} m at {at.x:g}, {at.y:g}, {at.z:g}")
+             f"{solid.id}  {solid.shape} {sides} m at {middle.x:g}, {middle.y:g}, {middle.z:g}")
 
 
 @app.command(context_settings={"ignore_unknown_options": True})  # -0.2 is a coordinate, not an option
@@ -40,30 +32,25 @@ def add(
     shape: Annotated[str, typer.Argument(metavar="SHAPE", help="box, sphere or cylinder")],
     size: Annotated[str, typer.Argument(
         metavar="SIZE", help="X,Y,Z of a box; radius of a sphere; radius,length of a cylinder [m]")],
-    at: Annotated[str, typer.Argument(metavar="X,Y,Z", help="its middle in world [m]")],
+    middle: Annotated[str, typer.Argument(metavar="X,Y,Z", help="its middle in world [m]")],
     rpy: Annotated[str, typer.Option("--rpy", metavar="R,P,Y", help="roll, pitch, yaw [rad]")] = "0,0,0",
     color: Annotated[str, typer.Option("--color", metavar="R,G,B", help="0 to 1 each")] = "",
-    cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None,
+    at: Place = UP,
 ) -> None:
     """Add a solid, until it is removed: it stays through restarts. An arm on its way into it brakes."""
-    from cli.inspection import in_cell
     from common.client.goals import pose
 
-    x, y, z = options.three("X,Y,Z", at)
+    x, y, z = options.three("X,Y,Z", middle)
     asked: dict[str, Any] = {"at": pose(x, y, z, rpy=options.three("--rpy", rpy))}
     if color:
         asked["color"] = options.three("--color", color)
     kind = cast(Literal["box", "sphere", "cylinder"], shape)
     dimensions = options.numbers("SIZE", size)
-    echo(in_cell(lambda joined: joined.scene.add(name, kind, dimensions, **asked), cell, domain, connect))
+    echo(at.join(lambda cell: cell.scene.add(name, kind, dimensions, **asked)))
 
 
 @app.command()
-def remove(
-    name: Name, cell: options.CellName = None, domain: options.Domain = None, connect: options.Connect = None
-) -> None:
+def remove(name: Name, at: Place = UP) -> None:
     """Take out what was added, by whomever."""
-    from cli.inspection import in_cell
-
-    left = in_cell(lambda joined: joined.scene.remove(name), cell, domain, connect)
+    left = at.join(lambda cell: cell.scene.remove(name))
     echo(f"still added: {', '.join(left) or 'nothing'}")

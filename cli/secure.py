@@ -9,20 +9,16 @@ from typing import Annotated
 import typer
 
 from cli import options
+from cli.inspection import Verbs
 from common.supervision.share import Share
 from common.terminal import echo
 
-app = typer.Typer(help="Certificates for a cell's processes, and who may do what.", no_args_is_help=True)
+app = Verbs("Certificates for a cell's processes, and who may do what.")
 
 DAYS = 365
 SHOWN = ("writes", "reads", "answers", "asks", "passes on")
 
 Folder = Annotated[str, typer.Argument(metavar="DIR", help="of the certificates")]
-
-
-@app.callback()
-def secure() -> None:
-    """Certificates for a cell's processes, and who may do what."""
 
 
 @app.command()

@@ -89,9 +89,8 @@ def seeds_of(text: str) -> range:
 
 def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float) -> int:
     """Run one seed and tell of all that happened; the exit code."""
-    from cli.recording import require_new
     from common.recording.own import Own
-    from common.recording.telling import about
+    from common.recording.telling import about, require_new
     from common.virtual.simulation import Simulation
     from common.virtual.trace import Trace
 

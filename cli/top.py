@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
+from cli.inspection import UP, Place
 from common.terminal import echo, printable
 
 if TYPE_CHECKING:
@@ -31,14 +32,10 @@ Once = Annotated[bool, typer.Option("--once", help="one table, then end")]
 def top(
     once: Once = False,
     count: options.Count = None,
-    cell: options.CellName = None,
+    at: Place = UP,
     as_json: options.Json = False,
-    domain: options.Domain = None,
-    connect: options.Connect = None,
 ) -> None:
     """Show CPU, memory, rates, losses and ages of a cell's services and topics each second, until Ctrl-C."""
-    from cli.inspection import inspect
-
     most = 1 if once else options.whole("--count", count, 1)
 
     async def visit(bus: Bus) -> None:
@@ -59,7 +56,7 @@ def top(
             finally:
                 close()
 
-    inspect(visit, cell=cell, domain=domain, connect=connect)
+    at.visit(visit)
 
 
 def _opened(*, live: bool, as_json: bool) -> tuple[Callable[[View], None], Callable[[], None]]:

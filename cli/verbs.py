@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 import typer
 
 from cli import options
+from cli.inspection import Place
 from common.application import Application, applications, find_application
 from common.errors import ConfigError
 from common.verbs import BeforeRun
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-TIMEOUT = 5.0  # [s] of a request
 SHARED = {
     "overrides": options.Overrides, "world": options.WorldName, "seed": options.Seed, "domain": options.Domain,
     "connect": options.Connect,
@@ -40,14 +40,13 @@ class CommandShell:
         """Send a request to a cell that is up and print the answer as JSON."""
         from cli.commands import send
 
-        send(request, message, TIMEOUT, cell, domain, connect)
+        send(Place(cell, domain, connect), request, message)
 
     def visit(
         self, visit: Callable[[Bus], Awaitable[T]], cell: str, overrides: list[str] | None, world: str | None,
         seed: str | None, domain: str | None, connect: str | None,
     ) -> T:
         """What a visit to a cell returns: to one that is up, or one that is brought up for it without its task."""
-        from cli.inspection import inspect as look
         from cli.operation import Operation
         from common.config import load_cell
         from common.supervision.launch import place_of, require_free_port
@@ -63,7 +62,7 @@ class CommandShell:
             is_up = True
         if is_up:
             name = load_cell(cell, tuple(overrides or ()), world=world).name
-            return look(visit, cell=name, domain=domain, connect=connect)
+            return Place(name, domain, connect).visit(visit)
         operation = Operation(cell, overrides, world, seed, "1", domain, connect, no_viewer=True)
         operation.leave_out(operation.cell.task)
         return operation.visit(visit)

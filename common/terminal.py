@@ -6,6 +6,7 @@ Everything that the command line, the logs and the live tables show goes through
 from __future__ import annotations
 
 import re
+import sys
 
 # Control characters, marks that turn the direction of text or end a line, and halves of characters, which no
 # terminal can be sent.
@@ -27,3 +28,9 @@ def echo(text: str, *, err: bool = False, nl: bool = True) -> None:
     import typer
 
     typer.echo(printable(text, keep="\n\t"), err=err, nl=nl)
+
+
+def rewrite(text: str) -> None:
+    """Have the line on stderr that is being written be another one; it stays open."""
+    sys.stderr.write(f"\r\x1b[K{printable(text)}")
+    sys.stderr.flush()

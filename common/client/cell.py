@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from common import topics
 from common.application import all_topics, find_topic
 from common.client.arm import Arm, Hand
-from common.client.hearing import Camera, Carried, Ear, Frames, NothingHeard, cameras, messages, the_camera, topic_in
+from common.client.frames import Frames
+from common.client.hearing import Camera, Carried, Ear, NothingHeard, cameras, messages, the_camera, topic_in
 from common.client.joining import cell_clock, joined, person, supervisor_status
 from common.client.parameters import Parameters
 from common.client.part import Part

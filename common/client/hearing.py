@@ -1,4 +1,4 @@
-"""What a program hears of a cell: the newest of a topic, frames, cameras."""
+"""What a program hears of a cell: the newest of a topic, cameras."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from common import topics
 from common.application import find_topic
 from common.client.part import Part
-from common.errors import DecodeError, RequestFailed, UnknownName, ZencellError
+from common.errors import DecodeError, RequestFailed, UnknownName
 from common.messages import CameraInfo, Header, Image, Message
 from common.perception.image import image_to_array
-from common.robot.transform_tree import TransformTree
 from common.topics import Request, Topic
 from common.transport.bus import Bus
 from common.transport.codec import decode
@@ -29,7 +28,6 @@ Array = NDArray[np.float64]
 Carried = Topic[Any] | Request[Any, Any]
 
 PATIENCE = 2.0  # [s] wall until what nothing was heard of counts as not there
-GATHER = 0.5  # [s] in which every moving frame surely comes once
 PICTURE, DEPTH, INFO = "image_raw", "depth/image_raw", "camera_info"  # last parts of keys of a camera
 
 
@@ -115,88 +113,6 @@ class Ear:
                         return found
         except TimeoutError:
             raise NothingHeard(f"{self.bus.cell}/{reader.topic.key}", seconds) from None
-
-
-class Frames:
-    """The tree that tf and tf_static make, kept up to date inside an `async with`."""
-
-    def __init__(self, bus: Bus) -> None:
-        """Subscribe to both."""
-        self.tree = TransformTree()
-        self.moving: set[str] = set()
-        self._cell = bus.cell
-        self._changed = asyncio.Event()
-        self._moving, self._fixed = bus.reader(topics.TF), bus.reader(topics.TF_STATIC)
-        self._following: list[asyncio.Task[None]] = []
-
-    async def __aenter__(self) -> Frames:
-        followed: list[Coroutine[Any, Any, None]] = [self._follow_moving(), self._follow_fixed()]
-        self._following = [asyncio.create_task(each) for each in followed]
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        for task in self._following:
-            task.cancel()
-        await asyncio.gather(*self._following, return_exceptions=True)
-
-    async def _follow_moving(self) -> None:
-        async for message in self._moving:
-            self.tree.update(message)
-            self.moving.update(each.child_frame_id for each in message.transforms)
-            self._changed.set()
-
-    async def _follow_fixed(self) -> None:
-        async for message in self._fixed:
-            self.tree.update(message)
-            self._changed.set()
-
-    async def until_known(self, target: str, source: str) -> None:
-        """Return when the pose of source in target is known.
-
-        Raises:
-            NothingHeard: nothing came at all.
-            UnknownName, NotConnected: it still is not after a while.
-        """
-        try:
-            async with asyncio.timeout(PATIENCE):
-                while not self._known(target, source):
-                    self._changed.clear()
-                    await self._changed.wait()
-        except TimeoutError:
-            self._require_some()
-            self.tree.path(target, source)
-
-    async def until_moved(self) -> None:
-        """Return when the next transforms have come; at once where nothing moves."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(PATIENCE if self.moving else 0.0):
-                self._changed.clear()
-                await self._changed.wait()
-
-    def _known(self, target: str, source: str) -> bool:
-        try:
-            self.tree.path(target, source)
-        except ZencellError:
-            return False
-        return True
-
-    def _require_some(self) -> None:
-        if not self.tree.frames:
-            raise NothingHeard(f"{self._cell}/tf and {self._cell}/tf_static")
-
-    async def gather(self) -> None:
-        """Return when every frame that comes regularly is in the tree.
-
-        Raises:
-            NothingHeard: nothing came at all.
-        """
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(PATIENCE):
-                while not self.tree.frames:
-                    self._changed.clear()
-                    await self._changed.wait()
-        self._require_some()
-        await asyncio.sleep(GATHER)
 
 
 class Camera(Part):

@@ -8,6 +8,7 @@ import getpass
 import os
 import socket
 from collections.abc import AsyncIterator, Iterable, Mapping
+from dataclasses import dataclass
 
 from common import topics
 from common.clock import Clock
@@ -125,6 +126,34 @@ async def alive(bus: Bus) -> list[tuple[str, str]]:
     """Cell and name of every service on the network that is ready."""
     tokens = [token.split("/") for token in await bus.raw_tokens("*/alive/*", LOOK_TIMEOUT)]
     return [(token[0], token[2]) for token in tokens]
+
+
+@dataclass(frozen=True)
+class Presence:
+    """What there is of a cell that is up."""
+
+    ready: frozenset[str]  # services
+    status: SupervisorStatus | None  # what its supervisor says, where there is one
+
+
+async def look(domain: str | None, connect: str | None) -> dict[str, Presence]:
+    """The cells that are up, by name; none when nothing is up there, for which nobody is waited for.
+
+    Args:
+        domain: where, as given to `--domain`.
+        connect: where, as given to `--connect`.
+    """
+    if not await asyncio.to_thread(somebody_listens, endpoint_of(domain, connect)):
+        return {}
+    ready: dict[str, set[str]] = {}
+    try:
+        async with joined(any_cell=True, domain=domain, connect=connect) as bus:
+            for cell, service in await alive(bus):
+                ready.setdefault(cell, set()).add(service)
+            return {cell: Presence(frozenset(names), await supervisor_status(bus, cell))
+                    for cell, names in ready.items()}
+    except NothingUp:
+        return {}
 
 
 async def supervisor_status(bus: Bus, cell: str = "") -> SupervisorStatus | None:

@@ -138,6 +138,49 @@ async def change(bus: Bus, values: Mapping[str, Any]) -> dict[str, tuple[Any, An
     return told
 
 
+async def dumped(bus: Bus, services: Iterable[str] | None, *, everything: bool = False) -> str:
+    """What differs from the defaults, or everything, as YAML in the shape of a cell file.
+
+    Raises:
+        UnknownName: a service that does not serve any; with the choices.
+        RequestFailed: one does not answer, and half of it would look like all of it.
+    """
+    import yaml
+
+    found = await listing(bus, services or None)
+    found.raise_first()
+    tree = tree_of(p for parameters in found.parameters.values() for p in parameters if everything or differs(p))
+    head = f"# Parameters of {bus.cell}; read back with: zencell up {bus.cell} --set @FILE\n"
+    return head + yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
+
+
+def differs(parameter: Parameter) -> bool:
+    """Whether a cell needs to be told the value, to start with it."""
+    return parameter.changed or parameter.value != parameter.default
+
+
+def tree_of(parameters: Iterable[Parameter]) -> dict[str, Any]:
+    """The values in the shape of a cell file."""
+    tree: dict[str, Any] = {}
+    for parameter in parameters:
+        *above, name = parameter.path.split(".")
+        node = tree
+        for part in above:
+            node = node.setdefault(part, {})
+        node[name] = parameter.value
+    return tree
+
+
+def range_of(parameter: Parameter) -> str:
+    """Bounds or choices in a few words."""
+    if parameter.choices:
+        return " | ".join(parameter.choices)
+    low, high = parameter.minimum, parameter.maximum
+    if low is None or high is None:
+        return f">= {low:g}" if low is not None else f"<= {high:g}" if high is not None else ""
+    return f"{low:g} to {high:g}"
+
+
 class Parameters(Part):
     """Parameters of a cell's services by path, as `zencell param list` has them; `services.` may be left out."""
 

@@ -13,7 +13,7 @@ from common.errors import ConfigError
 if TYPE_CHECKING:
     from common.clock import Clock
     from common.messages import Message
-    from common.topics import Topic
+    from common.topics import AnyTopic, Topic
     from common.transport.bus import Bus
 
 MATCH_TIMEOUT = 1.0  # [s] for somebody who listens to be found before the first message
@@ -21,7 +21,7 @@ LOOK_PERIOD = 0.02  # [s]
 LINGER = 0.1  # [s] after the last message, in which the network takes it
 
 
-def checked(topic: Topic[Any] | None, key: str, body: str) -> Any:
+def checked(topic: AnyTopic | None, key: str, body: str) -> Any:
     """The message that a line of JSON says, or for a key that is not ours the JSON itself.
 
     Raises:

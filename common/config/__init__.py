@@ -12,7 +12,7 @@ from common.config.basics import Coordinate, Length, Number, Parameters, Point, 
 from common.config.cell import Cell, Members, Reach, ServiceEntry
 from common.config.checking import check
 from common.config.files import config_root, find_file, names_of, read_robot, read_yaml
-from common.config.loading import load_cell, service_config, service_names
+from common.config.loading import load_cell, load_robot, service_config, service_names
 from common.config.motion import Grasp, Motion, Pipeline, PlannerEntry, Run, Watchdogs
 from common.config.overrides import expanded, parse_override, yaml_line
 from common.config.robot import (

@@ -22,6 +22,7 @@ from common.config.files import (
     with_files,
 )
 from common.config.overrides import expanded, parse_override
+from common.config.robot import RobotConfig
 from common.config.world import CAMERA, Surroundings
 from common.errors import ConfigError, UnknownName
 from common.remapping import SERVICE_NAME, checked_table
@@ -112,6 +113,15 @@ def load_cell(
     tree["services"] = _service_entries(services)
     _name_application(tree)
     return check(Cell, tree)
+
+
+def load_robot(robot: str | Path) -> RobotConfig:
+    """The robot of a file, by its name in config/robots or its path.
+
+    Raises:
+        ConfigError, UnknownName: one line naming the field, the value and the choices.
+    """
+    return check(RobotConfig, read_robot(find_file("robots", str(robot))), "robot")
 
 
 def _name_application(tree: dict[str, Any]) -> None:

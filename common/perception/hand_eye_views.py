@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from common.config import Number, Parameters, check, read_yaml
+from common.config import Number, Parameters, check, load_robot, read_yaml
 from common.errors import ConfigError
 from common.perception.calibration_board import Board, NotSeen
 from common.perception.calibration_file import CameraFile
@@ -112,10 +112,8 @@ def load_views(folder: Path, board: Board, camera: CameraFile) -> tuple[list[Vie
         ConfigError: it has no views, or they do not fit the robot.
         CalibrationFailed: pictures have another size than the intrinsics are for.
     """
-    from common.config import RobotConfig, find_file, read_robot
-
     said = _read(folder)
-    robot = RobotModel.load(check(RobotConfig, read_robot(find_file("robots", said.robot)), "robot"))
+    robot = RobotModel.load(load_robot(said.robot))
     if said.joints != robot.joint_names:
         raise ConfigError(f"{folder / JOINTS_FILE}: joints", said.joints, f"are not those of {said.robot}")
     views, why = [], []

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from common.errors import ConfigError
+from common.terminal import printable
 
 if TYPE_CHECKING:
     from common.recording.sink import Figures
+    from common.recording.summary import Summary
+
+MOST_SHOWN = 200  # [characters] of what a recording tells of its run
 
 
 def progress(now: Figures, before: Figures, missed: int) -> str:
@@ -45,3 +52,36 @@ def about(cell: str) -> dict[str, Any]:
         "cell": cell, "made": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "python": sys.version.split()[0],
         "versions": versions, "arguments": sys.argv[1:],
     }
+
+
+def contents(file: str, cell: str, summary: Summary) -> list[str]:
+    """What is in a recording, in lines for people."""
+    when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(summary.start * 1e-9)) if summary.messages else "never"
+    lines = [f"{file}: {cell}, {summary.seconds:.1f} s from {when}, "
+             f"{summary.messages:,} messages, {in_bytes(summary.size)}"]
+    if summary.run:
+        told = {key: printable(value)[:MOST_SHOWN] for key, value in summary.run.items() if value and key != "epoch"}
+        lines.append("  " + ", ".join(f"{printable(key)} {value}" for key, value in told.items()))
+    if not summary.finished:
+        lines.append(f"  not finished: the recorder was killed or still records. Make it whole: zencell recover {file}")
+    lines.append(f"{'topic':<30} {'type':<16} {'messages':>9} {'Hz':>8} {'payload':>10}")
+    for name, topic in summary.topics.items():
+        rate = f"{topic.hz:8.2f}" if topic.messages > 1 else " " * 8
+        lost = f"  {topic.dropped + topic.missed} lost" if topic.dropped + topic.missed else ""
+        named = f"{printable(name):<30} {printable(topic.type):<16}"
+        lines.append(f"{named} {topic.messages:>9,} {rate} {in_bytes(topic.bytes):>10}{lost}")
+    return lines
+
+
+def require_new(path: Path, option: str = "-o") -> None:
+    """Return when a recording can be made there.
+
+    Raises:
+        ConfigError: the folder is not there, or the file is.
+    """
+    if path.suffix != ".mcap":
+        raise ConfigError(option, str(path), "must end in .mcap")
+    if not path.absolute().parent.is_dir():
+        raise ConfigError(option, str(path), "is in a folder that does not exist")
+    if path.exists():
+        raise ConfigError(option, str(path), "is there already; choose another name")
