@@ -13,7 +13,8 @@ from common.errors import ConfigError
 from common.messages import PlanningScene
 from common.messages.basics import Header
 from common.planning.collision import CollisionWorld
-from common.planning.ik import solve_ik, why_no_ik
+from common.planning.free_axes import about, chooses, solve_in, why_not_in
+from common.planning.ik import solve_ik
 from common.planning.obstacles import ObstacleCache
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
@@ -62,26 +63,30 @@ class Arm:
                 remedy = "correct the pose, or move the fixture, the container or robot.base_position"
                 yield error(what, remedy, refused=True) if name == "home" else warning(what, remedy)
 
-    def why_not(self, poses: Sequence[Array], width: float | None = None) -> str:
+    def why_not(self, poses: Sequence[Array], width: float | None = None, tilt: float = 0.0) -> str:
         """Why the tool gets to none of some poses (4, 4), world; empty when it gets to one and touches nothing there.
 
         Args:
             poses: any of which will do.
             width: between the fingers [m].
+            tilt: by which an arm that cannot choose the pose may be off [rad]; its yaw is any.
         """
         touches = ""
         for T in poses:
             for seed in range(SEEDS):
                 rng = np.random.default_rng(seed)
                 start = self.home if seed == 0 else rng.uniform(self.robot.lower, self.robot.upper)
-                q = solve_ik(self.robot, T, start, rng=rng, restarts=RESTARTS)
+                if chooses(self.robot):
+                    q = solve_ik(self.robot, T, start, rng=rng, restarts=RESTARTS)
+                else:
+                    q = solve_in(self.robot, about(self.robot, T, tilt), start, rng=rng, restarts=RESTARTS)
                 if q is None:
                     continue
                 pair = self.touching(q, width)
                 if pair is None:
                     return ""
                 touches = touches or f"{pair[0]} would touch {pair[1]}"
-        return touches or why_no_ik(self.robot, poses[0], self.home)
+        return touches or why_not_in(self.robot, about(self.robot, poses[0], tilt), self.home)
 
 
 def require_free_home(config: RobotConfig, around: Surroundings, geometry: RobotGeometry) -> None:

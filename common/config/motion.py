@@ -40,6 +40,14 @@ class Grasp(Section):
     lift_height: float = Field(0.15, ge=0.05, le=0.5, description="lift above the grasp [m]")
     drop_z: float = Field(0.25, ge=0.18, le=0.6, description="height of release above the container [m]")
 
+    max_tilt: float | None = Field(
+        None, ge=0.0, le=1.5, description="the tool is tilted by so much at most where it grasps [rad]; without a "
+        "value 0, and 0.35 for an arm that cannot choose: one of fewer than six joints")
+
+    def tilt(self, joints: int) -> float:
+        """How far an arm of so many joints may be from pointing down where it grasps [rad]."""
+        return self.max_tilt if self.max_tilt is not None else 0.0 if joints >= 6 else 0.35
+
     def height(self, z: float) -> float:
         """Of the tool centre point at the grasp of what has its centre at z [m]."""
         return max(z + self.grasp_clearance, self.min_grasp_z)

@@ -28,7 +28,8 @@ class PoseGoal(Message):
 
     The straight-line planner ends at the pose itself. Sampling planners may end anywhere in the region: a box with
     the sides `position_tolerance` [m] centred on the pose, tilted by at most `tilt_tolerance` [rad] from the pose's
-    tool axis and turned about it by at most `yaw_tolerance` [rad].
+    tool axis and turned about it by at most `yaw_tolerance` [rad]. An arm of fewer than six joints, which cannot choose
+    tilt and yaw, may use up both of these on straight lines as well, and ends them at the place of the pose.
     """
 
     kind: Literal["pose"] = "pose"

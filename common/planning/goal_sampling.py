@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from common.planning.collision import Pair
+from common.planning.free_axes import chooses, solve_in
 from common.planning.ik import solve_ik
 from common.planning.problem import Cancel, Problem, Region, Result
 from common.robot.transforms import invert, transform
@@ -52,12 +53,16 @@ def sample_pose(region: Region, rng: np.random.Generator) -> Array:
 
 def missed_by(region: Region, T_world_tcp: Array) -> float:
     """How far a (4, 4) pose lies outside of the region, in its worst direction [m], [rad]; 0 and less for inside."""
-    T = invert(region.T_world_tcp) @ T_world_tcp
-    tilt = math.acos(float(np.clip(T[2, 2], -1, 1)))
-    # The turn that is left once the tool axis was brought back by the shortest way.
-    yaw = math.atan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1])
+    tilt, yaw = turned_from(region, T_world_tcp)
     away = np.abs(T_world_tcp[:3, 3] - region.T_world_tcp[:3, 3]) - region.half_sides
     return max(float(away.max()), tilt - region.tilt, abs(yaw) - region.yaw)
+
+
+def turned_from(region: Region, T_world_tcp: Array) -> tuple[float, float]:
+    """Tilt and yaw [rad] of a (4, 4) pose from that of a region."""
+    T = invert(region.T_world_tcp) @ T_world_tcp
+    # The yaw is the turn that is left once the tool axis was brought back by the shortest way.
+    return math.acos(float(np.clip(T[2, 2], -1, 1))), math.atan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1])
 
 
 def sample_goals(problem: Problem, goal: Array | Region, cancel: Cancel, *, wanted: int, tries: int) -> GoalSamples:
@@ -90,7 +95,11 @@ def _draw(problem: Problem, region: Region, cancel: Cancel, samples: GoalSamples
             break
         T = region.T_world_tcp if attempt == 0 or point else sample_pose(region, rng)
         seed = problem.start if attempt == 0 or (attempt % 2 and not point) else rng.uniform(robot.lower, robot.upper)
-        q = solve_ik(robot, T, seed, rng=rng, restarts=5 if attempt == 0 else 1)
+        if point or chooses(robot):
+            q = solve_ik(robot, T, seed, rng=rng, restarts=5 if attempt == 0 else 1)
+        else:
+            there = replace(region, T_world_tcp=transform(region.T_world_tcp[:3, :3], T[:3, 3]), half_sides=np.zeros(3))
+            q = solve_in(robot, there, seed, rng=rng, restarts=1)
         if q is not None:
             _look_at(problem, q, samples)
 

@@ -52,9 +52,9 @@ def converge(robot: RobotModel, target: pin.SE3, seed: Array, iterations: int) -
             return q
         jacobian = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL)
         damping = (0.05 * min(1.0, float(error @ error)) + 1e-7) * _EYE
-        following = q + _step(jacobian, error, damping)
+        following = q + damped_step(jacobian, error, damping)
         if (following < lower).any() or (following > upper).any():
-            following = _step_within(q, jacobian, error, damping, lower, upper)
+            following = damped_step_within(q, jacobian, error, damping, lower, upper)
         q = following
     return None
 
@@ -62,18 +62,19 @@ def converge(robot: RobotModel, target: pin.SE3, seed: Array, iterations: int) -
 _EYE = np.eye(6)
 
 
-def _step(jacobian: Array, error: Array, damping: Array) -> Array:
+def damped_step(jacobian: Array, error: Array, damping: Array) -> Array:
+    """The step (dof,) [rad] that lessens an error (m,) whose Jacobian is (m, dof), with a damping (m, m)."""
     step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping, error)
     largest = float(np.abs(step).max())
     return np.asarray(step * (_LARGEST_STEP / largest)) if largest > _LARGEST_STEP else np.asarray(step)
 
 
-def _step_within(q: Array, jacobian: Array, error: Array, damping: Array, lower: Array, upper: Array) -> Array:
+def damped_step_within(q: Array, jacobian: Array, error: Array, damping: Array, lower: Array, upper: Array) -> Array:
     """The next position within the limits: joints that stand at a limit and would go on are left out of the step."""
     free = np.ones(len(q))
     step = np.zeros(len(q))
     for _ in range(3):
-        step = _step(jacobian * free, error, damping)
+        step = damped_step(jacobian * free, error, damping)
         blocked = ((q + step < lower) & (q <= lower)) | ((q + step > upper) & (q >= upper))
         if not (blocked & (free > 0)).any():
             break
@@ -120,7 +121,7 @@ def _beyond_limits(robot: RobotModel, target: pin.SE3, seed: Array) -> Array | N
         if np.abs(error).max() < ROTATION_TOLERANCE:
             return np.asarray(np.where(turns, middle + (q - middle + np.pi) % _TURN - np.pi, q))
         jacobian = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL)
-        q = q + _step(jacobian, error, (0.05 * min(1.0, float(error @ error)) + 1e-7) * _EYE)
+        q = q + damped_step(jacobian, error, (0.05 * min(1.0, float(error @ error)) + 1e-7) * _EYE)
     return None
 
 

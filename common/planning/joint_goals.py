@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.messages import PlanAttempt
+from common.planning.free_axes import why_not_in
 from common.planning.goal_sampling import sample_goals
-from common.planning.ik import why_no_ik
 from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result
 from common.planning.resolving import quicker_goals
 from common.sources import monotonic
@@ -60,7 +60,7 @@ def _explained(problem: Problem, goal: Array | Region, failure: Result) -> Resul
     """The failure of a goal, with what keeps the arm from it."""
     if failure.error != "no_ik" or not isinstance(goal, Region):
         return failure
-    return replace(failure, message=f"{failure.message}: {why_no_ik(problem.robot, goal.T_world_tcp, problem.start)}")
+    return replace(failure, message=f"{failure.message}: {why_not_in(problem.robot, goal, problem.start)}")
 
 
 def none_of(failures: Mapping[int, Result]) -> Result:

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from common.planning.free_axes import chooses, converge_in, solve_in, why_not_in
 from common.planning.goal_sampling import GoalSamples, missed_by, sample_goals, sample_pose
 from common.planning.ik import converge
 from common.planning.path import blended_path
@@ -127,7 +128,12 @@ def _drawn(problem: Problem, given: Sequence[Choices], until: float) -> Iterator
             spread = (0.0, 0.5, 0.5, 1.5)[(attempt // len(ends)) % 4]
             seed = start if attempt < len(ends) else start + rng.normal(0.0, 1.0, robot.dof) * spread
             T = nearest_in(end, robot.fk(start)) if attempt < len(ends) else sample_pose(end, rng)
-            last = converge(robot, pin.SE3(T), np.clip(seed, robot.lower, robot.upper), _ITERATIONS)
+            seed = np.clip(seed, robot.lower, robot.upper)
+            if chooses(robot):
+                last = converge(robot, pin.SE3(T), seed, _ITERATIONS)
+            else:
+                there = transform(end.T_world_tcp[:3, :3], T[:3, 3])
+                last = solve_in(robot, replace(end, T_world_tcp=there, half_sides=np.zeros(3)), seed)
         if last is None:
             continue
         chain = [start]
@@ -151,6 +157,8 @@ def _brought_in(robot: RobotModel, goals: Choices, q: Array) -> Array | None:
     goal = min(goals, key=away)
     if not isinstance(goal, Region):
         return goal
+    if missed_by(goal, T) > 0.0 and not chooses(robot):
+        return converge_in(robot, goal, q, _ITERATIONS)
     return q if missed_by(goal, T) <= 0.0 else converge(robot, pin.SE3(nearest_in(goal, T)), q, _ITERATIONS)
 
 
@@ -265,6 +273,9 @@ def _why_none(problem: Problem, parts: Sequence[Part], cancel: Cancel) -> Result
                 break
         if not samples.goals:
             failure = samples.failure(cancel.reason(problem))
+            if failure.error == "no_ik" and isinstance(goal, Region) and not chooses(problem.robot):
+                why = why_not_in(problem.robot, goal, problem.start)
+                failure = replace(failure, message=f"{failure.message}: {why}")
             where = f"item {number} of {len(parts)}: " if len(parts) > 1 else ""
             return replace(failure, message=f"{where}{failure.message}", fraction=(number - 1) / len(parts))
     return Result(error=cancel.reason(problem) or "no_ik", message="no positions lead through all items")

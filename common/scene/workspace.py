@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from common.config import Grasp, Parameters, Tunable, check
-from common.planning.ik import solve_ik
+from common.planning.free_axes import about, chooses, solve_down, why_not_in
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 
@@ -88,19 +88,27 @@ def outside_reason(bounds: WorkspaceBounds, position: Sequence[float]) -> str:
     return ""
 
 
-def chain_reason(robot: RobotModel, position: Sequence[float], grasp: Grasp, bounds: WorkspaceBounds) -> str:
+def chain_reason(
+    robot: RobotModel, position: Sequence[float], grasp: Grasp, bounds: WorkspaceBounds, *, explained: bool = True
+) -> str:
     """Which stage of a grasp has no solution at a place (x, y, z) [m], for any yaw; empty when one yaw has them all.
 
-    The stages: pre-grasp above it, the straight line down, the grasp, the straight lift; tool down, from home.
+    The stages: pre-grasp above it, the straight line down, the grasp, the straight lift; tool down, from home. For an
+    arm that cannot choose yaw and tilt it is looked at length for what it misses them by, unless it is not `explained`.
     """
     furthest, worst = -1, ""
-    for yaw in yaw_candidates(bounds.yaw_count):
+    for yaw in yaw_candidates(bounds.yaw_count) if chooses(robot) else (0.0,):
         stage, reason = _chain(robot, position, yaw, grasp, bounds)
         if not reason:
             return ""
         if stage > furthest:
             furthest, worst = stage, reason
-    return worst
+    if chooses(robot) or not explained:
+        return worst
+    x, y, z = position
+    low = grasp.height(z)
+    T = tool_down(x, y, low + (grasp.approach_clearance, 0.0, 0.0, grasp.lift_height)[furthest])
+    return f"{worst}: {why_not_in(robot, about(robot, T, grasp.tilt(robot.dof)), robot.named('home'))}"
 
 
 def reach_reason(
@@ -108,10 +116,13 @@ def reach_reason(
     position: Sequence[float],
     grasp: Grasp | None = None,
     bounds: WorkspaceBounds | None = None,
+    *,
+    explained: bool = True,
 ) -> str:
     """Why the arm cannot take an object whose centre is at (x, y, z) [m] in world; empty when it can."""
     limits = bounds or WorkspaceBounds()
-    return outside_reason(limits, position) or chain_reason(robot, position, grasp or Grasp(), limits)
+    outside = outside_reason(limits, position)
+    return outside or chain_reason(robot, position, grasp or Grasp(), limits, explained=explained)
 
 
 class ReachCache:
@@ -197,22 +208,23 @@ def _chain(
     x, y, z = position
     low = grasp.height(z)
     above, top = low + grasp.approach_clearance, low + grasp.lift_height
-    turned = f"with any of {bounds.yaw_count} hand orientations"
+    tilt = grasp.tilt(robot.dof)
+    turned = f"with any of {bounds.yaw_count} hand orientations" if chooses(robot) else "at any yaw"
     home = robot.named("home")
-    q = solve_ik(robot, tool_down(x, y, above, yaw), home, restarts=0, iterations=_FROM_HOME)
+    q = solve_down(robot, (x, y, above), yaw, home, tilt=tilt, iterations=_FROM_HOME)
     if q is None:
         return 0, f"pre-grasp at ({x:z.3f}, {y:z.3f}, {above:.3f}) has no inverse kinematics {turned}"
     for height in _line(above, low, bounds.line_step):
-        q = _next(robot, (x, y, height), yaw, q, bounds) if q is not None else None
+        q = _next(robot, (x, y, height), yaw, tilt, q, bounds) if q is not None else None
         if q is None:
             return 1, f"straight line down to ({x:z.3f}, {y:z.3f}, {low:.3f}) ends at height {height:.3f} m {turned}"
-    at_grasp = solve_ik(robot, tool_down(x, y, low, yaw), home, restarts=0, iterations=_FROM_HOME)
+    at_grasp = solve_down(robot, (x, y, low), yaw, home, tilt=tilt, iterations=_FROM_HOME)
     if at_grasp is None:
         return 2, f"grasp at ({x:z.3f}, {y:z.3f}, {low:.3f}) has no inverse kinematics {turned}"
     for start in (q, at_grasp):
         q = start
         for height in _line(low, top, bounds.line_step):
-            q = _next(robot, (x, y, height), yaw, q, bounds) if q is not None else None
+            q = _next(robot, (x, y, height), yaw, tilt, q, bounds) if q is not None else None
             if q is None:
                 return 3, f"lift to ({x:z.3f}, {y:z.3f}, {top:.3f}) ends at height {height:.3f} m {turned}"
     return 4, ""
@@ -225,10 +237,10 @@ def _line(start: float, end: float, step: float) -> list[float]:
 
 
 def _next(
-    robot: RobotModel, place: tuple[float, float, float], yaw: float, q: Array, bounds: WorkspaceBounds
+    robot: RobotModel, place: tuple[float, float, float], yaw: float, tilt: float, q: Array, bounds: WorkspaceBounds
 ) -> Array | None:
     """Joint positions of the next pose of a line, near the last ones; None when there are none."""
-    found = solve_ik(robot, tool_down(*place, yaw), q, restarts=0, iterations=_FROM_NEAR)
+    found = solve_down(robot, place, yaw, q, tilt=tilt, iterations=_FROM_NEAR, upright=False)
     if found is None or float(np.abs(found - q).max()) > bounds.max_joint_step:
         return None
     return found

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from common.planning.ik import solve_ik
+from common.planning.free_axes import chooses, solve_down
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
-from common.robot.transforms import tool_down
 
 Array = NDArray[np.float64]
 
 RADII, HEIGHTS = (0.4, 0.5, 0.6, 0.7), (0.2, 0.3, 0.4, 0.5)  # of the tool, in reaches of the arm that points down
+LOWER = (0.15, 0.1, 0.06)  # for one that does not get there, as one whose slide moves it up and down
 LOW = 0.03  # above the table, in reaches of the stretched arm
 TURNS = (0.0, math.pi / 2, -math.pi / 2, math.pi, math.pi / 4, -math.pi / 4)  # of the tool [rad]
 SEEDS = 6
@@ -48,16 +49,18 @@ def find_home(robot: RobotModel, geometry: RobotGeometry) -> Home:
     rest = np.clip(np.zeros(robot.dof), robot.lower + 0.15 * (robot.upper - robot.lower),
                    robot.upper - 0.15 * (robot.upper - robot.lower))
     seeds = [rest, middle, *(rng.uniform(robot.lower, robot.upper) for _ in range(SEEDS))]
-    found: list[tuple[float, Array]] = []
     table = float(robot.config.base_position[2])
     reach = down_reach(robot, table)
-    for radius, height, turn in itertools.product(RADII, HEIGHTS, TURNS) if reach else ():
-        x, y = place(robot, radius * reach, 0.0)
-        target = tool_down(x, y, table + height * reach, turn)
-        for seed in seeds:
-            q = solve_ik(robot, target, seed, restarts=0, iterations=60)
-            if q is not None and not hits(robot, geometry, q):
-                found.append((_comfort(robot, q, rest, table) + height, q))
+
+    def down_at(heights: Sequence[float]) -> Iterator[tuple[float, Array]]:
+        for radius, height, turn in itertools.product(RADII, heights, _turns(robot)):
+            x, y = place(robot, radius * reach, 0.0)
+            for seed in seeds:
+                q = solve_down(robot, (x, y, table + height * reach), turn, seed, iterations=60)
+                if q is not None and not hits(robot, geometry, q):
+                    yield _comfort(robot, q, rest, table) + height, q
+
+    found = (list(down_at(HEIGHTS)) or list(down_at(LOWER))) if reach else []
     found.sort(key=lambda each: -each[0])
     best = [(_served(robot, geometry, q, table, reach), value, q) for value, q in _different(found)[:TRIED_OUT]]
     if best:
@@ -70,6 +73,11 @@ def find_home(robot: RobotModel, geometry: RobotGeometry) -> Home:
     return Home(rest, False, 0.0, hits(robot, geometry, rest))
 
 
+def _turns(robot: RobotModel) -> tuple[float, ...]:
+    """Of the tool [rad]: where the arm cannot choose one is as good as the others."""
+    return TURNS if chooses(robot) else TURNS[:1]
+
+
 def down_reach(robot: RobotModel, table: float) -> float:
     """How far [m] from the axis of the base the tool can point down a little above a table at a height [m].
 
@@ -78,8 +86,8 @@ def down_reach(robot: RobotModel, table: float) -> float:
     middle = (robot.lower + robot.upper) / 2
     for share in np.arange(1.0, 0.1, -0.05):
         x, y = place(robot, float(share) * robot.reach, 0.0)
-        targets = (tool_down(x, y, table + 2 * LOW * robot.reach, turn) for turn in TURNS)
-        if any(solve_ik(robot, target, middle, restarts=30, iterations=40) is not None for target in targets):
+        at = x, y, table + 2 * LOW * robot.reach
+        if any(solve_down(robot, at, turn, middle, restarts=30, iterations=40) is not None for turn in _turns(robot)):
             return float(share) * robot.reach
     return 0.0
 
@@ -119,9 +127,8 @@ def _served(robot: RobotModel, geometry: RobotGeometry, home: Array, table: floa
     """
     tried = []
     for (radius, angle), height in itertools.product(PLACES, (LOW, 3 * LOW)):
-        targets = (tool_down(*place(robot, radius * reach, angle), table + height * robot.reach, turn)
-                   for turn in TURNS)
-        found = (solve_ik(robot, target, home, restarts=0, iterations=STEPS) for target in targets)
+        at = *place(robot, radius * reach, angle), table + height * robot.reach
+        found = (solve_down(robot, at, turn, home, iterations=STEPS) for turn in _turns(robot))
         tried.append(any(
             q is not None and not hits(robot, geometry, q)
             and min(pose[2, 3] for pose in robot.link_poses(q).values()) > table - 0.01 for q in found))

@@ -11,9 +11,11 @@ from common import messages as m
 from common import topics
 from common.config import Motion, Parameters, RobotConfig
 from common.errors import Refused
+from common.planning.free_axes import chooses, solve_in
 from common.planning.ik import solve_ik
 from common.planning.pipeline import trajectory_message
 from common.planning.planners.joint_move import straight_profile
+from common.planning.problem import Region
 from common.planning.retiming import TimedPath, join
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
@@ -51,7 +53,12 @@ def waypoints(robot: RobotModel, start: Array, goal: object) -> list[Array]:
     poses = [goal.pose] if isinstance(goal, m.PoseGoal) else goal.waypoints[1:MOST_POSES]
     found = [start]
     for pose in poses:
-        q = solve_ik(robot, pose_to_matrix(pose), found[-1])
+        T = pose_to_matrix(pose)
+        if chooses(robot) or not isinstance(goal, m.PoseGoal):
+            q = solve_ik(robot, T, found[-1])
+        else:
+            region = Region(T, np.zeros(3), goal.tilt_tolerance, goal.yaw_tolerance)
+            q = solve_in(robot, region, found[-1], restarts=20)
         if q is None:
             raise Refused("no_ik", f"({pose.position.x:.3f}, {pose.position.y:.3f}, {pose.position.z:.3f}) is out of "
                                    "reach")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from common.robot.model import RobotModel
 from common.setup.fingers import tool_complaints
 from common.virtual.simulation import Simulation
 from tests.harness import ask
+from tests.small_arms import nodding, scara
 
 URDF = Path(__file__).parents[1] / "data" / "side_arm.urdf"
 NO_ARM = '<robot name="post"><link name="a"/><link name="b"/><joint name="j" type="fixed">' \
@@ -166,6 +168,17 @@ def test_what_cannot_be_set_up_is_told_in_one_line(case: str, tmp_path: Path) ->
 @pytest.mark.slow
 def test_an_arm_that_nobody_set_up_takes_all_that_lies_in_its_reach(made: Path) -> None:
     outcome = Simulation(load_cell(str(made / "side_cell.yaml")), 1).run()
+    assert (outcome.state, outcome.done, outcome.total) == ("DONE", 7, 7), outcome.message
+    assert (outcome.broken, outcome.crashes) == ([], [])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arm", [scara, nodding])
+def test_an_arm_of_four_joints_clears_its_table_of_balls(arm: Callable[[], str], tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(arm())
+    done = ask(tmp_path, "robot", "new", "arm.urdf", "--yes", "--name", "few", "--cell", "few_cell.yaml")
+    assert done.returncode == 0, done.stderr
+    outcome = Simulation(load_cell(str(tmp_path / "few_cell.yaml"), seed=1), 1).run()
     assert (outcome.state, outcome.done, outcome.total) == ("DONE", 7, 7), outcome.message
     assert (outcome.broken, outcome.crashes) == ([], [])
 

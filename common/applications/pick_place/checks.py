@@ -22,6 +22,7 @@ from common.sim.layout import layout
 from common.sim.objects import pose_of, solid_of
 from common.sim.places import is_inside
 
+TILTED = 0.25  # [rad] of the tool above a container, where the arm cannot choose: as orient_tol_rad
 ALONG = 0.03  # [m] by which the place above a container may be missed: half of place_pos_tol
 
 
@@ -123,6 +124,7 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
     cache = ReachCache(arm.robot, cell.grasp, bounds)
     gripper = cell.robot.gripper
     width = gripper.max_width if gripper is not None and gripper.joints else None
+    tilt = cell.grasp.tilt(arm.robot.dof)
     turns = [yaw + (math.pi / 2 if gripper is not None and gripper.closing_axis == "x" else 0.0)
              for yaw in yaw_candidates(bounds.yaw_count)]
     things = []
@@ -137,16 +139,16 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
         low = cell.grasp.height(z)
         poses = [tool_down(x, y, low, turn) for turn in turns]
         if reason := cache.reason((x, y, z)):
-            why = "" if reason.startswith(("too ", "singular")) else arm.why_not(poses, width)
+            why = "" if reason.startswith(("too ", "singular")) else arm.why_not(poses, width, tilt)
             yield error(f"{what}, {reason}{f' ({why})' if why else ''}", "move it, or robot.base_position")
-        elif why := arm.why_not(poses, width):
+        elif why := arm.why_not(poses, width, tilt):
             yield error(f"{what}, {why} with any of {len(turns)} hand orientations",
                         "move it away from there, or set grasp.grasp_clearance or grasp.min_grasp_z")
     for name, box in cell.world.containers.items():
         nearer = 1 - ALONG / max(math.hypot(box.x, box.y), ALONG)
         poses = [tool_down(share * box.x, share * box.y, cell.grasp.drop_z, turn)
                  for share in (1.0, nearer) for turn in turns]
-        if why := arm.why_not(poses, width):
+        if why := arm.why_not(poses, width, max(tilt, TILTED)):
             yield error(f"world.containers.{name}: the tool cannot be above it, at ({box.x:z.3f}, {box.y:z.3f}, "
                         f"{cell.grasp.drop_z:.3f}), with any of {len(turns)} hand orientations, {why}",
                         "move it, or set grasp.drop_z")

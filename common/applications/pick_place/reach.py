@@ -9,10 +9,9 @@ import numpy as np
 
 from common.config import Grasp
 from common.errors import ConfigError
-from common.planning.ik import solve_ik
+from common.planning.free_axes import chooses, solve_down
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
-from common.robot.transforms import tool_down
 from common.scene.workspace import WorkspaceBounds, reach_reason, yaw_candidates
 from common.setup.home import hits
 
@@ -87,7 +86,9 @@ def _reached(robot: RobotModel, grasp: Grasp, bounds: WorkspaceBounds, radius: f
     for x in np.arange(0.12, most, STEP):
         for y in np.arange(-most, most, STEP):
             place = round(float(x), 3), round(float(y), 3)
-            if math.hypot(*place) < most and abs(y) < 0.6 and not reach_reason(robot, (*place, radius), grasp, bounds):
+            if math.hypot(*place) >= most or abs(y) >= 0.6:
+                continue
+            if not reach_reason(robot, (*place, radius), grasp, bounds, explained=False):
                 found.append(place)
     return found
 
@@ -95,8 +96,9 @@ def _reached(robot: RobotModel, grasp: Grasp, bounds: WorkspaceBounds, radius: f
 def _is_free(robot: RobotModel, geometry: RobotGeometry, place: tuple[float, float, float], grasp: Grasp) -> bool:
     """Whether the arm is clear of itself as it takes something there, with one turn of the hand, coming from home."""
     x, y, z = place
-    targets = (tool_down(x, y, grasp.height(z), yaw) for yaw in yaw_candidates(WorkspaceBounds().yaw_count))
-    found = (solve_ik(robot, target, robot.named("home"), restarts=0, iterations=20) for target in targets)
+    at, home, tilt = (x, y, grasp.height(z)), robot.named("home"), grasp.tilt(robot.dof)
+    found = (solve_down(robot, at, yaw, home, tilt=tilt, iterations=20)
+             for yaw in (yaw_candidates(WorkspaceBounds().yaw_count) if chooses(robot) else (0.0,)))
     return any(q is not None and not hits(robot, geometry, q) for q in found)
 
 
@@ -127,5 +129,5 @@ def _box(robot: RobotModel, reached: list[Place], grasp: Grasp) -> tuple[Place, 
 
 def _released(robot: RobotModel, place: Place, grasp: Grasp) -> bool:
     """Whether the tool comes above the box, coming from home."""
-    target = tool_down(*place, grasp.drop_z)
-    return solve_ik(robot, target, robot.named("home"), restarts=20, iterations=40) is not None
+    at, tilt = (*place, grasp.drop_z), grasp.tilt(robot.dof)
+    return solve_down(robot, at, 0.0, robot.named("home"), tilt=tilt, restarts=20, iterations=40) is not None

@@ -9,6 +9,7 @@ from common import messages as m
 from common.applications.pick_place.choice import Pick, PickPlaceView
 from common.applications.pick_place.parameters import Config
 from common.config import GripperConfig
+from common.planning.free_axes import ALL
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down, transform
 from common.tasks.stages import Grip, Move, Place, Stage
 
@@ -28,6 +29,10 @@ class Rows:
         x, y, z = cycle.target.position
         low = self.grasp_height(z)
         grasp = self._at((x, y, low), yaw)
+        if self._takes_any and cycle.target.size is None:
+            grasp = self._at((x, y, low), *next(
+                (each for each in cycle.ranges if abs(math.remainder(yaw - each[0], 2 * math.pi)) <= each[1]),
+                (yaw, 0.0)))
         above = self._region((x, y, low + self.p.grasp.approach_clearance), yaw)
         approach: list[Stage] = [
             Move("pre-grasp", "GRASPING", cycle, whole=True, fresh=True, goal=above),
@@ -55,14 +60,20 @@ class Rows:
     def _grasps(self, cycle: Pick, at: Place) -> m.PoseGoal | m.GoalSet:
         """The grasps of which any will do: of what is round those at which the hand is clear, else both ways round."""
         ranges = [(cycle.yaw, 0.0), (cycle.yaw + math.pi, 0.0)]
-        if cycle.ranges and self.p.orient_yaw_tol_rad > ANY_YAW:
+        if cycle.ranges and (self.p.orient_yaw_tol_rad > ANY_YAW or self._takes_any):
             ranges = cycle.ranges
         goals = [self._at(at, middle, half) for middle, half in ranges]
         return goals[0] if len(goals) == 1 else m.GoalSet(goals=goals)
 
     def _at(self, at: Place, yaw: float, either_way: float = 0.0) -> m.PoseGoal:
         """The tool at a place, pointing down, turned by yaw or by up to so much more or less [rad]."""
-        return m.PoseGoal(pose=matrix_to_pose(tool_down(*at, yaw + self.turn)), yaw_tolerance=either_way)
+        return m.PoseGoal(pose=matrix_to_pose(tool_down(*at, yaw + self.turn)), yaw_tolerance=either_way,
+                          tilt_tolerance=self.p.grasp.tilt(len(self.p.robot.joints)))
+
+    @property
+    def _takes_any(self) -> bool:
+        """Whether the arm cannot choose how the tool is turned, so that any yaw must do that leaves the hand clear."""
+        return len(self.p.robot.joints) < ALL
 
     def _close(self, cycle: Pick, yaw: float) -> Grip:
         cup = self.gripper.cup is not None
@@ -123,7 +134,8 @@ class Rows:
         side = self.p.grasp_pos_tol if side is None else side
         return m.PoseGoal(
             pose=matrix_to_pose(tool_down(*at, yaw + self.turn)), position_tolerance=m.Vector3(x=side, y=side, z=side),
-            tilt_tolerance=self.p.orient_tol_rad, yaw_tolerance=self.p.orient_yaw_tol_rad,
+            tilt_tolerance=max(self.p.orient_tol_rad, self.p.grasp.tilt(len(self.p.robot.joints))),
+            yaw_tolerance=math.pi if self._takes_any else self.p.orient_yaw_tol_rad,
         )
 
 

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common.config import Parameters
+from common.planning.free_axes import chooses, converge_in
+from common.planning.goal_sampling import turned_from
 from common.planning.ik import converge
 from common.planning.joint_goals import none_of
 from common.planning.path import smoothed
@@ -27,7 +29,9 @@ from common.planning.problem import (
     ToolWay,
     too_fine,
 )
+from common.planning.resolving import nearest_in
 from common.robot.model import RobotModel
+from common.robot.transforms import transform
 
 Array = NDArray[np.float64]
 
@@ -53,12 +57,16 @@ class Options(Parameters):
 
 @dataclass(frozen=True)
 class _Target:
-    """A pose for the TCP, `length` [m] of its way after the one before; its turn alone would count as `turned` [m]."""
+    """A pose for the TCP, `length` [m] of its way after the one before; its turn alone would count as `turned` [m].
+
+    `region` is what the pose may be left within by an arm that cannot choose it.
+    """
 
     pose: pin.SE3
     length: float
     turned: float
     point: int  # of the path to which it leads
+    region: Region | None = None
 
 
 def plan(problem: Problem, options: Options, cancel: Cancel) -> Result:
@@ -102,18 +110,40 @@ def shortest_line(problem: Problem, choice: GoalChoice, follow: Callable[[Region
 def _line(problem: Problem, goal: Region, options: Options, cancel: Cancel) -> Result:
     """One line to the pose of a goal region."""
     T_start = pin.SE3(problem.robot.fk(problem.start))
-    targets = _between(T_start, pin.SE3(goal.T_world_tcp), options.step, options.rotation_step, 1)
+    T_end = pin.SE3(_end_of(problem.robot, goal, T_start.homogeneous))
+    targets = _between(T_start, T_end, options.step, options.rotation_step, 1)
+    if not chooses(problem.robot):
+        targets = _leaving_free(targets, goal, T_start.homogeneous)
     if not targets:
         return Result(waypoints=np.array([problem.start, problem.start]), dense=True, tool_line=True, fraction=1.0)
     waypoints, failure = _follow(problem, options, cancel, targets, None)
     count = len(targets)
     fraction = (len(waypoints) - 1) / count
-    distance, angle = _distance(T_start, pin.SE3(goal.T_world_tcp))
+    distance, angle = _distance(T_start, T_end)
     left = (1 - fraction) * max(distance, angle * options.goal_tolerance)
     if failure and (fraction < options.min_fraction or left > options.goal_tolerance):
         message = f"waypoint {failure.waypoint} of {count}: {failure.message} (fraction {fraction:.2f})"
         return replace(failure, fraction=fraction, message=message)
     return Result(waypoints=waypoints, dense=True, tool_line=True, fraction=fraction)
+
+
+def _end_of(robot: RobotModel, goal: Region, T_start: Array) -> Array:
+    """(4, 4) where a line to a goal ends: its pose, turned as at the start where that may be left to the arm."""
+    if chooses(robot):
+        return goal.T_world_tcp
+    return nearest_in(replace(goal, half_sides=np.zeros(3)), T_start)
+
+
+def _leaving_free(targets: list[_Target], goal: Region, T_start: Array) -> list[_Target]:
+    """Targets of a line, each with what its pose may be left within: first as at the start, last as the goal says."""
+    tilt, yaw = turned_from(goal, T_start)
+    found = []
+    for number, target in enumerate(targets, 1):
+        left = 1 - number / len(targets)
+        T = transform(goal.T_world_tcp[:3, :3], target.pose.translation)
+        region = Region(T, np.zeros(3), max(goal.tilt, left * tilt), max(goal.yaw, left * abs(yaw)))
+        found.append(replace(target, region=region))
+    return found
 
 
 def _path(problem: Problem, goal: ToolPath, options: Options, cancel: Cancel) -> Result:
@@ -200,7 +230,7 @@ def _follow(
     path, motion, length = [problem.start], np.zeros(problem.robot.dof), 1.0
     for i, target in enumerate(targets, 1):
         guess = path[-1] + motion * (target.length / length)
-        following = _step(problem, options, cancel, path[-1], guess, target.pose, i)
+        following = _step(problem, options, cancel, path[-1], guess, target, i)
         if isinstance(following, Result):
             return np.array(path), following
         if tolerance is not None and _bows(problem.robot, path[-1], following) > tolerance:
@@ -219,7 +249,7 @@ def _bows(robot: RobotModel, a: Array, b: Array) -> float:
 
 
 def _step(
-    problem: Problem, options: Options, cancel: Cancel, q: Array, guess: Array, target: pin.SE3, i: int
+    problem: Problem, options: Options, cancel: Cancel, q: Array, guess: Array, target: _Target, i: int
 ) -> Array | Result:
     """The next position (dof,) [rad], or why there is none."""
     stop = cancel.reason(problem)
@@ -227,11 +257,11 @@ def _step(
         return Result(error=stop, message="planning was ended", waypoint=i)
     robot = problem.robot
     # The step before, once more, is the best guess: one iteration less on a line.
-    following = converge(robot, target, guess, 10)
+    following = _brought_to(robot, target, guess, 10)
     if following is None:
-        following = converge(robot, target, q, 30)
+        following = _brought_to(robot, target, q, 30)
     if following is None:
-        return Result(error="no_ik", message=_why_not(robot, q, target), waypoint=i)
+        return Result(error="no_ik", message=_why_not(robot, q, target.pose), waypoint=i)
     jump = np.abs(following - q)
     if float(jump.max()) > options.jump_threshold:
         joint = int(np.argmax(jump))
@@ -240,6 +270,12 @@ def _step(
         found = problem.world.obstruction(q, following, 0.002)
         return Result(error=found.error, message=found.message, waypoint=i, colliding=found.colliding)
     return following
+
+
+def _brought_to(robot: RobotModel, target: _Target, seed: Array, iterations: int) -> Array | None:
+    if target.region is not None:
+        return converge_in(robot, target.region, seed, iterations)
+    return converge(robot, target.pose, seed, iterations)
 
 
 def _why_not(robot: RobotModel, q: Array, target: pin.SE3) -> str:

@@ -10,6 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from pydantic import Field
 
+from common.planning.free_axes import chooses
 from common.planning.planners import cartesian
 from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result, not_timed
 from common.planning.retiming import RetimingFailed, TooLong
@@ -53,8 +54,9 @@ def line_waypoints(problem: Problem, goal: Region, options: Options, cancel: Can
     result = cartesian.plan(replace(problem, goal=goal), given, cancel)
     if result.waypoints is None:
         return result
+    T_end = goal.T_world_tcp if chooses(problem.robot) else problem.robot.fk(result.waypoints[-1])
     shares = np.linspace(0, 1, len(result.waypoints))[:, None]
-    return ToolWaypoints(result.waypoints, shares * line_ways(problem.robot.fk(problem.start), goal.T_world_tcp))
+    return ToolWaypoints(result.waypoints, shares * line_ways(problem.robot.fk(problem.start), T_end))
 
 
 def line_ways(T_from: Array, T_to: Array) -> Array:

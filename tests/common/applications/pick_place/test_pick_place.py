@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from common import messages as m
 from common.applications.pick_place.choice import Pick, Target, finger_clearance
 from common.applications.pick_place.rows import Rows
-from common.robot.transforms import matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, transform
+from common.robot.transforms import matrix_to_pose, matrix_to_rpy, pose_to_matrix, rpy_to_matrix, tool_down, transform
+from common.tasks.stages import Move
 from tests.common.applications.pick_place.cell_double import CELL, CellDouble
 
 SEVEN = [tuple(spot) for spot in CELL.world.spots[:7]]
@@ -510,3 +511,20 @@ def test_whatever_slips_falls_moves_or_restarts_every_ball_ends_in_the_container
             cell.motion = m.MotionStatus(header=m.Header(stamp=int((cell.now + 0.01) * 1e9)))
     cell.until("DONE", most=5000)
     assert (cell.contained, cell.balls, cell.held, cell.task.status.placed) == (7, {}, "", 7)
+
+
+def test_an_arm_that_cannot_choose_is_left_any_clear_yaw_and_some_tilt_and_others_point_down() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    few = cell.task.p.robot.model_copy(update={"joints": cell.task.p.robot.joints[:4]})
+    ball, brick = Target("ball", (0.4, -0.3, 0.03), 0.03), Target("brick", (0.4, -0.3, 0.03), 0.03, (0.04, 0.03), 0.5)
+    many = cell.task.p.robot
+    for robot, thing, tilt, yaw in ((many, ball, 0.0, 0.0), (few, ball, 0.35, 0.4), (few, brick, 0.35, 0.0)):
+        rows = Rows(cell.task.p.model_copy(update={"robot": robot, "joined": False}), cell.task.gripper)
+        row = rows.pick_and_place(Pick(target=thing, yaws=[0.5], ranges=[(-1.0, 0.2), (0.3, 0.4)]))
+        goals = {stage.name: stage.goal for stage in row if isinstance(stage, Move)}
+        descend, over = goals["descend"], goals["pre-grasp"]
+        assert isinstance(descend, m.PoseGoal) and isinstance(over, m.PoseGoal)
+        assert (descend.tilt_tolerance, descend.yaw_tolerance) == (tilt, yaw)
+        middle = tool_down(0.4, -0.3, 0.03, 0.3 if yaw else 0.5)  # of the range in which the hand is clear
+        assert pose_to_matrix(descend.pose) == pytest.approx(middle)
+        assert over.tilt_tolerance == max(tilt, cell.task.p.orient_tol_rad)
