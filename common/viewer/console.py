@@ -31,6 +31,7 @@ from common.topics import Request, Topic
 from common.viewer.doors import VISITOR, Doors, Need
 from common.viewer.feeds import Feeds
 from common.viewer.words import UNDERSTOOD, problem
+from common.viewer.world_edits import WorldEdits
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -186,6 +187,9 @@ class Console(Desk):
         """
         super().__init__(doors)
         self._feeds, self._bus, self._jog = feeds, bus, bus.writer(topics.MOTION_JOG)
+        self.world = WorldEdits(
+            lambda edit: self.ask(topics.WORLD_EDIT, edit), lambda: self.latest(topics.SCENE_OBJECTS))
+        self.picked: Callable[[str], None] = lambda _name: None  # an object of the simulated world, in the scene
         self._newest = 0  # `since` of the stop that was said here
         asked: list[Request[Any, Any]] = [
             topics.TASK_COMMAND, topics.MOTION_STOP, topics.MOTION_OWN, topics.GRIPPER_COMMAND,
@@ -248,7 +252,7 @@ class Console(Desk):
 
     async def move(self, object_id: str, x: float, y: float) -> None:
         """Put an object of the simulated world somewhere [m]."""
-        await self.ask(topics.WORLD_EDIT, WorldEdit(op="move", id=object_id, position=Vector3(x=x, y=y)))
+        await self.world.do(WorldEdit(op="move", id=object_id, position=Vector3(x=x, y=y)))
 
     async def parameters(self) -> dict[str, list[Parameter]]:
         """The parameters of each service that answers."""

@@ -44,6 +44,7 @@ from common.viewer.tuning import TuningPanel
 from common.viewer.view_panel import ViewPanel
 from common.viewer.viser_inside import introduce
 from common.viewer.words import TaskWords, gripper
+from common.viewer.world_panel import WorldPanel
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
@@ -148,8 +149,8 @@ class Page:
             gui, self.console, self._kinds, self._shown, shadows=self._layout.shadows, on_layer=self._set_layer,
             on_shadows=lambda on: self._server.scene.configure_default_lights(cast_shadow=on))
         gui.add_divider()
-        edit = gui.add_checkbox("Edit the simulated world", self._editing, hint="drag objects to other places")
-        self.console.on_change(edit, self._set_editing)
+        self._world = WorldPanel(gui, self.console, editing=self._editing, on_editing=self._set_editing,
+                                 on_reset=self._rejected.places.clear)
         button = gui.add_button("Save layout", icon=viser.Icon.DEVICE_FLOPPY,
                                 hint="what is on now, and this view of the scene, is how the page opens")
 
@@ -216,6 +217,7 @@ class Page:
                 self._move.show(self._status, now)
             self._arm.show(self._feeds.latest(topics.ROBOT_STATUS))
             self._log.show()
+            self._world.show()
         if self._periods.due("health", now):
             self._health.show(self._feeds.latest(topics.SUPERVISOR_STATUS), alive)
         if self._plots is not None and self._periods.due("plots", now):

@@ -90,9 +90,13 @@ class Truth(Layer):
         for name, (_, node) in self._nodes.items():
             wanted = self._editing and self._things[name].state in _FREE
             if wanted and name not in self._drags:
-                self._drags[name] = Drag(node, partial(self._dropped, name))
+                self._drags[name] = Drag(node, partial(self._dropped, name), partial(self._picked, name))
             elif not wanted and name in self._drags:
                 self._drags.pop(name).stop()
+
+    def _picked(self, name: str) -> None:
+        console = self.stage.console
+        console.put(lambda: console.picked(name))
 
     def _dropped(self, name: str, x: float, y: float) -> None:
         """Ask for the middle of an object to lie where it was dropped by the origin of its frame."""
@@ -107,14 +111,15 @@ class Truth(Layer):
 class Drag:
     """Lets a node be dragged at its own height until `stop`; it goes back to where it was when it is dropped."""
 
-    def __init__(self, node: Any, dropped: Callable[[float, float], None]) -> None:
-        """Listen to the node. `dropped` is called with where it was let go, x, y [m]."""
-        self._node = node
+    def __init__(self, node: Any, dropped: Callable[[float, float], None], picked: Callable[[], None]) -> None:
+        """Listen to the node. `dropped` is called with where it was let go, x, y [m]; `picked` when it is touched."""
+        self._node, self._picked = node, picked
         self._dropped = dropped
         self._home = np.zeros(3)
         self._grip = np.zeros(2)
         self._held = False
         node.on_drag(self._on_drag)
+        node.on_click(self._on_click)
 
     @property
     def held(self) -> bool:
@@ -127,11 +132,16 @@ class Drag:
             self._held = False
             self._node.position = self._home
         self._node.remove_drag_callback(self._on_drag)
+        self._node.remove_click_callback(self._on_click)
+
+    async def _on_click(self, _event: object) -> None:
+        self._picked()
 
     async def _on_drag(self, event: viser.SceneNodeDragEvent[Any]) -> None:
         """Follow the pointer: viser keeps the order of the phases for coroutines only."""
         eye = event.client.camera.position
         if event.phase == "start":
+            self._picked()
             self._home = self._node.position.copy()
             grip = on_plane(eye, event.start_position, float(self._home[2]))
             self._held = grip is not None

@@ -76,6 +76,9 @@ class ConsoleDouble:
         if (doing := act()) is not None:
             asyncio.run(doing)
 
+    def picked(self, name: str) -> None:
+        self.chosen = name
+
     def move(self, name: str, x: float, y: float) -> None:
         self.moved.append((name, round(x, 6), round(y, 6)))
 
