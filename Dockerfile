@@ -50,4 +50,17 @@ RUN --mount=type=cache,target=/root/.cache/pip --mount=type=secret,id=pip,target
 COPY deploy/__init__.py deploy/watched.py deploy/
 USER zencell
 
+# For cells with `simulator: mujoco` (docs/pictures.md): `docker build --target physics`. Mesa's OpenGL, which needs no
+# graphics card, is 250 MB: the others do without.
+FROM run AS physics
+USER root
+RUN apt-get update -q && apt-get install -q -y --no-install-recommends libegl1 libgl1-mesa-dri \
+ && rm -rf /var/lib/apt/lists/* /var/cache/apt/*.bin
+COPY pyproject.toml constraints.txt /tmp/
+RUN --mount=type=cache,target=/root/.cache/pip --mount=type=secret,id=pip,target=/etc/pip.conf \
+    python -c 'import tomllib; print(*tomllib.load(open("/tmp/pyproject.toml", "rb"))["project"]["optional-dependencies"]["physics"], sep="\n")' > /tmp/needed \
+ && /usr/local/bin/python -m pip --python /opt/zencell/bin/python install -q --disable-pip-version-check \
+      -c /tmp/constraints.txt -r /tmp/needed
+USER zencell
+
 FROM run

@@ -8,27 +8,31 @@ import numpy as np
 from pydantic import Field
 
 from common import topics
-from common.config import Parameters, RobotConfig, Run, Surroundings, Tunable
+from common.config import RobotConfig, Run, Scenery, Surroundings, Tunable
 from common.messages import Image, WorldObjects
 from common.perception.image import array_to_image
-from common.perception.mounted import Mounted
 from common.process.pace import Pace
 from common.process.service import main
-from common.robot.model import RobotModel
-from common.sim.rendering import Picture, Renderer, disturbed
+from common.sim.camera import CameraParameters, SimulatedCamera
+from common.sim.lens import Lens
+from common.sim.rendering import Picture, disturbed
 from common.transport.bus import Bus
 
 
-class Config(Parameters):
+class Config(CameraParameters):
     """Rate and quality of the picture."""
 
     world: Surroundings
+    scenery: Scenery = Scenery()
     robot: RobotConfig
     run: Run
     rate: Tunable[float] = Field(10.0, gt=0, le=250, description="frames per second of cell time [Hz]")
     max_rate: Tunable[float] = Field(50.0, gt=0, le=250, description="frames per second of wall time at most [Hz]")
     noise_std: Tunable[float] = Field(0.0, ge=0, le=100, description="standard deviation of Gaussian noise [0..255]")
     brightness: Tunable[float] = Field(0.0, ge=-255, le=255, description="added to every channel [0..255]")
+    distorted: bool = Field(False, description="see through the lens of the world's camera, with its distortion d")
+    rectify: bool = Field(True, description="with distorted: take it out again, as camera_opencv does; false sends "
+                                            "pictures as they come, and d in camera_info: the detectors refuse them")
 
 
 async def run(bus: Bus, config: Config) -> None:
@@ -39,28 +43,26 @@ async def run(bus: Bus, config: Config) -> None:
     truth = bus.reader(topics.SCENE_OBJECTS)
     images, infos = bus.writer(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_INFO)
     frame = config.world.camera.frame
-    robot = RobotModel.load(config.robot) if config.world.camera.mount else None
-    joints = bus.reader(topics.JOINT_STATES) if robot is not None else None
-    mounted = Mounted(config.world.camera, robot)
-    renderer = Renderer(config.world, plain=True, camera=mounted.at())
     rng = np.random.default_rng(config.run.seed)
+    lens = Lens(config.world.camera, distorted=config.distorted, rectify=config.rectify)
+    camera = SimulatedCamera(config.world, config.scenery, config.robot, config, rng, plain=True, lens=lens)
+    joints = bus.reader(topics.JOINT_STATES) if camera.needs_joints else None
     await bus.ready()
     await truth.next()
     if joints is not None:
         await joints.next()
-    infos.put(renderer.camera.info(bus.header(frame)))
+    infos.put(camera.info(bus.header(frame)))
     pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
     sent: Image | None = None
     shown: Picture | None = None
     while True:
         header = bus.header(frame)  # the instant of exposure: what is drawn is where everything is now
-        objects = (truth.latest or WorldObjects()).objects
+        world = truth.latest or WorldObjects()
         state = joints.latest if joints is not None else None
-        q = robot.order(state.name, state.position) if robot is not None and state is not None else None
-        if state is not None and q is not None:
+        if state is not None and camera.is_at(state):
             header = header.model_copy(update={"stamp": state.header.stamp})
-            renderer.look_from(mounted.at(q))
-        view = await asyncio.to_thread(renderer.see, objects) if renderer.takes_long(objects) else renderer.see(objects)
+        view = (await asyncio.to_thread(camera.shoot, world, state, header.stamp) if camera.takes_long(world)
+                else camera.shoot(world, state, header.stamp))
         picture = disturbed(view.colour, config.noise_std, config.brightness, rng)
         if sent is None or picture is not shown:
             sent, shown = array_to_image(picture, "bgr8", header), picture

@@ -1,4 +1,4 @@
-"""Casts rays at the simulated world and the arm in it, and sends what a depth camera sends."""
+"""Looks at the simulated world and the arm in it, and sends what a depth camera sends."""
 
 from __future__ import annotations
 
@@ -8,22 +8,24 @@ import numpy as np
 from pydantic import Field
 
 from common import topics
-from common.config import Parameters, RobotConfig, Run, Surroundings, Tunable
-from common.messages import WorldObjects
+from common.config import RobotConfig, Run, Scenery, Surroundings, Tunable
+from common.messages import JointState, WorldObjects
 from common.perception.depth import point_cloud
 from common.perception.image import array_to_image
-from common.perception.mounted import Mounted
 from common.process.pace import Pace
 from common.process.service import main
-from common.robot.model import RobotModel
-from common.sim.rendering import Renderer, disturbed_depth
+from common.sim.camera import CameraParameters, SimulatedCamera
+from common.sim.depth_sensor import DepthSensorParameters, measured_depth
+from common.sim.ray_caster import View
+from common.sim.rendering import disturbed_depth
 from common.transport.bus import Bus
 
 
-class Config(Parameters):
+class Config(CameraParameters, DepthSensorParameters):
     """Rate, range and noise."""
 
     world: Surroundings
+    scenery: Scenery = Scenery()
     robot: RobotConfig
     run: Run
     rate: Tunable[float] = Field(1.0, gt=0, le=30, description="frames per second of cell time [Hz]")
@@ -44,29 +46,32 @@ async def run(bus: Bus, config: Config) -> None:
     points, infos = bus.writer(topics.DEPTH_CAMERA_POINTS), bus.writer(topics.DEPTH_CAMERA_INFO)
     frame = config.world.camera.frame
     rng = np.random.default_rng(config.run.seed)
-    robot = await asyncio.to_thread(RobotModel.load, config.robot)
-    mounted = Mounted(config.world.camera, robot)
-    view = await asyncio.to_thread(lambda: Renderer(config.world, robot, camera=mounted.at()))
+    camera = await asyncio.to_thread(
+        lambda: SimulatedCamera(config.world, config.scenery, config.robot, config, rng, plain=False))
+
+    def look(world: WorldObjects, state: JointState | None, now: int) -> View:
+        """What the camera measures."""
+        seen = camera.shoot(world, state, now)
+        return View(seen.colour, measured_depth(seen.depth, camera.pinhole, config, rng))
+
     await bus.ready()
     await truth.next()
     await joints.next()
-    infos.put(view.camera.info(bus.header(frame)))
+    infos.put(camera.info(bus.header(frame)))
     pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
     while True:
         header = bus.header(frame)  # the instant of exposure: of picture, depth and points alike
-        objects = (truth.latest or WorldObjects()).objects
+        world = truth.latest or WorldObjects()
         state = joints.latest
-        q = robot.order(state.name, state.position) if mounted.moves and state is not None else None
-        if state is not None and q is not None:
+        if state is not None and camera.is_at(state):
             header = header.model_copy(update={"stamp": state.header.stamp})
-            await asyncio.to_thread(view.look_from, mounted.at(q))
-        seen = await asyncio.to_thread(view.see, objects, state)
+        seen = await asyncio.to_thread(look, world, state, header.stamp)
         depth = seen.depth_within(config.nearest, config.farthest)
         depth = disturbed_depth(depth, rng, config.depth_noise_std, config.depth_dropout)
         depths.put(array_to_image(depth, "32FC1", header))  # first: who has the picture has its depth
         images.put(array_to_image(seen.colour, "bgr8", header))
         if points.matched:
-            points.put(point_cloud(seen.colour, depth, view.camera, header))
+            points.put(point_cloud(seen.colour, depth, camera.pinhole, header))
         await pace.wait()
 
 

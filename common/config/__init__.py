@@ -12,6 +12,7 @@ from common.config.basics import Coordinate, Length, Number, Parameters, Point, 
 from common.config.cell import Cell, Members, Reach, ServiceEntry
 from common.config.checking import check
 from common.config.files import config_root, find_file, names_of, read_robot, read_yaml
+from common.config.light import Light
 from common.config.loading import load_cell, load_robot, service_config, service_names
 from common.config.motion import Grasp, Motion, Pipeline, PlannerEntry, Run, Watchdogs
 from common.config.overrides import expanded, parse_override, yaml_line
@@ -25,4 +26,4 @@ from common.config.robot import (
     SuctionCup,
     TcpConfig,
 )
-from common.config.world import CameraConfig, Container, Fixture, ObjectConfig, Surroundings, World
+from common.config.world import CameraConfig, Container, Fixture, ObjectConfig, Scenery, Surroundings, World

@@ -9,7 +9,7 @@ from pydantic import Field
 from common.config.basics import Section
 from common.config.motion import Grasp, Motion, Pipeline, Run, Watchdogs
 from common.config.robot import RobotConfig
-from common.config.world import Surroundings, World
+from common.config.world import Scenery, Surroundings, World
 
 
 class ServiceEntry(Section):
@@ -78,6 +78,8 @@ class Cell(Section):
         if kind is Surroundings:
             around = {f: getattr(self.world, f) for f in Surroundings.model_fields}
             return Surroundings.model_validate(around | {"camera": self.world.camera_of(camera)})
+        if kind is Scenery:
+            return Scenery.model_validate({f: getattr(self.world, f) for f in Scenery.model_fields})
         if kind is Members:
             names = [entry.name for entry in self.services.values()]
             keys = [entry.topics for entry in self.services.values() if entry.topics]

@@ -7,24 +7,34 @@ A simulator is a module (of this folder, or a dotted one of the user's own) that
 
 where `objects` are those of the world, each with a place, and `tolerances` tell when the fingers catch something. What
 it gives is a `FeltWorld`, or a `PhysicalWorld` that brings an arm of its own for robot files with the backend `mock`.
-Times are cell time [s], passed in.
+Times are cell time [s], passed in. What cameras see of it is drawn by what its module offers as
+
+    def renderer(around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool,
+                 camera: Pinhole) -> Renderer
+
+in the process of each camera, from `scene_objects` and `joint_states`; a module without it is drawn as `kinematic` is.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, cast, runtime_checkable
+from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from common.config import GripperConfig, ObjectConfig, Parameters, Tunable, World
+from common.config import GripperConfig, ObjectConfig, Parameters, Scenery, Surroundings, Tunable, World
 from common.errors import ConfigError, UnknownName
 from common.hardware.interface import Hardware, Limits
-from common.messages import Header, SceneUpdate, WorldEdit, WorldObject, WorldObjects
+from common.messages import Header, JointState, SceneUpdate, WorldEdit, WorldObject, WorldObjects
 from common.robot.model import RobotModel
+
+if TYPE_CHECKING:
+    from common.perception.pinhole import Pinhole
+    from common.sim.ray_caster import View
 
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
@@ -151,13 +161,66 @@ def load_world(
         UnknownName: no such simulator; lists the choices.
         ConfigError: a module that cannot be imported or is no simulator, or an object that cannot be where it is.
     """
-    name = world.simulator
+    module = _module(world.simulator)
+    if not hasattr(module, "create"):
+        raise ConfigError("world.simulator", world.simulator, "is no simulator: it has no create")
+    return cast(Simulator, module).create(world, objects, tolerances or GraspTolerances(), gripper)
+
+
+class Renderer(Protocol):
+    """Draws what one camera sees. Its calls may block and may come from any thread, one at a time."""
+
+    camera: Pinhole
+    needs_arm: bool
+    """Whether the arm is in the picture, so that `see` wants the state of its joints."""
+
+    @property
+    def level(self) -> Array:
+        """(3,) [lx] of blue, green and red light that the value 255 of a white surface stands for."""
+
+    def look_from(self, camera: Pinhole) -> None:
+        """Take the camera elsewhere; its intrinsics stay."""
+
+    def light(self, scenery: Scenery) -> None:
+        """Take the light of the scenery."""
+
+    def takes_long(self, objects: Sequence[WorldObject]) -> bool:
+        """Whether to `see` the objects may take longer than a moment."""
+
+    def see(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
+        """The view of the objects, and of the arm in that state if it is complete; what is "elsewhere" is not seen.
+
+        Nothing in it is changed afterwards; when nothing moved it is the same as before.
+        """
+
+
+def load_renderer(
+    around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole
+) -> Renderer:
+    """What draws the world of the scenery's simulator for a camera.
+
+    Args:
+        around: fixtures and containers.
+        scenery: the simulator and the light.
+        robot: gives the robot; not asked when it is not in the picture.
+        plain: for a camera that a drawn world shows without arm and depth.
+        camera: intrinsics and pose.
+
+    Raises:
+        UnknownName: no such simulator; lists the choices.
+        ConfigError: a module that cannot be imported, a mesh of the robot that is not there.
+    """
+    module = _module(scenery.simulator)
+    if not hasattr(module, "renderer"):
+        module = _module(SIMULATORS[0])
+    made: Renderer = module.renderer(around, scenery, robot, plain=plain, camera=camera)
+    return made
+
+
+def _module(name: str) -> ModuleType:
     if "." not in name and name not in SIMULATORS:
         raise UnknownName("simulator", name, SIMULATORS)
     try:
-        module = importlib.import_module(name if "." in name else f"{PACKAGE}.{name}")
+        return importlib.import_module(name if "." in name else f"{PACKAGE}.{name}")
     except ImportError as error:
         raise ConfigError("world.simulator", name, f"cannot be imported: {error}") from None
-    if not hasattr(module, "create"):
-        raise ConfigError("world.simulator", name, "is no simulator: it has no create")
-    return cast(Simulator, module).create(world, objects, tolerances or GraspTolerances(), gripper)

@@ -7,14 +7,14 @@ stay where it falls appears at the nearest place where it can.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import GripperConfig, ObjectConfig, World
+from common.config import GripperConfig, ObjectConfig, Scenery, Surroundings, World
 from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Header, Pose, SceneUpdate, Vector3, WorldEdit, WorldObject, WorldObjects
 from common.robot.finger_joints import closing_frame
@@ -25,6 +25,11 @@ from common.sim.gripping import felt
 from common.sim.interface import GraspTolerances, StandingObject
 from common.sim.objects import Solid, pose_of, shaped, solid_of, solid_of_message
 from common.sim.resting import Ground
+
+if TYPE_CHECKING:
+    from common.perception.pinhole import Pinhole
+    from common.robot.model import RobotModel
+    from common.sim.rendering import Renderer
 
 Array = NDArray[np.float64]
 
@@ -40,6 +45,15 @@ def create(
 ) -> KinematicWorld:
     """The world with its objects, each of which has a place."""
     return KinematicWorld(world, objects, tolerances, gripper)
+
+
+def renderer(
+    around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole
+) -> Renderer:
+    """What draws this world for a camera: see `common.sim.interface`."""
+    from common.sim.rendering import Renderer  # of no use to who moves the world
+
+    return Renderer(around, None if plain else robot(), plain=plain, camera=camera, scenery=scenery)
 
 
 class KinematicWorld:

@@ -7,20 +7,21 @@ sight; spheres in it are exact and cost a few tenths of a millisecond for all of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.config import Container, Surroundings
+from common.config import Container, Scenery, Surroundings
 from common.messages import JointState, WorldObject
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import silhouette
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
 from common.scene.fixtures import container_panels
+from common.sim.lighting import flat_level
 from common.sim.objects import look_of, solid_of_message
 from common.sim.places import tables
 from common.sim.ray_caster import Mesh, View, cast, empty_view
@@ -49,7 +50,7 @@ class Renderer:
 
     def __init__(
         self, around: Surroundings, robot: RobotModel | None = None, *, plain: bool = False,
-        camera: Pinhole | None = None, rim_width: float = RIM_WIDTH,
+        camera: Pinhole | None = None, rim_width: float = RIM_WIDTH, scenery: Scenery | None = None,
     ) -> None:
         """Draw what never changes.
 
@@ -59,11 +60,14 @@ class Renderer:
             plain: draw a plain picture.
             camera: intrinsics and the pose of the optical frame.
             rim_width: of the white line on the outline of each sphere in a plain picture [px]; 0 for none.
+            scenery: the light. It is even: only how bright and of which colour it is counts.
 
         Raises:
             ConfigError: a mesh of the robot is not there.
         """
         self.camera = camera if camera is not None else Pinhole.from_config(around.camera)
+        self.needs_arm = robot is not None and not plain
+        self.light(scenery or Scenery())
         self._plain, self._rim_width, self._robot, self._around = plain, rim_width, robot, around
         self._shapes = robot_shapes(robot) if robot is not None and not plain else {}
         self._meshes: dict[tuple[object, ...], Array] = {}  # triangles of what was seen, in its own frame
@@ -73,6 +77,10 @@ class Renderer:
         self._joints: Array | None = None
         self._spheres: dict[tuple[float, ...], _Sphere | None] = {}  # of the last plain picture, by centre and radius
         self._draw_behind()
+
+    def light(self, scenery: Scenery) -> None:
+        """Take the light of the scenery: nothing looks different, but for who exposes a picture to it."""
+        self.level = flat_level(scenery)
 
     def look_from(self, camera: Pinhole) -> None:
         """Take the camera elsewhere: from there all is seen anew."""
@@ -151,13 +159,20 @@ class Renderer:
     def _arm(self, joints: JointState | None) -> list[Mesh]:
         if joints is None or self._robot is None or not self._shapes:
             return []
-        q = self._robot.order(joints.name, joints.position)
-        if q is None:
+        poses = link_poses(self._robot, joints)
+        if poses is None:
             return []
-        others = {name: value for name, value in zip(joints.name, joints.position, strict=True)
-                  if name in self._robot.config.locked_joints}
-        poses = self._robot.link_poses(q, others)
         return [Mesh(placed(corners, poses[link]), ARM) for link, corners in self._shapes.items()]
+
+
+def link_poses(robot: RobotModel, joints: JointState) -> Mapping[str, Array] | None:
+    """(4, 4) pose of each link in world, fingers too; None where the state lacks a joint of the arm."""
+    q = robot.order(joints.name, joints.position)
+    if q is None:
+        return None
+    others = {name: value for name, value in zip(joints.name, joints.position, strict=True)
+              if name in robot.config.locked_joints}
+    return robot.link_poses(q, others)
 
 
 def _solid(around: Surroundings) -> list[Mesh]:

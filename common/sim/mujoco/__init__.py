@@ -5,15 +5,18 @@ Only what `world.simulator: mujoco` names imports it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from common.config import GripperConfig, ObjectConfig, World
+from common.config import GripperConfig, ObjectConfig, Scenery, Surroundings, World
 from common.errors import ConfigError
 from common.sim.interface import GraspTolerances
 
 if TYPE_CHECKING:
+    from common.perception.pinhole import Pinhole
+    from common.robot.model import RobotModel
+    from common.sim.interface import Renderer
     from common.sim.mujoco.world import PhysicsWorld
 
 
@@ -29,6 +32,17 @@ def create(
     from common.sim.mujoco.world import PhysicsWorld
 
     return PhysicsWorld(world, objects, tolerances, gripper)
+
+
+def renderer(
+    around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole
+) -> Renderer:
+    """What draws this world for a camera: see `common.sim.interface`. A plain picture has no depth."""
+    require()
+    from common.sim.mujoco.gl import chosen_gl
+    from common.sim.mujoco.rendering import PhysicsRenderer
+
+    return PhysicsRenderer(around, scenery, robot(), camera, depth=not plain, gl=chosen_gl())
 
 
 def require() -> None:

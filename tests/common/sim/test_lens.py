@@ -1,0 +1,131 @@
+import cv2
+import numpy as np
+import pytest
+
+from common.config import CameraConfig, Scenery, load_cell
+from common.errors import ConfigError
+from common.messages import Header, JointState, Pose, Vector3, WorldObject, WorldObjects
+from common.perception.pinhole import Pinhole
+from common.sim.camera import CameraParameters, SimulatedCamera
+from common.sim.lens import Lens
+from common.sim.motion_blur import Movement, joints_before, times
+
+BARREL = [-0.25, 0.08, 0.001, -0.0005, 0.0]
+BENT = CameraConfig(d=BARREL)
+CELL = load_cell("panda")
+
+
+def spot(camera, place):
+    """A picture of a small blurred dot where a camera without distortion sees a place."""
+    u, v = camera.project(place)
+    y, x = np.mgrid[0:camera.height, 0:camera.width]
+    dot = 255 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / 18)
+    return np.repeat(np.rint(dot)[..., None], 3, axis=2).astype(np.uint8)
+
+
+def middle(picture):
+    weights = picture[..., 0].astype(float)
+    y, x = np.mgrid[0:weights.shape[0], 0:weights.shape[1]]
+    return np.array([(x * weights).sum(), (y * weights).sum()]) / weights.sum()
+
+
+PLACES = [(0.4, 0.0, 0.0), (0.68, 0.38, 0.0), (0.15, -0.4, 0.0)]
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_lens_shows_things_where_opencv_says(place):
+    lens = Lens(BENT, distorted=True, rectify=False)
+    plain = Pinhole.from_config(BENT)
+    seen = middle(lens.bend(spot(Pinhole.from_config(lens.drawn), place)))
+    k = np.array([[520, 0, 320], [0, 520, 240], [0, 0, 1.0]])
+    expected, _ = cv2.projectPoints(plain.to_camera(place)[None], np.zeros(3), np.zeros(3), k, np.array(BARREL))
+    np.testing.assert_allclose(seen, expected.ravel(), atol=0.1)
+    back = cv2.undistortPoints(seen.reshape(1, 1, 2), k, np.array(BARREL), P=k).ravel()
+    np.testing.assert_allclose(back, plain.project(place), atol=0.15)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_what_is_rectified_is_where_a_pinhole_sees_it(place):
+    lens = Lens(BENT, distorted=True)
+    picture = lens.come_out(lens.bend(spot(Pinhole.from_config(lens.drawn), place)))
+    np.testing.assert_allclose(middle(picture), Pinhole.from_config(BENT).project(place), atol=0.1)
+    assert lens.d == [0.0] * 5
+
+
+def test_pictures_are_drawn_as_wide_as_the_lens_sees_and_no_wider():
+    lens = Lens(BENT, distorted=True)
+    assert 640 < lens.drawn.width < 1000 and 480 < lens.drawn.height < 800 and not lens.drawn.d
+    assert lens.bend(np.full((lens.drawn.height, lens.drawn.width, 3), 200, np.uint8)).min() == 200, "no black corners"
+
+
+def test_without_distortion_nothing_is_done():
+    picture = np.zeros((480, 640, 3), np.uint8)
+    for lens in (Lens(BENT), Lens(CameraConfig(), distorted=True)):
+        assert lens.bend(picture) is picture and lens.come_out(picture) is picture
+
+
+def test_a_lens_that_bends_everything_is_refused():
+    with pytest.raises(ConfigError, match=r"world\.camera\.d"):
+        Lens(CameraConfig(d=[-1.5, 0.0]), distorted=True)
+
+
+def sphere(x, stamp):
+    thing = WorldObject(id="cup", shape="sphere", size=Vector3(x=0.06, y=0.06, z=0.06),
+                        pose=Pose(position=Vector3(x=x, y=0.0, z=0.03)))
+    return WorldObjects(header=Header(stamp=stamp), objects=[thing])
+
+
+def test_what_moves_was_elsewhere_within_the_exposure():
+    movement = Movement()
+    for number in range(3):
+        movement.take(sphere(0.4 + 0.01 * number, 50_000_000 * number))  # 0.2 m/s
+    now = 100_000_000
+    assert movement.objects(0.02, now)[0].pose.position.x == pytest.approx(0.416)
+    assert movement.objects(0.0, now)[0].pose.position.x == pytest.approx(0.42)
+    assert movement.objects(0.02, now + 500_000_000)[0].pose.position.x == pytest.approx(0.42), "it stands by now"
+
+
+def test_what_was_put_elsewhere_did_not_fly_there():
+    movement = Movement()
+    movement.take(sphere(0.0, 0))
+    movement.take(sphere(0.6, 50_000_000))
+    assert movement.objects(0.02, 50_000_000)[0].pose.position.x == pytest.approx(0.6)
+
+
+def test_joints_were_where_their_velocities_say():
+    state = JointState(header=Header(), name=["a", "b"], position=[1.0, 2.0], velocity=[0.5, 0.0])
+    assert joints_before(state, 0.1).position == pytest.approx([0.95, 2.0])
+    assert joints_before(state, 0.0) is state
+
+
+def test_times_of_an_exposure_are_even_and_end_with_it():
+    assert list(times(0.02, 1)) == [0.0]
+    assert list(times(0.02, 3)) == pytest.approx([0.02, 0.01, 0.0])
+
+
+def camera(**parameters):
+    config = CameraParameters(**parameters)
+    return SimulatedCamera(CELL.world, Scenery(), CELL.robot, config, np.random.default_rng(0), plain=True)
+
+
+def test_what_moves_is_blurred_along_its_way_by_as_much_as_it_moved():
+    still, moving = camera(), camera(sub_exposures=5)
+    for one in (still, moving):
+        table = one.shoot(WorldObjects(), None, 0).colour.astype(int)
+        one.shoot(sphere(0.40, 0), None, 0)
+        picture = one.shoot(sphere(0.56, 80_000_000), None, 80_000_000).colour.astype(int)  # 2 m/s along x
+        changed = np.argwhere(np.abs(picture - table).max(axis=2) > 8)
+        rows = np.ptp(changed[np.abs(changed[:, 1] - 320) < 3][:, 0])
+        if one is still:
+            sharp = rows
+        else:
+            assert rows - sharp == pytest.approx(2 * 0.01 * 520 / 0.77, abs=3)
+
+
+def test_light_that_changes_is_seen_at_once():
+    config = CameraParameters()
+    one = SimulatedCamera(CELL.world, Scenery(), CELL.robot, config, np.random.default_rng(0), plain=True)
+    bright = one.shoot(WorldObjects(), None, 0).colour
+    config.ambient = 20.0
+    dark = one.shoot(WorldObjects(), None, 0).colour
+    assert dark.mean() == pytest.approx(bright.mean() * 370 / 500, rel=0.02)

@@ -1,0 +1,117 @@
+import numpy as np
+import pytest
+
+from common.sim.lighting import REFERENCE, tint
+from common.sim.sensor import EXPOSURE, Sensor, SensorParameters, grey_balance
+
+DAY = np.full(3, REFERENCE)
+
+
+def flat(value=80, height=240, width=320):
+    return np.full((height, width, 3), value, np.uint8)
+
+
+def exposed(picture, level=DAY, seed=0, **parameters):
+    return Sensor(SensorParameters(**parameters), np.random.default_rng(seed)).expose([picture], np.asarray(level))
+
+
+def test_pictures_come_as_they_are_drawn_until_something_else_is_asked_for():
+    picture = flat()
+    assert exposed(picture) is picture
+
+
+@pytest.mark.parametrize("times", [0.25, 0.5, 2, 3])
+def test_values_are_proportional_to_exposure_gain_and_light(times):
+    assert (exposed(flat(), exposure=EXPOSURE * times) == 80 * times).all()
+    assert (exposed(flat(), DAY * times) == 80 * times).all()
+    if times > 1:
+        assert (exposed(flat(), gain=times) == 80 * times).all()
+
+
+def test_what_is_too_bright_is_white():
+    assert (exposed(flat(200), exposure=2 * EXPOSURE) == 255).all()
+
+
+def test_noise_grows_with_the_signal_as_that_of_light_does():
+    variances = [exposed(flat(value), full_well=5000, read_noise=0).astype(float).var() for value in (20, 80, 180)]
+    for value, variance in zip((20, 80, 180), variances, strict=True):
+        assert variance == pytest.approx(value * 255 / 5000 + 1 / 12, rel=0.05)  # and that of rounding
+
+
+def test_the_dark_has_the_noise_of_reading_and_gain_makes_it_larger():
+    read = [exposed(flat(40), DAY / gain, full_well=5000, read_noise=30, gain=gain).astype(float).std()
+            for gain in (1, 4)]
+    for gain, deviation in zip((1, 4), read, strict=True):
+        electrons = 40 / gain * 5000 / 255
+        assert deviation == pytest.approx(gain * 255 / 5000 * np.sqrt(electrons + 900), rel=0.05)
+
+
+def test_noise_is_that_of_the_seed():
+    one, same, other = (exposed(flat(), seed=seed, full_well=3000) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert (one != other).any()
+
+
+@pytest.mark.parametrize("lux", [100, 500, 3000, 10_000])
+def test_automatic_exposure_finds_the_same_brightness_in_any_light(lux):
+    assert exposed(flat(140), np.full(3, lux), auto_exposure=True).mean() == pytest.approx(110, rel=0.06)
+
+
+def test_automatic_exposure_takes_time_first_and_gain_when_there_is_no_more_of_it():
+    for lux, gained in ((1000, False), (20, True)):
+        sensor = Sensor(SensorParameters(auto_exposure=True, longest_exposure=0.02), np.random.default_rng(0))
+        sensor.expose([flat(140)], np.full(3, lux))
+        assert (sensor.gain > 1) == gained and sensor.exposure <= 0.02
+    assert sensor.exposure == 0.02
+
+
+def test_automatic_exposure_follows_light_that_changes():
+    sensor = Sensor(SensorParameters(auto_exposure=True), np.random.default_rng(0))
+    sensor.expose([flat(140)], DAY)
+    dark = [sensor.expose([flat(140)], DAY / 6).mean() for _ in range(4)]
+    assert dark[0] < 25 and dark[-1] == pytest.approx(110, rel=0.06)
+
+
+def test_something_bright_is_not_lost_for_something_dark():
+    picture = flat(10)
+    picture[:60, :80] = 220
+    assert exposed(picture, auto_exposure=True)[10, 10].max() < 255
+
+
+@pytest.mark.parametrize("temperature", [2700, 4000, 6500, 9000])
+def test_grey_is_grey_in_any_light_and_red_is_red(temperature):
+    picture = flat(150)
+    picture[80:140, 80:140] = (26, 38, 255)
+    level = REFERENCE / 2 * tint(temperature)
+    seen = exposed(picture, level, white_balance="auto", full_well=10_000).astype(float)
+    grey = seen[160:, 160:].reshape(-1, 3).mean(axis=0)
+    assert np.ptp(grey) < 0.12 * grey.max()
+    b, g, r = seen[90:130, 90:130].reshape(-1, 3).mean(axis=0)
+    assert r > 3 * max(b, g)
+    if temperature < 5000:
+        plain = exposed(picture, level).astype(float)[160:, 160:].reshape(-1, 3).mean(axis=0)
+        assert np.ptp(plain) > 0.3 * plain.max(), "without it grey is not grey"
+
+
+def test_what_has_no_grey_says_nothing_about_the_light():
+    green = np.zeros((64, 64, 3), np.float32)
+    green[...] = (30, 200, 20)
+    assert grey_balance(green) is None
+    assert grey_balance(np.zeros((64, 64, 3), np.float32)) is None
+
+
+def test_pictures_within_an_exposure_are_added():
+    left, right = flat(0), flat(0)
+    left[:, :100], right[:, 100:200] = 200, 200
+    sensor = Sensor(SensorParameters(sub_exposures=2), np.random.default_rng(0))
+    picture = sensor.expose([left, right], DAY)
+    assert (picture[:, :200] == 100).all() and (picture[:, 200:] == 0).all()
+
+
+def test_light_of_a_temperature_is_as_bright_as_daylight_and_warmer_or_colder():
+    weights = np.array([0.0722, 0.7152, 0.2126])  # of luminance, IEC 61966-2-1
+    for temperature in (2000, 3000, 5000, 10_000):
+        assert weights @ tint(temperature) == pytest.approx(1, abs=0.02)
+    blue, red = zip(*[(tint(t)[0], tint(t)[2]) for t in (2000, 3000, 5000, 6500, 10_000)], strict=True)
+    assert list(blue) == sorted(blue) and list(red) == sorted(red, reverse=True)
+    np.testing.assert_allclose(tint(6500), 1)
