@@ -7,12 +7,18 @@ from typing import Annotated, Any
 
 import typer
 
-from cli import options, securing, verbs, viewing
-from cli.operation import Operation, end_with_stdin
+from cli import options, verbs
+from common.operation.operation import Operation
 from common.supervision.share import Share
 
 Speed = Annotated[str, typer.Option("--speed", metavar="X", help="cell time per wall time, 0.1 to 10")]
 NoViewer = Annotated[bool, typer.Option("--no-viewer", help="without the operator's page")]
+ViewerPort = Annotated[
+    str | None, typer.Option("--viewer-port", metavar="N", help="of the operator's page [8080, or the next free]")
+]
+ViewerHost = Annotated[
+    str | None, typer.Option("--viewer-host", metavar="HOST", help="that it listens at; a token beyond [127.0.0.1]")
+]
 SummaryFile = Annotated[str | None, typer.Option("--summary", metavar="FILE.json", help="write the figures there")]
 LogJson = Annotated[bool, typer.Option("--log-json", help="log lines as JSON objects")]
 Record = Annotated[str | None, typer.Option("--record", metavar="FILE.mcap", help="record all of it there")]
@@ -41,8 +47,8 @@ def _operation(
     without: options.Without = None,
     secure: options.Secure = None,
     no_viewer: NoViewer = False,
-    viewer_host: viewing.Host = None,
-    viewer_port: viewing.Port = None,
+    viewer_host: ViewerHost = None,
+    viewer_port: ViewerPort = None,
     summary: SummaryFile = None,
     log_json: LogJson = False,
     record: Record = None,
@@ -53,15 +59,41 @@ def _operation(
     until_ended: bool,
 ) -> Operation:
     """What is asked for with the options of `run` and `up`, which are these."""
-    securing.choose(secure)
-    operation = Operation(cell, overrides, world, seed, speed, domain, connect, no_viewer, summary, log_json,
-                          Share(listen, link, only, without))
+    from common.security.requiring import choose
+    from common.supervision.interrupts import end_with_stdin
+
+    choose(secure)
+    operation = Operation(
+        cell, overrides, world=world, seed=options.whole("--seed", seed, 0), speed=options.number("--speed", speed),
+        domain=domain, connect=connect, no_viewer=no_viewer, summary=summary, log_json=log_json,
+        share=Share(listen, link, only, without),
+    )
     if until_stdin_ends:
         end_with_stdin()
     operation.serve_page(viewer_host, viewer_port)
     operation.record_to(record)
-    operation.disturb(chaos, chaos_rate, until_ended=until_ended)
+    disturbance = options.whole("--chaos", chaos, 0)
+    per_minute = _per_minute(chaos, chaos_rate)
+    if disturbance is not None:
+        operation.disturb(disturbance, per_minute, until_ended=until_ended)
     return operation
+
+
+def _per_minute(seed: str | None, rate: str | None) -> float:
+    """How often faults are made on purpose.
+
+    Raises:
+        ConfigError: the rate cannot be used.
+    """
+    from common.chaos.plan import MOST_PER_MINUTE, PER_MINUTE
+    from common.errors import ConfigError
+
+    per_minute = PER_MINUTE if rate is None else options.number("--chaos-rate", rate)
+    if not 0 < per_minute <= MOST_PER_MINUTE:
+        raise ConfigError("--chaos-rate", rate, f"must be more than 0 and at most {MOST_PER_MINUTE:g} [1/min]")
+    if rate is not None and seed is None:
+        raise ConfigError("--chaos-rate", rate, "needs --chaos SEED")
+    return per_minute
 
 
 def run(**given: Any) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 
-from cli import options, securing
+from cli import options
 from cli.inspection import Verbs
 from common.supervision.share import Share
 from common.terminal import echo
@@ -24,6 +24,7 @@ def config(
 ) -> None:
     """Print the router's configuration as JSON5, for zenohd or the image eclipse/zenoh."""
     from common.security.checking import require_valid
+    from common.security.requiring import choose
     from common.supervision.launch import Launch
     from common.transport.credentials import ROUTER_NAME, credentials_of, read_access, secure_folder
     from common.transport.endpoint import (
@@ -34,7 +35,7 @@ def config(
         router_settings,
     )
 
-    securing.choose(secure)
+    choose(secure)
     given = os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN) if domain is None else domain
     number = parse_domain(given, DOMAIN_VARIABLE if domain is None else "--domain")
     launch = Share(listen, link).linked(Launch(cell="", domain=number))

@@ -123,6 +123,7 @@ def check(
     from common.config import load_cell, names_of
     from common.errors import ConfigError
     from common.security.checking import require_current, require_valid
+    from common.security.requiring import renewal
     from common.security.rights import rights_in
     from common.transport.credentials import OPERATOR, RECORDER, ROUTER_NAME, common_name, read_access
 
@@ -139,11 +140,3 @@ def check(
             require_valid(place, names, again)
         require_current(place, read_access(place), cell.name, rights, again)
         echo(f"{cell.name}: {len(rights)} processes, certificates and rules are as they need them")
-
-
-def renewal(folder: str, cell: str) -> str:
-    """The command line that makes certificates and rules for a cell anew."""
-    from common.config import names_of
-
-    chosen = "" if cell in names_of("cells") else f" --cell {cell}"
-    return f"zencell secure init {folder} --renew{chosen}"

@@ -12,14 +12,12 @@ import typer
 
 from cli import options
 from cli.inspection import UP, Place
-from common.terminal import echo, printable
+from common.terminal import echo
 
 if TYPE_CHECKING:
-    from rich.console import Console, Group
-    from rich.table import Table
-    from rich.text import Text
+    from rich.console import Console
 
-    from common.client.watching import ServiceRow, TopicRow, View
+    from common.client.watching import View
     from common.transport.bus import Bus
 
 PERIOD = 1.0  # [s] between tables
@@ -68,74 +66,17 @@ def _opened(*, live: bool, as_json: bool) -> tuple[Callable[[View], None], Calla
     console = Console(width=None if sys.stdout.isatty() else PLAIN_WIDTH)
     if live and console.is_terminal:
         return _live(console)
+    from common.client.tables import render
+
     return lambda view: console.print(render(view)), lambda: None
 
 
 def _live(console: Console) -> tuple[Callable[[View], None], Callable[[], None]]:
     from rich.live import Live
 
+    from common.client.tables import render
+
     # Drawn when there is something new and not by a thread in between: the tool must cost little itself.
     table = Live(console=console, auto_refresh=False)
     table.start()
     return lambda view: table.update(render(view), refresh=True), table.stop
-
-
-def render(view: View) -> Group:
-    """The two tables, and a line above them."""
-    from rich.console import Group
-    from rich.text import Text
-
-    lost = "" if view.connected else "; the router is lost"
-    head = f"{view.cell} at speed {view.speed:g}; this tool takes {view.own_cpu:.1f} %{lost}"
-    notices = [Text(printable(line), style="red" if urgent else "yellow") for urgent, line in view.notices]
-    return Group(Text(printable(head), style="bold" if view.connected else "bold red"), *notices, Text(),
-                 services_table(view.services), Text(), topics_table(view.topics))
-
-
-def services_table(rows: list[ServiceRow]) -> Table:
-    """A row for each process."""
-    from rich.text import Text
-
-    from cli.live import STATE_STYLES
-
-    table = _table("service", "state", "pid", "CPU %", "MB", "restarts", "in/s", "dropped", "invalid", "overflow",
-                   text=2)
-    for row in rows:
-        table.add_row(
-            Text(printable(row.service)), Text(printable(row.state), style=STATE_STYLES.get(row.state, "")),
-            _number(row.pid), _number(row.cpu, 1), _number(row.memory), _alarming(row.restarts, "yellow"),
-            _number(row.received, 1), _number(row.dropped), _alarming(row.invalid, "red"),
-            _alarming(row.overflow, "red"),
-        )
-    return table
-
-
-def topics_table(rows: list[TopicRow]) -> Table:
-    """A row for each key that carries something."""
-    from rich.text import Text
-
-    table = _table("topic", "Hz", "kB/s", "messages", "age p50 ms", "age p99 ms", text=1)
-    for row in rows:
-        rate = None if row.bytes_per_second is None else row.bytes_per_second / 1e3
-        table.add_row(Text(printable(row.topic)), _number(row.hz, 2), _number(rate, 1), _number(row.messages),
-                      _number(row.p50, 1), _number(row.p99, 1))
-    return table
-
-
-def _table(*titles: str, text: int) -> Table:
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for index, title in enumerate(titles):
-        table.add_column(title, justify="left" if index < text else "right", no_wrap=True)
-    return table
-
-
-def _number(value: float | None, digits: int = 0) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
-
-
-def _alarming(value: int | None, style: str) -> Text:
-    from rich.text import Text
-
-    return Text("" if value is None else str(value), style=style if value else "dim")

@@ -47,8 +47,8 @@ class CommandShell:
         seed: str | None, domain: str | None, connect: str | None,
     ) -> T:
         """What a visit to a cell returns: to one that is up, or one that is brought up for it without its task."""
-        from cli.operation import Operation
         from common.config import load_cell
+        from common.operation.operation import Operation
         from common.supervision.launch import place_of, require_free_port
         from common.transport.endpoint import endpoint_of
         from common.transport.router import PortInUse
@@ -63,7 +63,8 @@ class CommandShell:
         if is_up:
             name = load_cell(cell, tuple(overrides or ()), world=world).name
             return Place(name, domain, connect).visit(visit)
-        operation = Operation(cell, overrides, world, seed, "1", domain, connect, no_viewer=True)
+        operation = Operation(cell, overrides, world=world, seed=options.whole("--seed", seed, 0), domain=domain,
+                              connect=connect, no_viewer=True)
         operation.leave_out(operation.cell.task)
         return operation.visit(visit)
 

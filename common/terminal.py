@@ -12,6 +12,8 @@ import sys
 # terminal can be sent.
 _STEERING = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]")
 
+STATE_STYLES = {"ready": "green", "starting": "cyan", "waiting": "dim", "restarting": "yellow", "failed": "bold red"}
+
 
 def printable(value: object, keep: str = "") -> str:
     r"""The value as text of one line; what could steer a terminal is written as JSON does, such as \u001b.

@@ -28,6 +28,22 @@ def refused(cell: Cell) -> list[Finding]:
         return []
 
 
+def require_safe(cell: Cell) -> None:
+    """Return when nothing is known because of which the arm or its fingers would move wrongly.
+
+    Raises:
+        ConfigError: something is; as `zencell check` says it.
+    """
+    for found in refused(cell):
+        field, _, rest = found.line.partition(": ")
+        raise ConfigError(field, ..., rest)
+
+
+def doubts(cell: Cell) -> list[Finding]:
+    """What else will not work, as far as it is told quickly."""
+    return [found for found in quick(cell) if not found.refused]
+
+
 def quick(cell: Cell) -> list[Finding]:
     """What the files tell; a model of the robot is loaded only to see where a camera on it looks from home."""
     from common.checking.robot_file import check_robot_file

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 from array import array
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from common.messages import MotionStatus, PlanFigure, Rejection, Rejections, TaskStatus, Vector3
@@ -153,6 +155,12 @@ class Summary:
         rejected = Rejected(list(self.rejected.places))
         rejected.add(self.status.skipped)
         return rejected
+
+    def write(self, file: Path) -> None:
+        """Write it as JSON, at once: a reader sees all of it or none."""
+        beside_it = file.with_name(file.name + ".part")
+        beside_it.write_text(json.dumps(self.as_dict(), indent=2) + "\n", encoding="utf-8")
+        beside_it.replace(file)
 
     def as_dict(self) -> dict[str, Any]:
         """The summary file."""

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import os
 import signal
+import sys
+import threading
 
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -29,3 +33,15 @@ class Interrupts:
         else:
             self.signal = number
             self.stop.set()
+
+
+def end_with_stdin() -> None:
+    """Have this process take the end of its standard input for Ctrl-C, also should nobody be left to close it."""
+
+    def watch() -> None:
+        with contextlib.suppress(OSError):
+            while os.read(sys.stdin.fileno(), 4096):
+                pass
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=watch, name="stdin", daemon=True).start()

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from cli.viewing import page_of
 from common.config import Cell, load_cell
 from common.errors import ConfigError
 from common.transport.credentials import SECURE_VARIABLE
 from common.viewer.access import FIRST_PORT, TOKEN_VARIABLE
+from common.viewer.serving import page_of
 from tests.harness import Zencell, ask
 
 OPTIONS = (("--viewer-port", "9000"), ("--viewer-host", "0.0.0.0"))

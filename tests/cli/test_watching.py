@@ -4,9 +4,9 @@ import os
 import pytest
 from rich.console import Console
 
-from cli.top import render
 from common import topics
 from common.application import all_topics
+from common.client.tables import render
 from common.client.watching import Processes, ServiceRow, TopicRow, View, Watch, on_demand, statuses
 from common.clock import Clock
 from common.messages import (

@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from cli.live import render
-from cli.screens import Content, PlainScreen
-from cli.top import services_table, topics_table
+from common.client.tables import services_table, topics_table
 from common.client.watching import ServiceRow, TopicRow
 from common.messages import ServiceStatus
+from common.operation.live import render
+from common.operation.screen import Content
+from common.operation.screens import PlainScreen
 from common.process.log import log_to_stderr
 from common.terminal import echo, printable
 from common.viewer import markup

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from cli.main import app
-from cli.securing import require_secured
 from common.config import load_cell
 from common.errors import ConfigError
 from common.security.certificates import Authority
+from common.security.requiring import require_secured
 from common.supervision.launch import Launch
 from common.supervision.share import Share
 from common.transport.credentials import ACCESS, ROUTER_NAME

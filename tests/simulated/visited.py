@@ -14,11 +14,11 @@ from unittest.mock import patch
 
 import typer
 
-from cli.operation import Operation
 from common import topics
 from common.application import find_application
 from common.config import Cell, load_cell
 from common.messages import TaskCommand
+from common.operation.operation import Operation
 from common.recording.own import Own
 from common.reporting.fold import Fold
 from common.reporting.summary import describe
@@ -111,7 +111,7 @@ def _run_to_end(operation: Operation) -> int:
     outcome = Simulation(operation.cell, 1, visit=work).run()
     assert not outcome.broken and not outcome.crashes, outcome
     operation.summary.restarts = outcome.restarts
-    operation._write_summary()
+    operation.write_summary()
     for line in describe(operation.summary.as_dict(), operation.fold.figures):
         typer.echo(line)
     return 0 if operation.summary.state == "DONE" else 1

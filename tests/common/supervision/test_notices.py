@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from cli.top import render
 from common import topics
+from common.client.tables import render
 from common.client.watching import View
 from common.config import load_cell
 from common.messages import Notice, SupervisorStatus

@@ -11,11 +11,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from cli.screens import Content
+from common.operation.screen import Content
 from common.process.lossy import told_lost
-from common.terminal import printable
+from common.terminal import STATE_STYLES, printable
 
-STATE_STYLES = {"ready": "green", "starting": "cyan", "waiting": "dim", "restarting": "yellow", "failed": "bold red"}
 REFRESHES = 4  # [1/s]
 MOST_LINES = 200  # between two of them: a line takes 0.1 ms to draw, and the cell's signals and news wait meanwhile
 

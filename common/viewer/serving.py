@@ -1,26 +1,29 @@
-"""Where the operator's page of a cell is served, from the options of `run` and `up`."""
+"""Where the operator's page of a cell is to be served, found before its service is started."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
+from common.errors import ConfigError
+from common.transport.credentials import secure_folder
+from common.viewer.access import (
+    TOKEN_VARIABLE,
+    VIEWER,
+    FreePort,
+    address_of,
+    first_free_port,
+    is_loopback,
+    make_token,
+    open_socket,
+    refusal,
+)
 
 if TYPE_CHECKING:
     from common.config import Cell
-    from common.viewer.access import FreePort
 
 HIGHEST_PORT = 65535
-
-Port = Annotated[
-    str | None, typer.Option("--viewer-port", metavar="N", help="of the operator's page [8080, or the next free]")
-]
-Host = Annotated[
-    str | None, typer.Option("--viewer-host", metavar="HOST", help="that it listens at; a token beyond [127.0.0.1]")
-]
-
 
 @dataclass(frozen=True)
 class Page:
@@ -43,19 +46,6 @@ def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
     Raises:
         ConfigError: there is no page, the port is taken, or one of the options cannot be used.
     """
-    from common.errors import ConfigError
-    from common.transport.credentials import secure_folder
-    from common.viewer.access import (
-        TOKEN_VARIABLE,
-        VIEWER,
-        address_of,
-        first_free_port,
-        is_loopback,
-        make_token,
-        open_socket,
-        refusal,
-    )
-
     entry = next((entry for entry in cell.services.values() if entry.kind == VIEWER), None)
     for option, value in (("--viewer-port", port), ("--viewer-host", host)):
         if value is not None and entry is None:
@@ -86,8 +76,6 @@ def page_of(cell: Cell, host: str | None, port: str | None) -> Page | None:
 
 
 def _port(text: str) -> int:
-    from common.errors import ConfigError
-
     if not (text.isascii() and text.isdigit() and 1 <= int(text) <= HIGHEST_PORT):
         raise ConfigError("--viewer-port", text, f"must be a whole number from 1 to {HIGHEST_PORT}")
     return int(text)

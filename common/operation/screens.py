@@ -9,37 +9,11 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol, TextIO, cast
+from typing import TextIO, cast
 
-from common.messages import ServiceStatus
+from common.operation.screen import Content, Screen
 from common.process.lossy import LossyWriter, told_lost
 from common.terminal import printable
-
-
-@dataclass(frozen=True)
-class Content:
-    """What the live table shows."""
-
-    services: list[ServiceStatus]
-    rates: dict[str, tuple[str, float]]  # by service: the topic that it writes most often, and how often [Hz]
-    progress: str  # of the task
-
-
-class Screen(Protocol):
-    """Where lines and the state of the cell are shown."""
-
-    def line(self, service: str, text: str) -> None:
-        """Show one line that a process wrote."""
-
-    def note(self, text: str) -> None:
-        """Show a line of the supervisor's own for the person in front of it."""
-
-    def progress(self, text: str) -> None:
-        """Show how far the task is."""
-
-    def close(self) -> None:
-        """Leave the terminal as it was."""
 
 
 class PlainScreen:
@@ -107,7 +81,7 @@ def open_screen(content: Callable[[], Content], *, log_json: bool, plain: bool =
     if not plain and sys.stderr.isatty() and os.environ.get("TERM", "dumb") != "dumb":
         from rich.console import Console
 
-        from cli.live import LiveScreen
+        from common.operation.live import LiveScreen
 
         terminal = _Terminal(sys.stderr)
         return LiveScreen(Console(file=cast(TextIO, terminal)), content, terminal.drain)

@@ -1,43 +1,39 @@
-"""One cell that is up at this terminal: checked, started, watched, told of, and ended."""
+"""One cell that is up at a terminal, from what was asked for to its end."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import json
 import logging
 import os
 import signal
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from cli import options, securing, viewing
+from common.operation.persons import kept_by_persons
 from common.supervision.share import Share
 from common.terminal import printable
 
 if TYPE_CHECKING:
-    from cli.screens import Content, Screen
     from common.chaos.agent import Chaos
     from common.checking.finding import Finding
     from common.config import Cell
     from common.messages import Inhibit
+    from common.operation.screen import Content, Screen
     from common.supervision.collector import Collector
     from common.supervision.supervisor import Supervisor
     from common.transport.bus import Bus
+    from common.viewer.serving import Page
 
 T = TypeVar("T")
 
 START_REQUEST_TIMEOUT = 5.0  # [s]
 LAST_WORDS = 5.0  # [s] for whoever is slow to read what became of a run
 LEFT = 3  # exit code
-FIRST_WORD = 2.0  # [s] in which the executor of a cell that is up has said how the robot is
-EXECUTOR, OURSELVES = "trajectory_executor", ("watchdog", "controller", "scene_monitor")
 
 
 class Disturbance(NamedTuple):
@@ -52,19 +48,34 @@ class Operation:
     """One bring-up, as a person asked for it."""
 
     def __init__(
-        self, cell: str, overrides: list[str] | None, world: str | None, seed: str | None, speed: str,
-        domain: str | None, connect: str | None, no_viewer: bool, summary: str | None = None, log_json: bool = False,
-        share: Share | None = None,
+        self, cell: str, overrides: Sequence[str] | None = None, *, world: str | None = None, seed: int | None = None,
+        speed: float = 1.0, domain: str | None = None, connect: str | None = None, no_viewer: bool = False,
+        summary: str | None = None, log_json: bool = False, share: Share | None = None,
     ) -> None:
         """Check everything that was asked for; nothing is started yet.
+
+        Args:
+            cell: name or path of its file.
+            overrides: as given to `--set`.
+            world: another one, by name or path.
+            seed: of everything random.
+            speed: cell time per wall time.
+            domain: where, as given to `--domain`.
+            connect: where, as given to `--connect`.
+            no_viewer: without the operator's page.
+            summary: file for the figures of a run.
+            log_json: log lines are JSON objects.
+            share: of this host in the cell.
 
         Raises:
             ConfigError, UnknownName: one line naming the option, the value and the choices.
         """
         from common.application import find_application
+        from common.checking.cell import require_safe
         from common.config import expanded, load_cell
         from common.errors import ConfigError
         from common.reporting.fold import Fold
+        from common.security.requiring import require_secured, with_near
         from common.supervision.launch import (
             Launch,
             clock_of,
@@ -82,10 +93,9 @@ class Operation:
             raise ConfigError("--summary", summary, "is in a folder that does not exist")
         share = share or Share()
         number, endpoint = place_of(domain, connect)
-        factor = options.number("--speed", speed)
         self.launch = share.linked(Launch(
-            cell=cell, overrides=tuple(expanded(overrides or ())), world=world, seed=options.whole("--seed", seed, 0),
-            domain=number, connect=endpoint, log_json=log_json, clock=clock_of(factor, share.epoch(factor)),
+            cell=cell, overrides=tuple(expanded(overrides or ())), world=world, seed=seed, domain=number,
+            connect=endpoint, log_json=log_json, clock=clock_of(speed, share.epoch(speed)),
         ))
         loaded = load_cell(cell, self.launch.overrides, world=world, seed=self.launch.seed)
         if no_viewer:
@@ -96,16 +106,16 @@ class Operation:
                          speed=self.launch.clock.speed, containers=list(loaded.world.containers))
         self.summary = self.fold.summary
         require_modules(loaded)
-        _require_safe(loaded)
+        require_safe(loaded)
         if endpoint is None:
             require_free_port(endpoint_of(number))
         self.cell = share.part_of(loaded)
-        securing.require_secured(self.launch, self.cell)
-        self.launch = securing.with_near(self.launch)
+        require_secured(self.launch, self.cell)
+        self.launch = with_near(self.launch)
         self._supervisor: Supervisor | None = None
         self._collector: Collector | None = None
         self._screen: Screen | None = None
-        self._page: viewing.Page | None = None
+        self._page: Page | None = None
         self._watchers: dict[str, list[str]] = {}  # commands by name
         self._disturbance: Disturbance | None = None
         self._chaos: Chaos | None = None
@@ -118,7 +128,9 @@ class Operation:
         Raises:
             ConfigError: there is no page, the port is taken, or host or port cannot be used.
         """
-        self._page = page = viewing.page_of(self.cell, host, port)
+        from common.viewer.serving import page_of
+
+        self._page = page = page_of(self.cell, host, port)
         if page is not None:
             overrides = (*self.launch.overrides, *page.overrides)
             self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
@@ -133,34 +145,22 @@ class Operation:
             return
         from common.recording.own import Own
         from common.recording.telling import require_new
+        from common.security.requiring import require_recorder
         from common.supervision.launch import python_module
         from common.transport.credentials import RECORDER
 
         path = Path(file).absolute()
         require_new(path, "--record")
-        securing.require_recorder(self.launch, self.cell)
+        require_recorder(self.launch, self.cell)
         place = ["--connect", self.launch.connect] if self.launch.connect else ["--domain", str(self.launch.domain)]
         self._watchers[RECORDER] = [
             *python_module("cli.main"), "record", "--cell", self.cell.name, "-o", str(path), *place, "--gate",
             "--own", str(Own.of(self.cell)),
         ]
 
-    def disturb(self, seed: str | None, rate: str | None, *, until_ended: bool) -> None:
-        """Have faults made on purpose once the cell is up: without end, or until a run has time left to finish.
-
-        Raises:
-            ConfigError: seed or rate cannot be used.
-        """
-        from common.chaos.plan import MOST_PER_MINUTE, PER_MINUTE
-        from common.errors import ConfigError
-
-        number = options.whole("--chaos", seed, 0)
-        per_minute = PER_MINUTE if rate is None else options.number("--chaos-rate", rate)
-        if not 0 < per_minute <= MOST_PER_MINUTE:
-            raise ConfigError("--chaos-rate", rate, f"must be more than 0 and at most {MOST_PER_MINUTE:g} [1/min]")
-        if rate is not None and number is None:
-            raise ConfigError("--chaos-rate", rate, "needs --chaos SEED")
-        self._disturbance = None if number is None else Disturbance(number, per_minute, until_ended)
+    def disturb(self, seed: int, per_minute: float, *, until_ended: bool) -> None:
+        """Have faults made on purpose once the cell is up: without end, or until a run has time left to finish."""
+        self._disturbance = Disturbance(seed, per_minute, until_ended)
 
     def leave_out(self, name: str) -> None:
         """Do not start a service."""
@@ -196,19 +196,24 @@ class Operation:
             code = asyncio.run(self._operate(self._until_ended))
         except StartFailed:
             self.summary.failed = True
-            self._write_summary()
+            self.write_summary()
             raise
-        self._write_summary()
+        self.write_summary()
         out = LossyWriter(sys.stdout)
         for line in describe(self.summary.as_dict(), self.fold.figures):
             out.put(printable(line) + "\n")
         out.flush(LAST_WORDS)
         return LEFT if code == 0 and self.summary.unexplained else code
 
+    def write_summary(self) -> None:
+        """Write the figures, if a file was named for them."""
+        if self.file is not None:
+            self.summary.write(self.file)
+
     def stay(self) -> int:
         """Exit code of staying up until a signal: 0 when that came after the cell was up."""
         code = asyncio.run(self._operate(self._until_interrupted))
-        self._write_summary()
+        self.write_summary()
         return 0 if self.summary.ready is not None else code
 
     async def _operate(self, work: Callable[[Bus], Awaitable[int]]) -> int:
@@ -267,7 +272,7 @@ class Operation:
                 self._screen.close()
 
     def _open_screen(self, early: list[tuple[str, str]]) -> None:
-        from cli.screens import ScreenHandler, open_screen
+        from common.operation.screens import ScreenHandler, open_screen
 
         self._screen = open_screen(self._content, log_json=self.launch.log_json, plain=self.first is not None)
         for name, text in early:
@@ -277,7 +282,7 @@ class Operation:
         root.setLevel(logging.INFO)
 
     def _content(self) -> Content:
-        from cli.screens import Content
+        from common.operation.screen import Content
 
         assert self._supervisor is not None
         statuses = self._supervisor.statuses
@@ -287,10 +292,11 @@ class Operation:
         return Content(statuses, {name: rate for name, rate in rates.items() if rate}, self.fold.progress)
 
     def _prepare(self, bus: Bus) -> None:
+        from common.checking.cell import doubts
         from common.supervision.collector import Collector
 
         assert self._screen is not None
-        self._doubts = asyncio.create_task(asyncio.to_thread(_doubts, self.cell))  # while services come up
+        self._doubts = asyncio.create_task(asyncio.to_thread(doubts, self.cell))  # while services come up
         self._collector = Collector(bus, self.fold, self.began, self._screen.progress)
 
     async def _until_ended(self, bus: Bus) -> int:
@@ -300,7 +306,7 @@ class Operation:
         from common.supervision.operation import beside
 
         collector = await self._came_up(bus)
-        kept = await self._kept(bus)
+        kept = await kept_by_persons(bus, self.cell, self._note)
         if not self._simulated:
             self._tell_kept(kept)
         if (self._simulated and kept) or (not self.cell.run.autostart and not kept):  # who says `run` says start
@@ -329,26 +335,9 @@ class Operation:
         took = f"{self.summary.ready:.1f} s"
         self._screen.note(f"{self.cell.name} is up at {endpoint} after {took}. Read it from outside:")
         self._screen.note(zenoh_cli_line(endpoint, self.cell.name))
-        self._tell_kept(await self._kept(bus))
+        self._tell_kept(await kept_by_persons(bus, self.cell, self._note))
         await beside(self._disturbing(), collector.run())
         return 0
-
-    async def _kept(self, bus: Bus) -> list[Inhibit]:
-        """What persons stopped or hold since before the cell came up; says so when they made it slower."""
-        from common import topics
-
-        if not any(entry.kind == EXECUTOR for entry in self.cell.services.values()):
-            return []  # on another host, or a cell without an arm
-        reader, motion = bus.reader(topics.MOTION_STATUS), None
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(FIRST_WORD):
-                motion = reader.latest or await reader.next()
-        if motion is None:
-            return []
-        if motion.speed_scaling < 1:
-            set_it = f"`zencell param set services.{EXECUTOR}.speed_scaling=1`"
-            self._note(f"Motions go at {100 * motion.speed_scaling:.0f} % of their speed: {set_it} ends that")
-        return [inhibit for inhibit in motion.inhibits if inhibit.by not in OURSELVES]
 
     def _tell_kept(self, kept: list[Inhibit]) -> None:
         for inhibit in kept:
@@ -379,49 +368,9 @@ class Operation:
             self._chaos = chaos_in(bus, self.cell, self._supervisor, known, seed, per_minute, until_ended=until_ended)
         return self._collector
 
-    def _write_summary(self) -> None:
-        if self.file is None:
-            return
-        text = json.dumps(self.summary.as_dict(), indent=2) + "\n"
-        beside_it = self.file.with_name(self.file.name + ".part")
-        beside_it.write_text(text, encoding="utf-8")
-        beside_it.replace(self.file)  # a reader sees all of it or none
-
-
-def _require_safe(cell: Cell) -> None:
-    """Return when nothing is known because of which the arm or its fingers would move wrongly.
-
-    Raises:
-        ConfigError: something is; as `zencell check` says it.
-    """
-    from common.checking.cell import refused
-    from common.errors import ConfigError
-
-    for found in refused(cell):
-        field, _, rest = found.line.partition(": ")
-        raise ConfigError(field, ..., rest)
-
-
-def _doubts(cell: Cell) -> list[Finding]:
-    """What else will not work, as far as it is told quickly."""
-    from common.checking.cell import quick
-
-    return [found for found in quick(cell) if not found.refused]
 
 
 def zenoh_cli_line(endpoint: str, cell: str) -> str:
     """A command line to paste that shows all of a cell with zenoh-cli."""
     line = "{key} {value}"
     return f"zenoh --mode client --connect {endpoint} subscribe -k '{cell}/**' --decoder msgpack --line '{line}'"
-
-
-def end_with_stdin() -> None:
-    """Have this process take the end of its standard input for Ctrl-C, also should nobody be left to close it."""
-
-    def watch() -> None:
-        with contextlib.suppress(OSError):
-            while os.read(sys.stdin.fileno(), 4096):
-                pass
-        os.kill(os.getpid(), signal.SIGINT)
-
-    threading.Thread(target=watch, name="stdin", daemon=True).start()

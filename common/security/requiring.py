@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cli.secure import renewal
 from common.errors import ConfigError, ZencellError
 
 if TYPE_CHECKING:
@@ -116,3 +115,11 @@ def _require_rules(launch: Launch, services: Sequence[str], folder: Path) -> Non
         lines = done.stderr.strip().splitlines() or [f"`secure check` ended with {done.returncode}"]
         said = [line.removeprefix(SAID) for line in lines if line.startswith(SAID)] or lines
         raise NotSecured(said[-1], done.returncode)
+
+
+def renewal(folder: str, cell: str) -> str:
+    """The command line that makes certificates and rules for a cell anew."""
+    from common.config import names_of
+
+    chosen = "" if cell in names_of("cells") else f" --cell {cell}"
+    return f"zencell secure init {folder} --renew{chosen}"
