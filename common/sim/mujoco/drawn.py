@@ -103,7 +103,7 @@ def _looks(spec: mujoco.MjSpec, camera: Pinhole) -> None:
     spec.stat.extent = EXTENT
     quality = spec.visual.quality
     quality.shadowsize, quality.offsamples = SHADOW_MAP, 4
-    quality.numslices, quality.numstacks, quality.numquads = SIDES, SIDES // 2, 16
+    quality.numslices, quality.numstacks, quality.numquads = SIDES, SIDES // 2, 8
     spec.visual.headlight.active = 0
     spec.visual.map.shadowclip, spec.visual.map.shadowscale = SHADOW_REACH / EXTENT, 1.0
     size = spec.visual.global_

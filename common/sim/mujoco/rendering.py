@@ -136,7 +136,7 @@ class Canvas:
         self._made.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._scene = mujoco.MjvScene(model, maxgeom=MOST_GEOMS)
         flags, render = self._scene.flags, mujoco.mjtRndFlag
-        for off in (render.mjRND_REFLECTION, render.mjRND_HAZE, render.mjRND_SKYBOX, render.mjRND_CULL_FACE):
+        for off in (render.mjRND_REFLECTION, render.mjRND_HAZE, render.mjRND_SKYBOX):
             flags[off] = 0
         self._option, self._any = mujoco.MjvOption(), mujoco.MjvCamera()
 
