@@ -33,6 +33,7 @@ class Config(CameraParameters):
     distorted: bool = Field(False, description="see through the lens of the world's camera, with its distortion d")
     rectify: bool = Field(True, description="with distorted: take it out again, as camera_opencv does; false sends "
                                             "pictures as they come, and d in camera_info: the detectors refuse them")
+    draw_robot: bool = Field(False, description="the arm stands before what lies behind it, as in a real picture")
 
 
 async def run(bus: Bus, config: Config) -> None:
@@ -45,7 +46,8 @@ async def run(bus: Bus, config: Config) -> None:
     frame = config.world.camera.frame
     rng = np.random.default_rng(config.run.seed)
     lens = Lens(config.world.camera, distorted=config.distorted, rectify=config.rectify)
-    camera = SimulatedCamera(config.world, config.scenery, config.robot, config, rng, plain=True, lens=lens)
+    camera = SimulatedCamera(config.world, config.scenery, config.robot, config, rng, plain=True, lens=lens,
+                             arm=config.draw_robot)
     joints = bus.reader(topics.JOINT_STATES) if camera.needs_joints else None
     await bus.ready()
     await truth.next()

@@ -60,7 +60,7 @@ async def run(bus: Bus, config: Config) -> None:
                 out.put(scene.scene())
 
     async def look(view: int, seen: Seen) -> None:
-        scene.see(seen.frame, seen.camera, hand(), view, seen.at_times)
+        scene.see(seen.frame, seen.camera, hand(), view, seen.at_times, seen.hidden)
         out.put(scene.scene())
 
     async with asyncio.TaskGroup() as group:

@@ -30,11 +30,14 @@ class Config(DetectorOptions):
     world: Surroundings
 
 
-def markers(detections: list[Detection], around: Surroundings, stamp: int, remark: str = "") -> MarkerArray:
-    """The message of what was found in the frame that was exposed at `stamp`."""
+def markers(
+    detections: list[Detection], around: Surroundings, stamp: int, remark: str = "", blind: str = ""
+) -> MarkerArray:
+    """The message of what was found in the frame that was exposed at `stamp`, or of why that tells nothing."""
     return MarkerArray(
         header=Header(stamp=stamp, frame_id=WORLD),
         remark=remark,
+        blind=blind,
         markers=[
             _marker(index, d.position, d.pixel, d.partial, around.ball_radius, around.ball_color)
             for index, d in enumerate(detections)
@@ -82,7 +85,8 @@ async def run(bus: Bus, config: Config) -> None:
                 left_out.note(error)
                 continue
             detections = detector.detect(picture, camera)
-            found.put(markers(detections, config.world, image.header.stamp, _remark(detector, bus.service)))
+            remark = _remark(detector, bus.service)
+            found.put(markers(detections, config.world, image.header.stamp, remark, detector.blind))
             if shown.matched:
                 shown.put(array_to_image(annotate(picture, detections), "bgr8", image.header))
             if masks.matched:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from contextlib import suppress
 
 from pydantic import Field
 
+from common.applications.pick_place.region import MOST_HIDDEN, Region
+from common.applications.pick_place.remembered import HIDDEN, Remembered
 from common.applications.pick_place.topics import (
     REJECTED_TARGETS,
     VALIDATED_TARGETS,
@@ -31,9 +34,42 @@ class Config(ViewsParameters, WorkspaceBounds):
     world: Surroundings
     robot: RobotConfig
     grasp: Grasp
+    may_hide: Tunable[float] = Field(
+        MOST_HIDDEN, ge=0, le=1, description="part of the table within reach that may be hidden while it counts as seen"
+    )
     forget_after: Tunable[float] = Field(
         2.0, ge=0, le=3600, description="a rejection is told again once its place was empty for so long [s, cell time]"
     )
+
+
+class Watched:
+    """Says what the newest pictures do not show of where things may lie."""
+
+    def __init__(self, around: Surroundings, bounds: WorkspaceBounds) -> None:
+        """Begin; the table is divided up when something is hidden for the first time."""
+        self._around, self._bounds = around, bounds
+        self._region: Region | None = None
+
+    def unseen(self, seen: list[Seen], views: Views, most: float) -> tuple[str, bool]:
+        """In words, empty where at most that share of the table is hidden; and whether nothing is seen at all."""
+        hiding = [one.hidden for one in seen if one.hidden is not None]
+        if not hiding:
+            return "", False
+        if len(hiding) == len(seen) and all(hidden.everything for hidden in hiding):
+            return hiding[0].by, True
+        self._region = self._region or Region(self._around, self._bounds)
+        robot, silhouettes = views.robot
+        share = self._region.hidden((self._region.within(one.camera, silhouettes, robot), one.hidden) for one in seen)
+        by = " and ".join(dict.fromkeys(hidden.by for hidden in hiding))
+        return (f"{by} hides {100 * share:.0f} % of the table within reach" if share > most else ""), False
+
+
+def hiding(seen: list[Seen], radius: float) -> Callable[[tuple[float, float, float]], bool] | None:
+    """Whether a place is hidden in all views, for what is as large as that [m]; None where any shows everything."""
+    hidden = [one.hidden for one in seen if one.hidden is not None]
+    if len(hidden) < len(seen) or not hidden:
+        return None
+    return lambda place: all(bool(one.hides([place], radius)[0]) for one in hidden)
 
 
 def shells(config: Config, header: Header) -> MarkerArray:
@@ -62,6 +98,8 @@ async def run(bus: Bus, config: Config) -> None:
     reach = ReachCache(RobotModel.load(config.robot), config.grasp, config)
     validation = Validation(config.world, reach, forget_after=config.forget_after)
 
+    watched, remembered, radius = Watched(config.world, config), Remembered(), config.world.ball_radius
+
     def show() -> None:
         markers.put(shells(config, bus.header(WORLD)))
 
@@ -78,8 +116,12 @@ async def run(bus: Bus, config: Config) -> None:
         verdict = validation.judge_all([(one.frame, one.camera) for one in seen])
         unfinished = seen if verdict.unknown else []
         header = Header(stamp=min(one.frame.header.stamp for one in seen), frame_id=WORLD)
-        poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in verdict.targets]
-        validated.put(PoseArray(header=header, poses=poses, remark=verdict.remark))
+        kept = remembered.hidden(verdict.targets, [place for place, _ in verdict.refused], hiding(seen, radius))
+        poses = [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in [*verdict.targets, *kept]]
+        labels = [*("" for _ in verdict.targets), *(HIDDEN for _ in kept)] if kept else []
+        unseen, blind = watched.unseen(seen, views, config.may_hide)
+        validated.put(PoseArray(header=header, poses=poses, labels=labels, remark=verdict.remark, unseen=unseen,
+                                blind=blind))
         if verdict.rejections:
             rejected.put(Rejections(header=header, rejected=verdict.rejections))
         for one in verdict.rejections:

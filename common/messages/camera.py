@@ -29,6 +29,7 @@ class CameraInfo(Message):
     """Pinhole calibration, as sensor_msgs/CameraInfo: `k` is the 3x3 intrinsic matrix [px], row by row."""
 
     most_bytes: ClassVar[int] = SMALL
+    later: ClassVar[tuple[str, ...]] = ("without_robot",)
 
     header: Header
     height: int = Field(ge=1, le=16384)
@@ -36,6 +37,7 @@ class CameraInfo(Message):
     distortion_model: Label = "plumb_bob"
     d: list[Finite] = Field([], max_length=64)
     k: list[Finite] = Field(min_length=9, max_length=9)
+    without_robot: bool = Field(False, description="its pictures are drawn, and show what lies behind the robot")
 
     @model_validator(mode="after")
     def _has_focal_lengths(self) -> CameraInfo:
@@ -63,10 +65,12 @@ class MarkerArray(Message):
 
     most_bytes: ClassVar[int] = 256 * 1024
     most_parts: ClassVar[int] = 8 * 1024
+    later: ClassVar[tuple[str, ...]] = ("blind",)
 
     header: Header
     markers: list[Marker] = Field(max_length=1000)
     remark: Text = Field("", description="what was seen there and is no marker, and why")
+    blind: Text = Field("", description="why the picture tells nothing; empty when it does")
 
 
 class PointCloud2(Message):

@@ -52,12 +52,16 @@ class PoseArray(Message):
 
     most_bytes: ClassVar[int] = 2 * SMALL
     most_parts: ClassVar[int] = 1024
+    later: ClassVar[tuple[str, ...]] = ("unseen", "blind")
 
     header: Header = Header()
     poses: list[Pose] = Field([], max_length=MOST_POSES)
     ids: Labels = []
-    labels: Labels = Field([], description="of truth: table, held, falling, box, or elsewhere (out of sight)")
+    labels: Labels = Field([], description="of truth: table, held, falling, box, or elsewhere (out of sight); of what "
+                                           "is seen: hidden for what was seen there before something hid it")
     remark: Text = Field("", description="what was seen and is none of the poses, and why")
+    unseen: Text = Field("", description="what the picture did not show of where things may lie; empty: nothing")
+    blind: bool = Field(False, description="the picture showed nothing at all")
 
     @model_validator(mode="after")
     def _same_length(self) -> PoseArray:

@@ -79,10 +79,11 @@ class Pinhole:
         """Optical centre in world, (3,) [m]."""
         return self._position
 
-    def info(self, header: Header) -> CameraInfo:
-        """The camera_info message of this camera."""
+    def info(self, header: Header, *, without_robot: bool = False) -> CameraInfo:
+        """The camera_info message of this camera; one that leaves the robot out of its pictures says so."""
         k = [self.fx, 0.0, self.cx, 0.0, self.fy, self.cy, 0.0, 0.0, 1.0]
-        return CameraInfo(header=header, height=self.height, width=self.width, d=[0.0] * 5, k=k)
+        return CameraInfo(header=header, height=self.height, width=self.width, d=[0.0] * 5, k=k,
+                          without_robot=without_robot)
 
     def to_camera(self, points: npt.ArrayLike) -> Array:
         """Points of world in the optical frame: (..., 3) [m]."""

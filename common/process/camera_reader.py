@@ -39,6 +39,12 @@ class CameraReader:
         info = self._infos.latest
         return (frame_id or (info.header.frame_id if info else "")) in self._on_robot
 
+    @property
+    def without_robot(self) -> bool:
+        """Whether the camera says that its pictures leave the robot out."""
+        info = self._infos.latest
+        return info is not None and info.without_robot
+
     async def of(self, picture: Header, *, own_frame: bool = True) -> Pinhole:
         """The camera of a picture, where it was when that was taken.
 

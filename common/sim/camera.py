@@ -40,7 +40,7 @@ class SimulatedCamera:
 
     def __init__(
         self, around: Surroundings, scenery: Scenery, robot: RobotConfig, config: CameraParameters,
-        rng: np.random.Generator, *, plain: bool, lens: Lens | None = None,
+        rng: np.random.Generator, *, plain: bool, lens: Lens | None = None, arm: bool = False,
     ) -> None:
         """Look at the world of a simulator.
 
@@ -52,6 +52,7 @@ class SimulatedCamera:
             rng: where noise comes from.
             plain: see `common.sim.interface.load_renderer`.
             lens: of the camera; else a pinhole.
+            arm: whether the arm is in plain pictures, too.
 
         Raises:
             ConfigError, UnknownName: something named in the cell is not there.
@@ -63,7 +64,8 @@ class SimulatedCamera:
         self._mounted = Mounted(self._lens.drawn, self._model() if around.camera.mount else None)
         self._camera = around.camera
         self._lit = self._light()
-        self._renderer = load_renderer(around, self._lit, self._model, plain=plain, camera=self._mounted.at())
+        self._renderer = load_renderer(around, self._lit, self._model, plain=plain, camera=self._mounted.at(),
+                                       arm=arm)
         self._sensor, self._movement = Sensor(config, rng), Movement()
         self.moves = self._mounted.moves
         self.needs_joints = self.moves or self._renderer.needs_arm
@@ -88,7 +90,7 @@ class SimulatedCamera:
 
     def info(self, header: Header) -> CameraInfo:
         """What it tells of itself."""
-        info = self.pinhole.info(header)
+        info = self.pinhole.info(header, without_robot=not self._renderer.needs_arm)
         return info.model_copy(update={"d": self._lens.d, "distortion_model": self._lens.model})
 
     def is_at(self, joints: JointState | None) -> bool:

@@ -195,7 +195,8 @@ class Renderer(Protocol):
 
 
 def load_renderer(
-    around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole
+    around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole,
+    arm: bool = False,
 ) -> Renderer:
     """What draws the world of the scenery's simulator for a camera.
 
@@ -205,6 +206,7 @@ def load_renderer(
         robot: gives the robot; not asked when it is not in the picture.
         plain: for a camera that a drawn world shows without arm and depth.
         camera: intrinsics and pose.
+        arm: have the arm in plain pictures, too.
 
     Raises:
         UnknownName: no such simulator; lists the choices.
@@ -213,7 +215,7 @@ def load_renderer(
     module = _module(scenery.simulator)
     if not hasattr(module, "renderer"):
         module = _module(SIMULATORS[0])
-    made: Renderer = module.renderer(around, scenery, robot, plain=plain, camera=camera)
+    made: Renderer = module.renderer(around, scenery, robot, plain=plain, camera=camera, arm=arm)
     return made
 
 

@@ -48,12 +48,14 @@ def create(
 
 
 def renderer(
-    around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole
+    around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole,
+    arm: bool = False,
 ) -> Renderer:
     """What draws this world for a camera: see `common.sim.interface`."""
     from common.sim.rendering import Renderer  # of no use to who moves the world
 
-    return Renderer(around, None if plain else robot(), plain=plain, camera=camera, scenery=scenery)
+    seen = robot() if arm or not plain else None
+    return Renderer(around, seen, plain=plain, camera=camera, scenery=scenery)
 
 
 class KinematicWorld:

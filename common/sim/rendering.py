@@ -2,7 +2,7 @@
 
 There are two kinds of picture. In a full one all of that is solid, with colour and depth, and rays are cast at it. In a
 plain one the table is grey with a grid, a container is drawn by its edges, and the arm, with what it holds, is out of
-sight; spheres in it are exact and cost a few tenths of a millisecond for all of them.
+sight unless a robot is given; spheres in it are exact and cost a few tenths of a millisecond for all of them.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Renderer:
 
         Args:
             around: fixtures and containers, and the camera if none is given.
-            robot: whose links are seen in a full picture; without one there is no arm.
+            robot: whose links are seen; without one there is no arm.
             plain: draw a plain picture.
             camera: intrinsics and the pose of the optical frame.
             rim_width: of the white line on the outline of each sphere in a plain picture [px]; 0 for none.
@@ -66,10 +66,10 @@ class Renderer:
             ConfigError: a mesh of the robot is not there.
         """
         self.camera = camera if camera is not None else Pinhole.from_config(around.camera)
-        self.needs_arm = robot is not None and not plain
+        self.needs_arm = robot is not None
         self.light(scenery or Scenery())
         self._plain, self._rim_width, self._robot, self._around = plain, rim_width, robot, around
-        self._shapes = robot_shapes(robot) if robot is not None and not plain else {}
+        self._shapes = robot_shapes(robot) if robot is not None else {}
         self._meshes: dict[tuple[object, ...], Array] = {}  # triangles of what was seen, in its own frame
         self._solid = [] if plain else _solid(around)
         self._asked: Sequence[WorldObject] | None = None
@@ -98,7 +98,7 @@ class Renderer:
     def takes_long(self, objects: Sequence[WorldObject]) -> bool:
         """Whether to `see` the objects may take longer than a moment: rays are cast at all but a few spheres."""
         slow = len(objects) > FEW or any(thing.shape != "sphere" for thing in objects)
-        return slow and objects != self._asked
+        return bool(self._shapes) or (slow and objects != self._asked)
 
     def see(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
         """The view of the objects and of the arm in that state; without a complete state, of the objects alone.
@@ -106,17 +106,20 @@ class Renderer:
         The depth of a plain picture knows neither table nor spheres. What is "elsewhere" is out of sight.
         """
         self._asked = objects
-        hidden = ("held", "elsewhere") if self._plain else ("elsewhere",)
+        hidden = ("held", "elsewhere") if self._plain and not self._shapes else ("elsewhere",)
         seen = [thing for thing in objects if thing.state not in hidden]
         changed = self._objects is None or seen != self._objects
         if changed:
             self._objects = seen
-            self._still = self._with_objects(seen)
+            self._still = self._with_objects(seen, [])
         positions = None if joints is None else np.array(joints.position)
         if changed or not _same(positions, self._joints):
             self._joints = positions
             arm = self._arm(joints)
-            self._seen = cast(arm, self.camera, self._still) if arm else self._still
+            if arm and self._plain:  # spheres are drawn after all else
+                self._seen = self._with_objects(seen, arm)
+            else:
+                self._seen = cast(arm, self.camera, self._still) if arm else self._still
         return self._seen
 
     def _plain_background(self, around: Surroundings) -> View:
@@ -131,10 +134,10 @@ class Renderer:
             _draw_container(view.colour, self.camera, container, around.table_height)
         return view
 
-    def _with_objects(self, objects: Sequence[WorldObject]) -> View:
+    def _with_objects(self, objects: Sequence[WorldObject], arm: list[Mesh]) -> View:
         spheres = [thing for thing in objects if self._plain and thing.shape == "sphere"]
         solid = [self._mesh(thing) for thing in objects if not (self._plain and thing.shape == "sphere")]
-        solid = [*self._solid, *solid]
+        solid = [*self._solid, *solid, *arm]
         plain = View(self._behind.colour.copy(), self._behind.depth)
         view = cast(solid, self.camera, self._behind) if solid else plain
         distances = [float(np.linalg.norm(_centre(thing) - self.camera.position)) for thing in spheres]

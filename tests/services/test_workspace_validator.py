@@ -174,5 +174,5 @@ async def test_shell_and_column_are_there_for_whoever_comes_late():
 
 async def test_it_reads_no_truth():
     found = await wiring(run, config)
-    assert found.reads == {DETECTED_OBJECTS, topics.CAMERA_INFO, topics.TF_STATIC}
+    assert found.reads == {DETECTED_OBJECTS, topics.CAMERA_INFO, topics.TF_STATIC, topics.JOINT_STATES}
     assert found.writes == {VALIDATED_TARGETS, REJECTED_TARGETS, WORKSPACE_MARKERS}

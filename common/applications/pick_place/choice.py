@@ -12,6 +12,7 @@ from typing import Any
 
 from common import messages as m
 from common.applications.pick_place.parameters import Config, HandShape
+from common.applications.pick_place.remembered import HIDDEN
 from common.config import Container
 from common.robot.transforms import matrix_to_rpy, pose_to_matrix
 from common.scene.workspace import yaw_candidates
@@ -22,6 +23,7 @@ Spots = list[tuple[float, float]]
 YawRange = tuple[float, float]  # its middle, and how far it reaches to either side [rad]
 FULL = "the container is full"
 FINE = 36  # yaws in half a turn at which it is looked whether the hand is clear
+SAME_PLACE = 0.02  # [m] what is hidden and a track that is nearer are one object
 SETTLING = 1.5  # [s] from letting go until the ball lies in the container and was seen there
 
 
@@ -98,7 +100,20 @@ class PickPlaceView(View):
     @property
     def targets(self) -> list[Place]:
         """Where something was seen that may be taken, in world [m]."""
-        return [place_of(pose) for pose in self.seen.poses] if self.seen else []
+        if self.seen is None:
+            return []
+        places = [place_of(pose) for pose in self.seen.poses]
+        if not self.seen.labels:
+            return places
+        # What is hidden and was taken meanwhile is still in the picture's memory, but no more in the planning scene.
+        known = [ball.position for ball in self.balls()]
+        return [place for place, label in zip(places, self.seen.labels, strict=True)
+                if label != HIDDEN or any(math.dist(place[:2], one[:2]) <= SAME_PLACE for one in known)]
+
+    @property
+    def blind(self) -> str:
+        """Why nothing is seen at all; empty when something is."""
+        return f"nothing can be seen: {self.seen.unseen}" if self.seen is not None and self.seen.blind else ""
 
     @property
     def stamps(self) -> tuple[float, ...]:

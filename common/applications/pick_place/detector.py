@@ -15,6 +15,7 @@ from common.applications.pick_place.masks import Colours, Masks
 from common.applications.pick_place.resting import Resting
 from common.applications.pick_place.separation import separate
 from common.config import Parameters, Surroundings, Tunable
+from common.perception.exposure import blindness
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouettes
 
@@ -105,6 +106,7 @@ class Detector:
         self._masks = Masks()
         self._outlines: dict[Traced, Outline] = {}  # of the last picture: what is there again is not worked out again
         self._fits: dict[_Key, list[_Round]] = {}
+        self.blind = ""  # why the last picture tells nothing
         self.too_small = 0  # blobs in the last picture that were not looked at, but for those in the container
         self._last: tuple[Mask, Pinhole, DetectorOptions, list[Detection]] | None = None
 
@@ -124,6 +126,7 @@ class Detector:
         if last and closed is last[0] and camera is last[1] and self.options == last[2]:
             return list(last[3])
         found = self._look_at(fine, closed, camera)
+        self.blind = "" if found else blindness(picture)
         self._last = (closed, camera, self.options.model_copy(), found)
         return list(found)
 

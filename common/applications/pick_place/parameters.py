@@ -62,6 +62,13 @@ class Config(TaskConfig):
     moved: Tunable[float] = Field(
         0.005, gt=0, le=0.05, description="an object that is further from where it was has moved [m]"
     )
+    look_from: Tunable[list[float]] = Field(
+        [], max_length=32, description="joint positions from which the camera sees past the arm [rad]; empty: found by "
+                                       "the shape of the robot"
+    )
+    look_timeout: Tunable[float] = Field(
+        20.0, ge=1, le=3600, description="ERROR once it could not see the table for so long [s]"
+    )
     width_tolerance: Tunable[float] = Field(
         0.01, gt=0, le=0.05, description="what is grasped may be so much wider or narrower than it was seen [m]"
     )

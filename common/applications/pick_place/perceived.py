@@ -12,6 +12,7 @@ from common import messages as m
 from common.applications.pick_place.resting import Resting
 from common.applications.pick_place.tracks import SceneParameters, Sighting, Track, Tracks
 from common.config import GripperConfig, Surroundings
+from common.perception.occlusion import Hidden
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix
 from common.scene.fixtures import color_of, fixed_objects
@@ -56,12 +57,12 @@ class PerceivedScene:
         self._stamp = 0
 
     def see(self, detections: m.MarkerArray, camera: Pinhole, T_world_tcp: Array | None, view: int = 0,
-            at_times: bool = False) -> None:
+            at_times: bool = False, hidden: Hidden | None = None) -> None:
         """Take in the detections of one frame, of one of several views.
 
         A frame that was taken before the hand last closed or opened still shows what is in the hand now on the table:
         it is left out. So is anything seen where the hand holds a ball. What a camera showed that looks `at_times` is
-        known until it looks again.
+        known until it looks again; what is `hidden` in the picture, until somebody sees that place.
         """
         stamp = detections.header.stamp
         if stamp <= self._changed_hands_at:
@@ -85,13 +86,29 @@ class PerceivedScene:
                 beside_slots.append(thing)
             elif hand is None or math.dist(hand, thing.position) > max(thing.size) / 2:
                 on_table.append(thing)
-        self._beside_slots[view] = beside_slots
-        self._tracks.update(on_table, stamp * 1e-9, view, at_times)
-        seen = occupied_slots(in_container, camera, self._slots, self.around.ball_radius, self._free)
+        radius = self.around.ball_radius
+        self._tracks.update(on_table, stamp * 1e-9, view, at_times, None if hidden is None else (
+            lambda place: bool(hidden.hides([place], radius)[0])))
+        seen = occupied_slots(in_container, camera, self._slots, radius, self._free)
+        if hidden is None:
+            self._beside_slots[view] = beside_slots
+        else:
+            seen |= self._still_in(view, seen, hidden)
+            if beside_slots or not hidden.everything:
+                self._beside_slots[view] = beside_slots
         self._free -= seen
         self._occupied[view] = stamp, seen
         if at_times:
             self._lasts.add(view)
+
+    def _still_in(self, view: int, seen: set[int], hidden: Hidden) -> set[int]:
+        """Slots in which something was and which cannot be judged now."""
+        before = self._occupied.get(view, (0, set()))[1] - seen
+        if not before:
+            return set()
+        slots = sorted(before)
+        behind = hidden.hides(self._slots[slots], self.around.ball_radius)
+        return {slot for slot, away in zip(slots, behind, strict=True) if away}
 
     def feel(self, gripper: m.GripperState, T_world_tcp: Array | None) -> None:
         """Take in whether the hand holds something: the nearest ball moves into it with its id, or leaves it."""

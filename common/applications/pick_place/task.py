@@ -9,6 +9,7 @@ import math
 
 from common import messages as m
 from common.applications.pick_place.choice import Choice, Pick, PickPlaceView, Spots, Target
+from common.applications.pick_place.looking import Looking
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.parameters import Config
 from common.applications.pick_place.rows import Rows
@@ -19,6 +20,7 @@ from common.tasks.watchdogs import Patience
 
 GONE = "the ball is no longer where it was seen"
 MOST = 400  # characters of a message
+STANDING = 0.5  # [s] for which the arm hides something before it goes out of the way: pictures are a little late
 CONTAINED_FOR = 0.5  # [s] balls that are seen in the container for so long are there
 
 
@@ -35,6 +37,7 @@ class PickPlace(Task[PickPlaceView]):
         self._rows = Rows(config, self.gripper)
         self._choice = Choice(config, config.world.container, config.world.ball_radius)
         self._contained = Patience()
+        self._looking, self._hidden = Looking(config), Patience()
 
     # --- what to do next -------------------------------------------------------------------------------------
 
@@ -90,7 +93,7 @@ class PickPlace(Task[PickPlaceView]):
 
     def _wait_for_the_end(self, view: PickPlaceView) -> None:
         """DONE after a moment with an empty table, or after the grace period when something cannot be taken."""
-        if self.status.state == "DONE":
+        if self.status.state == "DONE" or self._looks_for_more(view):
             return
         left = max(len(view.balls()), len(view.targets))  # one of the two may have just begun to look
         done = False
@@ -107,6 +110,31 @@ class PickPlace(Task[PickPlaceView]):
             self.status.overlooked = f"{message}{':' if left else ', but'} {remark}"[:MOST] if remark else ""
             self.status.message = self.status.overlooked or message
         self.status.state, self.status.stage, self.status.subject = "DONE" if done else "IDLE", "", ""
+
+    def unseen(self, view: PickPlaceView) -> str:
+        """Why the newest picture cannot be decided by: it is old, or tells nothing."""
+        return super().unseen(view) or view.blind
+
+    def _looks_for_more(self, view: PickPlaceView) -> bool:
+        """Whether part of the table is hidden, so that this is not the end: the arm goes out of the way to look."""
+        why = view.blind or (view.seen.unseen if view.seen else "")
+        if super().unseen(view):
+            return False
+        if not why:
+            self._looking.found()
+            self._hidden.reset()
+            return False
+        self.patience.reset()
+        self.status.state, self.status.stage, self.status.subject = "IDLE", "", ""
+        self.status.message = why if view.blind else f"{why}: it is not known to be empty"
+        waited = self._hidden.lasts(bool(view.blind), view.now)
+        looked = not view.blind and waited >= STANDING and min(view.stamps) > self.look_after
+        if looked and (pose := self._looking.next()):
+            self._hidden.reset()
+            self.row += [Move("look", "HOMING", goal=m.JointGoal(positions=pose)), Look()]
+        elif waited >= self.p.look_timeout:
+            self.end("ERROR", f"{why}, for {waited:.0f} s: what lies there is not known")
+        return True
 
     # --- what happened ---------------------------------------------------------------------------------------
 
@@ -148,6 +176,9 @@ class PickPlace(Task[PickPlaceView]):
     def _let_go(self, view: PickPlaceView) -> None:
         self.clear()
         self.row += [self._rows.open(), *self.back_off(view.let_go())]
+        if view.seen is not None and view.seen.unseen and (pose := self._looking.best()):
+            # The hand hides what it did not take, which may lie elsewhere now.
+            self.row += [Move("look", "HOMING", goal=m.JointGoal(positions=pose)), Look()]
         self.look_after = view.now
 
     def plan_failed(self, move: Move, response: m.PlanResponse, view: PickPlaceView) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -14,6 +14,7 @@ from common.messages import Color, Marker, Quaternion
 
 Place = tuple[float, float, float]
 Shape = Literal["sphere", "box", "cylinder"]
+Hides = Callable[[Place], bool]  # whether a place cannot be judged in a picture
 
 WIDTH_SLACK = 0.01  # [m] by which the fingers' width and the seen size of what they hold may differ
 
@@ -90,8 +91,12 @@ class Tracks:
         self._tracks: list[Track] = []
         self._count = 0
         self._looked: dict[int, float] = {}  # of views that look at times: when last [s]
+        self._hides: dict[int, tuple[float, Hides | None]] = {}  # of the others: when they looked last [s], what hides
 
-    def update(self, sightings: Sequence[Sighting], now: float, view: int = 0, at_times: bool = False) -> None:
+    def update(
+        self, sightings: Sequence[Sighting], now: float, view: int = 0, at_times: bool = False,
+        hides: Hides | None = None,
+    ) -> None:
         """Take in all detections of one frame.
 
         Args:
@@ -99,9 +104,12 @@ class Tracks:
             now: when it was taken [s].
             view: which of several views it is of.
             at_times: that one looks at times only: what it showed is known until it looks again.
+            hides: what of the frame cannot be judged: what was known there is known as long as nobody sees the place.
         """
         if at_times:
             self._looked[view] = now
+        else:
+            self._hides[view] = now, hides
         pairs = sorted(
             (math.dist(t.position, s.position), i, j)
             for i, t in enumerate(self._tracks)
@@ -120,11 +128,19 @@ class Tracks:
             x, y, z = (a + weight * (b - a) for a, b in zip(track.position, sightings[j].position, strict=True))
             track.position, track.seen, track.last_seen = (x, y, z), track.seen + 1, now
             track.sighting, track.view = sightings[j], view
+        for track in self._tracks:
+            if track.last_seen < now and track.seen >= self.p.confirm_frames and self._is_hidden(track, now):
+                track.last_seen = now
         self._tracks = [t for t in self._tracks if self._unseen_for(t, now) <= self.p.forget_after]
         for j, sighting in enumerate(sightings):
             if j not in matched:
                 self._count += 1
                 self._tracks.append(Track(f"track_{self._count}", sighting.position, 1, now, sighting, view))
+
+    def _is_hidden(self, track: Track, now: float) -> bool:
+        """Whether nobody who looks now can tell whether it is there."""
+        looking = [hides for at, hides in self._hides.values() if now - at <= self.p.forget_after]
+        return bool(looking) and all(hides is not None and hides(track.position) for hides in looking)
 
     def _unseen_for(self, track: Track, now: float) -> float:
         """For how long nobody has seen it who looked [s]."""

@@ -16,8 +16,10 @@ from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Marker, MarkerArray
 from common.perception.intake import LeftOut, Unusable
+from common.perception.occlusion import Hidden, RobotBefore, Silhouettes
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
+from common.robot.model import RobotModel
 from common.scene.home import HomeWatch
 from common.transport.bus import Bus
 
@@ -37,12 +39,14 @@ class ViewsParameters(Parameters):
 class Seen:
     """A frame of detections and the camera that took the picture.
 
-    A camera on the robot looks `at_times`, from home: its frame is what is known until it looks again.
+    A camera on the robot looks `at_times`, from home: its frame is what is known until it looks again. What cannot be
+    judged in the picture of a fixed one is `hidden`, and no detection of the frame reaches into that.
     """
 
     frame: MarkerArray
     camera: Pinhole
     at_times: bool = False
+    hidden: Hidden | None = None
 
 
 class Views:
@@ -67,7 +71,11 @@ class Views:
         self._cameras = [
             CameraReader(bus, around, replace(topics.CAMERA_INFO, key=f"{at}{topics.CAMERA_INFO.key}")) for at in keys
         ]
-        self._joints = bus.reader(topics.JOINT_STATES) if only_at_home or around.on_hand else None
+        self._joints = bus.reader(topics.JOINT_STATES)
+        self._watches_home = only_at_home or around.on_hand
+        self._radius, self._config = around.ball_radius, robot
+        self._robot: tuple[RobotModel, Silhouettes] | None = None
+        self._before: dict[int, RobotBefore] = {}
         self._names, self._home = robot.joints, HomeWatch(robot.named_poses["home"])
         self._only_at_home = only_at_home
         self._newest: list[Seen | None] = [None for _ in keys]
@@ -88,7 +96,9 @@ class Views:
                 except Unusable as error:
                     self._left_out.note(error)
                     continue
-                seen = self._newest[number] = Seen(self._without_cut_off(number, frame), camera, moves)
+                hidden = self._hidden(number, frame, camera) if not moves else None
+                clear = _clear_of(frame, hidden, self._radius)
+                seen = self._newest[number] = Seen(self._without_cut_off(number, clear), camera, moves, hidden)
                 async with turn:
                     await look(number, seen)
 
@@ -107,12 +117,32 @@ class Views:
                 if seen.at_times or latest - seen.frame.header.stamp <= OLDEST * 1e9]
 
     async def _watch_arm(self) -> None:
-        if self._joints is None:
+        if not self._watches_home:
             return
         async for state in self._joints:
             found = dict(zip(state.name, state.position, strict=True))
             if all(name in found for name in self._names):
                 self._home.note([found[name] for name in self._names], state.header.stamp)
+
+    @property
+    def robot(self) -> tuple[RobotModel, Silhouettes]:
+        """A robot of its own and its outlines, read when somebody asks for the first time."""
+        if self._robot is None:
+            robot = RobotModel.load(self._config)
+            self._robot = robot, Silhouettes(robot, self._radius)
+        return self._robot
+
+    def _hidden(self, number: int, frame: MarkerArray, camera: Pinhole) -> Hidden | None:
+        """What cannot be judged in a picture: all of it, or what the robot is before."""
+        if frame.blind:
+            return Hidden(camera, frame.blind)
+        if self._cameras[number].without_robot:
+            return None
+        robot, silhouettes = self.robot
+        before = self._before.setdefault(number, RobotBefore(silhouettes))
+        state = self._joints.latest
+        q = robot.order(state.name, state.position) if state is not None else None
+        return before.in_picture(camera, frame.header.stamp, q, state.header.stamp if state is not None else 0)
 
     def _without_cut_off(self, number: int, frame: MarkerArray) -> MarkerArray:
         """The frame without what is cut off by the border of its picture and whole in another one."""
@@ -123,6 +153,15 @@ class Views:
             if not (marker.partial and any(math.dist(_place(marker), _place(one)) < marker.scale.x for one in whole))
         ]
         return frame if len(kept) == len(frame.markers) else frame.model_copy(update={"markers": kept})
+
+
+def _clear_of(frame: MarkerArray, hidden: Hidden | None, radius: float) -> MarkerArray:
+    """The frame without what reaches into the part of its picture that cannot be judged: it is held, or cut off."""
+    if hidden is None or not frame.markers:
+        return frame
+    behind = hidden.touches([_place(marker) for marker in frame.markers], radius)
+    kept = [marker for marker, away in zip(frame.markers, behind, strict=True) if not away]
+    return frame if len(kept) == len(frame.markers) else frame.model_copy(update={"markers": kept})
 
 
 def _place(marker: Marker) -> tuple[float, float, float]:

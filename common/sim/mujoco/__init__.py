@@ -35,9 +35,10 @@ def create(
 
 
 def renderer(
-    around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole
+    around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole,
+    arm: bool = False,
 ) -> Renderer:
-    """What draws this world for a camera: see `common.sim.interface`. A plain picture has no depth."""
+    """What draws this world for a camera, always with the arm. A plain picture has no depth."""
     require()
     from common.sim.mujoco.gl import chosen_gl
     from common.sim.mujoco.rendering import PhysicsRenderer

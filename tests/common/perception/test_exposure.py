@@ -1,0 +1,32 @@
+"""A picture that tells nothing is told from one of an empty table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.config import Surroundings, load_cell
+from common.perception.exposure import blindness
+from common.perception.pinhole import Pinhole
+from common.sim.rendering import Renderer, disturbed
+
+AROUND = load_cell("panda").section(Surroundings)
+assert isinstance(AROUND, Surroundings)
+CAMERA = Pinhole.from_config(AROUND.camera)
+
+
+@pytest.mark.parametrize("plain", [True, False])
+def test_an_empty_table_shows_something_also_in_little_light_and_noise(plain: bool) -> None:
+    picture = Renderer(AROUND, plain=plain, camera=CAMERA).see([]).colour
+    dim = (picture * 0.3).astype(np.uint8)
+    for shown in (picture, dim, disturbed(dim, 8.0, 0.0, np.random.default_rng(1))):
+        assert blindness(shown) == ""
+
+
+@pytest.mark.parametrize(("level", "why"), [(0, "dark"), (4, "dark"), (255, "white"), (90, "one colour")])
+@pytest.mark.parametrize("noise", [0.0, 6.0])
+def test_a_covered_or_blinded_camera_shows_nothing(level: int, why: str, noise: float) -> None:
+    covered = np.full((480, 640, 3), level, np.uint8)
+    covered[100, 100] = 255  # a hot pixel
+    if not (noise and why == "white"):
+        assert why in blindness(disturbed(covered, noise, 0.0, np.random.default_rng(1)))
