@@ -85,8 +85,8 @@ class Silhouettes:
         self._shapes = _corners(robot)
         if carries > 0:
             tool = robot.config.tcp_link
-            ball = carries * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-            self._shapes[f"{tool} holds"] = ball
+            held = carries * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+            self._shapes[f"{tool} holds"] = held
         self._links = {name: name.removesuffix(" holds") for name in self._shapes}
 
     def hidden(self, camera: Pinhole, readings: Sequence[Array], links: Sequence[str] | None = None) -> Hidden:

@@ -10,7 +10,7 @@ it gives is a `FeltWorld`, or a `PhysicalWorld` that brings an arm of its own fo
 Times are cell time [s], passed in. What cameras see of it is drawn by what its module offers as
 
     def renderer(around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool,
-                 camera: Pinhole) -> Renderer
+                 camera: Pinhole, arm: bool) -> Renderer
 
 in the process of each camera, from `scene_objects` and `joint_states`; a module without it is drawn as `kinematic` is.
 """
