@@ -1,4 +1,4 @@
-"""Sends the pictures and the depth of a real camera, which a module of one's own reads."""
+"""Sends the pictures and the depth of a real camera, which a driver reads."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Config(Reopening):
     """Which camera it is. Its pose and the name of its frame are those of the world's camera, the lens is its own."""
 
     world: Surroundings
-    driver: str = Field("", description="dotted module of yours that opens the camera: docs/depth_camera.md")
+    driver: str = Field("", description="realsense, oak, or a dotted module of yours: docs/depth_camera.md")
     options: dict[str, Any] = Field({}, description="of the driver")
     rate: Tunable[float] = Field(10.0, gt=0, le=90, description="pictures per second of wall time at most [Hz]")
 

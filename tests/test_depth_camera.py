@@ -1,4 +1,4 @@
-"""docs/depth_camera.md: its driver, word for word, in the service that it is for, with a camera that is not there."""
+"""docs/depth_camera.md: drivers in the service that they are for, with cameras that are not there."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 import time
 import types
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +20,23 @@ from common import topics
 from common.config import check, load_cell, service_config
 from common.config.world import Surroundings
 from common.errors import ConfigError
-from common.messages import LogLine
+from common.messages import Header, LogLine
 from common.perception.depth import depth_of
-from common.perception.depth_sources import Shot
+from common.perception.depth_sources import PACKAGE, Shot
 from common.perception.image import image_to_array
+from common.perception.pinhole import Pinhole
 from common.planning.seeing import cloud_points
 from common.process.in_process import running_service
 from common.process.wiring import wiring
+from common.sim.interface import load_world
+from common.sim.rendering import Renderer
 from common.transport.local import LocalNetwork
 from common.transport.reader import Reader
 from services import depth_camera, real_depth_camera
 from tests import pages
 
 PAGE = pages.text_of("docs/depth_camera.md")
-DRIVER = "my_pkg.realsense"
+DRIVER, OWN = "realsense", "my_pkg.recorded"
 WIDTH, HEIGHT = 64, 48
 SCALE = 0.00025  # [m] of one step: other than the usual one
 STEPS = 4000
@@ -44,6 +48,7 @@ class FakeCamera:
     def __init__(self) -> None:
         self.plugged, self.coeffs, self.opened, self.stopped = True, [0.0] * 5, 0, 0
         self.streams: dict[str, tuple[Any, ...]] = {}
+        self.shot: Shot | None = None  # what it sees, where that matters
         self.lenses = {"color": (40.0, 41.0, 31.0, 23.0), "depth": (35.0, 35.0, 30.0, 22.0)}
 
     def module(self) -> types.ModuleType:
@@ -77,10 +82,14 @@ class FakeCamera:
             def get_depth_frame(self) -> Frame:
                 steps = np.full((HEIGHT, WIDTH), STEPS if self.aligned else 1, np.uint16)
                 steps[:, 5] = 0
+                if fake.shot is not None and self.aligned:
+                    steps = np.rint(np.nan_to_num(fake.shot.depth) / SCALE).astype(np.uint16)
                 return Frame(steps, self.aligned)
 
             def get_color_frame(self) -> Frame | None:
                 picture = np.full((HEIGHT, WIDTH, 3), (10, 20, 200), np.uint8)
+                if fake.shot is not None:
+                    picture = fake.shot.colour
                 return Frame(picture, "color") if self.number > 1 else None
 
         class Align:
@@ -149,7 +158,7 @@ def camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeCame
     monkeypatch.setitem(sys.modules, "pyrealsense2", fake.module())
     monkeypatch.syspath_prepend(tmp_path)
     yield fake
-    for name in ("my_pkg", DRIVER):
+    for name in ("my_pkg", OWN):
         sys.modules.pop(name, None)
 
 
@@ -231,7 +240,7 @@ async def test_mode_that_the_camera_does_not_have_is_told_with_what_was_asked(ca
 
 
 @pytest.mark.parametrize(("given", "told"), [
-    ({"driver": ""}, "services.camera.driver: '' must be the dotted name of a module of yours"),
+    ({"driver": ""}, "services.camera.driver: '' must be one of realsense, oak, or the dotted name of a module of"),
     ({"driver": "my_pkg.nothing"}, "services.camera.driver: 'my_pkg.nothing' cannot be imported: No module named"),
     ({"driver": "common.errors"}, "'common.errors' opens no cameras: it has no Options, open_camera"),
     ({"options": {"fps": 900}}, "services.camera.options.fps: 900 must be less than or equal to 90"),
@@ -249,9 +258,9 @@ async def test_driver_or_option_that_there_is_not_ends_the_start_with_one_line(
 async def test_pictures_that_are_not_as_the_lens_says_end_the_service_with_one_line(
     camera: FakeCamera, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    driver = importlib.import_module(DRIVER)
+    driver = importlib.import_module(f"{PACKAGE}.{DRIVER}")
     monkeypatch.setattr(driver, "Shot", lambda colour, depth, age: Shot(colour, depth.astype(np.float64), age))
-    with pytest.raises(ConfigError, match=r"my_pkg\.realsense' gives depth of shape \(48, 64\) and type float64"):
+    with pytest.raises(ConfigError, match=r"'realsense' gives depth of shape \(48, 64\) and type float64"):
         async with running_service(LocalNetwork(), real_depth_camera.run, config_of(), name="camera"):
             await asyncio.sleep(10)
 
@@ -261,3 +270,171 @@ async def test_it_writes_what_the_simulated_camera_writes_and_reads_nothing(came
     simulated = await wiring(depth_camera.run, service_config(ur5, "depth_camera", depth_camera.Config))
     real = await wiring(real_depth_camera.run, config_of())
     assert real.writes == simulated.writes and not real.reads
+
+
+# --- cameras that see what the project draws -----------------------------------------------------------------------
+
+LENS = (40.0, 40.0, 31.5, 23.5)
+
+
+def drawn() -> Shot:
+    """What a camera above the objects of a cell sees, and depth of which a part was not measured."""
+    cell = load_cell("ur5", world="w3")
+    T = Pinhole.from_config(cell.world.camera).T_world_optical
+    objects = load_world(cell.world, cell.world.objects).objects(Header()).objects
+    view = Renderer(cell.world, camera=Pinhole(*(10 * f for f in LENS[:2]), *LENS[2:], WIDTH, HEIGHT, T)).see(objects)
+    depth = view.depth_within(0.1, 10.0)
+    depth[:, 3] = np.nan
+    assert len(np.unique(depth[np.isfinite(depth)])) > 1, "something stands there"
+    return Shot(view.colour, depth)
+
+
+class FakeOak:
+    """What depthai knows of a camera, whose pictures are a shot."""
+
+    def __init__(self, shot: Shot) -> None:
+        self.shot, self.plugged, self.closed, self.aligned_by = shot, True, 0, ""
+        self.asked: dict[str, Any] = {}
+        self.platform = "RVC2"
+
+    def module(self) -> types.ModuleType:
+        """A module with as much of depthai as the driver uses."""
+        fake, space = self, types.SimpleNamespace
+        k = [[LENS[0], 0, LENS[2]], [0, LENS[1], LENS[3]], [0, 0, 1]]
+        frame = space(getTransformation=lambda: space(getIntrinsicMatrix=lambda: k), getWidth=lambda: WIDTH,
+                      getHeight=lambda: HEIGHT, getCvFrame=lambda: fake.shot.colour,
+                      getTimestamp=lambda: timedelta(seconds=10.0))
+        steps = np.rint(np.nan_to_num(self.shot.depth) * 1000).astype(np.uint16)
+
+        def linked(name: str) -> Any:
+            def link(to: Any) -> None:
+                if to in ("stereo.align", "align.align"):
+                    fake.aligned_by = to.partition(".")[0]
+            return space(link=link, name=name)
+
+        class Camera:
+            def build(self, socket: str) -> Camera:
+                self.socket = socket
+                return self
+
+            def requestOutput(self, size: tuple[int, int], **how: Any) -> Any:  # noqa: N802
+                fake.asked[self.socket] = (size, how)
+                return linked(self.socket)
+
+        class Stereo:
+            inputAlignTo, depth = "stereo.align", linked("depth")  # noqa: N815
+
+            def build(self, left: Any, right: Any, presetMode: str) -> Stereo:  # noqa: N803
+                assert (left.name, right.name) == ("left", "right")
+                return self
+
+            def setLeftRightCheck(self, on: bool) -> None: ...  # noqa: N802
+
+            def setSubpixel(self, on: bool) -> None: ...  # noqa: N802
+
+            PresetMode = space(DEFAULT="default")
+
+        class Align:
+            input, inputAlignTo, outputAligned = "align.in", "align.align", linked("aligned")  # noqa: N815
+
+        class Queue:
+            def get(self, timeout: timedelta) -> Any:
+                if not fake.plugged:
+                    raise RuntimeError("queue was closed")
+                time.sleep(0.002)
+                return {"rgb": frame, "depth": space(getFrame=lambda: steps)}
+
+        class Sync:
+            inputs = types.MappingProxyType({"rgb": "sync.rgb", "depth": "sync.depth"})
+            out = space(createOutputQueue=lambda maxSize, blocking: Queue())
+
+            def setSyncThreshold(self, threshold: timedelta) -> None: ...  # noqa: N802
+
+        def device(*which: Any) -> Any:
+            if not fake.plugged:
+                raise RuntimeError("No available devices")
+            return space(getPlatform=lambda: fake.platform, close=lambda: None)
+
+        def stop() -> None:
+            fake.closed += 1
+
+        module: Any = types.ModuleType("depthai")
+        module.Device, module.DeviceInfo = device, lambda name: name
+        module.Pipeline = lambda device: space(create=lambda kind: kind(), start=lambda: None, stop=stop)
+        module.CameraBoardSocket = space(CAM_A="color", CAM_B="left", CAM_C="right")
+        module.Platform, module.Clock = space(RVC4="RVC4"), space(now=lambda: timedelta(seconds=10.1))
+        module.ImgFrame = space(Type=space(BGR888i="bgr"))
+        module.node = space(Camera=Camera, StereoDepth=Stereo, ImageAlign=Align, Sync=Sync)
+        return module
+
+
+async def seen(config: real_depth_camera.Config) -> tuple[np.ndarray, np.ndarray, list[float]]:
+    """Picture, depth [m] and intrinsics that are sent."""
+    net = LocalNetwork()
+    bus = net.bus()
+    images, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
+    infos = bus.reader(topics.DEPTH_CAMERA_INFO)
+    async with running_service(net, real_depth_camera.run, config, name="camera"), asyncio.timeout(30):
+        return image_to_array(await images.next()), depth_of(await depths.next()), (await infos.next()).k
+
+
+async def test_realsense_sends_what_was_drawn_to_half_a_step_of_its_depth(camera: FakeCamera) -> None:
+    camera.shot = drawn()
+    picture, depth, _ = await seen(config_of())
+    np.testing.assert_array_equal(picture, camera.shot.colour)
+    np.testing.assert_array_equal(np.isnan(depth), np.isnan(camera.shot.depth))
+    np.testing.assert_allclose(depth, camera.shot.depth, atol=SCALE / 2 + 1e-6)
+
+
+@pytest.mark.parametrize(("platform", "aligned_by"), [("RVC2", "stereo"), ("RVC4", "align")])
+async def test_oak_sends_what_was_drawn_to_half_a_millimetre_through_its_own_lens(
+    monkeypatch: pytest.MonkeyPatch, platform: str, aligned_by: str,
+) -> None:
+    fake = FakeOak(drawn())
+    fake.platform = platform
+    monkeypatch.setitem(sys.modules, "depthai", fake.module())
+    picture, depth, k = await seen(config_of(driver="oak", options={"fps": 20}))
+    np.testing.assert_array_equal(picture, fake.shot.colour)
+    np.testing.assert_array_equal(np.isnan(depth), np.isnan(fake.shot.depth))
+    np.testing.assert_allclose(depth, fake.shot.depth, atol=0.5e-3 + 1e-6)
+    assert (k[0], k[4], k[2], k[5]) == LENS and fake.aligned_by == aligned_by
+    assert fake.asked["color"] == ((WIDTH, HEIGHT), {"type": "bgr", "fps": 20.0, "enableUndistortion": True})
+
+
+async def test_oak_that_is_unplugged_is_told_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = FakeOak(drawn())
+    monkeypatch.setitem(sys.modules, "depthai", fake.module())
+    net = LocalNetwork()
+    bus = net.bus()
+    images, log = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.LOG)
+    fake.plugged = False
+    async with running_service(net, real_depth_camera.run, config_of(driver="oak", options={}), name="camera"):
+        async with asyncio.timeout(30):
+            await told(log, "camera oak: No available devices; it is opened again in")
+            fake.plugged = True
+            await images.next()
+            fake.plugged = False
+            await told(log, "camera oak: queue was closed; it is opened again in")
+            fake.plugged = True
+            while not fake.closed:
+                await images.next()
+
+
+@pytest.mark.parametrize(("driver", "package"), [("realsense", "pyrealsense2"), ("oak", "depthai")])
+async def test_package_that_is_not_installed_is_told_with_its_extra(
+    monkeypatch: pytest.MonkeyPatch, driver: str, package: str,
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ConfigError, match=rf"'{driver}' needs the extra `cameras`: pip install 'zencell\[cameras\]'"):
+        async with running_service(LocalNetwork(), real_depth_camera.run, config_of(driver=driver, options={}),
+                                   name="camera"):
+            await asyncio.sleep(10)
+
+
+async def test_driver_of_the_page_plays_recorded_shots(camera: FakeCamera, tmp_path: Path) -> None:
+    shot = drawn()
+    np.savez(tmp_path / "shot_1.npz", colour=shot.colour, depth=shot.depth, lens=np.array(LENS))
+    picture, depth, k = await seen(config_of(driver=OWN, options={"folder": str(tmp_path)}))
+    np.testing.assert_array_equal(picture, shot.colour)
+    np.testing.assert_array_equal(depth, shot.depth)
+    assert (k[0], k[4], k[2], k[5]) == LENS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from common.doctor import certificates, clocks, configuration, leftovers, machine, network, software
+from common.doctor import cameras, certificates, clocks, configuration, leftovers, machine, network, software
 from common.doctor.finding import Finding
 
 
@@ -20,6 +20,7 @@ def examine(endpoint: str) -> Iterator[Finding]:
     yield from clocks.clocks(endpoint)
     yield from certificates.certificates()
     yield network.page()
+    yield from cameras.cameras()
     yield from leftovers.processes()
     yield machine.shared_memory()
     yield machine.memory()

@@ -1,4 +1,4 @@
-"""Where the pictures of a real depth camera come from: a module of one's own. All calls may block."""
+"""Where the pictures of a real depth camera come from: a driver, which may be one's own. All calls may block."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ import numpy.typing as npt
 
 from common.config import Parameters, check
 from common.errors import ConfigError, ZencellError
+
+DRIVERS = ("realsense", "oak")  # modules of common/perception/depth_drivers
+PACKAGE = "common.perception.depth_drivers"
 
 Picture = npt.NDArray[np.uint8]
 Depth = npt.NDArray[np.float32]
@@ -78,20 +81,20 @@ class Driver(Protocol):
 
 
 def find_driver(name: str, given: dict[str, Any], field: str) -> tuple[Driver, Parameters]:
-    """A driver by the dotted name of its module, and its options.
+    """A driver by its name, or by the dotted name of its module, and its options.
 
     Args:
-        name: of the module.
+        name: of the driver.
         given: options as they stand in the cell.
         field: of the cell in which the driver is named: for what is told.
 
     Raises:
         ConfigError: no such module, or not one that opens cameras; or an option that does not fit.
     """
-    if "." not in name:
-        raise ConfigError(field, name, "must be the dotted name of a module of yours, such as my_pkg.realsense")
+    if "." not in name and name not in DRIVERS:
+        raise ConfigError(field, name, f"must be one of {', '.join(DRIVERS)}, or the dotted name of a module of yours")
     try:
-        module = importlib.import_module(name)
+        module = importlib.import_module(name if "." in name else f"{PACKAGE}.{name}")
     except ImportError as error:
         raise ConfigError(field, name, f"cannot be imported: {error}") from None
     missing = [part for part in ("Options", "open_camera") if not hasattr(module, part)]
@@ -99,6 +102,19 @@ def find_driver(name: str, given: dict[str, Any], field: str) -> tuple[Driver, P
         raise ConfigError(field, name, f"opens no cameras: it has no {', '.join(missing)}")
     driver = cast(Driver, module)
     return driver, check(driver.Options, given, f"{field.rpartition('.')[0]}.options")
+
+
+def maker_of(driver: str, package: str) -> Any:
+    """The package of a camera's maker, which is imported only now.
+
+    Raises:
+        ConfigError: it is not installed, or a library that it needs is not there.
+    """
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise ConfigError("driver", driver, f"needs the extra `cameras`: pip install 'zencell[cameras]' ({error})"
+                          ) from None
 
 
 def require_whole(shot: Shot, lens: Lens, field: str, name: str) -> None:

@@ -1,0 +1,108 @@
+"""A Luxonis OAK-D, with the maker's package `depthai` (version 3): depth is computed on the camera."""
+
+from __future__ import annotations
+
+import contextlib
+from datetime import timedelta
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from common.config import Parameters
+from common.perception.depth_sources import CameraGone, Lens, Shot, maker_of
+
+PATIENCE = timedelta(seconds=2)  # without a frame after which the camera is gone
+STEREO_SIZE = (640, 400)  # [px] in which it compares its two lenses
+MILLIMETRE = np.float32(1e-3)  # [m] of one step of its depth
+
+
+class Options(Parameters):
+    """Which camera it is, and how often it looks."""
+
+    device: str = Field("", description="id, or address in the network; empty: the first that is found")
+    fps: float = Field(30.0, ge=1, le=60, description="frames per second it makes [Hz]")
+    subpixel: bool = Field(True, description="finer steps of depth, for more work of the camera")
+
+
+class Oak:
+    """A camera whose pipeline runs. Colour comes without the distortion of its lens, and depth fits it."""
+
+    def __init__(self, dai: Any, pipeline: Any, queue: Any) -> None:
+        """Wait for the first pictures, which tell of the lens.
+
+        Raises:
+            CameraGone: there are none.
+        """
+        self._dai, self._pipeline, self._queue = dai, pipeline, queue
+        try:
+            frame = self._next()["rgb"]
+        except CameraGone:
+            self.close()
+            raise
+        k = frame.getTransformation().getIntrinsicMatrix()
+        self.lens = Lens(frame.getWidth(), frame.getHeight(), k[0][0], k[1][1], k[0][2], k[1][2])
+
+    def _next(self) -> Any:
+        try:
+            group = self._queue.get(PATIENCE)
+        except RuntimeError as error:  # unplugged: the queue is closed
+            raise CameraGone(str(error)) from None
+        if group is None:
+            raise CameraGone(f"no picture within {PATIENCE.total_seconds():g} s")
+        return group
+
+    def read(self) -> Shot:
+        """The next shot, depth and colour of the same instant."""
+        group = self._next()
+        color = group["rgb"]
+        steps = np.asanyarray(group["depth"].getFrame())
+        metres = np.where(steps > 0, steps * MILLIMETRE, np.float32(np.nan)).astype(np.float32)
+        age = (self._dai.Clock.now() - color.getTimestamp()).total_seconds()  # both by the clock of this machine
+        return Shot(np.array(color.getCvFrame()), metres, max(0.0, age))
+
+    def close(self) -> None:
+        """Stop it."""
+        with contextlib.suppress(RuntimeError):  # it is gone already
+            self._pipeline.stop()
+
+
+def open_camera(options: Options, size: tuple[int, int], rate: float) -> Oak:
+    """The camera: see `common.perception.depth_sources`."""
+    dai = maker_of("oak", "depthai")
+    try:
+        device = dai.Device(dai.DeviceInfo(options.device)) if options.device else dai.Device()
+    except RuntimeError as error:  # none is plugged in, or somebody else has it
+        raise CameraGone(str(error)) from None
+    try:
+        pipeline = dai.Pipeline(device)
+        queue = _connected(dai, pipeline, device, options, size)
+        pipeline.start()
+    except RuntimeError as error:  # no such mode, or it was unplugged
+        device.close()
+        raise CameraGone(f"{size[0]}x{size[1]} at {options.fps:g} Hz: {error}") from None
+    return Oak(dai, pipeline, queue)
+
+
+def _connected(dai: Any, pipeline: Any, device: Any, options: Options, size: tuple[int, int]) -> Any:
+    """The queue of pictures `rgb` and `depth` that belong together."""
+    socket, node = dai.CameraBoardSocket, dai.node
+    color = pipeline.create(node.Camera).build(socket.CAM_A)
+    picture = color.requestOutput(size, type=dai.ImgFrame.Type.BGR888i, fps=options.fps, enableUndistortion=True)
+    sides = [pipeline.create(node.Camera).build(side).requestOutput(STEREO_SIZE, fps=options.fps)
+             for side in (socket.CAM_B, socket.CAM_C)]
+    stereo = pipeline.create(node.StereoDepth).build(*sides, presetMode=node.StereoDepth.PresetMode.DEFAULT)
+    stereo.setLeftRightCheck(True)
+    stereo.setSubpixel(options.subpixel)
+    together = pipeline.create(node.Sync)
+    together.setSyncThreshold(timedelta(seconds=0.5 / options.fps))
+    picture.link(together.inputs["rgb"])
+    if device.getPlatform() == dai.Platform.RVC4:  # its stereo does not align by itself
+        align = pipeline.create(node.ImageAlign)
+        stereo.depth.link(align.input)
+        picture.link(align.inputAlignTo)
+        align.outputAligned.link(together.inputs["depth"])
+    else:
+        picture.link(stereo.inputAlignTo)
+        stereo.depth.link(together.inputs["depth"])
+    return together.out.createOutputQueue(maxSize=1, blocking=False)
