@@ -4,15 +4,18 @@
     python -m benchmarks.arms --urdf FILE [--gripper FILE] [--package-dir DIR]
 
 Prints a table in Markdown. All runs are on the virtual clock. The descriptions are those of example-robot-data, which
-comes with the project, or the one that is named with --urdf.
+comes with the project, those of the package rtb-data where that is installed (`pip install --no-deps rtb-data`), or
+the one that is named with --urdf.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +23,9 @@ from cli.simulate import seeds_of
 from common.config import load_cell
 from common.virtual.simulation import Simulation
 
+_RTB = importlib.util.find_spec("rtbdata")
+RTB = Path(_RTB.submodule_search_locations[0]) / "xacro" if _RTB and _RTB.submodule_search_locations else None
+TROSSEN = "trossen_descriptions/urdf"
 DATA = "package://example-robot-data/robots"
 GRIPPER = str(Path(__file__).resolve().parent.parent / "config" / "robots" / "robotiq_2f85.urdf")
 
@@ -32,6 +38,19 @@ class Case:
     urdf: str
     gripper: str = ""
     package_dir: str = ""
+
+
+def _more(folder: Path) -> tuple[Case, ...]:
+    """Those of rtb-data, whose xacro files lie in a folder."""
+    kuka = f"{folder}/kuka_description"
+    return (
+        Case("iiwa14", f"{kuka}/kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.urdf", GRIPPER, str(folder)),
+        Case("puma560", f"{folder}/unimation_puma560_description/urdf/puma560_robot.urdf", GRIPPER, str(folder)),
+        Case("irb140", f"{folder}/abb_irb140_description/urdf/irb140.urdf", GRIPPER, str(folder)),
+        *(Case(name, f"{folder}/{TROSSEN}/{name}.urdf.xacro") for name in (
+            "px100", "px150", "rx150", "rx200", "wx200", "wx250", "vx300", "wx250s", "vx300s")),
+        Case("al5d", f"{folder}/lynxmotion_al5d_description/urdf/al5d_robot.urdf", package_dir=str(folder)),
+    )
 
 
 CASES = (
@@ -48,6 +67,7 @@ CASES = (
     Case("z1", f"{DATA}/z1_description/urdf/z1.urdf"),
     Case("so101", f"{DATA}/so_arm_description/urdf/so101.urdf"),
     Case("two_dof", f"{DATA}/asr_twodof_description/urdf/TwoDofs.urdf"),
+    *(_more(RTB) if RTB else ()),
 )
 
 
@@ -85,18 +105,20 @@ def main() -> None:
     parser.add_argument("--package-dir", default="", metavar="DIR", help="for --urdf")
     given = parser.parse_args()
     cases = (Case(Path(given.urdf).stem, given.urdf, given.gripper, given.package_dir),) if given.urdf else CASES
-    print("| arm | gripper | edits | result |\n|---|---|---|---|", flush=True)
+    print("| arm | gripper | edits | `robot new` | in the box |\n|---|---|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as kept:
         folder = Path(given.folder or kept)
         for case in cases:
             if given.only and case.name not in given.only:
                 continue
+            began = time.monotonic()
             refused = written(case, folder)
+            took = time.monotonic() - began
             result = refused or "; ".join(
                 f"seed {seed}: {told(str(folder / f'{case.name}_cell.yaml'), seed)}"
                 for seed in seeds_of(given.seeds))
             gripper = Path(case.gripper).stem if case.gripper else "its own"
-            print(f"| {case.name} | {gripper} | 0 | {result} |", flush=True)
+            print(f"| {case.name} | {gripper} | 0 | {took:.0f} s | {result} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 from common.checking.finding import Finding, error, warning
 from common.config import GripperConfig, RobotConfig
+from common.robot.finger_joints import driven_position
 from common.robot.merging import merged_urdf
 
 TURNS, SLIDES = ("revolute", "continuous"), ("prismatic",)
@@ -48,24 +49,25 @@ def check_robot_file(config: RobotConfig) -> Iterator[Finding]:
 def _opening(gripper: GripperConfig, number: int, joint: ET.Element) -> Iterator[Finding]:
     """Whether a finger's joint moves as widths are turned into its positions."""
     name, turns = gripper.joints[number], joint.get("type") in TURNS
-    if turns and gripper.linkage is None and number == 0:
+    angles = "linkage" if gripper.linkage is not None else "jaw" if gripper.jaw is not None else ""
+    if turns and not angles and number == 0:
         yield error(f"robot.gripper.joints: {name!r} turns ({joint.get('type')}), but without gripper.linkage half of "
                     "the width [m] is taken for its position [rad]", "give gripper.linkage: length, open_angle and "
-                    "closed", refused=True)
+                    "closed; or gripper.jaw, where the other finger is fixed", refused=True)
         return
-    if not turns and gripper.linkage is not None and number == 0:
-        yield error(f"robot.gripper.joints: {name!r} slides ({joint.get('type')}), but gripper.linkage gives angles "
-                    "for it", "leave gripper.linkage out", refused=True)
+    if not turns and angles and number == 0:
+        yield error(f"robot.gripper.joints: {name!r} slides ({joint.get('type')}), but gripper.{angles} gives angles "
+                    "for it", f"leave gripper.{angles} out", refused=True)
         return
-    if turns and gripper.linkage is None:
+    if turns and not angles:
         return
     limit, factor = joint.find("limit"), gripper.mimic[number] if gripper.mimic else 1.0
     if limit is None or joint.get("type") == "continuous":
         return
     low, high = (float(limit.get(side, "nan")) for side in ("lower", "upper"))
-    bars, unit = gripper.linkage, "rad" if turns else "m"
-    ends = (0.0, factor * (gripper.max_width / 2 if bars is None else bars.closed))
+    unit = "rad" if turns else "m"
+    ends = [factor * driven_position(gripper, width) for width in (0.0, gripper.max_width)]
     if not (math.isnan(low) or math.isnan(high)) and (min(ends) < low - SLACK or max(ends) > high + SLACK):
         yield warning(f"robot.gripper: {name!r} would go from {min(ends):g} to {max(ends):g} {unit} between closed and "
                       f"open, its limits are {low:g} to {high:g}",
-                      "correct gripper.max_width, gripper.linkage or gripper.mimic")
+                      f"correct gripper.max_width, gripper.{angles or 'closed'} or gripper.mimic")

@@ -21,6 +21,18 @@ class ParallelLinkage(Section):
     closed: float = Field(gt=0, le=3.2, description="driven joint when the pads meet [rad]")
 
 
+class TurningJaw(Section):
+    """A finger that turns towards a fixed one; the width [m] is that between their tips.
+
+    radius * (sin(angle + a) - sin(angle)) where it is turned by a from closed [rad].
+    """
+
+    radius: Length = Field(description="of its tip from the joint's axis [m]")
+    angle: float = Field(ge=-1.5, le=1.5, description="of the tip from the tool axis when closed, outwards [rad]")
+    closed: Number = Field(0.0, description="driven joint when closed [rad]")
+    opens: Literal[1, -1] = Field(1, description="sense of the joint in which it opens")
+
+
 class FingerShape(Section):
     """The tips of open fingers along the closing axis and across it, from the tool centre point."""
 
@@ -54,8 +66,9 @@ class PayloadConfig(Section):
 class GripperConfig(Section):
     """A parallel gripper: `width` is the distance between the inner faces of the fingers [m].
 
-    The first of the joints is driven. Without a linkage it slides by half the width. A suction cup has no joints: its
-    width is that of a valve, `max_width` while it does not draw, 0 while it draws nothing in, half when it holds.
+    The first of the joints is driven. Without a linkage it slides by half the width from `closed`. A suction cup has no
+    joints: its width is that of a valve, `max_width` while it does not draw, 0 while it draws nothing in, half when it
+    holds.
     """
 
     closing_axis: Literal["x", "y"] = Field("y", description="axis of the tool centre point along which fingers close")
@@ -66,6 +79,8 @@ class GripperConfig(Section):
     joints: list[str] = Field([], description="finger joints, the driven one first")
     mimic: list[Number] = Field([], description="each joint per driven joint; all 1 when empty")
     linkage: ParallelLinkage | None = Field(None, description="how the driven joint opens them; else each slides")
+    jaw: TurningJaw | None = Field(None, description="one finger turns and the other is fixed")
+    closed: Number = Field(0.0, description="where the driven joint is when fingers that slide are closed [m]")
     links: list[str] = Field(description="links that may touch what is grasped")
     max_width: Length = Field(0.08, description="fully open [m]")
     speed: Length = Field(0.2, description="closing speed of the width [m/s]")
@@ -85,6 +100,14 @@ class GripperConfig(Section):
             raise ValueError(f"gripper.mimic has {len(self.mimic)} values for {len(self.joints)} joints")
         if self.mimic and self.mimic[0] != 1:
             raise ValueError(f"gripper.mimic begins with the driven joint itself: 1, not {self.mimic[0]:g}")
+        if (self.linkage is not None or self.jaw is not None) and self.closed:
+            raise ValueError("gripper.closed is of fingers that slide; a linkage and a jaw have their own closed")
+        if self.jaw is not None:
+            if self.linkage is not None or len(self.joints) != 1:
+                raise ValueError("gripper.jaw is of one joint, and in the place of a linkage")
+            most = self.jaw.radius * (1 - math.sin(self.jaw.angle))
+            if self.max_width > most:
+                raise ValueError(f"gripper.jaw opens by {most:.4f} m at most, max_width is {self.max_width:g} m")
         if self.linkage is not None:
             bars = self.linkage
             opens = 2 * bars.length * (math.sin(bars.open_angle) - math.sin(bars.open_angle - bars.closed))

@@ -12,22 +12,28 @@ from common.config import GripperConfig
 
 
 def driven_position(gripper: GripperConfig, width: float) -> float:
-    """Position of the driven joint [rad or m] at a width [m]: half of it, or the angle of the linkage.
+    """Position of the driven joint [rad or m] at a width [m]: half of it beyond `closed`, or an angle.
 
     The pads move as the ends of the linkage's bars do, sideways by length * sin(open_angle - a).
     """
+    if (jaw := gripper.jaw) is not None:
+        sine = math.sin(jaw.angle) + width / jaw.radius
+        return jaw.closed + jaw.opens * (math.asin(min(max(sine, -1.0), 1.0)) - jaw.angle)
     bars = gripper.linkage
     if bars is None:
-        return width / 2
+        return gripper.closed + width / 2
     sine = math.sin(bars.open_angle - bars.closed) + width / (2 * bars.length)
     return bars.open_angle - math.asin(min(max(sine, -1.0), 1.0))
 
 
 def width_at(gripper: GripperConfig, position: float) -> float:
     """Width [m] at a position of the driven joint [rad or m]: the inverse of `driven_position`."""
+    if (jaw := gripper.jaw) is not None:
+        turned = jaw.opens * (position - jaw.closed)
+        return jaw.radius * (math.sin(jaw.angle + turned) - math.sin(jaw.angle))
     bars = gripper.linkage
     if bars is None:
-        return 2 * position
+        return 2 * (position - gripper.closed)
     return 2 * bars.length * (math.sin(bars.open_angle - position) - math.sin(bars.open_angle - bars.closed))
 
 
@@ -51,6 +57,9 @@ def finger_velocities(gripper: GripperConfig, width: float, rate: float) -> list
     if gripper.linkage is not None:
         bars = gripper.linkage
         driven = -rate / (2 * bars.length * math.cos(bars.open_angle - driven_position(gripper, width)))
+    if (jaw := gripper.jaw) is not None:
+        turned = jaw.opens * (driven_position(gripper, width) - jaw.closed)
+        driven = jaw.opens * rate / (jaw.radius * max(math.cos(jaw.angle + turned), 1e-3))
     return [factor * driven for factor in finger_factors(gripper)]
 
 

@@ -18,6 +18,7 @@ from common.robot.transforms import invert
 Array = NDArray[np.float64]
 
 TIP = 0.02  # of a finger, from its end on: what presses on things [m]
+VAGUE = 0.01  # [m] from where fingers begin to their middle: it does not tell which way they point
 PARALLEL = 0.03  # pads that turn by less while they close [rad]
 ALIGNED = math.cos(math.radians(10))
 
@@ -106,6 +107,11 @@ def measure(
     closing = _unit(moved[one] - moved[other])
     along = (cloud(one, 0).mean(axis=0) + cloud(other, 0).mean(axis=0)) / 2 - start
     approach = along - (along @ closing) * closing
+    if np.linalg.norm(approach) < VAGUE:  # fingers about their own frames: they point away from the arm
+        robot.fk(q)
+        T_carrier_world, wrist = invert(seen[0][carrier]), robot.data.oMi[robot.dof].translation
+        along = along + start - (T_carrier_world[:3, :3] @ wrist + T_carrier_world[:3, 3])
+        approach = along - (along @ closing) * closing
     if np.linalg.norm(approach) < 1e-3:
         return None
     approach = _unit(approach)
@@ -163,6 +169,8 @@ def tool_complaints(robot: RobotModel, points: dict[str, Array] | None = None) -
     gripper = robot.config.gripper
     if gripper is None or not gripper.joints:
         return []
+    if gripper.jaw is not None:
+        return []  # of one finger against a fixed one: see `common.setup.jaw`
     name, axis = robot.config.tcp_link, gripper.closing_axis
     widths = (0.0, gripper.max_width)
     found = measure(robot, name, links_moved(robot, gripper.joints), gripper.joints,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from common.robot.model import RobotModel
 from common.setup.fingers import PARALLEL, Grip, links_moved, measure
+from common.setup.jaw import measure_jaw
 from common.setup.tree import Joint, Tree
 
 Array = NDArray[np.float64]
@@ -33,6 +34,8 @@ class Hand:
     max_width: float
     speed: float
     grip: Grip
+    closed: float = 0.0
+    jaw: dict[str, float] | None = None
     remarks: list[str] = field(default_factory=list)
 
 
@@ -40,11 +43,13 @@ def find_hand(robot: RobotModel, tree: Tree, fingers: Sequence[Joint], points: d
     """The gripper that some joints make, or why they make none that the platform drives.
 
     One joint is driven and the others follow it: as the URDF says by `mimic`, or two slides that move alike. Slides
-    are closed at 0; fingers on parallelograms are open at 0, and their pads stay parallel.
+    are closed at their lower end; fingers on parallelograms are open at 0, and their pads stay parallel. What moves on
+    its own beside fingers that follow each other, and carries none of them, stands still.
     """
+    fingers, still = _without_others(tree, fingers)
     names = [joint.name for joint in fingers]
     if len(fingers) == 1:
-        return f"{names[0]} moves one finger against a fixed one; the platform drives pairs that meet in the middle"
+        return _jaw(robot, fingers[0], points)
     driven = next((joint for joint in fingers if any(j.mimic and j.mimic[0] == joint.name for j in fingers)), None)
     free = [joint for joint in fingers if joint.mimic is None]
     if driven is None:
@@ -66,10 +71,11 @@ def find_hand(robot: RobotModel, tree: Tree, fingers: Sequence[Joint], points: d
         sign = 1.0 if abs((other.upper or 0.0) - high) + abs((other.lower or 0.0) - low) < 1e-3 else -1.0
         factors[other.name] = sign
     mimic = [factors[joint.name] for joint in order]
-    if not low < high or low < -1e-6:
-        return f"{driven.name} runs from {low:g} to {high:g}; the platform drives joints that begin at 0"
-    travel = np.linspace(0.0, high, STEPS)
     slides = driven.kind == "prismatic"
+    if not low < high or low < -1e-6:
+        begin = "begin at 0 or more" if slides else "begin at 0"
+        return f"{driven.name} runs from {low:g} to {high:g}; the platform drives joints that {begin}"
+    travel = np.linspace(low if slides else 0.0, high, STEPS)
     rows = [[factor * float(at) for factor in mimic] for at in (travel if slides else travel[::-1])]
     grip = measure(robot, palm, links, [joint.name for joint in order], rows, points)
     if grip is None:
@@ -82,11 +88,50 @@ def find_hand(robot: RobotModel, tree: Tree, fingers: Sequence[Joint], points: d
                 "the platform drives pads that stay parallel")
     hand = Hand(palm, [joint.name for joint in order], mimic, None, [palm, *grip.pads], round(2 * high, 4),
                 round(min(2 * (driven.velocity or SPEED / 2), 0.2), 4), grip)
-    return _slides(hand) if slides else _with_linkage(hand, driven, travel[::-1])
+    if still:
+        hand.remarks.append(f"gripper: {', '.join(still)} stands still: it moves on its own beside {driven.name}")
+    return _slides(hand, low, high) if slides else _with_linkage(hand, driven, travel[::-1])
 
 
-def _slides(hand: Hand) -> Hand:
+def _jaw(robot: RobotModel, joint: Joint, points: dict[str, Array]) -> Hand | str:
+    """The hand of one finger against a fixed one, where it turns."""
+    if joint.kind != "revolute":
+        return f"{joint.name} slides one finger against a fixed one; the platform drives jaws that turn, or pairs"
+    found = measure_jaw(robot, joint.name, points)
+    if isinstance(found, str):
+        return found
+    if found.max_width < 2 * MISFIT:
+        return f"the jaw of {joint.name} opens by {1e3 * found.max_width:.0f} mm only"
+    jaw = {"radius": found.radius, "angle": found.angle, "closed": found.closed, "opens": found.opens}
+    links = list(dict.fromkeys([found.carrier, *found.grip.pads]))
+    speed = round(min(found.radius * 0.5 * (joint.velocity or 0.5), 0.2), 4)
+    hand = Hand(found.carrier, [joint.name], [1.0], None, links, found.max_width, speed, found.grip, jaw=jaw)
+    hand.remarks.append("gripper.jaw: one finger is fixed; the tool centre point is in the middle of the open jaws, so "
+                        "that closing brings the fixed finger and what is W mm wide together by "
+                        f"({1e3 * found.max_width:.0f} - W) / 2 mm")
+    return hand
+
+
+def _without_others(tree: Tree, fingers: Sequence[Joint]) -> tuple[list[Joint], list[str]]:
+    """Fingers of which one is driven and followed, and the names of the joints beside them that carry none of them."""
+    followed = {joint.mimic[0] for joint in fingers if joint.mimic}
+    if len(followed) != 1:
+        return list(fingers), []
+    carried = {above.name for joint in fingers if joint.mimic or joint.name in followed
+               for above in tree.above(joint.child)}
+    still = [joint.name for joint in fingers if joint.mimic is None and joint.name not in followed | carried]
+    return [joint for joint in fingers if joint.name not in still], still
+
+
+def _slides(hand: Hand, low: float, high: float) -> Hand:
     closed = hand.grip.widths[0]
+    if low > 0:  # they may be farther out than where they would meet, which the shapes tell
+        hand.closed = round(low - closed / 2, 5)
+        hand.max_width = round(2 * (high - hand.closed), 4)
+        if hand.closed < low - 1e-4:
+            hand.remarks.append(f"gripper.closed: the fingers would meet at {hand.closed:g}, beyond the end of "
+                                f"{hand.joints[0]}, {low:g}")
+        return hand
     if abs(closed) > 0.003:
         hand.remarks.append(f"gripper.max_width: the fingers are {1e3 * closed:.0f} mm apart where the platform takes "
                             "them to meet; what they hold seems narrower by that")
@@ -133,6 +178,10 @@ def section(hand: Hand, closing: str) -> dict[str, Any]:
         values["mimic"] = hand.mimic
     if hand.linkage:
         values["linkage"] = hand.linkage
+    if hand.closed:
+        values["closed"] = hand.closed
+    if hand.jaw:
+        values["jaw"] = hand.jaw
     return values | {
         "links": hand.links, "max_width": hand.max_width, "closing_axis": closing, "speed": hand.speed,
         "fingers": {"depth": round(hand.grip.depth, 4), "half_width": round(hand.grip.half_width, 4)},

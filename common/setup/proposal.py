@@ -203,6 +203,8 @@ def _tool(
         parent = palm
         out = poses[palm][:3, :3] @ grip.approach
         near = [link for link in links if _distance(poses[link], poses[palm] @ T_palm_tcp) < NEAR_GRIP]
+        if hand.jaw:  # between the open jaws is no link of a description
+            near = []
     else:
         parent, out_in_flange = find_flange(robot, whole, arm, tip)
         out = poses[parent][:3, :3] @ out_in_flange
