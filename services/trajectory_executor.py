@@ -137,7 +137,7 @@ def within_reach(
     x, y, z = place
     radius = max(math.hypot(x, y), REACH_MARGIN)
     scales = (1 + off / radius for off in (REACH_MARGIN, -REACH_MARGIN, 0.0))
-    return all(not reach_reason(robot, (s * x, s * y, z), grasp, bounds) for s in scales)
+    return all(not reach_reason(robot, (s * x, s * y, z), grasp, bounds, explained=False) for s in scales)
 
 
 async def run(bus: Bus, config: Config) -> None:

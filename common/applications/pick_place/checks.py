@@ -16,8 +16,9 @@ from common.config import CameraConfig, Cell, Container, ObjectConfig, Reach, se
 from common.config.basics import Rgb
 from common.hardware.loading import is_simulated
 from common.perception.pinhole import Pinhole
+from common.planning.free_axes import chooses
 from common.robot.transforms import tool_down
-from common.scene.workspace import ReachCache, bounds_told, yaw_candidates
+from common.scene.workspace import ReachCache, bounds_told, reach_reason, yaw_candidates
 from common.sim.layout import layout
 from common.sim.objects import pose_of, solid_of
 from common.sim.places import is_inside
@@ -125,11 +126,13 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
     gripper = cell.robot.gripper
     width = gripper.max_width if gripper is not None and gripper.joints else None
     tilt = cell.grasp.tilt(arm.robot.dof)
+    turned = f"with any of {bounds.yaw_count} hand orientations" if chooses(arm.robot) else "at any yaw"
     turns = [yaw + (math.pi / 2 if gripper is not None and gripper.closing_axis == "x" else 0.0)
-             for yaw in yaw_candidates(bounds.yaw_count)]
+             for yaw in (yaw_candidates(bounds.yaw_count) if chooses(arm.robot) else [0.0])]
     things = []
     if is_simulated(cell.robot):
-        layout(cell.world, cell.run.seed, lambda x, y, z: not cache.reason((x, y, z)))
+        layout(cell.world, cell.run.seed,
+               lambda x, y, z: not reach_reason(arm.robot, (x, y, z), cell.grasp, bounds, explained=False))
         things = [thing for thing in cell.world.objects if thing.placed]
     for thing in things:
         x, y, z = (float(value) for value in pose_of(thing, solid_of(thing))[:3, 3])
@@ -139,10 +142,11 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
         low = cell.grasp.height(z)
         poses = [tool_down(x, y, low, turn) for turn in turns]
         if reason := cache.reason((x, y, z)):
-            why = "" if reason.startswith(("too ", "singular")) else arm.why_not(poses, width, tilt)
+            told = reason.startswith(("too ", "singular")) or not chooses(arm.robot)
+            why = "" if told else arm.why_not(poses, width, tilt)
             yield error(f"{what}, {reason}{f' ({why})' if why else ''}", "move it, or robot.base_position")
         elif why := arm.why_not(poses, width, tilt):
-            yield error(f"{what}, {why} with any of {len(turns)} hand orientations",
+            yield error(f"{what}, {why} {turned}",
                         "move it away from there, or set grasp.grasp_clearance or grasp.min_grasp_z")
     for name, box in cell.world.containers.items():
         nearer = 1 - ALONG / max(math.hypot(box.x, box.y), ALONG)
@@ -150,5 +154,5 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
                  for share in (1.0, nearer) for turn in turns]
         if why := arm.why_not(poses, width, max(tilt, TILTED)):
             yield error(f"world.containers.{name}: the tool cannot be above it, at ({box.x:z.3f}, {box.y:z.3f}, "
-                        f"{cell.grasp.drop_z:.3f}), with any of {len(turns)} hand orientations, {why}",
+                        f"{cell.grasp.drop_z:.3f}), {turned}, {why}",
                         "move it, or set grasp.drop_z")
