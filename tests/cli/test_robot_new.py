@@ -184,6 +184,16 @@ def test_an_arm_of_four_joints_clears_its_table_of_balls(arm: Callable[[], str],
 
 
 @pytest.mark.slow
+def test_an_arm_with_one_jaw_against_a_fixed_finger_clears_its_table_of_balls(tmp_path: Path) -> None:
+    done = ask(tmp_path, "robot", "new", "package://example-robot-data/robots/z1_description/urdf/z1.urdf", "--yes",
+               "--name", "z1", "--cell", "z1_cell.yaml")
+    assert done.returncode == 0, done.stderr
+    outcome = Simulation(load_cell(str(tmp_path / "z1_cell.yaml"), seed=1), 1).run()
+    assert (outcome.state, outcome.done, outcome.total) == ("DONE", 7, 7), outcome.message
+    assert (outcome.broken, outcome.crashes) == ([], [])
+
+
+@pytest.mark.slow
 def test_the_commands_of_the_docs_set_up_an_arm_and_have_it_clear_its_table(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "robots.md").read_text()
     block = page.split("```sh\n")[1].split("```")[0].replace("\\\n", " ")
