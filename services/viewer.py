@@ -17,12 +17,13 @@ from common.transport.credentials import secure_folder
 from common.viewer.access import address_of, tokens_in
 from common.viewer.console import Console
 from common.viewer.doors import Doors
-from common.viewer.feeds import Feeds, Periods, Topics
+from common.viewer.feeds import Feeds, Latest, Periods, Topics
 from common.viewer.guard import close_server, make_server
 from common.viewer.layers import Layers, find_layers
 from common.viewer.layout import load_layout
 from common.viewer.line import Line
 from common.viewer.page import Page
+from common.viewer.recorded import folder_of
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
@@ -51,13 +52,16 @@ class Config(Parameters):
     layout: str = Field(
         "", description="file of the layout; empty: viewer.yaml of this user, in the folder ZENCELL_STATE"
     )
+    recordings: str = Field(
+        "", description="folder of recordings that the page opens; empty: where the cell was started"
+    )
     layers: list[str] = Field([], description="layers of the scene of your own: dotted modules, as my_pkg.my_layer")
     rate: float = Field(30.0, ge=1, le=60, description="of the moving robot, wall time [Hz]")
     picture_rate: float = Field(10.0, gt=0, le=30, description="of each camera picture at most, wall time [Hz]")
 
 
 def load(
-    server: viser.ViserServer, config: Config, layers: Layers, console: Console, feeds: Feeds, shown: dict[str, bool]
+    server: viser.ViserServer, config: Config, layers: Layers, console: Console, latest: Latest, shown: dict[str, bool]
 ) -> tuple[Scene, RobotModel, list[str]]:
     """The scene with its meshes, the robot and the names of the planners; takes seconds."""
     from common.planning.planners import planner_names
@@ -67,7 +71,7 @@ def load(
 
     client_files()  # kept from now on
     robot = RobotModel.load(config.robot)
-    scene = Scene(server, robot, config.world, layers, console, feeds.latest, shown=shown)
+    scene = Scene(server, robot, config.world, layers, console, latest, shown=shown)
     return scene, robot, planner_names()
 
 
@@ -110,7 +114,8 @@ async def run(bus: Bus, config: Config) -> None:
     try:
         page = Page(
             server, feeds, console, motions, config.members, application, layers, line, cell=config.run.cell,
-            layout=layout, layout_file=config.layout, periods=Periods(picture=1 / config.picture_rate),
+            layout=layout, layout_file=config.layout,
+            recordings=folder_of(config.recordings), periods=Periods(picture=1 / config.picture_rate),
         )
         await bus.ready()
         host = "127.0.0.1" if config.published else config.host
@@ -118,7 +123,8 @@ async def run(bus: Bus, config: Config) -> None:
 
         async def complete() -> None:
             await quiet(bus, config, page)
-            page.complete(*await asyncio.to_thread(load, server, config, layers, console, feeds, page.shown))
+            page.complete(*await asyncio.to_thread(
+                load, server, config, layers, console, page.timeline.latest, page.shown))
 
         async with asyncio.TaskGroup() as group:
             for activity in [*page.activities(bus.clock.age_ms), complete()]:

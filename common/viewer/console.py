@@ -93,7 +93,8 @@ class Desk:
         self.doors.refused = lambda line: self.put(lambda: self.tell(line))
         self._loop = asyncio.get_running_loop()
         self._orders: asyncio.Queue[tuple[Act, Context]] = asyncio.Queue()
-        self._pressed: dict[str, Act] = {}
+        self._pressed: dict[str, tuple[Act, Need]] = {}
+        self.operated: Act = lambda: None  # is done first when somebody operates by a button of our own
 
     def put(self, act: Act) -> None:
         """Have something done for who asks now; from any thread. A loop that has ended does nothing more."""
@@ -122,12 +123,14 @@ class Desk:
     def on_press(self, name: str, act: Act, what: str, need: Need = "operate") -> None:
         """Do something whenever a button of `markup.press` is clicked by somebody who may; `what` is for the log."""
         self.doors.need(f"press:{name}", need, what)
-        self._pressed[name] = act
+        self._pressed[name] = act, need
 
     def press(self, name: str) -> None:
         """A button was clicked by who asks now; one that there is not does nothing. From any thread."""
-        act = self._pressed.get(name)
+        act, need = self._pressed.get(name, (None, "look"))
         if act is not None and self.doors.admit(VISITOR.get(), f"press:{name}"):
+            if need == "operate":
+                self.put(self.operated)
             self.put(act)
 
     # Callbacks of viser that are coroutines run on its loop at once; others would wait for a thread.

@@ -21,6 +21,7 @@ M = TypeVar("M", bound=Message)
 ALWAYS: tuple[Topic[Any], ...] = (
     topics.JOINT_STATES, topics.MOTION_STATUS, topics.MOTION_OWNER, topics.ROBOT_STATUS, topics.GRIPPER_STATE,
     topics.SUPERVISOR_STATUS, topics.COUNTERS, topics.LOG,
+    topics.PLANNING_SCENE, topics.DISPLAY_TRAJECTORY,  # seldom new; who opens the page may look back at them
 )
 LIVE, ANNOTATED, MASK, DEPTH = "live", "annotated", "mask", "depth"  # pictures
 _LOG_SIZE = 2000  # lines that may wait
@@ -41,16 +42,23 @@ class Feeds:
         """
         self._bus = bus
         self._readers: dict[str, Reader[Any]] = {}
+        self._topics: dict[str, Topic[Any]] = {}
         self._seen: dict[str, Message] = {}
         self._on_demand: set[str] = set()
         for topic, listening in [*((t, True) for t in always), *((t, t.kind == "event") for t in on_demand)]:
             if topic.key not in self._readers:
                 self._readers[topic.key] = bus.reader(topic, size=_LOG_SIZE, listening=listening)
+                self._topics[topic.key] = topic
                 if not listening:
                     self._on_demand.add(topic.key)
 
     def __contains__(self, topic: Topic[Any]) -> bool:
         return topic.key in self._readers
+
+    @property
+    def topics(self) -> list[Topic[Any]]:
+        """All that is read, always or on demand."""
+        return list(self._topics.values())
 
     def reader(self, topic: Topic[M]) -> Reader[M] | None:
         """The reader of a topic, or None when the page does not read it."""
@@ -189,6 +197,7 @@ class Periods:
     health: float = 0.25
     line: float = 0.25
     plots: float = 0.5
+    memory: float = 0.1
     _due: dict[str, float] = field(default_factory=dict)
 
     def due(self, part: str, now: float) -> bool:
@@ -197,6 +206,11 @@ class Periods:
             return False
         self._due[part] = now + float(getattr(self, part))
         return True
+
+    def hurry_to(self, *parts: str) -> None:
+        """Have it be time for some parts."""
+        for part in parts:
+            self._due.pop(part, None)
 
     def hurry(self) -> None:
         """Have it be time for everything: somebody has come who has seen nothing yet."""

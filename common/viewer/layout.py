@@ -16,7 +16,7 @@ from common.kept_file import lasting_folder
 from common.viewer.taught import write_whole
 
 FILE = "viewer.yaml"
-Tab = Literal["Cameras", "Health", "Plots", "Log", "Tuning", "Move", "View"]
+Tab = Literal["Cameras", "Health", "Plots", "Log", "Tuning", "Move", "View", "Time"]
 TABS: tuple[Tab, ...] = get_args(Tab)
 LogLevel = Literal["debug", "info", "warning", "error"]
 HEADER = '# How the operator\'s page opens. "Save layout" on the page writes this file.\n'

@@ -55,6 +55,7 @@ class NewsOfAll:
     note: tuple[int, str, str] = (0, "", "")  # number, line, kind
     owner: MotionOwner | None = None
     live: Mapping[str, str] = field(default_factory=dict)  # numbers that stand in panels, by name
+    past: str = ""  # what is looked at, where that is not now
     at: float = field(default_factory=monotonic)
 
 
@@ -85,10 +86,13 @@ class Line:
 
     def tell(
         self, how: Iterable[tuple[str, str]], lost: Iterable[Loss], note: tuple[int, str, str],
-        owner: MotionOwner | None, live: Mapping[str, str],
+        owner: MotionOwner | None, live: Mapping[str, str], past: str = "",
     ) -> None:
-        """Say from now on how the cell is, what is lost, the newest line, whose the motion is, and numbers."""
-        self._news = NewsOfAll(tuple(how), tuple(lost), note, owner, live)
+        """Say from now on how the cell is, what is lost, the newest line, whose the motion is, and numbers.
+
+        `past` says what is looked at, where that is not now.
+        """
+        self._news = NewsOfAll(tuple(how), tuple(lost), note, owner, live, past)
 
     async def serve(self, connection: ServerConnection) -> None:
         """Answer a page until it is closed."""
@@ -115,6 +119,7 @@ class Line:
             try:
                 await connection.send(json.dumps({"news": {
                     "time": now, "how": news.how, "kept": self._kept(news.owner), "live": dict(news.live), "lost": lost,
+                    "past": news.past,
                     "unknown": sorted(unknown),
                     "note": {"number": number, "line": line, "kind": kind}}}))
             except ConnectionClosed:
@@ -160,6 +165,7 @@ class Line:
             if why := doors.objection(VISITOR.get(), "operate"):
                 answer(why, "bad")  # which has the script let go
             elif doors.admit(VISITOR.get(), HOLD, said.what):
+                desk.put(desk.operated)
                 desk.put(lambda: self.holder.hold(connection, said.what, said.n, lambda line: answer(line, "bad")))
         return False
 

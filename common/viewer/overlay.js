@@ -15,7 +15,7 @@
   bar.innerHTML = `<div id="zc-row"><button id="zc-stop" type="button" title="Stop the arm and the task (Escape)"
       aria-label="STOP: stop the arm and the task" aria-keyshortcuts="Escape">STOP</button>
     <div id="zc-said"><div id="zc-how"></div><div id="zc-note" role="status" aria-live="assertive"></div></div></div>
-    <div id="zc-lost" role="alert"></div>`;
+    <div id="zc-past" role="status"></div><div id="zc-lost" role="alert"></div>`;
   const part = id => bar.querySelector(`#zc-${id}`);
   const time = when => new Date(when).toLocaleTimeString([], {hour12: false});
 
@@ -68,6 +68,9 @@
       if (told || news.note.line) say(news.note.line, news.note.kind);
       told = news.note.number;
     }
+    const past = news.past ? `Not now: the scene shows ${news.past}` : "";
+    if (part("past").textContent !== past) part("past").textContent = past;
+    document.body.toggleAttribute("data-past", past !== "");
     keep(news.kept);
     for (const element of document.querySelectorAll("[data-live]")) {
       const value = news.live[element.dataset.live] ?? "–";

@@ -14,6 +14,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Coroutine
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import viser
@@ -22,7 +23,7 @@ from common import topics
 from common.application import Application
 from common.config import Members, check
 from common.errors import ZencellError
-from common.messages import Rejections, TaskStatus
+from common.messages import Image, PointCloud2, Rejections, TaskStatus
 from common.reporting.summary import Rejected
 from common.topics import Topic
 from common.viewer import words
@@ -37,9 +38,13 @@ from common.viewer.line import HOLD, STOP, Line
 from common.viewer.losses import Losses
 from common.viewer.markup import block, span
 from common.viewer.move import Motions, MovePanel
+from common.viewer.past import Memory
 from common.viewer.pictures import PicturePanel
-from common.viewer.plots import Limits, PlotPanel
+from common.viewer.plots import SECONDS, Limits, PlotPanel
+from common.viewer.recorded import RecordedPast, Watch, recordings_in
 from common.viewer.task_panel import TaskPanel
+from common.viewer.time_panel import TimePanel
+from common.viewer.timeline import Timeline
 from common.viewer.tuning import TuningPanel
 from common.viewer.view_panel import ViewPanel
 from common.viewer.viser_inside import introduce
@@ -64,7 +69,7 @@ class Page:
     def __init__(
         self, server: viser.ViserServer, feeds: Feeds, console: Console, motions: Motions, members: Members,
         application: Application | None, layers: Layers, line: Line, *, cell: str, layout: Layout, layout_file: str,
-        periods: Periods,
+        recordings: Path, periods: Periods,
     ) -> None:
         """Lay the page out; on the running loop.
 
@@ -80,6 +85,7 @@ class Page:
             cell: its name.
             layout: what is on.
             layout_file: where the layout is kept; empty for the project's file.
+            recordings: folder of those that can be opened.
             periods: of the parts.
 
         Raises:
@@ -89,8 +95,12 @@ class Page:
         self._motions, self._cell, self._kinds = motions, cell, layers
         self._layout, self._layout_file, self._periods = layout, layout_file, periods
         self._topics, self._words = Topics(application, layers.values(), members.keys), TaskWords.of(application)
+        self._remembered = [topic for topic in feeds.topics
+                            if topic.kind != "event" and not issubclass(topic.message, Image | PointCloud2)]
         self._shown, self._editing = layers_shown(layout.layers, layers), layout.edit_world
         self._rejected, self._line, self._losses = Rejected(), line, Losses()
+        self._memory, self._watch = Memory(), Watch(self._words.states)
+        self.timeline = Timeline(feeds.latest, self._memory)
         self._happened: list[tuple[Topic[Any], Any]] = []  # before there is a scene: an event does not come again
         self._scene: Scene | None = None
         self._plots: PlotPanel | None = None
@@ -121,6 +131,11 @@ class Page:
             self._pictures = PicturePanel(
                 gui, console, {LIVE: layout.live_image, ANNOTATED: layout.annotated_image, MASK: layout.mask_image,
                                DEPTH: layout.depth_image}, self._listen)
+        with place["Time"]:
+            self._time = TimePanel(gui, console, self.timeline, names=partial(recordings_in, recordings),
+                                   open_one=partial(self._open_recording, recordings))
+        self.timeline.moved = partial(self._periods.hurry_to, "plots", "picture")
+        console.operated = self.timeline.now
         with place["Health"]:
             self._health = HealthPanel(gui, members.services)
         with place["Log"]:
@@ -207,8 +222,11 @@ class Page:
         state = self._feeds.fresh(topics.JOINT_STATES)
         if state is not None and self._plots is not None:
             self._plots.measured(state, now)
+        if self._periods.due("memory", now):
+            self._remember(now)
         if not self.pages:
             return
+        self.timeline.step(now)
         if self._periods.due("task", now):
             holding = self._feeds.latest(topics.GRIPPER_STATE)
             self._task.show(self._status, self._feeds.latest(topics.MOTION_STATUS),
@@ -218,12 +236,13 @@ class Page:
             self._arm.show(self._feeds.latest(topics.ROBOT_STATUS))
             self._log.show()
             self._world.show()
+            self._time.show(now)
         if self._periods.due("health", now):
             self._health.show(self._feeds.latest(topics.SUPERVISOR_STATUS), alive)
         if self._plots is not None and self._periods.due("plots", now):
-            self._plots.show(now)
+            self._plot(self._plots, now)
         if self._periods.due("picture", now):
-            self._show_pictures()
+            self._show_pictures(now)
         if self._news is not None:
             self._news.tell(now)
         if self._scene is not None:
@@ -249,15 +268,42 @@ class Page:
                             self.console.answers(topics.TASK_COMMAND))}
         lost = self._losses.update(connected, alive, answers, now)
         self._line.tell(how, lost, self._task.note, owner,
-                        self._move.numbers.live() if self._move is not None else {})
+                        self._move.numbers.live() if self._move is not None else {}, self._time.told)
 
-    def _show_pictures(self) -> None:
+    def _show_pictures(self, now: float) -> None:
+        timeline = self.timeline
         for name, sources in self._topics.images.items():
-            for topic in sources:
-                image = self._feeds.fresh(topic) if self._pictures.shown[name] else None
+            for topic in sources if self._pictures.shown[name] else ():
+                image = self._feeds.fresh(topic) if timeline.is_now else timeline.picture(topic)
                 rgb = self._pictures.show(name, image, topic.key) if image is not None else None
-                if rgb is not None and name == LIVE and self._scene is not None:
+                if rgb is None:
+                    continue
+                if timeline.is_now:
+                    self._memory.note_picture(now, topic, rgb)
+                if name == LIVE and self._scene is not None:
                     self._scene.picture(topic, rgb)
+
+    def _plot(self, plots: PlotPanel, now: float) -> None:
+        at = self.timeline.at
+        if at is None:
+            plots.show(now)
+        else:
+            plots.show_past(self.timeline.past.between(topics.JOINT_STATES, at - SECONDS, at), at)
+
+    def _remember(self, now: float) -> None:
+        """Keep what is new, so that somebody may look back at it."""
+        for topic in self._remembered:
+            if (message := self._feeds.latest(topic)) is not None and self._memory.note(now, topic, message):
+                for words_, kind in self._watch.news(message):
+                    self._memory.happened(now, words_, kind)
+
+    def _open_recording(self, folder: Path, name: str) -> RecordedPast:
+        """Open a recording of that folder; on any thread.
+
+        Raises:
+            RecordingError: it cannot be read.
+        """
+        return RecordedPast(folder / name, self._cell, self._feeds.topics, self._words.states)
 
     # --- what goes on beside ------------------------------------------------------------------------------------------
 
@@ -275,6 +321,8 @@ class Page:
 
         def reject(rejections: Rejections) -> None:
             self._rejected.add(rejections.rejected)
+            for said, kind in self._watch.news(rejections):
+                self._memory.happened(now(), said, kind)
 
         acts: dict[Topic[Any], list[Callable[[Any], None]]] = {
             topics.LOG: [self._log.add], topics.COUNTERS: [lambda counters: self._health.count(counters, now())],

@@ -112,7 +112,7 @@ class PicturePanel:
         """
         said = ""
         try:
-            if name == DEPTH:
+            if name == DEPTH and image.encoding not in ("rgb8", "bgr8"):  # else it was coloured before
                 rgb, said = depth_picture(image)
             else:
                 rgb = rgb_picture(image)

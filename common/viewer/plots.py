@@ -34,6 +34,49 @@ class Limits:
     velocity: NDArray[np.float64]  # [rad/s]
 
 
+class Samples:
+    """Joints as they were in the last half minute.
+
+    Attributes:
+        kept: wall time [s], positions and velocities (dof,) [rad, rad/s] of each sample.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        """Start without any."""
+        self._limits = limits
+        self.kept: deque[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = deque()
+
+    def measured(self, state: JointState, now: float) -> None:
+        """Take a sample of joint states that came at a wall time [s]; one in which a joint is missing is left out."""
+        at = {name: index for index, name in enumerate(state.name)}
+        if all(name in at for name in self._limits.names):
+            order = [at[name] for name in self._limits.names]
+            speeds = [state.velocity[i] for i in order] if state.velocity else None
+            self.add([state.position[i] for i in order], speeds, now)
+
+    def add(self, positions: ArrayLike, velocities: ArrayLike | None, now: float) -> None:
+        """Take a sample of the joints, in the order of the limits, at a wall time [s]; too many are left out.
+
+        Args:
+            positions: (dof,) [rad].
+            velocities: (dof,) [rad/s]; None when they are not measured: told from the positions.
+            now: wall time [s], monotonic.
+        """
+        if self.kept and now - self.kept[-1][0] < SAMPLE:
+            return
+        q = np.asarray(positions, dtype=float)
+        if velocities is not None:
+            dq = np.asarray(velocities, dtype=float)
+        elif self.kept:
+            then, before, _ = self.kept[-1]
+            dq = (q - before) / (now - then)
+        else:
+            dq = np.zeros_like(q)
+        self.kept.append((now, q, dq))
+        while self.kept[0][0] < now - SECONDS:
+            self.kept.popleft()
+
+
 class PlotPanel:
     """Keeps samples and draws them: positions and speeds in percent of what the joints can do, latency in ms."""
 
@@ -46,7 +89,7 @@ class PlotPanel:
             latency: what the latency is from and to.
         """
         self._limits = limits
-        self._joints: deque[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = deque()
+        self._samples = Samples(limits)
         self._latencies: deque[tuple[float, float]] = deque()
         none = np.full(2, np.nan)
         x = np.array([-SECONDS, 0.0])
@@ -59,33 +102,26 @@ class PlotPanel:
 
     def measured(self, state: JointState, now: float) -> None:
         """Take a sample of joint states that came at a wall time [s]; one in which a joint is missing is left out."""
-        at = {name: index for index, name in enumerate(state.name)}
-        if all(name in at for name in self._limits.names):
-            order = [at[name] for name in self._limits.names]
-            speeds = [state.velocity[i] for i in order] if state.velocity else None
-            self.joints([state.position[i] for i in order], speeds, now)
+        self._samples.measured(state, now)
 
     def joints(self, positions: ArrayLike, velocities: ArrayLike | None, now: float) -> None:
-        """Take a sample of the joints, in the order of the limits, at a wall time [s]; too many are left out.
+        """Take a sample of the joints: see `Samples.add`."""
+        self._samples.add(positions, velocities, now)
 
-        Args:
-            positions: (dof,) [rad].
-            velocities: (dof,) [rad/s]; None when they are not measured: told from the positions.
-            now: wall time [s], monotonic.
-        """
-        if self._joints and now - self._joints[-1][0] < SAMPLE:
-            return
-        q = np.asarray(positions, dtype=float)
-        if velocities is not None:
-            dq = np.asarray(velocities, dtype=float)
-        elif self._joints:
-            then, before, _ = self._joints[-1]
-            dq = (q - before) / (now - then)
-        else:
-            dq = np.zeros_like(q)
-        self._joints.append((now, q, dq))
-        while self._joints[0][0] < now - SECONDS:
-            self._joints.popleft()
+    def show_past(self, states: Sequence[tuple[float, JointState]], at: float) -> None:
+        """Draw joint states, each with its time [s], up to a time that is looked back at."""
+        samples = Samples(self._limits)
+        for when, state in states:
+            samples.measured(state, when)
+        self._draw(samples, at)
+
+    def _draw(self, samples: Samples, now: float) -> None:
+        if len(samples.kept) >= 2:
+            times = np.array([t for t, _, _ in samples.kept]) - now
+            q, dq = np.array([q for _, q, _ in samples.kept]), np.array([dq for _, _, dq in samples.kept])
+            middle, half = (self._limits.upper + self._limits.lower) / 2, (self._limits.upper - self._limits.lower) / 2
+            self._positions.data = (times, *np.ascontiguousarray((100 * (q - middle) / half).T))
+            self._speeds.data = (times, *np.ascontiguousarray((100 * dq / self._limits.velocity).T))
 
     def latency(self, ms: float, now: float) -> None:
         """Take in how old [ms] a result was when it came, at a wall time [s]."""
@@ -95,12 +131,7 @@ class PlotPanel:
 
     def show(self, now: float) -> None:
         """Draw what is known at a wall time [s]."""
-        if len(self._joints) >= 2:
-            times = np.array([t for t, _, _ in self._joints]) - now
-            q, dq = np.array([q for _, q, _ in self._joints]), np.array([dq for _, _, dq in self._joints])
-            middle, half = (self._limits.upper + self._limits.lower) / 2, (self._limits.upper - self._limits.lower) / 2
-            self._positions.data = (times, *np.ascontiguousarray((100 * (q - middle) / half).T))
-            self._speeds.data = (times, *np.ascontiguousarray((100 * dq / self._limits.velocity).T))
+        self._draw(self._samples, now)
         recent = [(t, ms) for t, ms in self._latencies if t >= now - SECONDS]
         if len(recent) >= 2:
             times, values = np.array(recent).T
