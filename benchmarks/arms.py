@@ -19,9 +19,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from cli.simulate import seeds_of
 from common.config import load_cell
 from common.virtual.simulation import Simulation
+from common.virtual.telling import seeds_of
 
 _RTB = importlib.util.find_spec("rtbdata")
 RTB = Path(_RTB.submodule_search_locations[0]) / "xacro" if _RTB and _RTB.submodule_search_locations else None

@@ -2,34 +2,23 @@
 
 from __future__ import annotations
 
-import asyncio
-import math
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cli import options
 from cli.inspection import UP, Place, Verbs
-from common.errors import ConfigError, UnknownName, ZencellError
+from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 
 if TYPE_CHECKING:
-    from common.messages import Image
-    from common.perception.calibration import IntrinsicCalibration, ViewResidual
-    from common.perception.calibration_board import Board, Picture, Sighting
-    from common.perception.calibration_pose import PoseCalibration
-    from common.transport.bus import Bus
-    from common.transport.reader import Reader
+    from common.perception.calibration_board import Board
 
 app = Verbs("Calibrate a real camera with a ChArUco board.")
 
 BOARD_FORMATS = (".png", ".pdf")
-FIRST_PICTURE = 5.0  # [s] of wall time in which one comes
-_MOST_LISTED = 12  # views of which the residuals are shown
 SOURCE_HELP = "device number or path, video file, or folder of images"
 
 Squares = Annotated[str, typer.Option("--squares", metavar="COLUMNSxROWS", help="of the board")]
@@ -38,12 +27,6 @@ Marker = Annotated[str, typer.Option("--marker", metavar="M", help="length of a 
 Dictionary = Annotated[str, typer.Option("--dictionary", metavar="NAME", help="of markers: 4x4_50, 5x5_50, ...")]
 Size = Annotated[str, typer.Option("--size", metavar="WxH", help="size that a device is asked for [px]")]
 Seconds = Annotated[str, typer.Option("--seconds", metavar="S", help="how long a device is looked at")]
-
-
-class NoPicture(ZencellError):
-    """Nobody sends pictures."""
-
-    exit_code = 1
 
 
 @app.command(name="board")
@@ -84,6 +67,8 @@ def intrinsics(
     from common.config import check
     from common.perception.calibration import CollectingOptions, ViewCollector, calibrate_intrinsics
     from common.perception.calibration_record import camera_of
+    from common.perception.calibration_telling import intrinsics_told
+    from common.perception.sources import pictures
 
     least = options.whole("--views", views, 3) or 3
     settings = check(CollectingOptions, {"least_views": least, "most_views": max(60, least),
@@ -105,7 +90,7 @@ def intrinsics(
     if old.is_file() and "position:" in old.read_text(encoding="utf-8", errors="replace"):
         echo(f"{output} had a pose, which was found with other intrinsics and is gone: calibrate it again")
     camera.save(output)
-    echo(_told(found))
+    echo(intrinsics_told(found))
     echo(f"{output} holds the intrinsics; next: zencell calibrate pose SOURCE --intrinsics {output} ...")
 
 
@@ -136,10 +121,10 @@ def pose(
 
     Several places, far apart in the picture, make it much more precise: give a SOURCE and a --board-position for each.
     """
-    from common.perception.calibration import CalibrationFailed
     from common.perception.calibration_file import CameraFile
-    from common.perception.calibration_pose import calibrate_pose, sightings_of
+    from common.perception.calibration_pose import calibrate_pose, sightings_in
     from common.perception.calibration_record import with_pose
+    from common.perception.calibration_telling import pose_told
     from common.robot.transforms import rpy_to_matrix, transform
 
     rotations = board_rpy or ["0,0,0"]
@@ -152,23 +137,12 @@ def pose(
     angles = [options.three("--board-rpy", text) for text in rotations]
     camera, board = CameraFile.load(intrinsics_file), board_of(squares, square, marker, dictionary)
     most, limit = options.whole("--pictures", pictures_of_each, 1) or 1, options.number("--seconds", seconds)
-    places: list[tuple[Any, list[Sighting]]] = []
-    for source, position, rpy in zip(sources, positions, angles, strict=True):
-        seen: list[Sighting] = []
-        why: list[str] = []
-        for name, picture in pictures(source, (camera.width, camera.height), limit):
-            found, reasons = sightings_of(board, [(f"{source}: {name}", picture)], camera)
-            seen, why = seen + found, why + reasons
-            if len(seen) >= most:
-                break
-        if not seen:
-            raise CalibrationFailed(f"{source}: the board ({board.options}) is in none of {len(why)} pictures: "
-                                    f"{max(set(why), key=why.count)}")
-        places.append((transform(rpy_to_matrix(*rpy), position), seen))
+    places = [(transform(rpy_to_matrix(*rpy), position), sightings_in(source, board, camera, most, limit))
+              for source, position, rpy in zip(sources, positions, angles, strict=True)]
     result = calibrate_pose(places, camera)
     file = output or intrinsics_file
     with_pose(camera, result, sources, positions, angles).save(file)
-    echo(_pose_told(result))
+    echo(pose_told(result))
     echo(f"{file} holds intrinsics and pose; a cell takes both with --set world.camera={file}")
 
 
@@ -191,6 +165,7 @@ def hand_eye(
     from common.perception.calibration_file import CameraFile
     from common.perception.calibration_hand_eye import LEAST_VIEWS, Mount, calibrate_hand_eye
     from common.perception.calibration_record import with_hand_eye
+    from common.perception.calibration_telling import hand_eye_told
     from common.perception.hand_eye_views import load_views
 
     if mount not in get_args(Mount):
@@ -202,14 +177,7 @@ def hand_eye(
     result = calibrate_hand_eye(views, camera, "hand" if mount == "hand" else "beside")
     file = output or intrinsics_file
     with_hand_eye(camera, result, folder, said.robot, mount).save(file)
-    position, rpy = result.position, result.rpy
-    echo(f"{len(result.pictures)} views, residual {result.rms:.3f} px rms, {1e3 * result.rms_at_board:.2f} mm at the "
-         f"board; {_per_view(result.pictures)}")
-    echo(f"position {position[0]:.5f}, {position[1]:.5f}, {position[2]:.5f} m in "
-         f"{'the tool centre point' if mount == 'hand' else 'world'} +- {1e3 * max(result.position_std):.2f} mm")
-    echo(f"rpy      {rpy[0]:.5f}, {rpy[1]:.5f}, {rpy[2]:.5f} rad +- {math.degrees(result.rotation_std):.3f} degrees")
-    if result.dropped:
-        echo(f"dropped, since they do not fit: {_per_view(result.dropped)}")
+    echo(hand_eye_told(result))
     place = "the place on the hand" if mount == "hand" else "pose"
     echo(f"{file} holds intrinsics and {place}; a cell takes both with --set world.camera={file}")
     echo(result.verdict)
@@ -228,60 +196,18 @@ def collect(
 
     Bring it there by hand, by jogging or by a script of yours; nothing is moved from here.
     """
-    from dataclasses import replace
-
-    import numpy as np
-
-    from common import topics
+    from common.client.views import collect_views
     from common.config import load_robot
     from common.perception.hand_eye_views import ViewCollector
-    from common.perception.image import image_to_array
     from common.robot.model import RobotModel
 
     model = RobotModel.load(load_robot(robot))
     board, wanted = board_of(squares, square, marker, dictionary), options.whole("--views", views, 1) or 1
     collector = ViewCollector(Path(folder).expanduser(), model, robot, board)
 
-    async def visit(bus: Bus) -> None:
-        pictures, joints = bus.reader(replace(topics.CAMERA_IMAGE, key=key)), bus.reader(topics.JOINT_STATES)
-
-        async def take_note() -> None:
-            async for state in joints:
-                q = dict(zip(state.name, state.position, strict=True))
-                collector.joints(state.header.stamp * 1e-9, np.array([q[name] for name in model.joint_names]))
-
-        noting, said = asyncio.create_task(take_note()), ""
-        try:
-            while collector.count < wanted:
-                image = await next_of(pictures, noting)
-                why = await asyncio.to_thread(
-                    collector.picture, image.header.stamp * 1e-9, np.ascontiguousarray(image_to_array(image)))
-                line = why or f"view {collector.count} of {wanted}; {collector.hint}"
-                if line != said:
-                    echo(line)
-                said = line
-        finally:
-            noting.cancel()
-
-    at.visit(visit)
+    at.visit(lambda bus: collect_views(bus, key, collector, wanted, echo))
     echo(f"{folder} holds {collector.count} views; next: zencell calibrate hand-eye {folder} --intrinsics FILE "
          "--camera hand|beside")
-
-
-async def next_of(pictures: Reader[Image], noting: asyncio.Task[None]) -> Image:
-    """The next picture.
-
-    Raises:
-        NoPicture: none comes.
-    """
-    coming = asyncio.ensure_future(pictures.next())
-    done, _ = await asyncio.wait({coming, noting}, timeout=FIRST_PICTURE, return_when=asyncio.FIRST_COMPLETED)
-    if coming in done:
-        return coming.result()
-    coming.cancel()
-    if noting in done:
-        noting.result()
-    raise NoPicture(f"no picture came for {FIRST_PICTURE:g} s: is a camera up, and its key right (--key)?")
 
 
 def board_of(squares: str, square: str, marker: str, dictionary: str) -> Board:
@@ -304,25 +230,6 @@ def board_of(squares: str, square: str, marker: str, dictionary: str) -> Board:
                                           "marker": given or round(0.75 * side, 6), "dictionary": dictionary}, "board"))
 
 
-def pictures(source: str, size: tuple[int, int] | None, seconds: float) -> Iterator[tuple[str, Picture]]:
-    """Pictures of a source with their names: all of a file or folder, those of so many seconds of a device.
-
-    Raises:
-        ConfigError: it is nothing that pictures can be read from.
-    """
-    from common.perception.sources import open_source
-
-    opened = open_source(source, size, None, loop=False)
-    if opened is None:
-        raise ConfigError("SOURCE", source, "is a device that cannot be opened")
-    until = time.monotonic() + seconds
-    try:
-        while (picture := opened.read()) is not None and (not opened.live or time.monotonic() < until):
-            yield opened.name, picture
-    finally:
-        opened.close()
-
-
 def parse_size(text: str) -> tuple[int, int] | None:
     """Width and height of `WxH` [px]; None for nothing.
 
@@ -337,42 +244,3 @@ def _two(option: str, text: str, example: str) -> tuple[int, int]:
     if not found or not first.isdecimal() or not second.isdecimal():
         raise ConfigError(option, text, f"must be two whole numbers, as {example}")
     return int(first), int(second)
-
-
-def _told(found: IntrinsicCalibration) -> str:
-    lines = [
-        f"{len(found.views)} views, {found.corners} corners, {100 * found.coverage:.0f} % of the picture covered",
-        f"residual {found.rms:.3f} px rms; {_per_view(found.views)}",
-        *(f"{name} {value:8.2f} +- {std:.2f} px" for name, value, std in
-          zip(("fx", "fy", "cx", "cy"), found.k, found.k_std, strict=True)),
-        f"distortion {', '.join(f'{value:.4f}' for value in found.d) or 'none'}",
-    ]
-    if found.dropped:
-        lines.append(f"dropped, since they do not fit: {_per_view(found.dropped)}")
-    if found.unseen:
-        lines.append(f"no corner was seen in these parts of the picture: {', '.join(found.unseen)}; "
-                     "views with the board there make the distortion better")
-    return "\n".join(lines)
-
-
-def _pose_told(result: PoseCalibration) -> str:
-    position, rpy = result.position, result.rpy
-    std = max(result.position_std)
-    lines = [
-        f"{len(result.pictures)} pictures, residual {result.rms:.3f} px rms, "
-        f"{1e3 * result.rms_on_board:.3f} mm on the board; {_per_view(result.pictures)}",
-        f"position {position[0]:.5f}, {position[1]:.5f}, {position[2]:.5f} m +- {1e3 * std:.2f} mm",
-        f"rpy      {rpy[0]:.5f}, {rpy[1]:.5f}, {rpy[2]:.5f} rad +- {math.degrees(result.rotation_std):.3f} degrees",
-        f"places on the board's plane +- {1e3 * result.place_std:.2f} mm where it is worst in the picture",
-    ]
-    if result.dropped:
-        lines.append(f"dropped, since they do not fit: {_per_view(result.dropped)}")
-    return "\n".join(lines)
-
-
-def _per_view(views: list[ViewResidual]) -> str:
-    """Residuals of views [px], in their order; of many only the worst."""
-    if len(views) <= _MOST_LISTED:
-        return ", ".join(f"{view.name} {view.rms:.3f}" for view in views)
-    worst = sorted(views, key=lambda view: -view.rms)[:_MOST_LISTED]
-    return "worst: " + ", ".join(f"{view.name} {view.rms:.3f}" for view in worst)

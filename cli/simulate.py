@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
-import statistics
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,11 +15,7 @@ from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.config import Cell
-    from common.virtual.campaign import Tally
-    from common.virtual.simulation import Outcome
 
-MOST_SEEDS = 1_000_000
-SHOWN = 50  # seeds that did not end DONE, in the table
 
 
 def simulate(
@@ -50,6 +44,7 @@ def simulate(
     from common.config import load_cell
     from common.errors import ConfigError
     from common.virtual.doubles import settings_of, with_doubles
+    from common.virtual.telling import seeds_of
     from common.virtual.watched_arm import with_watched_arm
 
     if seeds is not None and seed is not None:
@@ -72,26 +67,12 @@ def simulate(
     raise typer.Exit(_single(loaded, one, faults, trace, longest))
 
 
-def seeds_of(text: str) -> range:
-    """The seeds of A-B, or of a single number.
-
-    Raises:
-        ConfigError: it is neither.
-    """
-    from common.errors import ConfigError
-
-    match = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", text.strip())
-    first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
-    if not first <= last < first + MOST_SEEDS:
-        raise ConfigError("--seeds", text, "must be a range such as 1-1000")
-    return range(first, last + 1)
-
-
 def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float) -> int:
     """Run one seed and tell of all that happened; the exit code."""
     from common.recording.own import Own
     from common.recording.telling import about, require_new
     from common.virtual.simulation import Simulation
+    from common.virtual.telling import told
     from common.virtual.trace import Trace
 
     trace = None
@@ -111,31 +92,13 @@ def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float)
     return 0 if outcome.ok and not outcome.crashes else 1
 
 
-def told(outcome: Outcome) -> list[str]:
-    """One seed in a few lines for people."""
-    lines = [f"seed {outcome.seed}: {outcome.state}{f', {outcome.message}' if outcome.message else ''}"]
-    lines.append(f"  {outcome.seconds:.1f} s of virtual time in {outcome.cpu_seconds:.1f} CPU seconds, "
-                 f"{outcome.messages:,} messages, digest {outcome.digest}")
-    lines.append(f"  faults: {listed(outcome.faults) or 'none'}")
-    lines.append(f"  requests: {listed(outcome.requests)}")
-    lines.append(f"  checked: {listed(outcome.checked)}")
-    lines += [f"  broken: {what}" for what in outcome.broken]
-    lines += [f"  crashed by itself: {what}" for what in outcome.crashes]
-    return lines
-
-
-def listed(counted: dict[str, int]) -> str:
-    """Counts in one line, the largest first."""
-    order = sorted(counted.items(), key=lambda item: (-item[1], item[0]))
-    return ", ".join(f"{name} {count:,}" for name, count in order)
-
-
 def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: float) -> int:
     """Run all seeds with a bar that tells how far it is, then the table; the exit code."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from common.virtual.campaign import Tally, run_seeds
+    from common.virtual.telling import reason, table
 
     tally, interrupted = Tally(), False
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -157,41 +120,3 @@ def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: 
         echo(f"interrupted after {len(tally.outcomes)} of {len(seeds)} seeds", err=True)
         return 130
     return 0 if tally.passed else 1
-
-
-def reason(outcome: Outcome) -> str:
-    """Why a seed is no success."""
-    crashes = [f"crashed by itself: {what}" for what in outcome.crashes[:1]]
-    return "; ".join([f"{outcome.state} {outcome.message}".strip(), *outcome.broken[1:], *crashes])
-
-
-def table(name: str, tally: Tally, faults: bool) -> object:
-    """All seeds in one table: how they ended, what went wrong on purpose, what was checked, and who failed."""
-    from rich.table import Table
-
-    outcomes = tally.outcomes
-    ended = [outcome.seconds for outcome in outcomes if outcome.ok] or [0.0]
-    cpu = [outcome.cpu_seconds for outcome in outcomes]
-    made = Table(title=f"{name}, {len(outcomes)} seeds{' with faults' if faults else ''}", show_header=False)
-    made.add_row("DONE", f"{tally.done} of {len(outcomes)} ({tally.done / len(outcomes):.1%})")
-    made.add_row("virtual time", f"{statistics.median(ended):.1f} s (median), {max(ended):.1f} s at most")
-    made.add_row("CPU time", f"{statistics.median(cpu):.1f} s a seed (median), {sum(cpu):.0f} s in all")
-    made.add_row("requests", listed(tally.requests))
-    made.add_section()
-    if faults:
-        for kind, count in sorted(tally.faults.items()):
-            each = [outcome.faults[kind] for outcome in outcomes]
-            made.add_row(f"fault: {kind}", f"{count:,} ({min(each)} to {max(each)} a run)")
-        made.add_section()
-    broken = [what for outcome in outcomes for what in outcome.broken]
-    for what, count in sorted(tally.checked.items()):
-        breaks = sum(what in line for line in broken)
-        made.add_row(f"invariant: {what}", f"{count:,} looks, {f'BROKEN {breaks} times' if breaks else 'held'}")
-    bad = [outcome for outcome in sorted(outcomes, key=lambda o: o.seed) if not outcome.ok or outcome.crashes]
-    if bad:
-        made.add_section()
-    for outcome in bad[:SHOWN]:
-        made.add_row(f"seed {outcome.seed}", reason(outcome))
-    if len(bad) > SHOWN:
-        made.add_row("...", f"{len(bad) - SHOWN} more")
-    return made

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from common.perception.calibration import CalibrationFailed, ViewResidual
 from common.perception.calibration_board import Board, NotSeen, Sighting
 from common.perception.calibration_file import CameraFile
+from common.perception.sources import pictures
 from common.robot.transforms import invert, matrix_to_rpy, transform
 
 Array = npt.NDArray[np.float64]
@@ -105,6 +106,33 @@ def calibrate_pose(
     on_board = np.concatenate([_on_board(one, T_world_camera, K) for one in seen])
     pictures = [ViewResidual(one.sighting.name, len(one.points), r) for one, r in zip(seen, residuals, strict=True)]
     return PoseCalibration(T_world_camera, position, rotation, place, rms, _rms(on_board), pictures, dropped)
+
+
+def sightings_in(source: str, board: Board, camera: CameraFile, most: int, seconds: float) -> list[Sighting]:
+    """What is seen of the board in pictures of a source, in so many of them at most.
+
+    Args:
+        source: device, file or folder.
+        board: that is looked for.
+        camera: its intrinsics.
+        most: pictures with the board.
+        seconds: how long a device is looked at.
+
+    Raises:
+        CalibrationFailed: the board is in none; why it is not in most of them.
+        ConfigError: the source is nothing that pictures can be read from.
+    """
+    seen: list[Sighting] = []
+    why: list[str] = []
+    for name, picture in pictures(source, (camera.width, camera.height), seconds):
+        found, reasons = sightings_of(board, [(f"{source}: {name}", picture)], camera)
+        seen, why = seen + found, why + reasons
+        if len(seen) >= most:
+            break
+    if not seen:
+        raise CalibrationFailed(f"{source}: the board ({board.options}) is in none of {len(why)} pictures: "
+                                f"{max(set(why), key=why.count)}")
+    return seen
 
 
 def sightings_of(board: Board, pictures: Sequence[tuple[str, npt.NDArray[np.uint8]]], camera: CameraFile,

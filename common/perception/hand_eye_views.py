@@ -63,6 +63,11 @@ class ViewCollector:
         self._recent: deque[tuple[float, Array]] = deque(maxlen=1000)
 
     @property
+    def joint_names(self) -> list[str]:
+        """Of the robot, in the order in which positions are told."""
+        return self._robot.joint_names
+
+    @property
     def count(self) -> int:
         """Views that are kept."""
         return len(self._hands)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.errors import ConfigError
+from common.sources import monotonic
 
 Picture = npt.NDArray[np.uint8]
 
@@ -142,3 +144,20 @@ def _as_bgr8(picture: npt.NDArray[Any]) -> Picture:
     if picture.ndim == 2 or picture.shape[2] == 1:
         return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR), np.uint8)
     return np.ascontiguousarray(picture[..., :3], np.uint8)
+
+
+def pictures(source: str, size: tuple[int, int] | None, seconds: float) -> Iterator[tuple[str, Picture]]:
+    """Pictures of a source with their names: all of a file or folder, those of so many seconds of a device.
+
+    Raises:
+        ConfigError: it is nothing that pictures can be read from.
+    """
+    opened = open_source(source, size, None, loop=False)
+    if opened is None:
+        raise ConfigError("SOURCE", source, "is a device that cannot be opened")
+    until = monotonic() + seconds
+    try:
+        while (picture := opened.read()) is not None and (not opened.live or monotonic() < until):
+            yield opened.name, picture
+    finally:
+        opened.close()

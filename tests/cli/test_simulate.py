@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from cli.main import app
-from cli.simulate import listed, seeds_of
 from common.errors import ConfigError
 from common.recording.reading import Recording
+from common.virtual.telling import listed, seeds_of
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
 SMALL = ["panda", "--set", "world.count=1"]
