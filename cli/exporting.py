@@ -46,10 +46,10 @@ def export(
         if folder and Path(folder).exists() and not Path(folder).is_dir():
             raise ConfigError(option, folder, "must be a folder")
     if video:
-        _require_video(Path(video))
+        require_new(Path(video), "--video", ".mp4")
     decoder = Decoder()
     with Recording(Path(file)) as recording:
-        _require_topics(recording, selection)
+        selection.require_in(recording.topics(), recording.path, "--topics")
         if foxglove:
             _foxglove(recording, Path(foxglove), selection, decoder)
         if csv:
@@ -60,24 +60,6 @@ def export(
             _video(recording, Path(video), selection, decoder)
     for topic, count in sorted(decoder.skipped.items()):
         echo(f"{printable(topic)}: {count} messages left out, which are none that this version knows", err=True)
-
-
-def _require_video(path: Path) -> None:
-    if path.suffix != ".mp4":
-        raise ConfigError("--video", str(path), "must end in .mp4")
-    if not path.absolute().parent.is_dir():
-        raise ConfigError("--video", str(path), "is in a folder that does not exist")
-    if path.exists():
-        raise ConfigError("--video", str(path), "is there already; choose another name")
-
-
-def _require_topics(recording: Recording, selection: Selection) -> None:
-    from common.recording.selection import covers
-
-    every = recording.topics()
-    for key in selection.keys:
-        if "*" not in key and not any(covers(key, topic) for topic in every):
-            raise ConfigError("--topics", key, f"is not in {recording.path}; choices: {', '.join(sorted(every))}")
 
 
 def _foxglove(recording: Recording, target: Path, selection: Selection, decoder: Decoder) -> None:

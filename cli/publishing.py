@@ -33,7 +33,7 @@ def pub(
 
     A state can be asked for while this runs. A key of your own services takes any JSON; {"base64": "..."} is bytes.
     """
-    from common.client.publishing import checked, publish
+    from common.client.publishing import checked, publish, writers_of
     from common.transport.credentials import refuse_to_publish
 
     refuse_to_publish("topic pub")
@@ -50,7 +50,8 @@ def pub(
         # A signed one goes under the key of whoever it says that it is of.
         written = of_service(topic, message.service) if topic is not None and topic.signed else topic
         under = written.key if written is not None else key
-        _warn_of_writers(await _others(bus, under), under)
+        if others := await writers_of(bus, [under]):
+            echo(f"zencell: {', '.join(name for name, _ in others)} writes {under} too: readers get both", err=True)
         await publish(bus, written, under, message, period, most)
 
     at.visit(visit)
@@ -69,13 +70,3 @@ def _publishable(key: str) -> Topic[Any] | None:
     if topic is None or isinstance(topic, Topic):
         return topic
     raise ConfigError("KEY", key, f"is a request, which is not published: zencell call {key} JSON")
-
-
-async def _others(bus: Bus, key: str) -> list[str]:
-    """Services of the cell that write the key."""
-    return [owner.service for owner in await bus.owners() if owner.key == key]
-
-
-def _warn_of_writers(services: list[str], key: str) -> None:
-    if services:
-        echo(f"zencell: {', '.join(services)} writes {key} too: readers get both", err=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from common.errors import ConfigError
@@ -115,3 +115,9 @@ async def publish(
             break
         await asyncio.sleep(max(0.0, began + sent * period - time.monotonic()))
     await asyncio.sleep(LINGER)
+
+
+async def writers_of(bus: Bus, keys: Iterable[str]) -> list[tuple[str, str]]:
+    """Services of the cell that write one of these keys, each with the key."""
+    owners = await bus.owners()
+    return [(owner.service, key) for key in keys for owner in owners if owner.key == key]

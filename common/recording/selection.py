@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 from common.errors import ConfigError
 
@@ -49,6 +50,17 @@ class Selection:
         if self.regex is not None and self.regex.search(topic):
             return True
         return any(covers(key, topic) for key in self.keys)
+
+    def require_in(self, topics: Iterable[str], path: Path, option: str) -> None:
+        """Return when each key without wildcards is one of the topics of a recording.
+
+        Raises:
+            ConfigError: names the first that is not, by the option with which it was given, and the choices.
+        """
+        every = sorted(topics)
+        for key in self.keys:
+            if "*" not in key and not any(covers(key, topic) for topic in every):
+                raise ConfigError(option, key, f"is not in {path}; choices: {', '.join(every) or 'none'}")
 
 
 def _compiled(option: str, text: str | None) -> re.Pattern[str] | None:

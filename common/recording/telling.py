@@ -73,14 +73,14 @@ def contents(file: str, cell: str, summary: Summary) -> list[str]:
     return lines
 
 
-def require_new(path: Path, option: str = "-o") -> None:
-    """Return when a recording can be made there.
+def require_new(path: Path, option: str = "-o", suffix: str = ".mcap") -> None:
+    """Return when a recording, or another file, can be made there.
 
     Raises:
         ConfigError: the folder is not there, or the file is.
     """
-    if path.suffix != ".mcap":
-        raise ConfigError(option, str(path), "must end in .mcap")
+    if path.suffix != suffix:
+        raise ConfigError(option, str(path), f"must end in {suffix}")
     if not path.absolute().parent.is_dir():
         raise ConfigError(option, str(path), "is in a folder that does not exist")
     if path.exists():

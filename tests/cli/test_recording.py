@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.playing import names_of
+from common.client.keyboard import names_of
 from common.recording.reading import Recording
 from common.recording.sink import Figures
 from common.recording.summary import summarise

@@ -1,0 +1,63 @@
+"""Keys that a person presses at a terminal, by name."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import termios
+import tty
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+NAMES = {b"\x1b[C": "right", b"\x1b[D": "left", b"\x1b[B": "down", b"\x1b[A": "up", b" ": "space"}
+
+
+class Keys:
+    """Calls back with the name of each key while the block runs; does nothing without a terminal.
+
+    The terminal is as before when the block ends, however it ends. Ctrl-C stays a signal.
+    """
+
+    def __init__(self, on_key: Callable[[str], None], *, on_terminal: bool) -> None:
+        """Take the terminal over only in the block, if standard input is one; on the running loop."""
+        self._on_terminal = on_terminal
+        self._on_key = on_key
+        self._before: list[Any] | None = None
+
+    def __enter__(self) -> Keys:
+        if self._on_terminal:
+            self._before = termios.tcgetattr(sys.stdin.fileno())
+            tty.setcbreak(sys.stdin.fileno())
+            asyncio.get_running_loop().add_reader(sys.stdin.fileno(), self._read)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._before is not None:
+            asyncio.get_running_loop().remove_reader(sys.stdin.fileno())
+            termios.tcsetattr(sys.stdin.fileno(), termios.TCSADRAIN, self._before)
+
+    def _read(self) -> None:
+        data = os.read(sys.stdin.fileno(), 64)
+        if not data:  # the terminal is gone
+            asyncio.get_running_loop().remove_reader(sys.stdin.fileno())
+        for name in names_of(data):
+            self._on_key(name)
+
+
+def names_of(data: bytes) -> list[str]:
+    """Names of the keys that the terminal's bytes stand for: right, left, up, down, space, or a letter."""
+    names = []
+    while data:
+        known = next((code for code in NAMES if data.startswith(code)), None)
+        if known is not None:
+            names.append(NAMES[known])
+        elif data[0] != 0x1B:
+            names.append(chr(data[0]))
+        else:  # another sequence, or Escape alone: a letter of it must not be taken for a key
+            break
+        data = data[len(known) if known else 1 :]
+    return names
