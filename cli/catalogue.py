@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from cli import completion, options
+from cli import options
+from common.completing import offers
 from common.errors import UnknownName
 from common.terminal import echo
 
@@ -42,11 +43,11 @@ def _first_line(path: Path) -> str:
 def service(
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="of `zencell services`, of the cell, or a module",
-                            autocompletion=completion.services)
+                            autocompletion=offers.services)
     ],
     cell: Annotated[
-        str, typer.Option("--cell", metavar="CELL", help="the cell that it belongs to", autocompletion=completion.cells)
-    ] = completion.default_cell(),
+        str, typer.Option("--cell", metavar="CELL", help="the cell that it belongs to", autocompletion=offers.cells)
+    ] = offers.default_cell(),
     overrides: options.Overrides = None,
     world: options.WorldName = None,
     seed: options.Seed = None,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import typer
@@ -12,10 +11,7 @@ from cli import options
 from common.terminal import echo
 
 if TYPE_CHECKING:
-    from common.checking.finding import Finding
-    from common.config import Cell
-
-SHOWS = "viewer"  # a page shows whatever there is
+    pass
 
 
 def check(
@@ -26,6 +22,7 @@ def check(
 
     Nothing is started and nothing moves. Exit 0 without errors, also with warnings.
     """
+    from common.checking.services import examine
     from common.config import load_cell
 
     loaded = load_cell(cell, tuple(overrides or ()), world=world, seed=options.whole("--seed", seed, 0))
@@ -45,40 +42,3 @@ def check(
 
 def _counted(count: int, what: str) -> str:
     return f"{count or 'no'} {what}{'' if count == 1 else 's'}"
-
-
-def examine(cell: Cell) -> Iterator[Finding]:
-    """All findings of a cell, each once; the quick ones first."""
-    from common.checking.cell import quick, thorough
-
-    told: set[str] = set()
-    for found in (*quick(cell), *thorough(cell), *wiring(cell)):
-        if not any(found.what.startswith(what) for what in told):  # a service says what was found here, too
-            told.add(found.what)
-            yield found
-
-
-def wiring(cell: Cell) -> Iterator[Finding]:
-    """What services refuse, and keys that do not fit together."""
-    from common.checking.finding import error, refusal
-    from common.checking.wiring import Keys, check_wiring
-    from common.errors import ConfigError, ZencellError
-    from common.graph.wired import Unwired, wired
-
-    found, complete = [], True
-    for entry in cell.services.values():
-        try:
-            each = wired(cell, entry)
-        except ConfigError as told:
-            yield refusal(told)
-        except Unwired as told:
-            yield error(str(told), "correct the service, or its parameters", refused=True)
-        except ZencellError as told:
-            yield error(f"services.{entry.name}: {told}", "correct it", refused=True)
-        else:
-            found.append(Keys(each.name, each.reads, each.writes, each.serves, each.calls, entry.kind == SHOWS))
-            continue
-        complete = False
-    for finding in check_wiring(found):
-        if complete or finding.severity == "error":  # what a service that is refused would write is not known
-            yield finding

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import completion, options
+from cli import options
 from cli.inspection import UP, Place, Verbs
+from common.completing import offers
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 
@@ -31,7 +32,7 @@ NEGATIVE_NUMBERS = {"ignore_unknown_options": True}  # -0.2 is a coordinate, not
 def call(
     key: Annotated[
         str, typer.Argument(metavar="KEY", help="of a request, as in `zencell topic list`",
-                            autocompletion=completion.requests)
+                            autocompletion=offers.requests)
     ],
     body: Annotated[str, typer.Argument(metavar="JSON", help="its fields; `zencell topic info KEY` has an example")],
     at: Place = UP,
@@ -108,7 +109,7 @@ def stop(at: Place = UP) -> None:
 @task.command()
 def home(
     planner: Annotated[
-        str, typer.Option("--planner", metavar="NAME", help="use only this one", autocompletion=completion.planners)
+        str, typer.Option("--planner", metavar="NAME", help="use only this one", autocompletion=offers.planners)
     ] = "",
     at: Place = UP,
 ) -> None:

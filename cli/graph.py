@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli import completion, options
+from cli import options
 from cli.inspection import Place
+from common.completing import offers
 from common.errors import ConfigError
 from common.terminal import echo
 
@@ -23,8 +24,8 @@ FORMATS = (".svg", ".dot", ".mmd")
 
 def graph(
     cell: Annotated[
-        str, typer.Argument(metavar="[CELL]", help="name or path of the cell file", autocompletion=completion.cells)
-    ] = completion.default_cell(),
+        str, typer.Argument(metavar="[CELL]", help="name or path of the cell file", autocompletion=offers.cells)
+    ] = offers.default_cell(),
     output: Annotated[
         str, typer.Option("-o", "--output", metavar="FILE", help="*.svg, *.dot or *.mmd; without it Mermaid on stdout")
     ] = "",

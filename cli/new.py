@@ -10,8 +10,8 @@ from typing import Annotated
 
 import typer
 
-from cli import completion
-from cli.model_sources import ROOT
+from common.completing import offers
+from common.completing.model_sources import ROOT
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 
@@ -22,11 +22,11 @@ DEFAULT = "sort_cubes"
 def new(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="is made; its name is that of cell and task")],
     task: Annotated[
-        str, typer.Option("--task", metavar="KIND", help="what it begins as", autocompletion=completion.tasks)
+        str, typer.Option("--task", metavar="KIND", help="what it begins as", autocompletion=offers.tasks)
     ] = DEFAULT,
 ) -> None:
     """Write a cell, a task in one file and their test into a new folder: they run at once."""
-    kinds = completion.task_kinds()
+    kinds = offers.task_kinds()
     if task not in kinds:
         raise UnknownName("task", task, kinds)
     to = Path(folder).expanduser().absolute()

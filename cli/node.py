@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
-from cli import completion, options
+from cli import options
 from cli.inspection import Place, Verbs
+from common.completing import offers
 from common.terminal import echo
 
 app = Verbs("Services: who is ready, and what each has to do with.")
@@ -37,11 +38,11 @@ def list_(
 @app.command()
 def info(
     service: Annotated[
-        str, typer.Argument(metavar="SERVICE", help="as in the cell file", autocompletion=completion.services)
+        str, typer.Argument(metavar="SERVICE", help="as in the cell file", autocompletion=offers.services)
     ],
     cell: Annotated[
         str | None, typer.Option("--cell", metavar="CELL", help="name or YAML file of its cell",
-                                 autocompletion=completion.cells)
+                                 autocompletion=offers.cells)
     ] = None,
     as_json: options.Json = False,
     domain: options.Domain = None,

@@ -6,8 +6,9 @@ from typing import Annotated
 
 import typer
 
-from cli import completion, options
+from cli import options
 from cli.inspection import UP, Place, Verbs
+from common.completing import offers
 from common.terminal import echo
 
 app = Verbs("Parameters of running services: what there is, and changing it.")
@@ -16,11 +17,11 @@ LONGEST_VALUE = 28  # characters of a value in a table
 
 PathArgument = Annotated[
     str, typer.Argument(metavar="PATH", help="as in `zencell param list`; services. may be left out",
-                        autocompletion=completion.parameters)
+                        autocompletion=offers.parameters)
 ]
 Assignments = Annotated[
     list[str], typer.Argument(metavar="PATH=VALUE...", help="values as YAML; @FILE: all of a file of `param dump`",
-                              autocompletion=completion.overrides)
+                              autocompletion=offers.overrides)
 ]
 
 
@@ -28,7 +29,7 @@ Assignments = Annotated[
 def list_(
     service: Annotated[
         str | None, typer.Argument(metavar="SERVICE", help="of one; of all if not given",
-                                   autocompletion=completion.services)
+                                   autocompletion=offers.services)
     ] = None,
     at: Place = UP,
     as_json: options.Json = False,
@@ -84,7 +85,7 @@ def set_(assignments: Assignments, at: Place = UP) -> None:
 def dump(
     services: Annotated[
         list[str] | None, typer.Argument(metavar="SERVICE...", help="all if none is given",
-                                         autocompletion=completion.services)
+                                         autocompletion=offers.services)
     ] = None,
     everything: Annotated[bool, typer.Option("--all", help="what is as by default, too")] = False,
     output: Annotated[str, typer.Option("-o", "--output", metavar="FILE", help="write there, not here")] = "",

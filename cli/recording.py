@@ -11,8 +11,9 @@ from typing import Annotated
 
 import typer
 
-from cli import completion, options
+from cli import options
 from cli.inspection import UP, Place
+from common.completing import offers
 from common.errors import ConfigError
 from common.recording.telling import contents, in_bytes, require_new
 from common.terminal import echo, rewrite
@@ -22,7 +23,7 @@ LEAST_FILE = 1.0  # [MB] of a recording that is split
 File = Annotated[str, typer.Argument(metavar="FILE.mcap", help="a recording")]
 Keys = Annotated[
     list[str] | None, typer.Argument(metavar="KEY", help="without the cell; * and ** as wildcards",
-                                     autocompletion=completion.published)
+                                     autocompletion=offers.published)
 ]
 Exclude = Annotated[str | None, typer.Option("--exclude", metavar="RE", help="leave out keys in which RE is found")]
 

@@ -7,8 +7,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from cli import completion, options, robot_new
+from cli import options, robot_new
 from cli.inspection import UP, Place, Verbs
+from common.completing import offers
 from common.errors import ConfigError
 from common.terminal import echo
 
@@ -21,7 +22,7 @@ app.command()(robot_new.check)
 def collisions(
     name: Annotated[
         str, typer.Argument(metavar="ROBOT", help="a name of config/robots, or the path of a YAML file",
-                            autocompletion=completion.robots)
+                            autocompletion=offers.robots)
     ],
     samples: Annotated[str, typer.Option("--samples", metavar="N", help="random configurations")] = "10000",
     margin: Annotated[str, typer.Option("--margin", metavar="M", help="pairs that come this close are checked [m]")]

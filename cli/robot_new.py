@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli import completion
+from common.completing import offers
 from common.errors import ConfigError
 from common.terminal import echo
 
@@ -35,13 +34,14 @@ def new(
     cell: Annotated[str, typer.Option("--cell", metavar="FILE.yaml", help="write a cell too, whose world lies in "
                                                                           "reach of this arm")] = "",
     like: Annotated[str, typer.Option("--like", metavar="CELL", help="which that cell is like",
-                                      autocompletion=completion.cells)] = "",
+                                      autocompletion=offers.cells)] = "",
     yes: Annotated[bool, typer.Option("--yes", "-y", help="ask nothing: take the best guess")] = False,
     force: Annotated[bool, typer.Option("--force", help="overwrite what is there")] = False,
 ) -> None:
     """Write a robot file for an arm from its URDF: what it says, what is measured on it, and guesses marked as such."""
     from common.config import names_of
     from common.robot.merging import read_urdf
+    from common.setup.cell_like import layout_of, write_cell
     from common.setup.meshes import folders_of_meshes
     from common.setup.proposal import draft, finish
     from common.setup.tree import find_wrists, read_tree
@@ -65,7 +65,7 @@ def new(
     layout = None
     if cell:
         _writable("--cell", Path(cell).expanduser(), force)
-        layout = _layout_of(template)
+        layout = layout_of(template)
     wrists = find_wrists(tree)
     if tip is None and len(wrists) > 1 and not yes:
         longest = max(wrists, key=lambda link: len(tree.above(link)))
@@ -82,7 +82,7 @@ def new(
     pairs.write_text(made.srdf, encoding="utf-8")
     _tell(made, robot, path, pairs)
     if layout is not None:
-        _write_cell(Path(cell).expanduser(), template, path, layout)
+        write_cell(Path(cell).expanduser(), template, path, layout)
     echo(f"next: zencell robot check {path}")
     if robot.config.gripper is not None:
         echo(f"      zencell run {cell or f'{template} --set robot={path}'}")
@@ -91,7 +91,7 @@ def new(
 def check(
     name: Annotated[
         str, typer.Argument(metavar="ROBOT", help="a name of config/robots, or the path of a YAML file",
-                            autocompletion=completion.robots)
+                            autocompletion=offers.robots)
     ],
 ) -> None:
     """Check what a robot file says of the tool on the robot's model; exit code 1 with a line for all that is not so."""
@@ -147,35 +147,6 @@ def _described(urdf: str, out: str, force: bool) -> str:
     from common.setup.xacro import urdf_of_xacro
 
     return urdf_of_xacro(urdf, Path(out).expanduser().parent if out else Path(), overwrite=force)
-
-
-Layout = Callable[["RobotModel", dict[str, Any]], dict[str, Any]]
-
-
-def _layout_of(template: str) -> Layout:
-    """What lays out a world in reach of an arm, for the application of a cell."""
-    from common.application import find_application
-    from common.config import load_cell
-
-    application = find_application(load_cell(template).application)
-    layout: Layout | None = application.find("reach", "fitted")
-    if layout is None:
-        raise ConfigError("--like", template, f"is for {application.name}, which lays out no world by reach")
-    return layout
-
-
-def _write_cell(path: Path, template: str, robot_path: Path, layout: Layout) -> None:
-    """A cell like another, with this robot and a world in its reach."""
-    import yaml
-
-    from common.config import find_file, load_robot, read_yaml
-    from common.robot.model import RobotModel
-
-    robot = RobotModel.load(load_robot(robot_path))
-    tree = layout(robot, read_yaml(find_file("cells", template)))
-    tree |= {"cell": path.stem, "robot": os.path.relpath(robot_path.resolve(), path.parent.resolve())}
-    head = f"# As {template}, for {robot.config.name}: its world was laid out in reach by `zencell robot new`.\n"
-    path.write_text(head + yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=118), encoding="utf-8")
 
 
 def _tell(made: Proposal, robot: RobotModel, path: Path, pairs: Path) -> None:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli import completion, options, publishing
+from cli import options, publishing
 from cli.inspection import UP, Place, Verbs
 from common import terminal
+from common.completing import offers
 
 if TYPE_CHECKING:
     from common.client.keys import Known
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 app = Verbs("Topics: what there is, what it carries, what comes and how often.")
 
 AnyKey = Annotated[
-    str, typer.Argument(metavar="KEY", help="as in `zencell topic list`", autocompletion=completion.keys)
+    str, typer.Argument(metavar="KEY", help="as in `zencell topic list`", autocompletion=offers.keys)
 ]
 
 

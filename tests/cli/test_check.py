@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from cli.check import wiring
 from common.checking.cell import quick, refused, thorough
 from common.checking.finding import Finding
+from common.checking.services import wiring
 from common.checking.wiring import Keys, check_wiring
 from common.config import Cell, load_cell, names_of
 from common.errors import ConfigError

@@ -8,19 +8,19 @@ from pathlib import Path
 
 import pytest
 
-from cli import completion
 from common.application import find_application
+from common.completing import offers
 from common.config import load_cell
 from common.supervision.launch import Launch
 from tests.harness import ask, environment
 
-KINDS = completion.task_kinds()
+KINDS = offers.task_kinds()
 
 
 def test_kinds_are_the_examples_with_a_cell_and_are_completed() -> None:
     assert KINDS == ["sort_cubes", "stack_cubes"]
-    offers = dict(completion.tasks("st"))
-    assert list(offers) == ["stack_cubes"] and offers["stack_cubes"].startswith("Stacks cubes")
+    found = dict(offers.tasks("st"))
+    assert list(found) == ["stack_cubes"] and found["stack_cubes"].startswith("Stacks cubes")
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,0 +1,1 @@
+"""What a shell may offer for the word that is being typed, read from files: nothing heavy is imported for it."""
