@@ -38,7 +38,7 @@ TOLD = 1.5e-3  # [s] between two readings that are told, at least, where nothing
 class Arm(Protocol):
     """What a driver does inside the process; every method may take its time, and raise anything: that ends it."""
 
-    rate: float  # [Hz] at which it wants set-points
+    rate: float  # [Hz] at which it wants set-points: less where its clock is slower than the host's, and that may change
     paces: bool  # whether `read` waits for the arm, and so says when the next cycle begins
     hurries: bool  # whether its process is to run ahead of all else on this host
 
@@ -268,7 +268,9 @@ def _follow(arm: Arm, stream: SetPointStream, pipe: Connection) -> None:
             if taken or kept is not None:
                 epoch, taken, kept, why = epoch + 1, False, None, state.message
         else:
-            for at in arm.due():
+            wanted = arm.due()
+            stream.period = 1 / arm.rate
+            for at in wanted:
                 if taken:
                     kept, dq = stream.at(at)
                     if stream.ceased and not np.any(np.abs(dq) > REST):

@@ -27,11 +27,13 @@ from common.messages import RobotMode
 
 Array = NDArray[np.float64]
 
+RATE = 1000.0  # [Hz] of set-points, in the arm's time
 BLEND = 0.5  # [s] in which a motion comes from where the arm is told to be to its set-points
 SMOOTHED = 20  # set-points whose mean is commanded: the arm judges acceleration and jerk from one to the next
 RESTS = 1e-9  # [rad] that they differ by at most, at rest
 WINDOW = 100  # cycles, of which the one that came soonest tells how far the two clocks are apart
-DRIFT, BEND = 0.1, 1e-3  # share by which they may run apart, and by which that changes in a cycle
+DRIFT, BEND = 0.1, 1e-3  # share by which they may run apart, and by which that changes in a cycle,
+BEND_SLOW = 2e-2  # for an arm whose clock is much slower: only simulated ones are
 JUDGED = 0.3  # [s] between two looks at the arm's clock,
 EVEN, GRAIN = 0.98, 0.05  # which is even at so much of the host's; else steps of it by which motions are slower
 LOST = 20  # cycles that the arm does without at most: then it stops by itself
@@ -77,7 +79,7 @@ def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) 
         gripper = Fingers(robot.gripper, robot.gripper.max_width) if simulated(options) else DrivenGripper(
             "common.hardware.franka_hand", {"host": options.host}, robot.gripper, name=f"hand at {options.host}")
     return DrivenArm("common.hardware.franka", options.model_dump(), limits, gripper=gripper, ahead=options.ahead,
-                     delay=options.ahead + SMOOTHED / 2 / FrankaArm.rate, name=f"arm at {options.host}")
+                     delay=options.ahead + SMOOTHED / 2 / RATE, name=f"arm at {options.host}")
 
 
 def connect(options: dict[str, Any], limits: Limits) -> FrankaArm:
@@ -88,13 +90,14 @@ def connect(options: dict[str, Any], limits: Limits) -> FrankaArm:
 class FrankaArm:
     """The connection to a controller, and the motion that is fed through it while there is one."""
 
-    rate, paces = 1000.0, True
+    paces = True
 
     def __init__(self, options: Options) -> None:
         """Connect; nothing moves, and no motion is begun."""
         import pylibfranka
 
         self._library, self.hurries = pylibfranka, options.realtime
+        self.rate = RATE  # in the host's time
         # The process asks for real-time priority itself, and goes on without.
         self._robot = pylibfranka.Robot(options.host, pylibfranka.RealtimeConfig.kIgnore)
         self._motion: Any = None
@@ -105,6 +108,7 @@ class FrankaArm:
         self._ahead = 0.0  # [s] of the host's time before the arm's, as it is reckoned with
         self._late: list[float] = []  # [s] by which states came later than that
         self._drift = self._drifts = 0.0  # share by which the host's clock is taken to be faster: now, and soon
+        self._slow = 0.0  # of that, what is known of an arm whose clock is much slower
         self._newest: deque[Vector] = deque(maxlen=SMOOTHED + 3)
         self._off = np.zeros((3, 7))  # the arm's reference less ours, and its derivatives, when the two last parted
         self._since = BLEND  # [s] ago
@@ -141,6 +145,7 @@ class FrankaArm:
             if before is not None and 0 < arms - before[1] < 2 * JUDGED:
                 share = (arms - before[1]) / (now - before[0])
                 self._speed = 1.0 if share > EVEN else max(math.floor(share / GRAIN - 1) * GRAIN, GRAIN)
+                self._slow = 0.0 if share > EVEN else 1 / max(share, GRAIN) - 1
 
     def _mode(self, state: Any) -> tuple[RobotMode, str]:
         name = state.robot_mode.name
@@ -154,20 +159,24 @@ class FrankaArm:
         now = self._state.time.to_sec()
         late = time.monotonic() - now
         if self._motion is None:
-            self._ahead, self._drift, self._drifts, self._played = late, 0.0, 0.0, now
+            self._ahead, self._drift, self._drifts, self._played = late, self._slow, 0.0, now
             self._late.clear()
             return [now + late]
         self._late.append(late - self._ahead)
         if len(self._late) == WINDOW:
-            self._drifts = min(max(min(self._late) * self.rate / WINDOW, -DRIFT), DRIFT)
+            most = DRIFT + self._slow
+            self._drifts = min(max(min(self._late) * RATE / WINDOW, -most), most)
             self._late.clear()
-        cycles = round((now - self._played) * self.rate)
+        cycles = round((now - self._played) * RATE)
         self._played = now
-        times = []
+        times, bend = [], BEND_SLOW if self._slow else BEND
         for n in reversed(range(min(max(cycles, 1), LOST))):
-            self._drift += min(max(self._drifts - self._drift, -BEND), BEND)
-            self._ahead += self._drift / self.rate
-            times.append(now - n / self.rate + self._ahead)
+            self._drift += min(max(self._slow + self._drifts - self._drift, -bend), bend)
+            self._ahead += self._drift / RATE
+            if self._slow:  # which may have changed: what is yet to come cannot be played
+                self._ahead = max(min(self._ahead, late), self._ahead - self._drift / RATE)
+            times.append(now - n / RATE + self._ahead)
+        self.rate = RATE / (1 + max(self._drift, 0.0))
         return times
 
     def servo(self, points: list[Vector]) -> None:
@@ -176,7 +185,7 @@ class FrankaArm:
         What the arm did without it has guessed, as if the acceleration had stayed: from there we come back to our own.
         What it takes for the velocity and acceleration then is what it judges by, in the cycle after that too.
         """
-        step = 1 / self.rate
+        step = 1 / RATE
         if len(points) > 1:
             self._parted = 2
         if self._wanted and (self._motion is None or self._rests):

@@ -54,6 +54,7 @@ class SetPointStream:
     """What is played of the set-points that came; times are [s] of one clock, whichever.
 
     Attributes:
+        period: see below; an arm may want set-points less often for a while.
         ceased: why nothing is taken until the next `begin`; empty while all is well.
     """
 
@@ -62,7 +63,7 @@ class SetPointStream:
 
         The arm takes what it is told every `period` [s] for where it has to be a period later.
         """
-        self._limits, self._ahead, self._period = limits, ahead, period
+        self._limits, self._ahead, self.period = limits, ahead, period
         self._points: deque[Point] = deque(maxlen=MOST)
         self._braking: tuple[float, ruckig.Trajectory] | None = None
         self._last = np.zeros(0)  # acceleration at the end of the newest piece (dof,) [rad/s^2]
@@ -145,16 +146,16 @@ class SetPointStream:
 
     def _advance(self, elapsed: float, wanted: float) -> None:
         """Play on for so long [s], where the set-points' time should be the one that is wanted."""
-        pace, held_up = self._pace, elapsed > self._period + JITTER
+        pace, held_up = self._pace, elapsed > self.period + JITTER
         rests = self._rests_until()
         if self._time < min(rests, wanted):
             self._time = min(rests, wanted)
             pace.rate, pace.slope = 1.0, 0.0
             elapsed = wanted - self._time
-            held_up = elapsed > self._period + JITTER
+            held_up = elapsed > self.period + JITTER
         elif held_up:
-            pace.rate, pace.slope = pace.rate * math.exp(-(elapsed - self._period) / SMOOTHING), 0.0
-        step = self._period if held_up else elapsed
+            pace.rate, pace.slope = pace.rate * math.exp(-(elapsed - self.period) / SMOOTHING), 0.0
+        step = self.period if held_up else elapsed
         late = wanted - self._time - step
         target = 1.0
         if self._braking is None and self.ceased:
@@ -168,7 +169,7 @@ class SetPointStream:
         pace.gentle = QUICKEST if pace.rate < 1.0 else UNHURRIED
         if held_up or not np.any(pace.acceleration):  # how it would go on
             dq = self._path(self._time)[1]
-            pace.acceleration = (self._path(self._time + pace.rate * self._period)[1] - dq) * pace.rate / self._period
+            pace.acceleration = (self._path(self._time + pace.rate * self.period)[1] - dq) * pace.rate / self.period
         most = self._limits.braking if self.ceased else self._limits.acceleration
         self._time = pace.advance(self._path, self._time, target, step, most, RAMP_SHARE * self._limits.jerks)
 

@@ -36,7 +36,7 @@ class FrankaHost:
         """Start the controller; returns when it listens."""
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
-                [PYTHON, "-m", "franka_sim.run_server", *self._options], stdout=log, stderr=log,
+                [PYTHON, ROOT / "tests" / "doubles" / "franka_server.py", *self._options], stdout=log, stderr=log,
                 env={**os.environ, **self._models})
         end = time.monotonic() + READY
         while True:
