@@ -38,7 +38,7 @@ TOLD = 1.5e-3  # [s] between two readings that are told, at least, where nothing
 class Arm(Protocol):
     """What a driver does inside the process; every method may take its time, and raise anything: that ends it."""
 
-    rate: float  # [Hz] at which it wants set-points: less where its clock is slower than the host's, and that may change
+    rate: float  # [Hz] at which it wants set-points, in the host's time; it may change
     paces: bool  # whether `read` waits for the arm, and so says when the next cycle begins
     hurries: bool  # whether its process is to run ahead of all else on this host
 

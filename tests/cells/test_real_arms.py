@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib.util
 import os
 from pathlib import Path
 
@@ -10,15 +11,26 @@ import pytest
 
 from common import topics
 from common.messages import MotionStatus, RobotCommand, RobotStatus
+from tests.doubles.franka_host import PYTHON as FRANKA_SIM
+from tests.doubles.franka_host import FrankaHost
 from tests.doubles.ur_host import UrHost
 from tests.harness import RunningCell, until
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(300)]
-if os.environ.get("CI") != "true":
-    pytest.importorskip("rtde_control", reason="make setup EXTRAS=ur")
+
+
+def missing(module: str) -> bool:
+    """Whether that is not there; where it has to be that is found out when it is needed."""
+    return os.environ.get("CI") != "true" and importlib.util.find_spec(module) is None
+
+
+on_ur = pytest.mark.skipif(missing("rtde_control"), reason="make setup EXTRAS=ur")
+on_franka = pytest.mark.skipif(not FRANKA_SIM.exists() or missing("pylibfranka"),
+                               reason="make franka-sim setup EXTRAS=franka")
 
 HOME = "0,-2.36,1.57,-1.57,-1.57,0"
 SOON, WHOLE = 30.0, 150.0  # [s] for what a link or a controller does; for a whole outline
+BRAKES = 2.0  # [s] in which an arm that has stopped for protection has come to rest
 PULLED = float(os.environ.get("ZENCELL_TEST_PULLED", "10"))  # [s] that the cable is out: 60 was tried by hand
 
 
@@ -50,6 +62,7 @@ async def check_told(cell: RunningCell) -> None:
         assert (done.stdout + done.stderr).strip() == said
 
 
+@on_ur
 async def test_an_outline_is_traced_through_a_protective_stop_and_a_pulled_cable(tmp_path: Path) -> None:
     with UrHost("127.0.0.51", q=HOME) as host, outliner(tmp_path, host) as cell:
         async with cell.listen() as bus:
@@ -74,6 +87,7 @@ async def test_an_outline_is_traced_through_a_protective_stop_and_a_pulled_cable
     assert "tester asks the arm: recover" in cell.text
 
 
+@on_ur
 async def test_an_outline_is_traced_through_a_cable_that_is_out_for_long_and_a_controller_that_is_rebooted(
     tmp_path: Path,
 ) -> None:
@@ -96,6 +110,7 @@ async def test_an_outline_is_traced_through_a_cable_that_is_out_for_long_and_a_c
         check_traced(cell, host)
 
 
+@on_ur
 async def test_an_outline_is_traced_at_thirty_percent_of_the_slider(tmp_path: Path) -> None:
     with UrHost("127.0.0.53", q=HOME) as host, outliner(tmp_path, host) as cell:
         host.tell("slider 0.3")
@@ -107,3 +122,52 @@ async def test_an_outline_is_traced_at_thirty_percent_of_the_slider(tmp_path: Pa
             assert await cell.ended(WHOLE + SOON) == 0, cell.tail()
         check_traced(cell, host)
         assert host.tell()["fastest"] <= 0.3 * 3.14159 * 1.05
+
+
+def picker(folder: Path) -> RunningCell:
+    """The cell of the Panda, with a Franka Research 3."""
+    values = ["robot=fr3", "robot.hardware.backend=franka", "robot.hardware.options={host: 127.0.0.1, ahead: 0.3, "
+              "world: simulated}", "motion.velocity_scaling=0.4", "motion.acceleration_scaling=0.4"]
+    return RunningCell(folder, "run", "panda", *(word for value in values for word in ("--set", value)))
+
+
+@on_franka
+@pytest.mark.timeout(600)
+async def test_balls_are_brought_through_a_reflex_silences_and_a_controller_that_is_started_again(
+    tmp_path: Path,
+) -> None:
+    with FrankaHost() as host, picker(tmp_path) as cell:
+        async with cell.listen() as bus:
+            robot, motion = bus.reader(topics.ROBOT_STATUS), bus.reader(topics.MOTION_STATUS)
+
+            async def under_way() -> None:
+                await until(robot, lambda status: status.mode == "running", SOON)
+                await until(motion, lambda status: status.state == "active" and 0.2 < status.progress < 0.6, WHOLE)
+
+            await under_way()
+            host.hit()
+            told: RobotStatus = await until(robot, lambda status: status.mode == "protective_stop", SOON)
+            assert "cartesian reflex" in told.message and "recover" in told.message
+            failed: MotionStatus = await until(motion, lambda status: bool(status.fault), SOON)
+            assert failed.state == "aborted" and failed.error == "hardware_fault"
+            await asyncio.sleep(BRAKES)
+            stood = host.stands
+            await asyncio.sleep(2.0)
+            assert host.stands == pytest.approx(stood, abs=1e-3), "nobody has asked for that"
+            await bus.client(topics.ROBOT_COMMAND).call(RobotCommand(act="recover", owner="tester"), SOON)
+            for silent in (1.0, PULLED):
+                await under_way()
+                await asyncio.to_thread(host.freeze, silent)
+                await until(robot, lambda status: status.mode == "disconnected", SOON)
+            await under_way()
+            host.crash()
+            await until(robot, lambda status: status.mode == "disconnected", SOON)
+            stood = host.stands
+            await asyncio.to_thread(host.boot)
+            await until(robot, lambda status: status.mode == "running", SOON)
+            assert host.stands == pytest.approx(stood, abs=0.05), "it went on from where it stood"
+            assert await cell.ended(2 * WHOLE) == 0, cell.tail()
+    summary = cell.summary
+    assert summary["state"] == "DONE" and summary["failures"] == 0, cell.text
+    assert summary["placed"] == summary["truth"]["in_box"] == 7, summary
+    assert "tester asks the arm: recover" in cell.text

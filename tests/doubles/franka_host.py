@@ -13,6 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
+
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = ROOT / ".venv-franka-sim" / "bin" / "python"
 PORTS = (1337, 1338)  # of arm and hand; they are part of the protocol: one such host at a time
@@ -33,11 +35,12 @@ class FrankaHost:
         self.boot()
 
     def boot(self) -> None:
-        """Start the controller; returns when it listens."""
+        """Start the controller, with the arm where it stood; returns when it listens."""
+        folder = Path(self._folder.name)
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
-                [PYTHON, ROOT / "tests" / "doubles" / "franka_server.py", *self._options], stdout=log, stderr=log,
-                env={**os.environ, **self._models})
+                [PYTHON, ROOT / "tests" / "doubles" / "franka_server.py", folder / "stands", *self._options],
+                stdout=log, stderr=log, env={**os.environ, **self._models})
         end = time.monotonic() + READY
         while True:
             try:
@@ -53,6 +56,15 @@ class FrankaHost:
         """Have the controller be gone at once."""
         self._process.kill()
         self._process.wait()
+
+    def hit(self) -> None:
+        """Have the arm stop with a reflex."""
+        self._process.send_signal(signal.SIGUSR1)
+
+    @property
+    def stands(self) -> list[float]:
+        """Where its joints are [rad]."""
+        return list(np.fromfile(Path(self._folder.name) / "stands"))
 
     def freeze(self, seconds: float) -> None:
         """Have it do and say nothing for a while [s]."""

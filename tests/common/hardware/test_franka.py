@@ -185,8 +185,9 @@ def test_a_controller_that_is_frozen_or_started_again_is_found_again_where_it_st
     rig.until("")
     host.freeze(1.0)
     rig.until_it_moves()
+    before = rig.arm.read(0.0)[0]
     host.crash()
     rig.until("no word") if rig.arm.state.mode == "running" else None
     host.boot()
     rig.until("")
-    assert np.allclose(rig.arm.read(0.0)[0], [0, 0, 0, -1.57, 0, 1.57, 0.785], atol=5e-3), "nothing has moved it"
+    assert np.allclose(rig.arm.read(0.0)[0], before, atol=5e-3), "nothing has moved it"
