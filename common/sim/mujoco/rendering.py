@@ -6,6 +6,7 @@ sensor (`common/sim/sensor.py`) exposes it. Values are proportional to light.
 
 from __future__ import annotations
 
+import atexit
 import logging
 from collections.abc import Sequence
 from typing import Any
@@ -130,6 +131,7 @@ class Canvas:
         """
         self._model = model
         self._context = gl_context(gl, camera.width, camera.height)
+        atexit.register(self._context.free)  # what is left to the end of the interpreter finds OpenGL gone
         self._context.make_current()
         self._made = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._made)
@@ -143,6 +145,7 @@ class Canvas:
     def close(self) -> None:
         """Give the memory back."""
         self._made.free()
+        atexit.unregister(self._context.free)
         self._context.free()
 
     def draw(self, data: mujoco.MjData, camera: Pinhole, scenery: Scenery, level: Array, *, depth: bool) -> View:
