@@ -177,7 +177,7 @@ class Simulation:
         )
         self._host = host
         self._misfortune = Misfortune(host, self.plan, outcome.seed, self._status, self._say)
-        self._misfortune.lose_supervisor, self._misfortune.leave = self._bring_up_again, self._leave
+        self._misfortune.lose_supervisor, self._misfortune.persons.leave = self._bring_up_again, self._leave
         self._bring_up()
         playing = asyncio.create_task(self._play())
         try:
