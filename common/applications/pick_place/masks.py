@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.applications.pick_place.blobs import Mask
+from common.perception.white import green_gain, with_green
 
 Picture = npt.NDArray[np.uint8]
 Window = tuple[tuple[int, int, int], tuple[int, int, int]]  # lower and upper end: hue, saturation, value
@@ -29,6 +30,7 @@ class Colours:
 class _Known:
     picture: Picture
     colours: Colours
+    gain: float  # of green, for the colour of the light
     opened: Mask
     closed: Mask
 
@@ -47,9 +49,10 @@ class Masks:
             part = changed(known.picture, picture)
             if part is None:
                 return known.opened, known.closed
-        if known is None or part is None or _share(part, picture) > _MOST:
-            opened, closed = _masks(picture, colours)
-            self._known = _Known(picture.copy(), colours, opened, closed)
+        gain = green_gain(picture)
+        if known is None or part is None or gain != known.gain or _share(part, picture) > _MOST:
+            opened, closed = _masks(with_green(picture, gain), colours)
+            self._known = _Known(picture.copy(), colours, gain, opened, closed)
             return opened, closed
         reach = 4 * (colours.kernel_px // 2)  # erosion and dilation, twice: so far a pixel acts on the masks
         inner, outer = _grown(part, reach, picture), _grown(part, 2 * reach, picture)
@@ -58,9 +61,9 @@ class Masks:
         offset = inner[0].start - outer[0].start, inner[1].start - outer[1].start
         size = inner[0].stop - inner[0].start, inner[1].stop - inner[1].start
         within = slice(offset[0], offset[0] + size[0]), slice(offset[1], offset[1] + size[1])
-        for whole, fresh in zip(new[1:], _masks(picture[outer], colours), strict=True):
+        for whole, fresh in zip(new[1:], _masks(with_green(picture[outer], gain), colours), strict=True):
             whole[inner] = fresh[within]
-        self._known = _Known(new[0], colours, new[1], new[2])
+        self._known = _Known(new[0], colours, gain, new[1], new[2])
         return new[1], new[2]
 
 

@@ -1,0 +1,44 @@
+"""The colour of the light, judged by what most of a picture shows: in warm light a brown table is as red as red things.
+
+A lamp of 2700 K gives surfaces less than half the green, compared with red, that daylight gives them. Where most of a
+picture has so little green that no usual surface would have it in daylight, it is the light, and green is raised again.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+Picture = npt.NDArray[np.uint8]
+
+STRIDE = 8  # [px] between the pixels that are looked at
+DIM = 20  # [0..255] what is darker tells no colour
+SHARE = 60  # percentile: so much of the picture may be redder than what tells the light
+LEAST_GREEN = -0.9  # log(green / red) of what is still taken for a surface in white light
+USUAL_GREEN = -0.5  # to which that of anything redder is raised
+MOST = 1.0  # of the logarithm: no lamp is redder
+STEP = 0.1  # of the logarithm: a little more or less changes nothing
+
+
+def green_gain(picture: Picture) -> float:
+    """By how much green is too weak in a bgr8 picture (height, width, 3); 1 in any usual light."""
+    pixels = picture[::STRIDE, ::STRIDE].reshape(-1, 3).astype(np.float32)
+    pixels = pixels[pixels.max(axis=1) > DIM]
+    if not len(pixels):
+        return 1.0
+    green = float(np.percentile(np.log((pixels[:, 1] + 1) / (pixels[:, 2] + 1)), SHARE))
+    if green >= LEAST_GREEN:
+        return 1.0
+    return math.exp(STEP * round(min(USUAL_GREEN - green, MOST) / STEP))
+
+
+def with_green(picture: Picture, gain: float) -> Picture:
+    """The picture with its green so much stronger; itself for a gain of 1."""
+    if gain == 1.0:
+        return picture
+    raised = picture.copy()
+    table = np.clip(np.rint(gain * np.arange(256)), 0, 255).astype(np.uint8)
+    raised[..., 1] = table[picture[..., 1]]
+    return raised

@@ -1,0 +1,70 @@
+"""Balls are found in any light: bright and dim, warm and cold, with one side in shadow, in noise."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from common.applications.pick_place.detector import Detector
+from common.config import Light, Scenery, Surroundings, load_cell
+from common.messages import Color, Header, JointState, Pose, Vector3, WorldObject, WorldObjects
+from common.perception.pinhole import Pinhole
+from common.robot.model import RobotModel
+from common.sim.camera import CameraParameters, SimulatedCamera
+from common.sim.lighting import tint
+from common.sim.rendering import Renderer
+
+CELL = load_cell("panda")
+AROUND = CELL.section(Surroundings)
+assert isinstance(AROUND, Surroundings)
+CAMERA = Pinhole.from_config(AROUND.camera)
+PLACES = [(0.40, -0.30, 0.03), (0.60, -0.10, 0.03), (0.25, 0.20, 0.03), (0.15, -0.15, 0.03), (0.62, 0.02, 0.03)]
+
+
+def balls() -> list[WorldObject]:
+    return [WorldObject(id=f"ball_{k}", shape="sphere", pose=Pose(position=Vector3(x=x, y=y, z=z)),
+                        size=Vector3(x=0.06, y=0.06, z=0.06), color=Color(r=1.0, g=0.15, b=0.1))
+            for k, (x, y, z) in enumerate(PLACES)]
+
+
+def errors(picture: np.ndarray) -> list[float]:
+    found = Detector(AROUND).detect(picture, CAMERA)
+    assert len(found) == len(PLACES), found
+    return [min(math.dist(place[:2], one.position[:2]) for one in found) for place in PLACES]
+
+
+@pytest.fixture(scope="module")
+def scene() -> np.ndarray:
+    return Renderer(AROUND, RobotModel.load(CELL.robot), camera=CAMERA).see(balls()).colour
+
+
+@pytest.mark.parametrize("kelvin", [2700, 4000, 6500, 10_000])
+@pytest.mark.parametrize(("bright", "shade"), [(1.0, 0.1), (0.5, 0.3), (0.15, 1.0)])
+def test_balls_are_found_to_3_mm_and_none_is_made_up(
+    scene: np.ndarray, kelvin: float, bright: float, shade: float
+) -> None:
+    rng = np.random.default_rng(1)
+    fall = np.linspace(1.0, 0.7, 640)[None, :, None] * np.where(np.arange(480) < 245, 1.0, shade)[:, None, None]
+    values = scene * tint(kelvin) * bright * fall  # a shadow across it, and light that fades along it
+    noisy = values + np.sqrt(0.02 * values + 0.3) * rng.standard_normal(values.shape)
+    assert max(errors(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))) < 0.003
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(4))
+def test_balls_are_found_in_drawn_light_and_shadow(number: int) -> None:
+    pytest.importorskip("mujoco")
+    rng, robot = np.random.default_rng(number), RobotModel.load(CELL.robot)
+    turn, lux = rng.uniform(0, 2 * math.pi), 10 ** rng.uniform(2, 4)
+    lamp = Light(position=(0.4 + math.cos(turn), math.sin(turn), 1.2), aim=(0.4, 0.0, 0.0), illuminance=lux,
+                 temperature=[2700.0, 4000.0, 6500.0, 10_000.0][number])
+    lit = Scenery(simulator="mujoco", lights={"lamp": lamp}, ambient=0.2 * lux)
+    q = robot.named("home")
+    q[0] += 2.6
+    locked = robot.config.locked_joints
+    joints = JointState(header=Header(), name=[*robot.joint_names, *locked], position=[*q.tolist(), *locked.values()])
+    sensor = CameraParameters(auto_exposure=True, full_well=10_000)
+    eye = SimulatedCamera(AROUND, lit, CELL.robot, sensor, rng, plain=True)
+    assert max(errors(eye.shoot(WorldObjects(objects=balls()), joints, 0).colour)) < 0.003

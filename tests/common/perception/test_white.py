@@ -1,0 +1,38 @@
+"""The colour of very warm light is told from that of things, and usual pictures stay as they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.perception.white import green_gain, with_green
+from common.sim.lighting import tint
+
+TABLE, RED = (0.10, 0.35, 0.55), (0.10, 0.15, 1.0)  # blue, green, red
+
+
+def table(kelvin: float, light: float = 255.0, red: float = 0.0) -> np.ndarray:
+    picture = np.empty((240, 320, 3))
+    picture[:] = TABLE
+    picture[: int(240 * red)] = RED
+    return np.clip(np.rint(light * picture * tint(kelvin)), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kelvin", [4000, 5000, 6500, 10_000])
+def test_usual_light_changes_nothing(kelvin: float) -> None:
+    picture = table(kelvin)
+    assert green_gain(picture) == 1.0 and with_green(picture, 1.0) is picture
+
+
+@pytest.mark.parametrize("light", [120.0, 255.0])
+@pytest.mark.parametrize("red", [0.0, 0.3])
+def test_green_is_raised_in_warm_light_to_about_what_it_is_in_daylight(light: float, red: float) -> None:
+    picture = table(2400, 0.5 * light, red)
+    raised = with_green(picture, green_gain(picture)).astype(float)
+    assert green_gain(picture) > 1.5
+    assert raised[-1, 0, 1] / raised[-1, 0, 2] == pytest.approx(0.35 / 0.55, rel=0.2)
+
+
+def test_grey_and_dark_pictures_stay_as_they_are() -> None:
+    assert green_gain(np.full((48, 64, 3), 128, np.uint8)) == 1.0
+    assert green_gain(np.zeros((48, 64, 3), np.uint8)) == 1.0
