@@ -105,7 +105,7 @@ CAMERA = [
                   "Smaller blobs are noise."),
     SeedParameter("hsv_red_lo1, hsv_red_hi1", "[0, 120, 80], [10, 255, 255]", "",
                   ("services.vision_detector.hsv_red_lo1", "services.vision_detector.hsv_red_hi1"), "replaced",
-                  "First window of hue, saturation and value: what counts as red. A value from 12 on: also in shadow."),
+                  "First window of hue, saturation and value: what counts as red. A value from 8 on: also in shadow."),
     SeedParameter("hsv_red_lo2, hsv_red_hi2", "[170, 120, 80], [180, 255, 255]", "",
                   ("services.vision_detector.hsv_red_lo2", "services.vision_detector.hsv_red_hi2"), "replaced",
                   "Second window: red lies on both sides of hue 0. Hue from 160 on: also in cold light."),

@@ -33,10 +33,10 @@ _Key = tuple[Traced, tuple[float, float], float]  # of a blob: its outline, its 
 class DetectorOptions(Parameters):
     """How red is told from the rest. HSV as OpenCV has it: hue 0 to 180, saturation and value 0 to 255."""
 
-    hsv_red_lo1: Tunable[Hsv] = Field((0, 120, 12), description="lower end of the first window: hue, saturation, value")
+    hsv_red_lo1: Tunable[Hsv] = Field((0, 120, 8), description="lower end of the first window: hue, saturation, value")
     hsv_red_hi1: Tunable[Hsv] = Field((10, 255, 255), description="upper end of the first window")
     hsv_red_lo2: Tunable[Hsv] = Field(
-        (160, 120, 12), description="lower end of the second window: red goes round the hue axis"
+        (160, 120, 8), description="lower end of the second window: red goes round the hue axis"
     )
     hsv_red_hi2: Tunable[Hsv] = Field((180, 255, 255), description="upper end of the second window")
     morph_kernel_px: Tunable[int] = Field(7, ge=1, le=51, description="ellipse for opening, then closing [px]")
