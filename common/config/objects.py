@@ -36,7 +36,7 @@ class Container(Section):
     y: Coordinate = Field(0.25, description="centre [m]")
     half_side: Length = Field(0.08, description="outer half side [m]")
     floor_thickness: Length = Field(0.005, description="[m]")
-    wall_height: Length = Field(0.07, description="from the table [m]")
+    wall_height: Length = Field(0.10, description="from the table, above the middle of a second layer [m]")
     wall_thickness: Length = Field(0.008, description="[m]")
     slot_offset: Length = Field(0.033, description="slots lie at plus and minus this from the centre [m]")
     layers: int = Field(2, ge=1, le=5, description="of four slots each")

@@ -133,6 +133,7 @@ class Invariants:
         self._ids: list[str] = []  # what there is
         self._edits = 0  # of the world, that were asked for and not answered yet
         self._edited = False  # and nothing was said of what there is since
+        self._forces = cell.world.simulator != "kinematic"  # what lies is pushed, and rolls
         self._lying: dict[str, tuple[str, Place]] = {}  # by object: state and place
         self._held_since: float | None = None  # cell time
         self._last: tuple[Vector, Vector, float] | None = None  # newest set-points and when
@@ -247,7 +248,7 @@ class Invariants:
             was, there = self._lying.get(name, (state, place))
             self._lying[name] = state, place
             way = 0.0 if state in CARRIED else math.dist(place, there)
-            legal = touched or state in CARRIED or was in CARRIED or (state == was and way < MOVED)
+            legal = touched or self._forces or state in CARRIED or was in CARRIED or (state == was and way < MOVED)
             if self._broke(legal and state != LOST, OBJECTS):
                 self._tell(OBJECTS, f"{name} went from {was} to {state} by itself, {way:.3f} m")
 
