@@ -71,7 +71,9 @@ def length(points: list[Place]) -> float:
 class TracingParameters(Parameters):
     """How the tool goes along a contour."""
 
-    standoff: Tunable[float] = Field(0.0, ge=0, le=0.2, description="of the finger tips above the contour [m]")
+    standoff: Tunable[float] = Field(
+        0.002, ge=0, le=0.2, description="of the finger tips above the contour, which they must not drag [m]"
+    )
     approach_clearance: Tunable[float] = Field(
         0.10, gt=0, le=0.5, description="approach and retreat above the contour [m]"
     )
