@@ -34,7 +34,7 @@ from common.viewer.words import plan, problem
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
 
-PIPELINE = "pipeline"
+PIPELINE, NOTHING = "pipeline", "nothing"
 MARKER, TOOL, JOINTS = "goal marker", "tool: numbers", "joints: numbers"
 SETTLED = 0.5  # [s] for which the marker rests before it is looked for why it cannot be reached, which takes longer
 RESTARTS = 20  # of the search for joint positions
@@ -72,6 +72,9 @@ class Goal(Protocol):
     def play(self, plan: JointTrajectory) -> None:
         """Show a plan as a motion of the ghost."""
 
+    def compare(self, plan: JointTrajectory | None) -> None:
+        """Show another beside it; None: none any more."""
+
 
 class MovePanel:
     """Jogging, fingers, goals and taught poses, and how it went."""
@@ -99,6 +102,8 @@ class MovePanel:
         self.marker = marker
         self._kind = MARKER
         self._found: PlanResponse | None = None
+        self._other: PlanResponse | None = None  # that it is compared with
+        self.compared = NOTHING
         self._reached: tuple[Pose, float, bool] | None = None  # goal, since when, whether it was looked for why not
         self.numbers = ArmNumbers(robot, console.latest)
         q = robot.named("home")
@@ -131,8 +136,12 @@ class MovePanel:
             names = gui.add_dropdown("Planner", [PIPELINE, *planners], initial_value=self.planner,
                                      hint="pipeline: the cell's planners, in their order")
             console.on_change(names, self._set_planner)
+            others = gui.add_dropdown("Compare with", [NOTHING, PIPELINE, *planners], initial_value=NOTHING,
+                                      hint="Plan asks this one, too, and shows both")
+            console.on_change(others, self._set_compared)
             for name, act, told in (
                 ("plan", self._plan_it, "Plan"), ("execute", self._execute, "Execute"), ("go", self._go, "Go there"),
+                ("other", self._execute_other, "Execute the other"),
                 ("here", self._take_numbers, "Numbers from the arm"),
             ):
                 console.on_press(f"move:{name}", act, told)
@@ -160,6 +169,8 @@ class MovePanel:
         found = "" if self._found is not None else "plan first"
         content = block(buttons(
             press("Plan", "move:plan"), press("Execute", "move:execute", self._kept or found, arm=True),
+            *([press("Execute the other", "move:other", self._kept or (
+                "" if self._other is not None else "plan first"), arm=True)] if self.compared != NOTHING else []),
             press("Go there", "move:go", self._kept, arm=True),
             press("Numbers from the arm", "move:here", "" if self._kind in (TOOL, JOINTS) else
                   "for goals in numbers")), "orders")
@@ -243,6 +254,10 @@ class MovePanel:
             return
         await self._do(self._follow(found, found.trajectory), "Executing the plan …")
 
+    async def _execute_other(self) -> None:
+        self._found = self._other
+        await self._execute()
+
     async def _do(self, doing: Coroutine[Any, Any, None], line: str) -> None:
         self._tell(line, "busy")
         try:
@@ -251,20 +266,30 @@ class MovePanel:
             self._tell(problem(error), "bad")
 
     async def _plan(self, goal: PoseGoal | JointGoal) -> None:
-        self._found = None
-        response = await self._motions.plan(goal, planner=self._asked)
-        self._tell(plan(response), "good" if response.ok else "bad")
-        if response.ok and response.trajectory is not None:
-            self._found = response
-            self._goal.play(response.trajectory)
+        self._forget()
+        asked = [self.planner] + ([self.compared] if self.compared != NOTHING else [])
+        responses = [await self._motions.plan(goal, planner="" if name == PIPELINE else name) for name in asked]
+        kept = [response if response.ok and response.trajectory is not None else None for response in responses]
+        self._found, self._other = kept[0], kept[1] if len(kept) > 1 else None
+        if self._other is not None:
+            self._goal.compare(self._other.trajectory)
+        if self._found is not None and self._found.trajectory is not None:
+            self._goal.play(self._found.trajectory)
+        lines = [f"{name}: {plan(each)}" for name, each in zip(asked, responses, strict=True)]
+        self._tell(plan(responses[0]) if len(lines) == 1 else " — ".join(lines), "good" if kept[0] else "bad")
+
+    def _forget(self) -> None:
+        """Forget what was planned: it is for another goal, or begins elsewhere than the arm is now."""
+        self._found = self._other = None
+        self._goal.compare(None)
 
     async def _follow(self, found: PlanResponse, trajectory: JointTrajectory) -> None:
-        self._found = None  # it begins where the arm is now
+        self._forget()
         await self._motions.follow(trajectory, plan=found)
         self._tell("There", "good")
 
     async def _move(self, goal: PoseGoal | JointGoal, planner: str, there: str) -> None:
-        self._found = None
+        self._forget()
         await self._motions.move(goal, planner=planner)
         self._tell(there, "good")
 
@@ -290,7 +315,8 @@ class MovePanel:
         assign(self._choice, self._kind)
 
     def _set_kind(self, kind: str) -> None:
-        self._kind, self._found = kind, None
+        self._kind = kind
+        self._forget()
         self._tick.visible = kind == MARKER
         self._at.visible = self._turned.visible = kind == TOOL
         for number_field in self._angles:
@@ -312,19 +338,27 @@ class MovePanel:
             assign(field, value)
 
     def _set_xyz(self, xyz: Numbers) -> None:
-        self._xyz, self._found = xyz, None
+        self._xyz = xyz
+        self._forget()
 
     def _set_rpy(self, rpy: Numbers) -> None:
-        self._rpy, self._found = rpy, None
+        self._rpy = rpy
+        self._forget()
 
     def _setter(self, number: int) -> Callable[[float], None]:
         def put(value: float) -> None:
-            self._q[number], self._found = value, None
+            self._q[number] = value
+            self._forget()
 
         return put
 
     def _set_planner(self, name: str) -> None:
         self.planner = name
+
+    def _set_compared(self, name: str) -> None:
+        self.compared = name
+        self._other = None
+        self._goal.compare(None)
 
     def _tell(self, line: str, kind: str) -> None:
         self._html.content = _line(line, kind)

@@ -142,6 +142,11 @@ class Scene:
         for layer in self.layers.values():
             layer.play(plan)
 
+    def compare(self, plan: JointTrajectory | None) -> None:
+        """Let a second ghost move along another plan beside the first; None: none any more."""
+        for layer in self.layers.values():
+            layer.compare(plan)
+
     # --- what the person moves ---
 
     def goal_marker(self, on: bool) -> None:

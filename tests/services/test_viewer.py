@@ -698,6 +698,40 @@ async def test_plan_that_was_found_is_executed_once(panda: Played, page: Browser
     await page.until(lambda: page.button("Execute")[1] == "plan first")
 
 
+async def test_plans_of_two_planners_are_shown_beside_each_other_and_either_is_executed(
+    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+) -> None:
+    asked: list[m.ExecuteRequest] = []
+
+    def found(seconds: float) -> m.JointTrajectory:
+        return m.JointTrajectory(joint_names=["panda_joint1"], points=[
+            m.JointTrajectoryPoint(time_from_start=at, positions=[at], velocities=[0.0], accelerations=[0.0])
+            for at in (0.0, seconds)])
+
+    async def plan(request: m.PlanRequest) -> m.PlanResponse:
+        return m.PlanResponse(id=request.id, ok=True, planner=request.planner or "first", seconds=0.1,
+                              trajectory=found(2.0 if request.planner else 1.0))
+
+    async def execute(request: m.ExecuteRequest) -> m.MotionStatus:
+        asked.append(request)
+        return m.MotionStatus(id=request.id, state="active")
+
+    panda.bus.serve(topics.MOTION_PLAN, plan)
+    panda.bus.serve(topics.MOTION_EXECUTE, execute)
+    panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
+    await ready_to_jog(panda, page)
+    await page.set("Goal", "home")
+    await page.set("Compare with", "ptp")
+    await page.until(lambda: page.button("Execute the other")[1] == "plan first")
+    await page.press("Plan")
+    await page.until(lambda: "a motion of 1.0 s" in page.text and "ptp: Planned by ptp" in page.text)
+    assert scenes[0].told("play") == [(found(1.0),)] and scenes[0].told("compare")[-1] == (found(2.0),)
+    await page.press("Execute the other")
+    await until(lambda: asked)
+    assert asked[0].trajectory == found(2.0)
+    await page.until(lambda: page.button("Execute")[1] == page.button("Execute the other")[1] == "plan first")
+
+
 async def test_whose_the_motion_is_is_told_and_it_is_taken_over_when_that_is_said_twice(
     panda: Played, page: BrowserDouble
 ) -> None:

@@ -81,6 +81,9 @@ class Layer:
     def play(self, plan: JointTrajectory) -> None:
         """Show how the robot would move along a plan that a person asked for."""
 
+    def compare(self, plan: JointTrajectory | None) -> None:
+        """Show another plan beside the one that is played; None: none any more."""
+
     def edit(self, on: bool) -> None:
         """Let a person change the simulated world, or not."""
 

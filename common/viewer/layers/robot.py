@@ -5,7 +5,8 @@ along it; and the path of its tool.
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import viser
@@ -15,16 +16,17 @@ from common import topics
 from common.messages import JointTrajectory
 from common.topics import Topic
 from common.viewer.layers import Layer
-from common.viewer.nodes import add_line
+from common.viewer.nodes import Rgb, add_line
 
 if TYPE_CHECKING:
-    from common.viewer.figure import Figure
+    from common.viewer.figure import Figure, LinkPoses
 
 Array = NDArray[np.float64]
 
 GHOST = (90, 200, 255)
 PATH = (255, 200, 60)
 COLLISION = (255, 120, 90)
+OTHER = (220, 120, 255)
 _SAMPLES = 120  # points of the line
 _THERE = 0.01  # [rad] the robot is where the plan ends, or has left where it stood
 _APART = 0.01  # [m] links no farther than this from the robot's, nor turned by more than 0.03 rad, lie in them
@@ -83,25 +85,26 @@ class Plan(Layer):
 
     LABEL = "Planned: where the arm will be"
     LEGEND = (("where the planned motion ends", GHOST),)
-    TOPICS = (topics.DISPLAY_TRAJECTORY, topics.JOINT_STATES)
+    COLOR: ClassVar[Rgb] = GHOST
+    TOPICS: ClassVar[Sequence[Topic[Any]]] = (topics.DISPLAY_TRAJECTORY, topics.JOINT_STATES)
 
     def build(self) -> None:
         """Start without a plan."""
         from common.viewer.figure import Figure, LinkPoses
 
         self.ghost = Figure(self.scene, f"{self.root}/robot", self.stage.rough, LinkPoses(self.stage.robot),
-                            color=GHOST, opacity=0.35, visible=False)
+                            color=self.COLOR, opacity=0.35, visible=False)
         self._names: list[str] = []
         self._times: Array = np.empty(0)
         self._positions: Array = np.empty((0, 0))
         self._playing: tuple[float, Array | None] | None = None  # since when, and where the robot was then
-        self._played = -1  # stamp of the plan that a person asked for
+        self._played = self._beside = -1  # stamps of the plan that a person asked for, and of the one beside it
 
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Take another plan, or do what the robot's motion means for the ghost."""
         if topic == topics.JOINT_STATES:
             self._follow()
-        elif message.header.stamp != self._played:  # else it is on show and would begin anew
+        elif message.header.stamp not in (self._played, self._beside):  # else it is on show and would begin anew
             self._take(message)
 
     def play(self, plan: JointTrajectory) -> None:
@@ -110,6 +113,11 @@ class Plan(Layer):
         self._take(plan)
         if len(self._times):
             self._playing = (self.stage.clock(), None)
+
+    def compare(self, plan: JointTrajectory | None) -> None:
+        """Leave that plan to the ghost beside, although it is the newest."""
+        if plan is not None:
+            self._beside = plan.header.stamp
 
     @property
     def playing(self) -> bool:
@@ -160,6 +168,52 @@ class Plan(Layer):
         self.ghost.move(self._names, at)
 
 
+class Compared(Plan):
+    """A ghost that moves along what another planner found, beside the first, and the path of its tool."""
+
+    LABEL = "Planned: what it is compared with"
+    LEGEND = (("plan that it is compared with", OTHER),)
+    COLOR = OTHER
+    TOPICS = (topics.JOINT_STATES,)
+
+    def build(self) -> None:
+        """Start without a plan."""
+        from common.viewer.figure import LinkPoses
+
+        super().build()
+        self._tool = LinkPoses(self.stage.robot)
+        self.line: viser.LineSegmentsHandle | None = None
+
+    def show(self, topic: Topic[Any], message: Any) -> None:
+        """Move on; be gone once the robot moves."""
+        self._follow()
+        if self.line is not None and not self.playing:
+            self.compare(None)
+
+    def play(self, plan: JointTrajectory) -> None:
+        """Leave that to the first."""
+
+    def compare(self, plan: JointTrajectory | None) -> None:
+        """Move along a plan, over and over; None: be gone."""
+        if self.line is not None:
+            self.line.remove()
+            self.line = None
+        self._take(plan or JointTrajectory(joint_names=self.stage.robot.joint_names, points=[]))
+        if plan is not None and len(plan.points) > 1:
+            self._playing = (self.stage.clock(), None)
+            points = tool_points(self._tool, self.stage.robot.config.tcp_link, plan)
+            self.line = add_line(self.scene, f"{self.root}/line", points, OTHER, 3.0)
+
+
+def tool_points(poses: LinkPoses, tcp: str, plan: JointTrajectory) -> Array:
+    """(n, 3) where the tool centre point is along a plan [m], at some of its points."""
+    points = []
+    for index in np.unique(np.linspace(0, len(plan.points) - 1, _SAMPLES).round().astype(int)):
+        poses.update(plan.joint_names, plan.points[index].positions)
+        points.append(poses.pose(tcp)[0].copy())
+    return np.array(points)
+
+
 class ToolPath(Layer):
     """The path of the tool centre point as a line."""
 
@@ -173,17 +227,28 @@ class ToolPath(Layer):
 
         self._tool = LinkPoses(self.stage.robot)
         self.line: viser.LineSegmentsHandle | None = None
+        self._played = self._beside = -1  # stamps
 
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Draw the path of a plan in place of the last; one without points clears it."""
+        if message.header.stamp not in (self._played, self._beside):
+            self._draw(message)
+
+    def compare(self, plan: JointTrajectory | None) -> None:
+        """Leave that plan to what is drawn beside, although it is the newest."""
+        if plan is not None:
+            self._beside = plan.header.stamp
+
+    def play(self, plan: JointTrajectory) -> None:
+        """Draw the path of a plan that a person asked for."""
+        self._played = plan.header.stamp
+        self._draw(plan)
+
+    def _draw(self, plan: JointTrajectory) -> None:
         if self.line is not None:
             self.line.remove()
             self.line = None
-        count = len(message.points)
-        if count < 2:
+        if len(plan.points) < 2:
             return
-        points = []
-        for index in np.unique(np.linspace(0, count - 1, _SAMPLES).round().astype(int)):
-            self._tool.update(message.joint_names, message.points[index].positions)
-            points.append(self._tool.pose(self.stage.robot.config.tcp_link)[0])
-        self.line = add_line(self.scene, f"{self.root}/line", np.array(points), PATH, 3.0)
+        points = tool_points(self._tool, self.stage.robot.config.tcp_link, plan)
+        self.line = add_line(self.scene, f"{self.root}/line", points, PATH, 3.0)

@@ -45,7 +45,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_cell_has_the_layers_of_the_platform_and_of_its_application() -> None:
     panda, ur5 = find_layers(PANDA), find_layers(find_application("outlining"))
     everywhere = {"robot", "fixtures", "objects", "plan", "tool_path", "camera", "frames", "truth", "grid",
-                  "collision_shapes", "reach", "points"}
+                  "collision_shapes", "reach", "points", "compared"}
     assert {*panda} & {*ur5} == everywhere
     assert {*panda} - {*ur5} == {"targets", "rejected", "workspace"}
     assert {*ur5} - {*panda} == {"outline", "contours"}
@@ -98,7 +98,8 @@ def test_layer_is_offered_where_something_is_written_that_it_is_about() -> None:
     def offered(*keys: str) -> set[str]:
         return {name for name, kind in layers.items() if has_something(kind, keys)}
     assert offered() == {"grid"}
-    assert offered("tf", "tf_static", "joint_states") == {"grid", "robot", "collision_shapes", "reach", "frames"}
+    assert offered("tf", "tf_static", "joint_states") == {
+        "grid", "robot", "collision_shapes", "reach", "frames", "compared"}
     assert offered("depth_camera/points") - offered() == {"points"}
     assert offered("camera/camera_info") - offered() == {"camera"}
     assert offered("scene_objects") - offered() == {"truth"}

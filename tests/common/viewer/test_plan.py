@@ -120,3 +120,24 @@ def test_plan_of_other_joints_does_no_harm(panda: Stage, there: NDArray[np.float
     odd = plan(panda, there).model_copy(update={"joint_names": [f"other_{i}" for i in range(7)]})
     panda.view.play(odd)
     panda.joints(there)
+
+
+def test_two_plans_are_played_beside_each_other_until_the_robot_moves(
+    panda: Stage, there: NDArray[np.float64]
+) -> None:
+    first, second = plan(panda, there), plan(panda, there - 0.3)
+    first.header.stamp, second.header.stamp = 10, 20
+    panda.view.compare(second)
+    panda.view.play(first)
+    panda.say(topics.DISPLAY_TRAJECTORY, second, 0.0)  # the planner tells of the newest
+    other = panda.layer("compared")
+    panda.joints(panda.robot.named("home"))
+    panda.clock.now += 1.999999
+    panda.joints(panda.robot.named("home") + 1e-5)
+    np.testing.assert_allclose(tool_of_ghost(panda), panda.robot.link_poses(there)["panda_hand"], atol=1e-3)
+    beside = in_world(panda.server, other.ghost.links["panda_hand"])
+    np.testing.assert_allclose(beside, panda.robot.link_poses(there - 0.3)["panda_hand"], atol=1e-3)
+    assert other.line.points.shape[1:] == (2, 3) and panda.layer("tool_path").line is not None
+    np.testing.assert_allclose(panda.layer("tool_path").line.points[-1][1], panda.robot.fk(there)[:3, 3], atol=1e-4)
+    panda.joints(panda.robot.named("home") + 0.05)
+    assert not other.ghost.visible and other.line is None

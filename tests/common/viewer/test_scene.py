@@ -122,7 +122,7 @@ def test_layers_begin_as_wanted_and_unknown_ones_are_refused(server: viser.Viser
     assert view.shows("truth") and not view.shows("workspace") and view.shows("robot")
     with pytest.raises(UnknownName, match=r"layer 'truht'.*'truth'"):
         view.set_shown("truht", True)
-    with pytest.raises(UnknownName, match="choices: camera, collision_shapes, fixtures"):
+    with pytest.raises(UnknownName, match="choices: camera, collision_shapes, compared, fixtures"):
         Stage(server, "panda", shown={"roboter": True})
 
 
