@@ -88,6 +88,14 @@ def test_principal_point_off_the_middle_moves_the_picture_by_as_much():
 
 
 @pytest.mark.parametrize("gl", [pytest.param(GL, marks=needs_gl), ""])
+def test_pixels_need_not_be_square_nor_the_axis_in_the_middle(gl):
+    view = Pinhole.from_config(CameraConfig(width=160, height=120, fx=150, fy=110, cx=70, cy=66))
+    _, _, _, middles = cv2.connectedComponentsWithStats(red(drawn(balls(), view=view, gl=gl).colour).astype(np.uint8))
+    for place in view.project(PLACES):
+        assert np.linalg.norm(middles[1:] - place, axis=1).min() < 0.6
+
+
+@pytest.mark.parametrize("gl", [pytest.param(GL, marks=needs_gl), ""])
 def test_depth_is_that_along_the_optical_axis(gl):
     view = drawn(balls(), gl=gl)
     for (x, y, z), (u, v) in zip(PLACES, SMALL.project(PLACES), strict=True):
