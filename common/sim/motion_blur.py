@@ -12,6 +12,7 @@ from common.messages import JointState, Vector3, WorldObject, WorldObjects
 Array = npt.NDArray[np.float64]
 
 OLDEST = 0.1  # [s] after which what was told of a thing says nothing about how it moves
+LONGEST = 0.25  # [s] between two pictures that tell how fast a thing moves
 FASTEST = 5.0  # [m/s]: what went farther was put elsewhere
 
 
@@ -30,7 +31,7 @@ class Movement:
             return
         seconds = (truth.header.stamp - before.header.stamp) * 1e-9
         self._velocities = {}
-        if not 0 < seconds <= OLDEST:
+        if not 0 < seconds <= LONGEST:
             return
         places = {thing.id: thing.pose.position for thing in before.objects}
         for thing in truth.objects:

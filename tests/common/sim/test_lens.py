@@ -78,9 +78,9 @@ def sphere(x, stamp):
 def test_what_moves_was_elsewhere_within_the_exposure():
     movement = Movement()
     for number in range(3):
-        movement.take(sphere(0.4 + 0.01 * number, 50_000_000 * number))  # 0.2 m/s
-    now = 100_000_000
-    assert movement.objects(0.02, now)[0].pose.position.x == pytest.approx(0.416)
+        movement.take(sphere(0.4 + 0.01 * number, 100_000_000 * number))  # 0.1 m/s, at ten pictures a second
+    now = 200_000_000
+    assert movement.objects(0.02, now)[0].pose.position.x == pytest.approx(0.418)
     assert movement.objects(0.0, now)[0].pose.position.x == pytest.approx(0.42)
     assert movement.objects(0.02, now + 500_000_000)[0].pose.position.x == pytest.approx(0.42), "it stands by now"
 
