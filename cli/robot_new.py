@@ -98,16 +98,16 @@ def check(
     from common.config import load_robot
     from common.planning.robot_geometry import RobotGeometry
     from common.robot.model import RobotModel
-    from common.setup.fingers import tool_complaints
+    from common.setup.hand import complaints
     from common.setup.home import hits
 
     robot = RobotModel.load(load_robot(name))
-    complaints = tool_complaints(robot)
+    wrong = complaints(robot)
     touching = hits(robot, RobotGeometry(robot), robot.named("home"))
-    complaints += [f"named_poses.home: {pair} touch" for pair in touching]
-    for line in complaints:
+    wrong += [f"named_poses.home: {pair} touch" for pair in touching]
+    for line in wrong:
         echo(line)
-    if complaints:
+    if wrong:
         raise typer.Exit(1)
     gripper = robot.config.gripper
     fingers = f", fingers close along its {gripper.closing_axis}" if gripper and gripper.joints else ""

@@ -169,8 +169,6 @@ def tool_complaints(robot: RobotModel, points: dict[str, Array] | None = None) -
     gripper = robot.config.gripper
     if gripper is None or not gripper.joints:
         return []
-    if gripper.jaw is not None:
-        return []  # of one finger against a fixed one: see `common.setup.jaw`
     name, axis = robot.config.tcp_link, gripper.closing_axis
     widths = (0.0, gripper.max_width)
     found = measure(robot, name, links_moved(robot, gripper.joints), gripper.joints,

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.robot.model import RobotModel
-from common.setup.fingers import PARALLEL, Grip, links_moved, measure
-from common.setup.jaw import measure_jaw
+from common.setup.fingers import PARALLEL, Grip, links_moved, measure, tool_complaints
+from common.setup.jaw import jaw_complaints, measure_jaw
 from common.setup.tree import Joint, Tree
 
 Array = NDArray[np.float64]
@@ -91,6 +91,12 @@ def find_hand(robot: RobotModel, tree: Tree, fingers: Sequence[Joint], points: d
     if still:
         hand.remarks.append(f"gripper: {', '.join(still)} stands still: it moves on its own beside {driven.name}")
     return _slides(hand, low, high) if slides else _with_linkage(hand, driven, travel[::-1])
+
+
+def complaints(robot: RobotModel) -> list[str]:
+    """What of the tool's frame and the fingers is not as the platform takes it to be, in one line each."""
+    gripper = robot.config.gripper
+    return jaw_complaints(robot) if gripper is not None and gripper.jaw is not None else tool_complaints(robot)
 
 
 def _jaw(robot: RobotModel, joint: Joint, points: dict[str, Array]) -> Hand | str:

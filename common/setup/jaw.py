@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from common.robot.model import RobotModel
 from common.robot.transforms import invert
-from common.setup.fingers import TIP, Grip, links_moved
+from common.setup.fingers import ALIGNED, TIP, Grip, link_points, links_moved, told
 
 Array = NDArray[np.float64]
 
 ALONG = math.cos(math.radians(35))  # of the last joint's axis with the way to the tip: then that is the tool's axis
 DROP = 0.012  # of the tip of the jaw behind where it is when closed, up to which it is opened [m]
+CLOSED = 0.05  # by which the joint may be said to be closed elsewhere than it was measured to be [rad]
 APART = 0.03  # between the tips when closed: more is no gripper [m]
 
 
@@ -102,6 +103,32 @@ def measure_jaw(robot: RobotModel, joint: str, points: dict[str, Array]) -> Jaw 
                 half_width=float(sides.max() - sides.min()) / 2)
     return Jaw(carrier, round(radius, 5), round(angle, 5), round(closed, 5), 1 if opened > closed else -1,
                round(width - 5e-5, 4), grip)
+
+
+def jaw_complaints(robot: RobotModel, points: dict[str, Array] | None = None) -> list[str]:
+    """As `common.setup.fingers.tool_complaints`, of a robot with a jaw."""
+    gripper = robot.config.gripper
+    assert gripper is not None and gripper.jaw is not None
+    found = measure_jaw(robot, gripper.joints[0], points or link_points(robot))
+    if isinstance(found, str):
+        return [f"gripper.joints: {found}"]
+    name, axis, given = robot.config.tcp_link, gripper.closing_axis, gripper.jaw
+    poses = robot.link_poses(np.clip(np.zeros(robot.dof), robot.lower, robot.upper))
+    R = invert(poses[name])[:3, :3] @ poses[found.carrier][:3, :3]
+    closing, approach = R @ found.grip.closing, R @ found.grip.approach
+    complaints = []
+    if abs(closing["xy".index(axis)]) < ALIGNED:
+        way = told(closing).removeprefix("-")
+        complaints.append(f"gripper.closing_axis: the jaw closes along {way} of {name}, not along {axis}")
+    if approach[2] < ALIGNED:
+        complaints.append(f"tcp_link: z of {name} must point from the palm to the tips of the jaws, which is "
+                          f"{told(approach)}")
+    if given.opens != found.opens or abs(given.closed - found.closed) > CLOSED:
+        complaints.append(f"gripper.jaw: it is closed at {found.closed:g} and opens by {found.opens:+d}, not at "
+                          f"{given.closed:g} and by {given.opens:+d}")
+    elif abs(given.radius - found.radius) > 0.1 * found.radius:
+        complaints.append(f"gripper.jaw.radius: its tip is {found.radius:.4f} m from its axis, not {given.radius:g} m")
+    return complaints
 
 
 def _rigid(robot: RobotModel, link: str) -> int:

@@ -20,9 +20,9 @@ from common.robot.finger_joints import finger_positions
 from common.robot.merging import read_urdf
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, matrix_to_rpy, transform
-from common.setup.fingers import ALIGNED, link_points, tool_complaints
+from common.setup.fingers import ALIGNED, link_points
 from common.setup.flange import find_flange, flange_links, rotation_between
-from common.setup.hand import Hand, find_hand, section
+from common.setup.hand import Hand, complaints, find_hand, section
 from common.setup.home import find_home
 from common.setup.limits import SPEED, TO_ACCELERATION, TO_SPEED, guessed_acceleration, guessed_jerk, position_range
 from common.setup.tree import Arm, Joint, Tree, find_arm, read_tree
@@ -293,6 +293,6 @@ def finish(made: Proposal) -> RobotModel:
         made.lost.append(f"no pose is free of collisions; in the middle of the joints these touch: "
                          f"{', '.join(home.hits[:3])}")
     made.guessed.append(f"named_poses.home: the tool at ({x:.2f}, {y:.2f}, {z:.2f})")
-    made.check += tool_complaints(robot)
+    made.check += complaints(robot)
     made.check.append("base_position: is not given, so the base stands at the origin of the world")
     return robot

@@ -13,6 +13,7 @@ from common.robot.finger_joints import finger_positions, width_at
 from common.robot.model import RobotModel
 from common.robot.transforms import invert
 from common.setup.fingers import link_points, links_moved, tool_complaints
+from common.setup.hand import complaints
 from common.setup.proposal import Proposal, draft
 from tests.small_arms import scara
 
@@ -75,6 +76,24 @@ def test_a_jaw_that_turns_towards_a_fixed_finger_is_measured(urdf: str, opens: i
     assert shut[tip, 1] == pytest.approx(-gripper.max_width / 2, abs=2e-4)  # the tool is in the middle of the open jaws
     for width in (0.2 * gripper.max_width, gripper.max_width):
         assert in_tool(width)[tip, 1] - shut[tip, 1] == pytest.approx(width, abs=5e-4)
+
+
+def test_a_jaw_file_that_is_not_so_is_told_what_is() -> None:
+    made = draft("package://example-robot-data/robots/z1_description/urdf/z1.urdf", "arm")
+    config = check(RobotConfig, made.values, "robot")
+    assert config.gripper is not None and config.gripper.jaw is not None and config.tcp is not None
+    assert complaints(RobotModel.load(config)) == []
+
+    def of(**changes: object) -> list[str]:
+        assert config.gripper is not None
+        return complaints(RobotModel.load(config.model_copy(update={
+            "gripper": config.gripper.model_copy(update=changes)})))
+
+    assert of(closing_axis="x") == ["gripper.closing_axis: the jaw closes along y of arm_tcp, not along x"]
+    (told,) = of(jaw=config.gripper.jaw.model_copy(update={"opens": 1}))
+    assert told.startswith("gripper.jaw: it is closed at 0 and opens by -1")
+    (told,) = of(jaw=config.gripper.jaw.model_copy(update={"radius": 0.2}))
+    assert told == "gripper.jaw.radius: its tip is 0.1000 m from its axis, not 0.2 m"
 
 
 def test_a_jaw_that_comes_to_nothing_is_no_gripper_and_told_so() -> None:
