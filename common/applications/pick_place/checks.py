@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from common.applications.pick_place.detector import DetectorOptions
+from common.applications.pick_place.parameters import RELEASED
 from common.checking.arm import Arm
 from common.checking.finding import Finding, error, warning
 from common.config import CameraConfig, Cell, Container, ObjectConfig, Reach, service_config
@@ -23,7 +24,6 @@ from common.sim.layout import layout
 from common.sim.objects import pose_of, solid_of
 from common.sim.places import is_inside
 
-TILTED = 0.25  # [rad] of the tool above a container, where the arm cannot choose: as orient_tol_rad
 ALONG = 0.03  # [m] by which the place above a container may be missed: half of place_pos_tol
 
 
@@ -152,7 +152,7 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
         nearer = 1 - ALONG / max(math.hypot(box.x, box.y), ALONG)
         poses = [tool_down(share * box.x, share * box.y, cell.grasp.drop_z, turn)
                  for share in (1.0, nearer) for turn in turns]
-        if why := arm.why_not(poses, width, max(tilt, TILTED)):
+        if why := arm.why_not(poses, width, max(tilt, RELEASED)):
             yield error(f"world.containers.{name}: the tool cannot be above it, at ({box.x:z.3f}, {box.y:z.3f}, "
                         f"{cell.grasp.drop_z:.3f}), {turned}, {why}",
                         "move it, or set grasp.drop_z")

@@ -14,6 +14,9 @@ PLACES = {"finger_inner": "gripper.fingers.inner", "finger_outer": "gripper.fing
           "finger_half_width": "gripper.fingers.half_width"}
 
 
+RELEASED = 0.9  # [rad] that a hand may be tilted above a container where the arm cannot choose: what it lets go falls
+
+
 class HandShape(Parameters):
     """The open fingers as seen from above: two rectangles beside the object, in the frame of the tool centre point.
 

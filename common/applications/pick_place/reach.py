@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from common.applications.pick_place.parameters import RELEASED
 from common.config import Grasp
 from common.errors import ConfigError
 from common.planning.free_axes import chooses, solve_down
@@ -129,5 +130,5 @@ def _box(robot: RobotModel, reached: list[Place], grasp: Grasp) -> tuple[Place, 
 
 def _released(robot: RobotModel, place: Place, grasp: Grasp) -> bool:
     """Whether the tool comes above the box, coming from home."""
-    at, tilt = (*place, grasp.drop_z), grasp.tilt(robot.dof)
+    at, tilt = (*place, grasp.drop_z), grasp.tilt(robot.dof) if chooses(robot) else RELEASED
     return solve_down(robot, at, 0.0, robot.named("home"), tilt=tilt, restarts=20, iterations=40) is not None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from common import messages as m
 from common.applications.pick_place.choice import Pick, PickPlaceView
-from common.applications.pick_place.parameters import Config
+from common.applications.pick_place.parameters import RELEASED, Config
 from common.config import GripperConfig
 from common.planning.free_axes import ALL
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down, transform
@@ -91,6 +91,8 @@ class Rows:
     def _across(self, cycle: Pick, yaw: float) -> Move:
         box = self.p.world.container
         above = self._region((box.x, box.y, self.p.grasp.drop_z), yaw, self.p.place_pos_tol)
+        if self._takes_any:
+            above.tilt_tolerance = max(above.tilt_tolerance, RELEASED)
         return Move("across", "PLACING", cycle, goal=above, carries=True)
 
     def _release(self, cycle: Pick) -> Grip:

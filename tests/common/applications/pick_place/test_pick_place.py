@@ -523,8 +523,10 @@ def test_an_arm_that_cannot_choose_is_left_any_clear_yaw_and_some_tilt_and_other
         row = rows.pick_and_place(Pick(target=thing, yaws=[0.5], ranges=[(-1.0, 0.2), (0.3, 0.4)]))
         goals = {stage.name: stage.goal for stage in row if isinstance(stage, Move)}
         descend, over = goals["descend"], goals["pre-grasp"]
+        assert isinstance(goals["across"], m.PoseGoal)
         assert isinstance(descend, m.PoseGoal) and isinstance(over, m.PoseGoal)
         assert (descend.tilt_tolerance, descend.yaw_tolerance) == (tilt, yaw)
         middle = tool_down(0.4, -0.3, 0.03, 0.3 if yaw else 0.5)  # of the range in which the hand is clear
         assert pose_to_matrix(descend.pose) == pytest.approx(middle)
         assert over.tilt_tolerance == max(tilt, cell.task.p.orient_tol_rad)
+        assert goals["across"].tilt_tolerance == (0.9 if tilt else cell.task.p.orient_tol_rad)  # what is let go falls
