@@ -367,3 +367,16 @@ async def beside(*work: Any) -> AsyncIterator[None]:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def wait_router(endpoint: str, timeout: float) -> None:
+    """Return as soon as a client can connect to the router.
+
+    Raises:
+        TimeoutError: none could within `timeout` seconds.
+    """
+    from common.transport.zenoh_session import close_bounded, open_zenoh
+
+    async with asyncio.timeout(timeout):
+        session = await open_zenoh(endpoint)
+    await close_bounded(session, 0.5)

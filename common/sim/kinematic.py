@@ -9,20 +9,21 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.config import GripperConfig, ObjectConfig, Scenery, Surroundings, World
 from common.errors import ConfigError, Refused, UnknownName
-from common.messages import Header, Pose, SceneUpdate, Vector3, WorldEdit, WorldObject, WorldObjects
+from common.messages import Header, WorldEdit, WorldObject, WorldObjects
 from common.robot.finger_joints import closing_frame
-from common.robot.transforms import invert, matrix_to_pose, transform
+from common.robot.transforms import invert, transform
 from common.sim.bodies import Body, Rest, restored
 from common.sim.footprints import is_convex
 from common.sim.gripping import felt
 from common.sim.interface import GraspTolerances, StandingObject
+from common.sim.news import News
 from common.sim.objects import Solid, pose_of, shaped, solid_of, solid_of_message
 from common.sim.resting import Ground
 
@@ -58,7 +59,7 @@ def renderer(
     return Renderer(around, seen, plain=plain, camera=camera, scenery=scenery)
 
 
-class KinematicWorld:
+class KinematicWorld(News):
     """The objects, and what becomes of them while a hand moves among them.
 
     Attributes:
@@ -74,7 +75,7 @@ class KinematicWorld:
         Raises:
             ConfigError: an object cannot lie where it is to.
         """
-        self.version = 0
+        super().__init__()
         self._config = world
         self._tolerances = tolerances or GraspTolerances()
         self._gripper = gripper
@@ -84,7 +85,6 @@ class KinematicWorld:
         self._solids = {name: solid_of(thing) for name, thing in self._first.items()}
         self._bodies: dict[str, Body] = {}
         self._between: dict[str, tuple[float, float]] = {}  # what the fingers would press on: its ends along tool y [m]
-        self._events: list[SceneUpdate] = []
         try:
             self._lay_out()
         except Refused as refusal:
@@ -359,18 +359,6 @@ class KinematicWorld:
         """Where everything is; what is "elsewhere" is off the table, out of sight."""
         return WorldObjects(header=header, objects=[body.message() for body in self._bodies.values()])
 
-    def take_events(self) -> list[SceneUpdate]:
-        """What was taken away or came to lie since the last call, in order."""
-        events, self._events = self._events, []
-        return events
-
-    def _say(self, what: Literal["add", "remove"], body: Body) -> None:
-        pose = None
-        if what == "add":
-            x, y, z = (float(v) for v in body.T[:3, 3])
-            pose = Pose(position=Vector3(x=x, y=y, z=z)) if body.solid.shape == "sphere" else matrix_to_pose(body.T)
-        self._events.append(SceneUpdate(data=f"{what}:{body.name}", pose=pose))
-        self.version += 1
 
 
 def _requested(request: WorldEdit) -> Solid:

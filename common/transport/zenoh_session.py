@@ -330,17 +330,6 @@ async def open_zenoh(
         stop.set()
 
 
-async def wait_router(endpoint: str, timeout: float) -> None:
-    """Return as soon as a client can connect to the router.
-
-    Raises:
-        TimeoutError: none could within `timeout` seconds.
-    """
-    async with asyncio.timeout(timeout):
-        session = await open_zenoh(endpoint)
-    await close_bounded(session, 0.5)
-
-
 async def close_bounded(session: Any, seconds: float) -> bool:
     """Close in a thread, and say whether that ended within the time: a dead network can hold it for many seconds."""
     loop = asyncio.get_running_loop()

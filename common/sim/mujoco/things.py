@@ -11,10 +11,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from common.messages import WorldObject
 from common.sim.footprints import convex_parts
 from common.sim.mujoco.contact import THING, touches
-from common.sim.objects import Solid, solid_of_message
+from common.sim.objects import Solid
 
 Array = NDArray[np.float64]
 
@@ -30,11 +29,6 @@ class Thing:
     solid: Solid
     color: tuple[float, float, float]
     mass: float = USUAL_MASS
-
-
-def thing_of_message(told: WorldObject) -> Thing:
-    """The object that a message tells of, which says no mass."""
-    return Thing(told.id, solid_of_message(told), (told.color.r, told.color.g, told.color.b))
 
 
 def add_thing(spec: mujoco.MjSpec, thing: Thing) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 import mujoco
 import numpy as np
@@ -17,9 +16,8 @@ from numpy.typing import NDArray
 from common.config import GripperConfig, ObjectConfig, World
 from common.errors import ConfigError, Refused
 from common.hardware.interface import Hardware, Limits, Vector
-from common.messages import Header, Pose, SceneUpdate, Vector3, WorldEdit, WorldObjects
+from common.messages import Header, WorldEdit, WorldObjects
 from common.robot.model import RobotModel
-from common.robot.transforms import matrix_to_pose
 from common.sim.bodies import Body
 from common.sim.interface import GraspTolerances, Numbers, StandingObject
 from common.sim.kinematic import KinematicWorld
@@ -29,6 +27,7 @@ from common.sim.mujoco.model import CellModel, build_model
 from common.sim.mujoco.servo import tune
 from common.sim.mujoco.things import USUAL_MASS, Thing
 from common.sim.mujoco.watching import RESTS, Contacts, Watch, differs, straightened
+from common.sim.news import News
 
 Array = NDArray[np.float64]
 
@@ -38,7 +37,7 @@ SLIPPERY = 0.5  # [s] fingers do not touch what a person lets slip
 ASLEEP = 1e-3  # [m/s] or [rad/s]: velocities below are not kept over a restart
 
 
-class PhysicsWorld:
+class PhysicsWorld(News):
     """The objects and the arm among them.
 
     Attributes:
@@ -56,13 +55,12 @@ class PhysicsWorld:
         """
         if gripper is not None and gripper.cup is not None:
             raise ConfigError("world.simulator", "mujoco", "has fingers only: with a suction cup use kinematic")
-        self.version = 0
+        super().__init__()
         self._config = world
         self._paper = KinematicWorld(world, objects, tolerances, gripper)
         self._first_masses = {thing.id: thing.mass for thing in objects}
         self._masses = dict(self._first_masses)
         self._watch = Watch(world)
-        self._events: list[SceneUpdate] = []
         self._taken: set[str] = set()  # what "remove" was said of
         self._slippery: dict[str, float] = {}  # until when
         self._time: float | None = None
@@ -186,18 +184,6 @@ class PhysicsWorld:
         """Where everything is; what is "elsewhere" lies on the floor."""
         return self._paper.objects(header)
 
-    def take_events(self) -> list[SceneUpdate]:
-        """What was taken away or came to lie since the last call, in order."""
-        events, self._events = self._events, []
-        return events
-
-    def _say(self, what: Literal["add", "remove"], body: Body) -> None:
-        pose = None
-        if what == "add":
-            x, y, z = (float(v) for v in body.T[:3, 3])
-            pose = Pose(position=Vector3(x=x, y=y, z=z)) if body.solid.shape == "sphere" else matrix_to_pose(body.T)
-        self._events.append(SceneUpdate(data=f"{what}:{body.name}", pose=pose))
-        self.version += 1
 
     # --- over a restart ---
 

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from common.config import CameraConfig
 from common.perception.pinhole import Pinhole
-from common.perception.sphere import ray_distances, silhouette, wholly_in_view
+from common.perception.sphere import ray_distances, silhouette
 
 camera = Pinhole.from_config(CameraConfig())
 places = st.tuples(st.floats(-0.2, 0.9), st.floats(-0.6, 0.6), st.floats(-0.2, 0.5))
@@ -50,10 +50,3 @@ def test_the_centre_of_the_silhouette_is_not_the_image_of_the_centre():
 @pytest.mark.parametrize("center", [(0.4, 0.0, 0.81), (0.4, 0.0, 1.0), (0.4, 0.0, 0.78)])
 def test_a_sphere_at_or_behind_the_camera_has_no_silhouette(center):
     assert silhouette(camera, center, 0.03).shape == (0, 2)
-    assert not wholly_in_view(camera, center, 0.03)
-
-
-def test_a_ball_is_wholly_in_view_only_when_its_whole_outline_is():
-    assert wholly_in_view(camera, (0.4, 0.43, 0.03), 0.03)
-    assert not wholly_in_view(camera, (0.4, 0.46, 0.03), 0.03)
-    assert not wholly_in_view(camera, (0.4, 0.43, 0.03), 0.03, margin=20)

@@ -8,7 +8,7 @@ import pytest
 
 from common.process.loop_watch import PERIOD, STUCK_EXIT, Turning
 from common.transport.endpoint import endpoint_of
-from common.transport.zenoh_session import wait_router
+from tests.harness import wait_router
 
 PATIENCE = 20.0
 CELL = str(Path(__file__).with_name("toy_cell.yaml"))

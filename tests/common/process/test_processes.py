@@ -22,8 +22,8 @@ from common.process.service import add_options, prepare
 from common.transport.bus import Bus, Client
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of, port_of
-from common.transport.zenoh_session import wait_router
 from tests.common.process.toy import Config
+from tests.harness import wait_router
 
 PATIENCE = 20.0  # only ever waited for by a test that fails
 CELL = str(Path(__file__).with_name("toy_cell.yaml"))

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from common.config import World, load_cell
-from common.messages import Header
+from common.messages import Header, WorldObject
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix, transform
 from common.sim.kinematic import KinematicWorld
 from common.sim.mujoco.kept_meshes import kept
 from common.sim.mujoco.model import CellModel, build_model
-from common.sim.mujoco.things import thing_of_message
+from common.sim.mujoco.things import Thing
+from common.sim.objects import solid_of_message
 
 SHAPES = [
     {"id": "ball", "shape": "sphere", "radius": 0.03, "x": 0.3, "y": 0.0},
@@ -26,6 +27,11 @@ SHAPES = [
      "polygon": [[-0.02, -0.02], [0.03, -0.02], [0.03, 0.0], [0.0, 0.0], [0.0, 0.03], [-0.02, 0.03]]},
     {"id": "ring", "shape": "ring", "radius": 0.04, "inner_radius": 0.02, "height": 0.03, "x": 0.7, "y": 0.0},
 ]
+
+
+def thing_of_message(told: WorldObject) -> Thing:
+    """The object that a message tells of, which says no mass."""
+    return Thing(told.id, solid_of_message(told), (told.color.r, told.color.g, told.color.b))
 
 
 def model_of(cell: str, visuals: bool = False) -> tuple[RobotModel, CellModel]:
