@@ -13,7 +13,7 @@ SINGLE = (
 )
 REAL = tuple(f"common/{name}.py" for name in (  # of real arms and cameras, which no simulation has
     "hardware/driver", "hardware/driver_process", "hardware/driven_gripper", "hardware/franka", "hardware/ur",
-    "perception/calibration_record"))
+    "perception/calibration_record", "perception/depth_drivers/oak", "perception/depth_drivers/realsense"))
 OF_THE_MACHINE = {"time", "uuid", "secrets", "random", "datetime"}
 
 
