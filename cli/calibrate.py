@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
-from cli.inspection import UP, Place, Verbs
+from cli.place import UP, Place, Verbs
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 
@@ -49,7 +49,7 @@ def board_command(
         raise ConfigError("--output", output, f"cannot be written: {error.strerror}") from None
     width, height = (1e3 * pixels / density for pixels in reversed(page.shape))
     echo(f"{output}: {board.options}; {width:.1f} x {height:.1f} mm. Print it at 100 %, measure the line on it, "
-               "fix it to something flat.")
+         "fix it to something flat.")
 
 
 @app.command()
@@ -80,7 +80,7 @@ def intrinsics(
         if terminal:
             part, unseen = collector.coverage()
             echo(f"{name}: {reason or f'view {len(collector.views)}'}; {100 * part:.0f} % of the picture covered"
-                       + (f", nothing {unseen[0]}" if unseen else ""), err=True)
+                 + (f", nothing {unseen[0]}" if unseen else ""), err=True)
         if collector.complete:
             break
     collector.require_enough()
@@ -204,7 +204,6 @@ def collect(
     model = RobotModel.load(load_robot(robot))
     board, wanted = board_of(squares, square, marker, dictionary), options.whole("--views", views, 1) or 1
     collector = ViewCollector(Path(folder).expanduser(), model, robot, board)
-
     at.visit(lambda bus: collect_views(bus, key, collector, wanted, echo))
     echo(f"{folder} holds {collector.count} views; next: zencell calibrate hand-eye {folder} --intrinsics FILE "
          "--camera hand|beside")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
-from cli.inspection import Place
+from cli.place import Place
 from common.completing import offers
 from common.errors import ConfigError
 from common.terminal import echo
@@ -53,7 +53,7 @@ def graph(
         return
     options.write_text(output, text)
     echo(f"{path}: {len(made.services)} services, {len(made.kinds)} keys"
-               f"{'' if made.alive is None else f', {sum(map(made.is_lit, names(made)))} services alive'}")
+         f"{'' if made.alive is None else f', {sum(map(made.is_lit, names(made)))} services alive'}")
 
 
 def _writer_of(path: Path | None) -> Callable[[Graph], str]:

@@ -40,7 +40,7 @@ from cli import (
     topic,
     verbs,
 )
-from cli.inspection import Verbs
+from cli.place import Verbs
 from common.errors import RequestFailed, ZencellError
 from common.terminal import echo, printable
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from cli import options
-from cli.inspection import Place, Verbs
+from cli.place import Place, Verbs
 from common.completing import offers
 from common.terminal import echo
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from cli import options
-from cli.inspection import UP, Place, Verbs
+from cli.place import UP, Place, Verbs
 from common.completing import offers
 from common.terminal import echo
 
@@ -75,7 +75,6 @@ def set_(assignments: Assignments, at: Place = UP) -> None:
     for text in expanded(assignments):
         parts, value = parse_override(text, "param set")
         values[".".join(parts)] = value
-
     for path, (before, after) in at.visit(lambda bus: change(bus, values)).items():
         is_now = f"is {yaml_line(before)} already" if before == after else f"{yaml_line(before)} -> {yaml_line(after)}"
         echo(f"{path}: {is_now}")

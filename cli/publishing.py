@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import options
-from cli.inspection import UP, Place
+from cli.place import UP, Place
 from common.errors import ConfigError
 from common.terminal import echo
 

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from cli import options
-from cli.inspection import UP, Place
+from cli.place import UP, Place
 from common.completing import offers
 from common.errors import ConfigError
 from common.recording.telling import contents, in_bytes, require_new
@@ -108,4 +108,4 @@ def recover(
     lost = [f"{in_bytes(saved.lost_bytes)} after the cut"] if saved.lost_bytes else []
     lost += [f"{saved.damaged_chunks} damaged chunks"] if saved.damaged_chunks else []
     echo(f"saved {saved.messages:,} messages, {saved.seconds:.1f} s: {target}; "
-               f"lost {' and '.join(lost) or 'nothing'}")
+         f"lost {' and '.join(lost) or 'nothing'}")

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from cli import options, robot_new
-from cli.inspection import UP, Place, Verbs
+from cli.place import UP, Place, Verbs
 from common.completing import offers
 from common.errors import ConfigError
 from common.terminal import echo
@@ -51,7 +51,7 @@ def collisions(
     options.write_text(output, text)
     found = Counter(pair.reason for pair in pairs)
     echo(f"{output}: {len(pairs)} pairs need no check "
-               f"({', '.join(f'{found[reason]} {reason.lower()}' for reason in sorted(found))})")
+         f"({', '.join(f'{found[reason]} {reason.lower()}' for reason in sorted(found))})")
 
 
 @app.command()

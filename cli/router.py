@@ -6,7 +6,7 @@ import json
 import os
 
 from cli import options
-from cli.inspection import Verbs
+from cli.place import Verbs
 from common.supervision.share import Share
 from common.terminal import echo
 

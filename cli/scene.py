@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, cast
 import typer
 
 from cli import options
-from cli.inspection import UP, Place, Verbs
+from cli.place import UP, Place, Verbs
 from common.terminal import echo
 
 app = Verbs("Add solids that motion keeps away from though nobody perceives them.")

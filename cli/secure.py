@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from cli import options
-from cli.inspection import Verbs
+from cli.place import Verbs
 from common.supervision.share import Share
 from common.terminal import echo
 

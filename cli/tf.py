@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
-from cli.inspection import UP, Place, Verbs
+from cli.place import UP, Place, Verbs
 from common import terminal
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
-from cli.inspection import UP, Place
+from cli.place import UP, Place
 from common.terminal import echo
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import options, publishing
-from cli.inspection import UP, Place, Verbs
+from cli.place import UP, Place, Verbs
 from common import terminal
 from common.completing import offers
 

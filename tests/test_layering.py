@@ -59,6 +59,12 @@ def test_common_never_imports_services_or_the_command_line() -> None:
     assert offences(sources("common"), ("services", "cli")) == []
 
 
+def test_the_command_line_is_thin() -> None:
+    """What is not options and printing lies in common; a verb has some lines over it."""
+    lines = {name_of(path): len(path.read_text(encoding="utf-8").splitlines()) for path in sources("cli")}
+    assert sum(lines.values()) < 4000, sorted(lines.items(), key=lambda item: -item[1])[:5]
+
+
 def test_tests_do_not_import_benchmarks() -> None:
     assert offences(sources("tests"), ("benchmarks",)) == []
 

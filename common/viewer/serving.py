@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 HIGHEST_PORT = 65535
 
+
 @dataclass(frozen=True)
 class Page:
     """Where the page of a cell will be, and what its service has to be told for that."""
