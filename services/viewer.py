@@ -114,7 +114,7 @@ async def run(bus: Bus, config: Config) -> None:
     try:
         page = Page(
             server, feeds, console, motions, config.members, application, layers, line, cell=config.run.cell,
-            layout=layout, layout_file=config.layout,
+            layout=layout, layout_file=config.layout, robot=config.robot,
             recordings=folder_of(config.recordings), periods=Periods(picture=1 / config.picture_rate),
         )
         await bus.ready()

@@ -100,25 +100,39 @@ class ViewCollector:
         return ""
 
     @property
+    def turns(self) -> Array:
+        """(3,) [rad] by how much the hand was turned about each of its axes, between all views."""
+        if not self._hands:
+            return np.zeros(3)
+        first = self._hands[0][:3, :3]
+        turns = np.array([cv2.Rodrigues(first.T @ hand[:3, :3])[0].ravel() for hand in self._hands])
+        return np.asarray(np.ptp(turns, axis=0))
+
+    @property
     def hint(self) -> str:
         """What the next view had better be like."""
         if len(self._hands) < 2:
             return "tilt the hand to another side"
-        first = self._hands[0][:3, :3]
-        turns = np.array([cv2.Rodrigues(first.T @ hand[:3, :3])[0].ravel() for hand in self._hands])
-        axis = int(np.argmin(np.ptp(turns, axis=0)))
-        return f"turn the hand further about its {AXES[axis]} axis"
+        return f"turn the hand further about its {AXES[int(np.argmin(self.turns))]} axis"
 
 
-def load_views(folder: Path, board: Board, camera: CameraFile) -> tuple[list[View], list[str], JointsFile]:
+def load_views(
+    folder: Path, board: Board, camera: CameraFile, moved: RobotModel | None = None
+) -> tuple[list[View], list[str], JointsFile]:
     """The views of a folder, for each picture without the board why, and what the folder says.
+
+    Args:
+        folder: in which they are kept.
+        board: that they show.
+        camera: that they were taken with.
+        moved: the robot; left out: the one that the folder names.
 
     Raises:
         ConfigError: it has no views, or they do not fit the robot.
         CalibrationFailed: pictures have another size than the intrinsics are for.
     """
     said = _read(folder)
-    robot = RobotModel.load(load_robot(said.robot))
+    robot = moved or RobotModel.load(load_robot(said.robot))
     if said.joints != robot.joint_names:
         raise ConfigError(f"{folder / JOINTS_FILE}: joints", said.joints, f"are not those of {said.robot}")
     views, why = [], []

@@ -21,7 +21,7 @@ import viser
 
 from common import topics
 from common.application import Application
-from common.config import Members, check
+from common.config import Members, RobotConfig, check
 from common.errors import ZencellError
 from common.messages import Image, PointCloud2, Rejections, TaskStatus
 from common.reporting.summary import Rejected
@@ -31,6 +31,7 @@ from common.viewer.arm_panel import ArmPanel
 from common.viewer.console import Console
 from common.viewer.doors import VISITOR
 from common.viewer.feeds import ANNOTATED, DEPTH, LIVE, MASK, Feeds, News, Periods, Topics
+from common.viewer.hand_eye_panel import HandEyePanel
 from common.viewer.health import HealthPanel, LogPanel
 from common.viewer.layers import Layers, layers_shown
 from common.viewer.layout import TABS, Layout, Tab, Viewpoint, save_layout
@@ -69,7 +70,7 @@ class Page:
     def __init__(
         self, server: viser.ViserServer, feeds: Feeds, console: Console, motions: Motions, members: Members,
         application: Application | None, layers: Layers, line: Line, *, cell: str, layout: Layout, layout_file: str,
-        recordings: Path, periods: Periods,
+        robot: RobotConfig, recordings: Path, periods: Periods,
     ) -> None:
         """Lay the page out; on the running loop.
 
@@ -85,6 +86,7 @@ class Page:
             cell: its name.
             layout: what is on.
             layout_file: where the layout is kept; empty for the project's file.
+            robot: of the cell.
             recordings: folder of those that can be opened.
             periods: of the parts.
 
@@ -131,6 +133,9 @@ class Page:
             self._pictures = PicturePanel(
                 gui, console, {LIVE: layout.live_image, ANNOTATED: layout.annotated_image, MASK: layout.mask_image,
                                DEPTH: layout.depth_image}, self._listen)
+        with place["Cameras"], gui.add_folder("Hand-eye calibration", expand_by_default=False):
+            self._hand_eye = HandEyePanel(gui, console, feeds.latest, self._topics.images[LIVE], robot,
+                                          on_listen=self._listen)
         with place["Time"]:
             self._time = TimePanel(gui, console, self.timeline, names=partial(recordings_in, recordings),
                                    open_one=partial(self._open_recording, recordings))
@@ -237,6 +242,8 @@ class Page:
             self._log.show()
             self._world.show()
             self._time.show(now)
+            self._hand_eye.show()
+        self._hand_eye.follow(now)
         if self._periods.due("health", now):
             self._health.show(self._feeds.latest(topics.SUPERVISOR_STATUS), alive)
         if self._plots is not None and self._periods.due("plots", now):
@@ -381,6 +388,7 @@ class Page:
             wanted += self._controls.TOPICS if self._controls is not None else ()
             for name, kind in self._kinds.items():
                 wanted += kind.TOPICS if self._shown[name] or (kind.EDITS and self._editing) else ()
+            wanted += self._hand_eye.wanted
             for name, sources in self._topics.images.items():
                 wanted += sources if self._pictures.shown[name] else ()
         self._feeds.listen(wanted)

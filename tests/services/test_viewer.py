@@ -856,3 +856,20 @@ async def test_page_looks_back_and_what_moves_the_arm_brings_it_to_now(
     await page.press("Take")
     await until(lambda: seen() == 2.0)
     await page.until(lambda: not page.news["past"])
+
+
+async def test_page_guides_a_hand_eye_calibration(panda: Played, page: BrowserDouble) -> None:
+    await page.until(lambda: page.button("Begin")[1] == "give it a name first")
+    assert page.button("Take a picture")[1] == "begin first"
+    await page.set("Take pictures by itself", False)
+    for part in [uuid for uuid, part in page.parts.items() if part.get("hint") == "under which the views are kept"]:
+        await page.say({"type": "GuiUpdateMessage", "uuid": part, "updates": {"value": "wrist"}})
+    await page.press("Begin")
+    await page.until(lambda: "Missing: 15 more views: tilt the hand to another side" in page.text)
+    assert page.button("Calibrate")[1] == "6 views are needed"
+    picture = m.Image(header=m.Header(), height=48, width=64, encoding="bgr8", data=bytes(3 * 48 * 64))
+    panda.bus.writer(topics.CAMERA_IMAGE).put(picture)
+    await page.press("Take a picture")
+    await page.until(lambda: "nobody says where the joints were" in page.text or "no picture comes" in page.text)
+    await page.press("End")
+    await page.until(lambda: page.button("Calibrate")[1] == "begin first")
