@@ -37,7 +37,7 @@ def folder_of(name: str) -> Path:
         ConfigError: the name is none.
     """
     if not _NAME.fullmatch(name):
-        raise ConfigError("Name", name, "must be letters, digits, '_' and '-', at most 40")
+        raise ConfigError("Called", name, "must be letters, digits, '_' and '-', at most 40")
     return lasting_folder() / "hand_eye" / name
 
 

@@ -52,7 +52,7 @@ class HandEyePanel:
         self._seen: tuple[Image | None, JointState | None] = (None, None)
         self._result: Result | None = None
         made: list[tuple[str, Any]] = [
-            ("name", gui.add_text("Name", "", hint="under which the views are kept")),
+            ("name", gui.add_text("Called", "", hint="under which the views are kept")),
             ("camera", gui.add_dropdown("Camera", list(self._images) or [""])),
             ("mount", gui.add_dropdown("It is", list(MOUNTS))),
             ("columns", gui.add_number("Squares along x", 7, min=3, max=50, step=1)),
