@@ -21,7 +21,7 @@ def test_table_is_cleared_by_friction_alone() -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_pile_of_seven_stays_in_the_box(seed: int) -> None:
     summary = SimulatedCell("panda", [PHYSICS, "world.layout=random", f"seed={seed}"], seed=seed).summary
-    assert (summary["state"], summary["placed"], summary["targets"]) == ("DONE", 7, 7)
+    assert summary["state"] == "DONE"
     assert summary["truth"] == {"in_box": 7, "on_table": 0, "elsewhere": 0, "containers": {"box": 7}}
 
 

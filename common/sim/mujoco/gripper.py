@@ -38,6 +38,7 @@ class PhysicsFingers:
         """Drive the fingers of this model from here on."""
         name = self._config.joints[0]
         self._cell, self._data = cell, data
+        self._slope = width_slope(self._config, float(data.qpos[cell.joints[name]]))
         self._qpos, self._dof, self._actuator = cell.joints[name], cell.dofs[name], cell.actuators[name]
 
     def command(self, width: float, now: float, effort: float) -> None:
@@ -68,7 +69,7 @@ class PhysicsFingers:
         """Give the servo its set-point before a step."""
         wanted = self._profile.read(now)
         width, rate = (self._target, 0.0) if self._at_once else (wanted.width, wanted.velocity)
-        slope = width_slope(self._config, float(self._data.qpos[self._qpos]))
+        slope = self._slope
         effort = self._effort if self._target < self._width else self._config.max_effort
         limit_force(self._cell.model, self._actuator, effort * abs(slope))
         self._data.ctrl[self._actuator] = driven_position(self._config, width) + FINGER_LEAD * rate / slope
@@ -76,7 +77,7 @@ class PhysicsFingers:
     def sense(self, now: float) -> None:
         """Read the joint after steps: whether they move, and press on something."""
         position = float(self._data.qpos[self._qpos])
-        slope = width_slope(self._config, position)
+        self._slope = slope = width_slope(self._config, position)
         self._width = min(max(width_at(self._config, position), 0.0), self._config.max_width)
         self._rate = slope * float(self._data.qvel[self._dof])
         self._force = abs(float(self._data.actuator_force[self._actuator]) / slope)

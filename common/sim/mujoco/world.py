@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 MOST_CAUGHT_UP = 2.0  # [s] of a hold-up; what is longer, the world has stood still
 TOLD = 0.05  # [s] between changes that are told of while something moves
 SLIPPERY = 0.5  # [s] fingers do not touch what a person lets slip
+QUIET = 1e-6  # [m] or of a quaternion: nothing has moved since the last look
 ASLEEP = 1e-3  # [m/s] or [rad/s]: velocities below are not kept over a restart
 
 
@@ -67,6 +68,7 @@ class PhysicsWorld(News):
         self._told_at = -math.inf
         self._cell: CellModel | None = None
         self._data: mujoco.MjData
+        self._touching: tuple[set[str], set[str], set[str]] | None = None
 
     # --- the arm ---
 
@@ -108,6 +110,8 @@ class PhysicsWorld(News):
             _copy(*before, cell, data)
         mujoco.mj_forward(cell.model, data)
         self._cell, self._data, self._contacts = cell, data, Contacts(cell, self._robot)
+        self._qpos = np.array([at for place in cell.things.values() for at in range(place.qpos, place.qpos + 7)], int)
+        self._touching, self._looked_at = None, np.full(len(self._qpos), np.inf)
         self._arm.attach(cell, data)
 
     # --- time ---
@@ -135,7 +139,12 @@ class PhysicsWorld(News):
         contacts = self._contacts.look(data)
         bodies = self._paper.bodies
         self._watch.look(now, contacts, bodies)
-        due = now - self._told_at >= TOLD
+        places = data.qpos[self._qpos]
+        if contacts == self._touching and not self._taken and np.abs(places - self._looked_at).max(initial=0.0) < QUIET:
+            return
+        self._touching, due = contacts, now - self._told_at >= TOLD
+        if due:  # else the next look tells of it
+            self._looked_at = places
         for name, body in bodies.items():
             T = straightened(cell.pose_of(data, name))
             state, container = self._watch.state_of(body, T, name in contacts[2])
