@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from functools import lru_cache
 
 import cv2
@@ -10,6 +11,7 @@ import cv2
 from common import topics
 from common.applications.pick_place.annotation import annotate
 from common.applications.pick_place.detector import Detection, Detector, DetectorOptions
+from common.applications.pick_place.odd import Odd
 from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common.applications.pick_place.tracks import Place
 from common.config import Surroundings
@@ -31,9 +33,13 @@ class Config(DetectorOptions):
 
 
 def markers(
-    detections: list[Detection], around: Surroundings, stamp: int, remark: str = "", blind: str = ""
+    detections: list[Detection], around: Surroundings, stamp: int, remark: str = "", blind: str = "",
+    odd: Sequence[Odd] = (),
 ) -> MarkerArray:
-    """The message of what was found in the frame that was exposed at `stamp`, or of why that tells nothing."""
+    """The message of what was found in the frame that was exposed at `stamp`, or of why that tells nothing.
+
+    What is `odd` is among it with the reason as its text: it stands in the way, and is not to be taken.
+    """
     return MarkerArray(
         header=Header(stamp=stamp, frame_id=WORLD),
         remark=remark,
@@ -41,19 +47,23 @@ def markers(
         markers=[
             _marker(index, d.position, d.pixel, d.partial, around.ball_radius, around.ball_color)
             for index, d in enumerate(detections)
+        ] + [
+            _marker(len(detections) + index, one.position, one.pixel, False, around.ball_radius, around.ball_color,
+                    one.reason)
+            for index, one in enumerate(odd)
         ],
     )
 
 
 @lru_cache(maxsize=64)  # what lies still is described once
 def _marker(
-    index: int, position: Place, pixel: tuple[float, float], partial: bool, radius: float, color: Rgb
+    index: int, position: Place, pixel: tuple[float, float], partial: bool, radius: float, color: Rgb, odd: str = "",
 ) -> Marker:
     x, y, z = position
     return Marker(
         ns="ball", id=index, type="sphere", pose=Pose(position=Vector3(x=x, y=y, z=z)),
         scale=Vector3(x=2 * radius, y=2 * radius, z=2 * radius), color=Color(r=color[0], g=color[1], b=color[2]),
-        pixel=pixel, partial=partial,
+        pixel=pixel, partial=partial, text=odd,
     )
 
 
@@ -86,7 +96,7 @@ async def run(bus: Bus, config: Config) -> None:
                 continue
             detections = detector.detect(picture, camera)
             remark = _remark(detector, bus.service)
-            found.put(markers(detections, config.world, image.header.stamp, remark, detector.blind))
+            found.put(markers(detections, config.world, image.header.stamp, remark, detector.blind, detector.odd))
             if shown.matched:
                 shown.put(array_to_image(annotate(picture, detections), "bgr8", image.header))
             if masks.matched:

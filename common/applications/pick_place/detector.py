@@ -12,6 +12,17 @@ from pydantic import Field, model_validator
 from common.applications.pick_place.blobs import Blob, Mask, Outline, Traced, find_blobs, small_blobs
 from common.applications.pick_place.fit import fit_each, fit_spheres
 from common.applications.pick_place.masks import Colours, Masks
+from common.applications.pick_place.odd import (
+    EXPLAINED,
+    FLAT,
+    MOST_OVAL,
+    MOST_UNLIKE,
+    NOT_ROUND,
+    Odd,
+    oval,
+    sized,
+    unlike,
+)
 from common.applications.pick_place.resting import Resting
 from common.applications.pick_place.separation import separate
 from common.config import Parameters, Surroundings, Tunable
@@ -45,7 +56,7 @@ class DetectorOptions(Parameters):
         -1.0, ge=-10, le=10, description="where the outline is expected, outside of the silhouette [px]"
     )
     max_offset_px: Tunable[float] = Field(
-        2.0, gt=0, le=20, description="an outline that is further from where it is expected is not that of a ball [px]"
+        1.5, gt=0, le=20, description="an outline that is further from where it is expected is not that of a ball [px]"
     )
 
     @model_validator(mode="after")
@@ -89,6 +100,7 @@ class _Round(NamedTuple):
     center: Array
     offset: float
     close: float  # part of the outline that fits
+    oval: float  # by which it is longer one way [m]
 
 
 class Detector:
@@ -107,6 +119,7 @@ class Detector:
         self._outlines: dict[Traced, Outline] = {}  # of the last picture: what is there again is not worked out again
         self._fits: dict[_Key, list[_Round]] = {}
         self.blind = ""  # why the last picture tells nothing
+        self.odd: list[Odd] = []  # what is red in the last picture and no ball on the table
         self.too_small = 0  # blobs in the last picture that were not looked at, but for those in the container
         self._last: tuple[Mask, Pinhole, DetectorOptions, list[Detection]] | None = None
 
@@ -142,6 +155,7 @@ class Detector:
         pixel_size = abs(float(camera.position[2]) - self.resting.plane) / camera.fx  # at the plane of the balls
         offset = self.options.outline_offset_px * pixel_size
         seen: list[_Seen] = []
+        self.odd = []
         alone, crowded, offsets = self._alone(blobs, camera, offset, pixel_size)
         seen += alone
         # All outlines of a picture are off by as much: balls that stand alone say by how much.
@@ -152,7 +166,14 @@ class Detector:
             centers = separate(blob.outline, closed, camera, self.resting, offset)
             if len(centers):
                 fit = fit_spheres(blob.outline, centers, self.resting.radius, offset=offset, offset_std=spread)
+                if not self._is_explained(blob, fit.owner, camera):
+                    self.odd += [self._odd(camera.project(center + camera.position), camera, NOT_ROUND)
+                                 for center in fit.centers]
+                    continue
                 seen += [_Seen(center, blob.area / len(centers), blob.border) for center in fit.centers]
+            elif not len(blob.border):
+                self.odd.append(self._odd(blob.centroid, camera, NOT_ROUND))
+        self.odd = [one for one in self.odd if not self.resting.shows_container(camera, one.pixel)]
         return sorted(self._detections(seen, camera), key=lambda d: (d.pixel[1], d.pixel[0]))
 
     def _alone(
@@ -185,10 +206,12 @@ class Detector:
                 [outline for outline, _, _ in fitted], np.array([start for _, _, start in fitted]), self.resting.radius,
                 offset=offset, gates=(self.resting.radius, 4 * pixel_size, 3 * pixel_size), close=1.3 * pixel_size,
             )
-            for (_, key, _), center, off, close in zip(fitted, *found, strict=True):
-                fits[key].append(_Round(center, float(off), float(close)))
+            for (outline, key, _), center, off, close in zip(fitted, *found, strict=True):
+                longer = oval(outline, center, camera) if close >= _ROUND else 0.0
+                fits[key].append(_Round(center, float(off), float(close), longer))
         self._fits = fits
-        alone, offsets = [], []
+        alone: list[_Seen] = []
+        offsets: list[float] = []
         for blob, key in tried:
             if not (tries := fits[key]):
                 continue
@@ -196,10 +219,29 @@ class Detector:
                 crowded.append(blob)
                 continue
             best = min(tries, key=lambda one: abs(one.offset - offset))
-            if abs(best.offset - offset) <= self.options.max_offset_px * pixel_size:
+            if abs(best.offset - offset) > self.options.max_offset_px * pixel_size:
+                self.odd.append(self._odd(blob.centroid, camera, sized(best.offset, offset)))
+            elif best.oval > MOST_OVAL * pixel_size and not self.resting.shows_container(camera, blob.centroid):
+                self.odd.append(self._odd(blob.centroid, camera, FLAT))
+            else:
                 alone.append(_Seen(best.center, blob.area, blob.border))
                 offsets.append(best.offset)
+        usual = float(np.median(offsets)) if offsets else offset
+        for k in np.flatnonzero(unlike(np.array(offsets), MOST_UNLIKE * pixel_size))[::-1].tolist():
+            pixel = camera.project(alone[k].center + camera.position)
+            if not self.resting.shows_container(camera, pixel):
+                self.odd.append(self._odd(pixel, camera, sized(offsets[k], usual)))
+                del alone[k], offsets[k]
         return alone, crowded, offsets
+
+    def _is_explained(self, blob: Blob, owner: npt.NDArray[np.intp], camera: Pinhole) -> bool:
+        """Whether a blob is nothing but its balls; one that is cut off or in the container may be."""
+        if len(blob.border) or self.resting.shows_container(camera, blob.centroid):
+            return True
+        return float(np.mean(owner >= 0)) >= EXPLAINED
+
+    def _odd(self, pixel: Array, camera: Pinhole, reason: str) -> Odd:
+        return Odd.at(camera, pixel, self.resting.plane, reason)
 
     def _detections(self, seen: list[_Seen], camera: Pinhole) -> list[Detection]:
         if not seen:

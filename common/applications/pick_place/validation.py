@@ -117,6 +117,8 @@ class Validation:
         pixel = marker.pixel if marker.pixel is not None else camera.project(place)
         if self._resting.shows_container(camera, pixel):
             return place, INSIDE_CONTAINER
+        if marker.text:  # the detector says why it is nothing to be taken
+            return place, marker.text
         return place, PARTLY_OUT_OF_VIEW if marker.partial else self._reach.known(place)
 
     def _tell(self, verdict: Verdict, place: Place, reason: str, stamp: int) -> None:
