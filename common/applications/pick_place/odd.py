@@ -1,7 +1,7 @@
 """What has the colour of balls and is none that lies on the table: told by its outline and by how large it looks.
 
 The outline of a sphere of known size at a known place is known; that of a cube or a cable is another one. A disc, such
-as the picture of a ball on a sheet, is seen as an ellipse of another shape the further it is off the axis of the camera;
+as the picture of a ball on a sheet, is seen as an ellipse of another shape the further it is off the axis of a camera;
 straight below it cannot be told from a ball. A ball on top of something looks larger than one on the table.
 """
 
