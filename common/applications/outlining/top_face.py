@@ -33,6 +33,7 @@ MARGIN = 12  # of the cut about a contour [px]
 AROUND = 4  # the object about a hole is looked at so far from its edge [px]
 INWARDS = 0.75  # from a point of a sub-pixel contour to the pixel of the object beside it [px]
 OUTSIDE = 3.0  # the height beside an object is looked at so far from its contour [px]
+FRAYED = 2  # cameras that measure depth by a pattern lose it so far from an edge [px]: what is beside it stands for it
 HIGHEST = 98  # percentile of the heights in a contour that lies on the top face
 SHORT = 0.3  # upright edges that are seen shorter than this are not looked for [px]
 SQUARE = np.ones((3, 3), np.uint8)
@@ -44,7 +45,7 @@ class TopFaceOptions(Parameters):
     top_tolerance: Tunable[float] = Field(
         0.002, gt=0, le=0.1, description="heights that differ by less are one face [m]; grows with the depth's noise"
     )
-    max_invalid: Tunable[float] = Field(0.05, ge=0, le=1, description="part of a contour that may lack depth")
+    max_invalid: Tunable[float] = Field(0.05, ge=0, le=1, description="part of a contour that may lack depth nearby")
     rounding: Tunable[float] = Field(
         0.0, ge=0, le=0.1, description="points are rounded to multiples of this [m]; 0: not at all"
     )
@@ -95,17 +96,20 @@ def top_face(
     out = normals(contour, hole=hole)
     inwards = 0.0 if _to_the_pixel(contour) else INWARDS
     cells = np.clip(np.rint(contour - inwards * out).astype(int), 0, (width - 1, height - 1))
-    filled = int(np.count_nonzero(~is_valid(depth[cells[:, 1], cells[:, 0]])))
-    if filled > options.max_invalid * len(cells):
-        raise DepthError("invalid", f"{filled} of the {len(cells)} pixels of the contour have no valid depth, more "
-                                    f"than {options.max_invalid:.0%}: is the object within the camera's range?")
+    bare = ~is_valid(depth[cells[:, 1], cells[:, 0]])
+    filled = int(np.count_nonzero(bare))
     cut = _cut(cells, depth, camera, hole=hole)
     core = _core(cut.inside) & np.isfinite(cut.heights)
+    known = cv2.dilate(core.astype(np.uint8), np.ones((2 * FRAYED + 1,) * 2, np.uint8)) > 0
+    lost = int(np.count_nonzero(bare & ~known[tuple((cells - cut.low).T[::-1])]))
+    if lost > options.max_invalid * len(cells):
+        raise DepthError("invalid", f"{lost} of the {len(cells)} pixels of the contour have no valid depth, more "
+                                    f"than {options.max_invalid:.0%}: is the object within the camera's range?")
     if not core.any():
         raise DepthError("nothing", "no pixel within the contour has a valid depth")
     tolerance = max(options.top_tolerance, 4 * _noise(cut.heights, core))
-    near = core if not hole else core & (cv2.dilate(cut.hole, np.ones((2 * AROUND + 1,) * 2, np.uint8)) > 0)
-    top = _plateau(cut.heights[near if near.any() else core], tolerance)
+    about = core if not hole else core & (cv2.dilate(cut.hole, np.ones((2 * AROUND + 1,) * 2, np.uint8)) > 0)
+    top = _plateau(cut.heights[about if about.any() else core], tolerance)
     beside = _heights_beside(contour, out, depth, camera)
     lower = beside[beside < top - tolerance]
     base = float(np.median(lower)) if len(lower) else None

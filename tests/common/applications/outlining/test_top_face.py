@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from common.applications.outlining.contours import ContourOptions, find_contours, is_hole
 from common.applications.outlining.top_face import TopFaceOptions, rounded, top_face
 from common.perception.depth import DepthError
+from common.sim.depth_sensor import DepthSensorParameters, measured_depth
 from common.sim.objects import world_object
 from common.sim.ray_caster import Mesh, cast, empty_view
 from common.sim.solids import fixture_mesh
@@ -108,6 +109,18 @@ def test_noise_of_the_depth_hardly_moves_the_outline():
     for face, _, true in outlines((camera, picture, noisy), [thing], FINE):
         assert distances(dense(face.outline), true).max() < 0.4e-3
         assert face.top == pytest.approx(1.2, abs=2e-4)
+
+
+@pytest.mark.parametrize("name", ["w2", "w3", "w6"])
+def test_depth_of_a_stereo_camera_with_its_frayed_edges_hardly_moves_the_outline(name):
+    camera, picture, depth = seen_world(name)
+    stereo = DepthSensorParameters(baseline=0.075)
+    measured = measured_depth(depth, camera, stereo, np.random.default_rng(1))
+    for face, thing, true in outlines((camera, picture, measured), world(name).objects, FINE):
+        assert face.filled > 0
+        assert face.top == pytest.approx(thing.base + thing.height, abs=1e-3)
+        off = distances(dense(face.outline), true)
+        assert off.max() < 0.6e-3 and off.mean() < 0.2e-3
 
 
 def contour_of(scene, mode=SEED):
