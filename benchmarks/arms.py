@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from common.config import load_cell
@@ -38,13 +38,15 @@ class Case:
     urdf: str
     gripper: str = ""
     package_dir: str = ""
+    package: tuple[str, str] = ("", "")  # a name that the description calls its package by, and where that is
 
 
 def _more(folder: Path) -> tuple[Case, ...]:
     """Those of rtb-data, whose xacro files lie in a folder."""
     kuka = f"{folder}/kuka_description"
     return (
-        Case("iiwa14", f"{kuka}/kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.urdf", GRIPPER, str(folder)),
+        Case("iiwa14", f"{kuka}/kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.urdf", GRIPPER,
+             package=("kuka_lbr_iiwa_support", f"{kuka}/kuka_lbr_iiwa")),
         Case("puma560", f"{folder}/unimation_puma560_description/urdf/puma560_robot.urdf", GRIPPER, str(folder)),
         Case("irb140", f"{folder}/abb_irb140_description/urdf/irb140.urdf", GRIPPER, str(folder)),
         *(Case(name, f"{folder}/{TROSSEN}/{name}.urdf.xacro") for name in (
@@ -73,6 +75,12 @@ CASES = (
 
 def written(case: Case, folder: Path) -> str:
     """Nothing when the robot file and the cell were written; else the line that says why not."""
+    if case.package[0]:
+        named = folder / "packages" / case.package[0]
+        named.parent.mkdir(exist_ok=True)
+        if not named.exists():
+            named.symlink_to(case.package[1])
+        case = replace(case, package_dir=str(named.parent))
     options = ["--name", case.name, "--out", str(folder / f"{case.name}.yaml"), "--yes", "--force",
                "--cell", str(folder / f"{case.name}_cell.yaml"), *(["--gripper", case.gripper] if case.gripper else []),
                *(["--package-dir", case.package_dir] if case.package_dir else [])]
