@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from common import topics
+from common.transport.bus import Bus
 from tests.simulated.visited import SimulatedCell
 
 pytest.importorskip("mujoco")
@@ -15,6 +17,20 @@ def test_table_is_cleared_by_friction_alone() -> None:
     summary = SimulatedCell("panda", [PHYSICS, "world.count=1"]).summary
     assert (summary["state"], summary["placed"]) == ("DONE", 1)
     assert summary["truth"] == {"in_box": 1, "on_table": 0, "elsewhere": 0, "containers": {"box": 1}}
+
+
+@pytest.mark.slow
+def test_executor_that_dies_with_something_in_the_hand_finds_it_there_again() -> None:
+    async def visit(cell: SimulatedCell, bus: Bus) -> None:
+        async for state in bus.reader(topics.GRIPPER_STATE):
+            if state.holding and state.outcome == "grasped":
+                break
+        await bus.clock.sleep(1.0)  # on its way
+        cell.kill("trajectory_executor")
+
+    summary = SimulatedCell("panda", [PHYSICS, "world.count=1"], visit=visit).summary
+    assert summary["restarts"] == {"trajectory_executor": 1}
+    assert (summary["state"], summary["truth"]["in_box"]) == ("DONE", 1)
 
 
 @pytest.mark.slow

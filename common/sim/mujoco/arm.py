@@ -13,6 +13,7 @@ from common.sim.mujoco.gripper import PhysicsFingers
 from common.sim.mujoco.model import CellModel
 from common.sim.mujoco.servo import LEAD
 
+ENCODER = 6  # decimals of what is measured [rad], [rad/s]
 GOES_ON = 0.1  # [s] a set-point that is older stands still
 
 
@@ -40,7 +41,8 @@ class PhysicsArm:
     def read(self, now: float) -> tuple[Vector, Vector]:
         """Measured positions (dof,) [rad] and velocities (dof,) [rad/s] at a time that does not go back."""
         self._advance(now)
-        return np.array(self._data.qpos[self._qpos]), np.array(self._data.qvel[self._dofs])
+        q, dq = self._data.qpos[self._qpos], self._data.qvel[self._dofs]
+        return np.round(q, ENCODER) + 0.0, np.round(dq, ENCODER) + 0.0  # no negative zeros: at rest nothing changes
 
     def write(self, positions: Vector, velocities: Vector, now: float) -> None:
         """Head for the set-points, which go on with their velocities until there are new ones."""

@@ -13,6 +13,7 @@ from common.robot.finger_joints import driven_position, finger_positions, width_
 from common.sim.mujoco.model import CellModel
 from common.sim.mujoco.servo import FINGER_LEAD, limit_force, width_slope
 
+ENCODER = 5  # decimals of what is measured [m], [m/s]
 STILL = 2e-3  # [m/s] fingers that are slower stand
 SHORT = 3e-3  # [m] from the width that they were told, or nearer: they are there
 STALLS = 0.05  # [s] so long they stand short of it, and press then
@@ -53,7 +54,8 @@ class PhysicsFingers:
 
     def read(self, now: float) -> GripperReading:
         """As measured after the last step."""
-        return GripperReading(self._width, self._rate, self._moves, self._holds, self._force if self._holds else 0.0)
+        width, rate = round(self._width, ENCODER), round(self._rate, ENCODER)
+        return GripperReading(width, rate, self._moves, self._holds, round(self._force, 1) if self._holds else 0.0)
 
     def place(self, width: float) -> None:
         """Stand at a width [m] at once."""

@@ -127,6 +127,17 @@ def test_still_arm_stays_where_it_is_against_gravity() -> None:
     assert q == pytest.approx(rig.robot.named("home"), abs=1e-3) and np.abs(dq).max() < 1e-3
 
 
+def test_at_rest_nothing_that_is_measured_changes() -> None:
+    rig = Rig(BALL)
+    rig.wait(0.5)
+    readings = set()
+    for _ in range(50):
+        rig.now += PERIOD
+        q, dq = rig.arm.read(rig.now)
+        readings.add((q.tobytes(), dq.tobytes(), rig.fingers.read(rig.now)))
+    assert len(readings) == 1
+
+
 def test_grasp_lifts_by_friction_and_drops_what_is_let_go() -> None:
     rig = Rig(BALL)
     rig.move(rig.above(0.45, 0.0, 0.1))
