@@ -29,6 +29,7 @@ def checked(topic: AnyTopic | None, key: str, body: str) -> Any:
     """
     from common.config import check
     from common.messages.schema import from_json
+    from common.topics import Topic
 
     try:
         given = from_json(json.loads(body))
@@ -37,7 +38,8 @@ def checked(topic: AnyTopic | None, key: str, body: str) -> Any:
     if topic is None:
         return given
     if not isinstance(given, dict):
-        raise ConfigError(key, body, f"must be a JSON object, a {topic.message.__name__}")
+        what = f", a {topic.message.__name__}" if isinstance(topic, Topic) else ""
+        raise ConfigError(key, body, f"must be a JSON object{what}")
     if "header" in topic.message.model_fields:
         given.setdefault("header", {})
     return check(topic.message, given, key)
