@@ -17,13 +17,16 @@ from common.robot.model import RobotModel
 Array = NDArray[np.float64]
 Reason = Literal["Adjacent", "Fixed", "Always", "Never"]
 
+MOSTLY = 0.95  # of the samples
+
 
 @dataclass(frozen=True)
 class DisabledPair:
     """Two links that are not checked, and why.
 
     Adjacent: a joint connects them. Fixed: no joint of the group moves one against the other. Always: they touch
-    wherever the robot is. Never: they came no closer than the margin at any sample.
+    wherever the robot is; on both sides of one joint nearly wherever it is, as hulls of a wrist do that lie in each
+    other. Never: they came no closer than the margin at any sample.
     """
 
     one: str
@@ -62,16 +65,23 @@ def disabled_pairs(
     generator = rng if rng is not None else np.random.default_rng(0)
     configurations = sampled(robot, samples, generator)
     close = _hits(model, geometry, configurations, margin)
+
+    def least(pair: tuple[str, str]) -> float:
+        """The share of samples at which a pair must touch to be called always touching."""
+        one, other = (bodies[link] for link in pair)
+        return MOSTLY if robot.model.parents[one] == other or robot.model.parents[other] == one else 1.0
+
     columns = {pair: [k for k, other in enumerate(between) if other == pair] for pair in between}
     suspects = []
     for pair, mine in columns.items():
         if not close[:, mine].any():
             found[pair] = "Never"
-        elif close[:, mine].any(axis=1).all():
+        elif close[:, mine].any(axis=1).mean() >= least(pair):
             suspects.append(pair)
     if suspects:
         touching = _hits(model, geometry, configurations, 0.0)
-        found.update({pair: "Always" for pair in suspects if touching[:, columns[pair]].any(axis=1).all()})
+        found.update({pair: "Always" for pair in suspects
+                      if touching[:, columns[pair]].any(axis=1).mean() >= least(pair)})
     return [DisabledPair(one, other, found[one, other])
             for i, one in enumerate(links) for other in links[i + 1:] if (one, other) in found]
 

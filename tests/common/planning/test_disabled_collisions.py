@@ -107,3 +107,29 @@ def test_srdf_names_groups_and_poses_and_is_taken_by_the_planner(tmp_path):
     everything = RobotModel.load(ROBOT.config.model_copy(update={"srdf": ""}))
     counts = [len(RobotGeometry(robot).geometry.collisionPairs) for robot in (reduced, everything)]
     assert counts[0] < counts[1]
+
+
+def _wrist(gap: float) -> str:
+    """A box before a joint and a wall behind it, `gap` [m] apart where it is at 0: they meet when it turns."""
+    def link(name: str, at: str, size: str) -> str:
+        shape = f'<origin xyz="{at}"/><geometry><box size="{size}"/></geometry>'
+        return f'<link name="{name}"><collision>{shape}</collision></link>'
+
+    def joint(name: str, parent: str, child: str, kind: str = "revolute") -> str:
+        return (f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+                '<axis xyz="0 0 1"/><limit lower="-1.5" upper="1.5" velocity="1" effort="1"/></joint>')
+
+    return "".join([
+        '<robot name="r"><link name="base"/>', joint("a", "base", "arm"), link("arm", "0 0 0", "0.1 0.02 0.02"),
+        joint("b", "arm", "hand"), link("hand", "0 0 0.03", "0.02 0.02 0.01"),
+        joint("on", "hand", "wall", "fixed"), link("wall", f"0 {0.011 + gap} 0", "0.1 0.002 0.08"), "</robot>"])
+
+
+@pytest.mark.parametrize(("gap", "reason"), [(0.0002, "Always"), (0.02, None)])
+def test_neighbours_that_touch_nearly_everywhere_are_left_out_and_others_stay_checked(gap, reason, tmp_path):
+    (tmp_path / "r.urdf").write_text(_wrist(gap))
+    robot = RobotModel.load(RobotConfig.model_validate({
+        "name": "r", "urdf": str(tmp_path / "r.urdf"), "joints": ["a", "b"], "base_link": "base", "tcp_link": "hand",
+        "acceleration_limits": [1, 1], "jerk_limits": [1, 1], "named_poses": {"home": [0, 0]}}))
+    found = {frozenset((p.one, p.other)): p.reason for p in disabled_pairs(robot, samples=400)}
+    assert found.get(frozenset(("arm", "wall"))) == reason
