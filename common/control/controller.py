@@ -35,6 +35,7 @@ USUAL = 0.2  # of what is usual is how it was the last time
 LATER = 0.1  # cell time that an arm behind its set-points may be later than that: hosts and networks are no clocks [s]
 RESEATED = 1.0  # cell time between two takings of an arm that was moved from outside: oftener it is not held [s]
 RAMP_SHARE = 0.95  # of the accelerations is for going on: the rest is for what differences see of a bend
+JERK_SHARE = 0.85  # the same of jerk, also in a stop: where the rate turns, that of the path comes on top
 BEHIND = 1e-3  # [rad] between path and set-point, at which the goal's time stands still
 ARRIVED = 1e-6  # [rad] nearer, the set-point is on the path
 LONG = 3000  # points and samples of a trajectory, which cost a few milliseconds
@@ -300,7 +301,8 @@ class TrajectoryController:
         goal.time = goal.pace.advance(
             goal.at, goal.time, 0.0 if braking else self.speed_scaling * goal.share * waiting,
             min(max(now - goal.last, 0.0), most),
-            self._limits.braking if braking else RAMP_SHARE * self._limits.acceleration, self._limits.jerks,
+            self._limits.braking if braking else RAMP_SHARE * self._limits.acceleration,
+            JERK_SHARE * self._limits.jerks,
         )
         goal.last = now
         self._hold, change = goal.at(goal.time)

@@ -1,0 +1,60 @@
+"""Jerk of what is executed, by differences from cycle to cycle: of stops, holds and changes of speed in mid-motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ruckig
+
+from common.control.controller import PERIOD, TrajectoryController
+from common.control.limiter import SLACK
+from common.hardware.interface import Limits
+from common.messages import JointTrajectory, JointTrajectoryPoint
+
+DOF = 6
+LIMITS = Limits(  # those of an arm whose jerk is what binds it
+    tuple(f"j{n}" for n in range(DOF)), np.full(DOF, -6.0), np.full(DOF, 6.0), np.full(DOF, 3.0), np.full(DOF, 5.0),
+    np.full(DOF, 10.0), np.full(DOF, 500.0))
+
+
+def motion(rng: np.random.Generator) -> JointTrajectory:
+    """As fast as the limits allow from a place to another."""
+    given, way = ruckig.InputParameter(DOF), ruckig.Trajectory(DOF)
+    given.current_position, given.target_position = rng.uniform(-2, 2, DOF).tolist(), rng.uniform(-2, 2, DOF).tolist()
+    given.max_velocity, given.max_acceleration = LIMITS.velocity.tolist(), LIMITS.acceleration.tolist()
+    given.max_jerk = LIMITS.jerks.tolist()
+    ruckig.Ruckig(DOF).calculate(given, way)
+    points = []
+    for time in [*np.arange(0.0, way.duration - PERIOD / 2, PERIOD), way.duration]:
+        q, dq, ddq = way.at_time(time)
+        points.append(JointTrajectoryPoint(time_from_start=time, positions=q, velocities=dq, accelerations=ddq))
+    return JointTrajectory(joint_names=list(LIMITS.names), points=points)
+
+
+@pytest.mark.parametrize(("event", "over"), [("stop", SLACK), ("hold", SLACK), ("held", 0.2), ("speed", 0.2)])
+def test_jerk_limits_hold_in_a_stop_and_nearly_where_the_speed_comes_back(event: str, over: float) -> None:
+    for seed in range(20, 28):
+        rng = np.random.default_rng(seed)
+        planned = motion(rng)
+        q = np.array(planned.points[0].positions)
+        controller, now, dq, sent = TrajectoryController(LIMITS, q), 100.0, 0 * q, [q] * 4
+        controller.update(now, q, dq)
+        assert controller.accept("a", planned, now, q).state == "active"
+        at = rng.integers(10, int(0.9 * planned.points[-1].time_from_start / PERIOD))
+        for cycle in range(400):
+            now += PERIOD
+            if cycle == at and event == "stop":
+                controller.cancel("a", "enough", now)
+            elif cycle == at and event in ("hold", "held"):
+                controller.hold(True, "wait")
+            elif cycle == at + 50 and event == "held":
+                controller.hold(False, "go on")
+            elif cycle in (at, at + 50) and event == "speed":
+                controller.speed_scaling = 0.3 if cycle == at else 1.0
+            set_point = controller.update(now, q, dq)
+            assert set_point is not None
+            q, dq = set_point
+            sent.append(q)
+        assert controller.at_rest
+        jerk = np.abs(np.diff(sent, n=3, axis=0)) / PERIOD**3
+        assert jerk.max() <= LIMITS.jerks[0] * (1 + over), (seed, jerk.max())
