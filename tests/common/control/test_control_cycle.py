@@ -364,7 +364,8 @@ def test_what_takes_long_in_the_world_is_left_to_others_and_the_arm_goes_on(rig,
     before = len(rig.joints)
     with monkeypatch.context() as patched:
         for name in ("tick", "obstruction", "objects", "take_events", "standing"):
-            patched.delattr(KinematicWorld, name)  # nothing of it is asked meanwhile
+            owner = next(made for made in KinematicWorld.__mro__ if name in vars(made))
+            patched.delattr(owner, name)  # nothing of it is asked meanwhile
         rig.run(0.2)
         assert len(rig.joints) == before + 20 and rig.cycle.standing() is None
     rig.cycle.due()
