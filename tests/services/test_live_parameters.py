@@ -367,7 +367,7 @@ async def test_the_next_outline_is_rounded_and_cleared_as_it_is_said_now(tmp_pat
 async def test_the_next_trace_keeps_the_standoff_and_speed_of_now(tmp_path: Path) -> None:
     async with Running("contour_tracer", tmp_path) as service:
         trace = (await service.turn()).goal
-        assert (trace.waypoints[0].position.z, trace.tool_speed) == (1.1, 0.05)
+        assert (trace.waypoints[0].position.z, trace.tool_speed) == (1.102, 0.05)
         await service.tune(standoff=0.02, tool_speed=0.1, step=0.002)
         trace = (await service.turn()).goal
         assert (trace.waypoints[0].position.z, trace.tool_speed, trace.step) == (1.12, 0.1, 0.002)
