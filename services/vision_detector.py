@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import lru_cache
 
 import cv2
+from pydantic import Field
 
 from common import topics
 from common.applications.pick_place.annotation import annotate
@@ -16,13 +19,17 @@ from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IM
 from common.applications.pick_place.tracks import Place
 from common.config import Surroundings
 from common.config.basics import Rgb
-from common.messages import Color, Header, Marker, MarkerArray, Pose, Vector3
+from common.messages import Color, Header, Image, Marker, MarkerArray, Pose, Vector3
+from common.perception.depth import Depth, DepthError, check_depth, depth_of
 from common.perception.image import array_to_image
 from common.perception.intake import LeftOut, Unusable, picture_of
+from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.service import main
 from common.transport.bus import Bus
 
+KEPT = 5  # depth images that wait for their pictures
+PATIENCE = 0.3  # [s, wall time] for which a picture waits for its depth
 WORLD = "world"
 
 
@@ -30,6 +37,8 @@ class Config(DetectorOptions):
     """How red is told from the rest."""
 
     world: Surroundings
+    depth: bool = Field(False, description="pictures come with depth, on depth_camera/depth/image_raw: balls are where "
+                                           "that shows them, on others too")
 
 
 def markers(
@@ -82,19 +91,48 @@ async def run(bus: Bus, config: Config) -> None:
     found, shown = bus.writer(DETECTED_OBJECTS), bus.writer(DETECTION_IMAGE)
     masks = bus.writer(DETECTION_MASK)
     cv2.setNumThreads(1)  # the other cores have other services
+    depths = bus.reader(topics.DEPTH_CAMERA_DEPTH) if config.depth else None
+    kept: deque[Image] = deque(maxlen=KEPT)
+    news = asyncio.Event()
     detector = Detector(config.world, config)
     left_out = LeftOut(bus.log, "a picture")
     await bus.ready()
+
+    async def watch_depths() -> None:
+        if depths is not None:
+            async for depth in depths:
+                kept.append(depth)
+                news.set()
+
+    async def depth_with(stamp: int, camera: Pinhole) -> Depth:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(PATIENCE):
+                while all(one.header.stamp != stamp for one in kept):
+                    news.clear()
+                    await news.wait()
+        found = next((one for one in kept if one.header.stamp == stamp), None)
+        if found is None:
+            raise Unusable("depth", "no depth image of the same time came")
+        depth = depth_of(found)
+        try:
+            check_depth(depth, camera.width, camera.height)
+        except DepthError as error:
+            raise Unusable(error.kind, str(error)) from None
+        return depth
 
     async def look() -> None:
         async for image in images:
             try:
                 camera = await cameras.of(image.header)
                 picture = picture_of(image, camera)
+                depth = await depth_with(image.header.stamp, camera) if config.depth else None
             except Unusable as error:
                 left_out.note(error)
                 continue
-            detections = detector.detect(picture, camera)
+            if depth is None:
+                detections = detector.detect(picture, camera)
+            else:
+                detections = await asyncio.to_thread(detector.detect_in_depth, picture, depth, camera)
             remark = _remark(detector, bus.service)
             found.put(markers(detections, config.world, image.header.stamp, remark, detector.blind, detector.odd))
             if shown.matched:
@@ -104,6 +142,7 @@ async def run(bus: Bus, config: Config) -> None:
 
     async with asyncio.TaskGroup() as group:
         group.create_task(cameras.follow())
+        group.create_task(watch_depths())
         group.create_task(look())
 
 

@@ -112,6 +112,17 @@ def small_blobs(closed: Mask, min_area: float) -> list[tuple[float, float]]:
     return [(float(u), float(v)) for u, v in small]
 
 
+def middles(closed: Mask, min_area: float) -> list[tuple[tuple[float, float], Contour]]:
+    """Blobs of at least `min_area` [px^2] in the closed mask: the middle (u, v) [px] and the outer edge of each."""
+    outer, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    found = []
+    for contour in outer:
+        if cv2.contourArea(contour) >= min_area:
+            u, v = np.asarray(contour).reshape(-1, 2).mean(axis=0).tolist()
+            found.append(((float(u), float(v)), np.asarray(contour, np.int32)))
+    return found
+
+
 def _off_border(pixels: Array, camera: Pinhole) -> npt.NDArray[np.bool_]:
     u, v = pixels[:, 0], pixels[:, 1]
     clear: npt.NDArray[np.bool_] = (u >= 1) & (u <= camera.width - 2) & (v >= 1) & (v <= camera.height - 2)

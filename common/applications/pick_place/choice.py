@@ -23,6 +23,7 @@ Spots = list[tuple[float, float]]
 YawRange = tuple[float, float]  # its middle, and how far it reaches to either side [rad]
 FULL = "the container is full"
 FINE = 36  # yaws in half a turn at which it is looked whether the hand is clear
+TIPS = 0.012  # [m] by which finger tips reach below the middle of what they grip
 SAME_PLACE = 0.02  # [m] what is hidden and a track that is nearer are one object
 SETTLING = 1.5  # [s] from letting go until the ball lies in the container and was seen there
 
@@ -163,10 +164,12 @@ class Choice:
         full = self._is_full(view, bool(under_way))
         if not full:  # it was emptied, or only expected to be full
             self._given_up = [g for g in self._given_up if g.reason != FULL]
-        candidates = [ball for ball in view.balls() if self._is_open(ball, view, under_way)]
+        balls = view.balls()
+        candidates = [ball for ball in balls if self._is_open(ball, view, under_way) and not lies_below(ball, balls)]
         candidates.sort(key=lambda ball: math.dist(ball.position[:2], origin[:2]))
         for ball in candidates:
-            others = [(*b.position[:2], b.radius) for b in view.others(ball, self.radius)]
+            others = [(*b.position[:2], b.radius) for b in view.others(ball, self.radius)
+                      if b.position[2] + b.radius > ball.position[2] - TIPS]
             flat = yaws_of(ball, self.p.hand)
             yaws = grasp_yaws(self.p.hand, ball.position, others, self.radius, self.container, flat)
             if full:
@@ -237,8 +240,17 @@ class Choice:
 
 
 def same_place(a: Place, b: Place, radius: float) -> bool:
-    """Whether two places are of one ball: two balls are never closer than their diameter."""
-    return math.dist(a[:2], b[:2]) < radius
+    """Whether two places are of one ball: two balls are never closer than their diameter, one above the other too."""
+    return math.dist(a[:2], b[:2]) < radius and abs(a[2] - b[2]) < radius
+
+
+def lies_below(ball: Target, balls: Sequence[Target]) -> bool:
+    """Whether another one lies on a ball: that is taken first."""
+    x, y, z = ball.position
+    return any(
+        b.position[2] - z > 0.5 * ball.radius and math.dist(b.position[:2], (x, y)) < 0.98 * (b.radius + ball.radius)
+        for b in balls
+    )
 
 
 def finger_clearance(

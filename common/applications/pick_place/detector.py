@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from common.applications.pick_place.blobs import Blob, Mask, Outline, Traced, find_blobs, small_blobs
+from common.applications.pick_place.blobs import Blob, Mask, Outline, Traced, find_blobs, middles, small_blobs
+from common.applications.pick_place.depth_balls import find_in_depth
 from common.applications.pick_place.fit import fit_each, fit_spheres
 from common.applications.pick_place.masks import Colours, Masks
 from common.applications.pick_place.odd import (
@@ -26,6 +28,7 @@ from common.applications.pick_place.odd import (
 from common.applications.pick_place.resting import Resting
 from common.applications.pick_place.separation import separate
 from common.config import Parameters, Surroundings, Tunable
+from common.perception.depth import Depth
 from common.perception.exposure import blindness
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouettes
@@ -142,6 +145,27 @@ class Detector:
         self.blind = "" if found else blindness(picture)
         self._last = (closed, camera, self.options.model_copy(), found)
         return list(found)
+
+    def detect_in_depth(self, picture: Picture, depth: Depth, camera: Pinhole) -> list[Detection]:
+        """The same by a picture with depth (height, width) [m]: balls are where they are, on the table or on others."""
+        fine, closed = self.masks(picture)
+        centers = find_in_depth(fine, depth, camera, self.resting.radius)
+        found = []
+        if len(centers):
+            pixels, outlines = camera.project(centers), silhouettes(camera, centers, self.resting.radius, 32)
+            inside = np.asarray(camera.in_picture(outlines).all(axis=1))
+            area = cv2.countNonZero(fine) / len(centers)
+            for center, pixel, outline, whole in zip(centers.tolist(), pixels.tolist(), outlines, inside, strict=True):
+                place, seen = (center[0], center[1], center[2]), (pixel[0], pixel[1])
+                found.append(Detection(place, seen, area, not whole, outline))
+        self.odd = [
+            self._odd(np.array(middle), camera, NOT_ROUND)
+            for middle, contour in middles(closed, self.options.min_contour_area_px)
+            if not any(cv2.pointPolygonTest(contour, one.pixel, False) >= 0 for one in found)
+            and not self.resting.shows_container(camera, middle)
+        ]
+        self.blind, self.too_small = "" if found else blindness(picture), 0
+        return sorted(found, key=lambda d: (d.pixel[1], d.pixel[0]))
 
     def _look_at(self, fine: Mask, closed: Mask, camera: Pinhole) -> list[Detection]:
         if self._last is None or camera is not self._last[1]:

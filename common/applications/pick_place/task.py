@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from common import messages as m
-from common.applications.pick_place.choice import Choice, Pick, PickPlaceView, Spots, Target
+from common.applications.pick_place.choice import Choice, Pick, PickPlaceView, Spots, Target, same_place
 from common.applications.pick_place.looking import Looking
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.parameters import Config
@@ -253,9 +253,9 @@ class PickPlace(Task[PickPlaceView]):
             return view.attached, True
         if pick is None:
             return "", False
-        place = pick.target.position[:2]
-        near = min(view.balls(), key=lambda b: math.dist(b.position[:2], place), default=pick.target)
-        is_it = math.dist(near.position[:2], place) < self._around.ball_radius
+        place = pick.target.position
+        near = min(view.balls(), key=lambda b: math.dist(b.position, place), default=pick.target)
+        is_it = same_place(near.position, place, self._around.ball_radius)
         return (near if is_it else pick.target).id, False
 
     def obstacles(self, move: Move, view: PickPlaceView) -> Spots:
