@@ -220,7 +220,7 @@ async def test_it_reads_no_truth():
         ({"hsv_red_lo1": [0, 300, 80]}, "hsv_red_lo1.1"),
         ({"hsv_red_hi1": [10, 100, 255]}, "hsv_red_lo1 s = 120 is above hsv_red_hi1 s = 100"),
         ({"min_contour_area_px": 0}, "min_contour_area_px"),
-        ({"hsv_red": [0, 0, 0]}, "choices: hsv_red_hi1, hsv_red_hi2, hsv_red_lo1, hsv_red_lo2"),
+        ({"hsv_red": [0, 0, 0]}, "choices: depth, hsv_red_hi1, hsv_red_hi2, hsv_red_lo1, hsv_red_lo2"),
     ],
 )
 def test_a_parameter_out_of_bounds_is_named(values, told):

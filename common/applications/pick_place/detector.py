@@ -16,6 +16,7 @@ from common.applications.pick_place.fit import fit_each, fit_spheres
 from common.applications.pick_place.masks import Colours, Masks
 from common.applications.pick_place.odd import (
     EXPLAINED,
+    FALLING,
     FLAT,
     MOST_OVAL,
     MOST_UNLIKE,
@@ -243,6 +244,8 @@ class Detector:
                 crowded.append(blob)
                 continue
             best = min(tries, key=lambda one: abs(one.offset - offset))
+            if best.offset - offset > FALLING:
+                continue
             if abs(best.offset - offset) > self.options.max_offset_px * pixel_size:
                 self.odd.append(self._odd(blob.centroid, camera, sized(best.offset, offset)))
             elif best.oval > MOST_OVAL * pixel_size and not self.resting.shows_container(camera, blob.centroid):

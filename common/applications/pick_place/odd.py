@@ -23,6 +23,7 @@ FLAT = "it is not as round as a ball there: flat, such as a picture of one"
 EXPLAINED = 0.8  # part of the outline of a blob that lies on those of its balls, at least
 MOST_OVAL = 0.55  # [px] by which the outline of a ball may be longer one way than the other
 MOST_UNLIKE = 0.5  # [px] by which balls of one picture may differ in how large they look
+FALLING = 0.006  # [m] what looks so much larger is higher than a stack: it falls, or hangs in the hand
 FEWEST = 3  # balls by which it is told how large they look
 
 

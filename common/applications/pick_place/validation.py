@@ -14,6 +14,8 @@ from common.scene.workspace import INSIDE_CONTAINER, PARTLY_OUT_OF_VIEW, ReachCa
 
 Place = tuple[float, float, float]
 
+ODD_FOR = 0.5  # [s] for which a detector finds something odd at a place before that is told
+
 
 @dataclass
 class Verdict:
@@ -52,6 +54,11 @@ class _Told:
     seen: int  # stamp of the newest frame that shows something there [ns]
 
 
+@dataclass
+class _Suspect(_Told):
+    since: int  # [ns]
+
+
 class Validation:
     """Judges the detections of frame after frame. Says each rejection once for each place."""
 
@@ -71,6 +78,7 @@ class Validation:
         self.forget_after = forget_after
         self._same_place = same_place
         self._told: list[_Told] = []
+        self._odd: list[_Suspect] = []
 
     def judge_all(self, views: Sequence[tuple[MarkerArray, Pinhole]]) -> Verdict:
         """What becomes of what several views show, of which each place counts once."""
@@ -101,7 +109,8 @@ class Validation:
                 verdict.inside += 1
             elif reason:
                 verdict.refused.append((place, reason))
-                self._tell(verdict, place, reason, stamp)
+                if not marker.text or self._stays(place, stamp):  # what falls looks odd for a moment
+                    self._tell(verdict, place, reason, stamp)
             else:
                 verdict.targets.append(place)
         return verdict
@@ -120,6 +129,16 @@ class Validation:
         if marker.text:  # the detector says why it is nothing to be taken
             return place, marker.text
         return place, PARTLY_OUT_OF_VIEW if marker.partial else self._reach.known(place)
+
+    def _stays(self, place: Place, stamp: int) -> bool:
+        """Whether something odd has been there for a while."""
+        self._odd = [one for one in self._odd if stamp - one.seen <= ODD_FOR * 1e9]
+        for one in self._odd:
+            if math.dist(one.place, place) < self._same_place:
+                one.seen = max(one.seen, stamp)
+                return stamp - one.since >= ODD_FOR * 1e9
+        self._odd.append(_Suspect(place, stamp, stamp))
+        return False
 
     def _tell(self, verdict: Verdict, place: Place, reason: str, stamp: int) -> None:
         for told in self._told:

@@ -97,8 +97,13 @@ class Anywhere:
 
 def test_what_is_odd_is_rejected_with_the_reason_of_the_detector() -> None:
     detector = look(red("box", (0.5, -0.1, 0.03), (0.06, 0.06, 0.06)))
-    verdict = Validation(AROUND, Anywhere()).judge(markers([], AROUND, 1, odd=detector.odd), CAMERA)  # type: ignore[arg-type]
-    assert verdict.targets == [] and [one.reason for one in verdict.rejections] == [NOT_ROUND]
+    validation = Validation(AROUND, Anywhere())  # type: ignore[arg-type]
+    told = []
+    for k in range(10):
+        verdict = validation.judge(markers([], AROUND, 1 + k * 100_000_000, odd=detector.odd), CAMERA)
+        assert verdict.targets == [] and [why for _, why in verdict.refused] == [NOT_ROUND]
+        told.append([one.reason for one in verdict.rejections])
+    assert [reasons for reasons in told if reasons] == [[NOT_ROUND]] and told[0] == [], "not what falls past"
 
 
 CELL = """
