@@ -197,6 +197,19 @@
   document.addEventListener("focusout", event => { if (held && typeof held.pointer === "string") letGo(); });
   for (const name of ["blur", "pagehide", "beforeunload"]) window.addEventListener(name, letGo);
 
+  // --- names for screen readers ---
+
+  // viser's fields stand beside their words, but do not say that these are their name.
+  setInterval(() => {
+    for (const input of document.querySelectorAll("#root input:not([aria-label])")) {
+      if (input.type === "hidden" || (input.labels && input.labels.length)) continue;
+      for (let row = input.closest(".mantine-Flex-root"); row; row = row.parentElement?.closest(".mantine-Flex-root")) {
+        const words = row.firstElementChild?.textContent.trim() || "";
+        if (/\p{L}/u.test(words)) { input.setAttribute("aria-label", words); break; }
+      }
+    }
+  }, 1000);
+
   // --- begin ---
 
   window.zencellPage = key => { page = key; send({do: "page", what: key}); };  // called over viser's connection
