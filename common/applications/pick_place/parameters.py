@@ -65,11 +65,11 @@ class Config(TaskConfig):
     moved: Tunable[float] = Field(
         0.005, gt=0, le=0.05, description="an object that is further from where it was has moved [m]"
     )
-    look_from: Tunable[list[float]] = Field(
+    look_from: list[float] = Field(
         [], max_length=32, description="joint positions from which the camera sees past the arm [rad]; empty: found by "
                                        "the shape of the robot"
     )
-    look_timeout: Tunable[float] = Field(
+    look_timeout: float = Field(
         20.0, ge=1, le=3600, description="ERROR once it could not see the table for so long [s]"
     )
     width_tolerance: Tunable[float] = Field(
