@@ -71,3 +71,9 @@ def ray_distances(directions: Array, centers: Array) -> tuple[Array, Array]:
     square = np.einsum("ij,ij->i", centers, centers) - along**2
     distance: Array = np.sqrt(np.maximum(square, 1e-18))
     return distance, along
+
+
+def wholly_in_view(camera: Pinhole, center: npt.ArrayLike, radius: float, margin: float = 0.0) -> bool:
+    """Whether the whole silhouette of a sphere lies in the picture, at least `margin` [px] inside its border."""
+    outline = silhouette(camera, center, radius, 32)
+    return len(outline) > 0 and bool(camera.in_picture(outline, margin).all())
