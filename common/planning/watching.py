@@ -81,7 +81,7 @@ class SceneMonitor:
         self._times, self._pieces = np.zeros(1), np.zeros((0, 4, self.robot.dof))
         self._plan: _Plan | None = None
         self._judged: PlanningScene | None = None
-        self._problem = ""
+        self._found = self._problem = ""  # what is in the way, and of what
 
     def follow(self, goal: str, plan: str, trajectory: JointTrajectory | None = None) -> None:
         """Judge this goal from now on: the answer to a plan request, or any trajectory.
@@ -113,12 +113,15 @@ class SceneMonitor:
         self._judged = scene
         if news and len(rest):
             try:
-                hit = self._hit(rest, scene, news)
+                hit = self._hit(rest, scene, news, 0.0)
+                if hit is None and (still := [thing for thing in news if thing.id == self._found]):
+                    hit = self._hit(rest, scene, still, FARTHER)
             except BadShape as error:
                 raise NotWatched(str(error)) from None
         names = {thing.id for thing in news}
         found = [name for name in hit.pair if name in names] if hit is not None else []
         other = [name for name in hit.pair if name not in names] if hit is not None else []
+        self._found = found[0] if found else ""
         self._problem = f"{found[0]} is in the way of {other[0] if other else 'the robot'}" if found else ""
         return self._problem
 
@@ -148,8 +151,8 @@ class SceneMonitor:
         beyond = (_reaches(objects)[:, None] - self._plan.known[None]).max(axis=2).min(axis=1)
         return [thing for thing, by in zip(objects, beyond.tolist(), strict=True) if by > MOVED]
 
-    def _hit(self, rest: Array, scene: PlanningScene, news: list[CollisionObject]) -> Hit | None:
-        plan, more = self._plan, FARTHER if self._problem else 0.0
+    def _hit(self, rest: Array, scene: PlanningScene, news: list[CollisionObject], more: float) -> Hit | None:
+        plan = self._plan
         if plan is None:
             touched = [thing.id for thing in news if thing.role in _PERCEIVED]
             world = CollisionWorld(

@@ -178,3 +178,14 @@ def test_what_was_in_the_way_has_to_leave_it_clearly(monitor, pipeline):
 def _free(monitor: SceneMonitor, place) -> bool:
     monitor.follow("g", "p")
     return monitor.in_the_way(scene(thing("mug", place)), 0.0) == ""
+
+
+def test_only_what_was_in_the_way_has_to_leave_it_clearly(monitor, pipeline):
+    begin(monitor, pipeline, scene())
+    place = ROBOT.fk(HALF)[:3, 3]
+    away = next(d for d in np.arange(0.0, 0.2, 0.001) if _free(monitor, up(place, -d)))
+    close_by = thing("bowl", up(place, -away))  # never in the way, and no farther than that
+    monitor.follow("g", "p")
+    assert monitor.in_the_way(scene(close_by), 0.0) == ""
+    assert monitor.in_the_way(scene(close_by, thing("mug", place)), 0.0).startswith("mug ")
+    assert monitor.in_the_way(scene(close_by), 0.0) == ""
