@@ -44,6 +44,7 @@ LONGEST_JOG = 60.0  # [s] wall
 FIRST_WORD = 3.0  # [s] in which the motion has become ours
 RESTS, AT_REST = 1.0, 1e-3  # [s] wall in which a jogged arm rests, [rad/s, m/s]
 UNHEARD, LET_GO = 0.3, 0.4  # [s] of jogging in vain, and without it, after which it counts anew
+SCENE_KNOWS = 0.5  # [s] wall until the planning scene has what is held, if it can know of that
 FINGERS = 10.0  # [s] wall in which fingers have come to their end
 ARCS = "circ"  # plans arcs, and need not be in the pipeline of a cell
 ACTIVE = ("active", "none")
@@ -371,6 +372,7 @@ class Hand(Part):
             "width": width, "effort": force, "expected_width": expected, "width_tolerance": tolerance, "mass": mass,
         }, "gripper")
         reader = self._ear.reader(topics.GRIPPER_STATE)
+        scenes = self._ear.reader(topics.PLANNING_SCENE)  # has come by the time the fingers rest
         state = await self._bus.client(topics.GRIPPER_COMMAND).call(asked, TIMEOUT)
         try:
             async with asyncio.timeout(timeout):
@@ -384,6 +386,11 @@ class Hand(Part):
             raise MotionFailed("replaced", f"another command has taken the fingers: {state.id}")
         if state.state == "rejected":
             raise MotionFailed(state.error, f"the gripper refused: {state.message}")
+        with contextlib.suppress(TimeoutError):  # the next motion is planned with what is in the hand
+            async with asyncio.timeout(SCENE_KNOWS):
+                scene = scenes.latest
+                while scene is not None and bool(scene.attached) != state.holding:
+                    scene = await scenes.next()
         return state
 
     async def open(self, force: float = 0.0) -> GripperState:
