@@ -13,7 +13,7 @@ from pydantic import Field
 
 from common import topics
 from common.applications.pick_place.annotation import annotate
-from common.applications.pick_place.detector import Detection, Detector, DetectorOptions
+from common.applications.pick_place.detector import Detection, Detector, DetectorOptions, rehearse
 from common.applications.pick_place.odd import Odd
 from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common.applications.pick_place.tracks import Place
@@ -96,6 +96,8 @@ async def run(bus: Bus, config: Config) -> None:
     news = asyncio.Event()
     detector = Detector(config.world, config)
     left_out = LeftOut(bus.log, "a picture")
+    if not bus.declares_only:
+        rehearse(config.world, config)
     await bus.ready()
 
     async def watch_depths() -> None:

@@ -28,7 +28,7 @@ from common.applications.pick_place.odd import (
 )
 from common.applications.pick_place.resting import Resting
 from common.applications.pick_place.separation import separate
-from common.config import Parameters, Surroundings, Tunable
+from common.config import CameraConfig, Parameters, Surroundings, Tunable
 from common.perception.depth import Depth
 from common.perception.exposure import blindness
 from common.perception.pinhole import Pinhole
@@ -296,3 +296,15 @@ class Detector:
             return False
         distance, _ = ray_distances(camera.directions(seen.border), seen.center[None])
         return bool((distance < self.resting.radius).any())
+
+
+def rehearse(surroundings: Surroundings, options: DetectorOptions) -> None:
+    """Look at a made-up picture: what is set up when it is first used does not hold up the first real one."""
+    radius, plane = surroundings.ball_radius, Resting.of(surroundings).plane
+    camera = Pinhole.from_config(CameraConfig(position=(0, 0, plane + 25 * radius), rpy=(np.pi, 0, 0)))
+    picture = np.full((camera.height, camera.width, 3), 128, np.uint8)
+    detector = Detector(surroundings, options)
+    places = np.array([(0, 0, plane)]) + radius * np.array([(0, 0, 0), (4, 0, 0), (4, 2, 0)])
+    for outline in silhouettes(camera, places, radius, 32):
+        cv2.fillConvexPoly(picture, np.rint(outline).astype(np.int32), (0, 0, 255))
+    detector.detect(picture, camera)

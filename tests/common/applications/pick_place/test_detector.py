@@ -1,6 +1,7 @@
 """Pictures of known layouts in, places out: every ball counted once, every whole one within 3 mm (in fact within 1)."""
 
 import math
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.applications.pick_place.annotation import annotate
-from common.applications.pick_place.detector import Detector, DetectorOptions
+from common.applications.pick_place.detector import Detector, DetectorOptions, rehearse
 from common.config import Container, Surroundings
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouette, wholly_in_view
@@ -18,6 +19,7 @@ from tests.common.sim.spheres import draw_spheres
 
 around = Surroundings(container=Container())
 camera = Pinhole.from_config(around.camera)
+DETECT = Detector.detect
 detector = Detector(around)
 TOUCHING = 0.06
 LOW, HIGH = (0.08, -0.43), (0.72, 0.43)  # with a pixel to spare to the border of the picture
@@ -330,3 +332,11 @@ def test_what_was_found_in_a_picture_does_not_depend_on_the_pictures_before(seed
         assert [one.area for one in found] == [one.area for one in alone]
         looked_at += len(found)
     assert looked_at > 12
+
+
+@pytest.mark.parametrize("height", [-1.0, 0.0, 5.0])
+def test_rehearsal_is_possible_wherever_the_table_is(height):
+    found = []
+    with patch.object(Detector, "detect", lambda self, picture, camera: found.append(DETECT(self, picture, camera))):
+        rehearse(around.model_copy(update={"table_height": height}), DetectorOptions())
+    assert [len(balls) for balls in found] == [3]
