@@ -13,10 +13,11 @@ from typing import Generic, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from common.errors import ConfigError, ZencellError
-from common.sim.standing import STATE_VARIABLE
 
 R = TypeVar("R", bound=BaseModel)
 
+STATE_VARIABLE = "ZENCELL_STATE"  # folder for what is kept: what persons decided, how the simulated world stands
+STANDING_VARIABLE = "ZENCELL_STANDING"  # folder for the world alone; without both it is not kept
 LARGEST = 1_000_000  # [bytes]
 ROOM = 128 * 1024  # [bytes] that each file takes: more than the largest record there can be
 

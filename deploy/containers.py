@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from common.clock import KEPT_VARIABLE
 from common.config import Cell, load_cell, names_of
-from common.sim.standing import STATE_VARIABLE
+from common.kept_file import STATE_VARIABLE
 
 IMAGE = "zencell"
 ROUTER, ROUTER_PORT = "router", 7447

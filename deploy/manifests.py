@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from common.sim.standing import STATE_VARIABLE
+from common.kept_file import STATE_VARIABLE
 from deploy.containers import (
     DATA,
     IMAGE,

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from common.control.inhibits import Record, damaged
 from common.errors import ConfigError
-from common.kept_file import KeptFile, Unreadable, lasting_folder
-from common.sim.standing import STATE_VARIABLE
+from common.kept_file import STATE_VARIABLE, KeptFile, Unreadable, lasting_folder
 
 
 class RecordFile(KeptFile[Record]):

@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 from common.errors import ConfigError
-from common.sim.standing import STATE_VARIABLE
+from common.kept_file import STATE_VARIABLE
 from common.sources import monotonic
 
 PATIENCE = 3.0  # [s] for a process that ends just now: it brakes first

@@ -20,7 +20,6 @@ from common.terminal import printable
 
 if TYPE_CHECKING:
     from common.chaos.agent import Chaos
-    from common.checking.finding import Finding
     from common.config import Cell
     from common.messages import Inhibit
     from common.operation.screen import Content, Screen
@@ -119,7 +118,7 @@ class Operation:
         self._watchers: dict[str, list[str]] = {}  # commands by name
         self._disturbance: Disturbance | None = None
         self._chaos: Chaos | None = None
-        self._doubts: asyncio.Task[list[Finding]] | None = None
+        self._doubts: asyncio.Task[None] | None = None
         self.first: Callable[[Bus], Awaitable[None]] | None = None  # is done at the terminal once the cell is up
 
     def serve_page(self, host: str | None, port: str | None) -> None:
@@ -221,8 +220,7 @@ class Operation:
 
         What is simulated stays as it is through restarts, until the end; what persons decided outlives that.
         """
-        from common.kept_file import lasting_folder
-        from common.sim.standing import STANDING_VARIABLE, STATE_VARIABLE
+        from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE, lasting_folder
         from common.transport.endpoint import DEFAULT_DOMAIN
 
         if os.environ.get(STATE_VARIABLE):
@@ -264,6 +262,8 @@ class Operation:
         except Interrupted:
             return 128 + (interrupts.signal or signal.SIGINT)
         finally:
+            if self._doubts:
+                self._doubts.cancel()
             if self._collector:
                 self._collector.read_truth()
             self.summary.restarts = self._supervisor.restarts
@@ -292,11 +292,9 @@ class Operation:
         return Content(statuses, {name: rate for name, rate in rates.items() if rate}, self.fold.progress)
 
     def _prepare(self, bus: Bus) -> None:
-        from common.checking.cell import doubts
         from common.supervision.collector import Collector
 
         assert self._screen is not None
-        self._doubts = asyncio.create_task(asyncio.to_thread(doubts, self.cell))  # while services come up
         self._collector = Collector(bus, self.fold, self.began, self._screen.progress)
 
     async def _until_ended(self, bus: Bus) -> int:
@@ -348,6 +346,15 @@ class Operation:
         assert self._screen is not None
         self._screen.note(line)
 
+    async def _tell_doubts(self) -> None:
+        from common.checking.beside import NotLooked, doubts_beside
+
+        try:
+            for found in await doubts_beside(self.cell, self.launch.environment()):
+                self._note(f"{found.severity}: {printable(found.line)}")
+        except NotLooked as told:
+            self._note(f"warning: {told}")
+
     async def _disturbing(self) -> None:
         if self._chaos is not None:
             await self._chaos.run()
@@ -357,8 +364,7 @@ class Operation:
         self.summary.ready = time.monotonic() - self.began
         if self._page and self._screen:
             self._screen.note(f"Open {self._page.address}")
-        for found in await self._doubts if self._doubts is not None else ():
-            self._note(f"{found.severity}: {printable(found.line)}")
+        self._doubts = asyncio.create_task(self._tell_doubts(), name="doubts")
         if self._disturbance is not None:
             from common.chaos.setting import chaos_in, keys_of
 

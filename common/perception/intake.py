@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections import Counter
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -122,4 +121,8 @@ def colour_picture(image: Image) -> Picture:
         pixels: Picture = image_to_array(image)
     except ImageError as error:
         raise Unusable(error.kind, str(error)) from None
-    return pixels if image.encoding == "bgr8" else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), np.uint8)
+    if image.encoding == "bgr8":
+        return pixels
+    import cv2  # many read clouds by this module, and no picture
+
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), np.uint8)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -10,8 +10,10 @@ import numpy.typing as npt
 from common.config.world import TCP, CameraConfig, Surroundings
 from common.errors import ConfigError
 from common.perception.pinhole import Pinhole
-from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_rpy, rpy_to_matrix, transform
+
+if TYPE_CHECKING:  # a fixed camera needs none
+    from common.robot.model import RobotModel
 
 Array = npt.NDArray[np.float64]
 S = TypeVar("S", bound=Surroundings)

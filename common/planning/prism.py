@@ -7,10 +7,13 @@ one corner more neighbours than fit.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import coal
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import coal
 
 Array = NDArray[np.float64]
 
@@ -26,6 +29,8 @@ def is_line(outline: Sequence[tuple[float, float]]) -> bool:
 
 def prism(outline: Sequence[tuple[float, float]], length: float) -> coal.Convex:
     """The convex hull of a cross-section [m], as long as given along z [m] and centred there."""
+    import coal  # many need the hull of an outline, and no shape of it
+
     hull = convex_hull(np.array(outline, dtype=float))
     count = len(hull)
     points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
@@ -11,12 +11,14 @@ from common.config import Light, RobotConfig, Scenery, Surroundings, Tunable
 from common.messages import CameraInfo, Header, JointState, WorldObjects
 from common.perception.mounted import Mounted
 from common.perception.pinhole import Pinhole
-from common.robot.model import RobotModel
 from common.sim.interface import load_renderer
 from common.sim.lens import Lens
 from common.sim.motion_blur import Movement, joints_before, times
 from common.sim.ray_caster import View
 from common.sim.sensor import Sensor, SensorParameters
+
+if TYPE_CHECKING:  # loaded for a camera that has the arm in its picture, or sits on it
+    from common.robot.model import RobotModel
 
 
 class CameraParameters(SensorParameters):
@@ -60,7 +62,7 @@ class SimulatedCamera:
         self._lens = lens or Lens(around.camera)
         self._scenery, self._config = scenery, config
         self._robot: RobotModel | None = None
-        self._load: Callable[[], RobotModel] = lambda: RobotModel.load(robot)
+        self._robot_config = robot
         self._mounted = Mounted(self._lens.drawn, self._model() if around.camera.mount else None)
         self._camera = around.camera
         self._lit = self._light()
@@ -72,7 +74,9 @@ class SimulatedCamera:
 
     def _model(self) -> RobotModel:
         if self._robot is None:
-            self._robot = self._load()
+            from common.robot.model import RobotModel
+
+            self._robot = RobotModel.load(self._robot_config)
         return self._robot
 
     def _light(self) -> Scenery:

@@ -30,10 +30,10 @@ from common.config import GripperConfig, ObjectConfig, Parameters, Scenery, Surr
 from common.errors import ConfigError, UnknownName
 from common.hardware.interface import Hardware, Limits
 from common.messages import Header, JointState, SceneUpdate, WorldEdit, WorldObject, WorldObjects
-from common.robot.model import RobotModel
 
 if TYPE_CHECKING:
     from common.perception.pinhole import Pinhole
+    from common.robot.model import RobotModel
     from common.sim.ray_caster import View
 
 Array = NDArray[np.float64]

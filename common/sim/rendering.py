@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -18,15 +19,16 @@ from common.config import Container, Scenery, Surroundings
 from common.messages import JointState, WorldObject
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import silhouette
-from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
 from common.scene.fixtures import container_panels
 from common.sim.lighting import flat_level
 from common.sim.objects import look_of, solid_of_message
 from common.sim.places import tables
 from common.sim.ray_caster import Mesh, View, cast, empty_view
-from common.sim.robot_shapes import robot_shapes
 from common.sim.solids import fixture_mesh, placed, primitive
+
+if TYPE_CHECKING:  # most pictures have no arm in them
+    from common.robot.model import RobotModel
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
@@ -69,7 +71,7 @@ class Renderer:
         self.needs_arm = robot is not None
         self.light(scenery or Scenery())
         self._plain, self._rim_width, self._robot, self._around = plain, rim_width, robot, around
-        self._shapes = robot_shapes(robot) if robot is not None else {}
+        self._shapes = _shapes_of(robot) if robot is not None else {}
         self._meshes: dict[tuple[object, ...], Array] = {}  # triangles of what was seen, in its own frame
         self._solid = [] if plain else _solid(around)
         self._asked: Sequence[WorldObject] | None = None
@@ -166,6 +168,12 @@ class Renderer:
         if poses is None:
             return []
         return [Mesh(placed(corners, poses[link]), ARM) for link, corners in self._shapes.items()]
+
+
+def _shapes_of(robot: RobotModel) -> dict[str, Array]:
+    from common.sim.robot_shapes import robot_shapes
+
+    return robot_shapes(robot)
 
 
 def link_poses(robot: RobotModel, joints: JointState) -> Mapping[str, Array] | None:

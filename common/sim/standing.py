@@ -18,10 +18,9 @@ from pathlib import Path
 import msgpack
 from pydantic import BaseModel, ConfigDict
 
+from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE
 from common.sim.interface import StandingObject
 
-STATE_VARIABLE = "ZENCELL_STATE"  # folder for what is kept, this and what persons decided
-STANDING_VARIABLE = "ZENCELL_STANDING"  # folder for this alone; without both nothing is kept
 SLOT = 4 * 1024 * 1024  # [bytes] for each of the two newest states
 CLOSE_SECONDS = 0.3
 _HEAD = struct.Struct("<QII")  # number of the state, its length and checksum

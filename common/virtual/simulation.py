@@ -24,8 +24,8 @@ from common import topics
 from common.application import find_application
 from common.clock import Clock
 from common.config import Cell
+from common.kept_file import STATE_VARIABLE
 from common.messages import TaskStatus
-from common.sim.standing import STATE_VARIABLE
 from common.sources import drawn_from
 from common.supervision.launch import Launch
 from common.supervision.operation import supervise

@@ -11,6 +11,7 @@ from common.clock import Clock
 from common.control import decisions, sole_use
 from common.control.record_file import RecordFile
 from common.errors import ConfigError
+from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE
 from common.messages import (
     GripperCommand,
     HoldRequest,
@@ -20,7 +21,6 @@ from common.messages import (
 )
 from common.process.in_process import running_service
 from common.robot.model import RobotModel
-from common.sim.standing import STANDING_VARIABLE, STATE_VARIABLE
 from common.transport.local import LocalNetwork
 from services import trajectory_executor
 from tests.doubles import stopping_arm

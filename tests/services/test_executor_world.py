@@ -8,6 +8,7 @@ import pytest
 from common import topics
 from common.config import load_cell
 from common.errors import ConfigError, RemoteError
+from common.kept_file import STATE_VARIABLE
 from common.messages import (
     Vector3,
     WorldEdit,
@@ -17,7 +18,7 @@ from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.scene.workspace import reach_reason
 from common.sim.kinematic import KinematicWorld
-from common.sim.standing import STATE_VARIABLE, StateFile
+from common.sim.standing import StateFile
 from tests.services.executor_person import blocked, executor, goes_on, move
 
 

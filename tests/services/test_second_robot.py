@@ -11,13 +11,13 @@ from common import topics
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import RemoteError
+from common.kept_file import STATE_VARIABLE
 from common.messages import ExecuteRequest, GripperCommand, JointState, TFMessage, Vector3, WorldEdit
 from common.process.in_process import running_service
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
 from common.robot.transforms import pose_to_matrix
 from common.sim.objects import centre_of
-from common.sim.standing import STATE_VARIABLE
 from common.transport.local import LocalNetwork
 from services import robot_state_publisher, trajectory_executor
 from tests.services.test_trajectory_executor import move

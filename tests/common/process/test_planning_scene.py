@@ -10,11 +10,10 @@ import pytest
 
 from common import topics
 from common.errors import ConfigError, RemoteError
-from common.kept_file import KeptFile
+from common.kept_file import STATE_VARIABLE, KeptFile
 from common.messages import CollisionObject, Header, PlanningScene, Pose, SceneEdit
 from common.process.in_process import running_service
 from common.process.planning_scene import SceneWriter
-from common.sim.standing import STATE_VARIABLE
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 

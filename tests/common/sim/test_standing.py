@@ -12,11 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.config import World
+from common.kept_file import STATE_VARIABLE
 from common.messages import Header
 from common.robot.transforms import tool_down
 from common.sim.interface import StandingObject
 from common.sim.kinematic import KinematicWorld
-from common.sim.standing import SLOT, STATE_VARIABLE, Standing, StateFile, state_file
+from common.sim.standing import SLOT, Standing, StateFile, state_file
 
 PLACES = [(0.40, -0.30), (0.52, -0.30), (0.40, -0.17)]
 OPEN, GRIP, R = 0.08, 0.06, 0.03

@@ -61,6 +61,25 @@ def test_a_state_that_stays_is_known_for_as_long_as_it_stays() -> None:
     assert memory.latest(topics.PLANNING_SCENE, 400.0) is scene
 
 
+def test_what_is_looked_back_at_is_what_was_said_and_the_same_as_long_as_it_is_looked_at() -> None:
+    memory = Memory()
+    for step in range(100):
+        memory.note(float(step), topics.JOINT_STATES, joints(step))
+    found = memory.latest(topics.JOINT_STATES, 41.5)
+    assert found == joints(41) and memory.latest(topics.JOINT_STATES, 41.7) is found
+    assert memory.latest(topics.JOINT_STATES, 42.0) == joints(42)
+
+
+def test_of_large_messages_fewer_minutes_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(past_module, "MOST_TOLD", 10_000)
+    memory = Memory()
+    for step in range(1000):
+        memory.note(step * 0.1, topics.JOINT_STATES, joints(step))
+    kept = memory.between(topics.JOINT_STATES, -1.0, 100.0)
+    assert kept[-1][1] == joints(999) and 50 < len(kept) == len({at for at, _ in kept}) < 200
+    assert memory.latest(topics.JOINT_STATES, 50.0) is None
+
+
 def test_pictures_take_no_more_memory_than_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(past_module, "MOST_BYTES", 200_000)
     memory, rng = Memory(), np.random.default_rng(0)
