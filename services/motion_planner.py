@@ -170,7 +170,9 @@ class Watcher:
             return
         request = HoldRequest(hold=bool(problem), reason=problem, by=HOLDER, goal=status.id)
         self._answer = await self._hold.call(request, REQUEST_TIMEOUT)
-        if problem:
+        if problem and HOLDER not in self._answer.held_by:
+            self._woken.set()  # it was over by then: look at what runs now
+        elif problem:
             self._bus.log.warning("the arm is held: %s", problem)
         else:
             self._bus.log.info("the arm goes on: nothing is in its way any more")

@@ -185,7 +185,9 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         status, let_go = cycle.authority.hold(request)
         who = (request.owner or SOMEBODY) if request.by == "person" else request.by
         why = request.reason or "asked to"
-        if request.hold:
+        if request.hold and not status.held:
+            bus.log.info("%s asked to hold %s, which is over: %s", who, request.goal, why)
+        elif request.hold:
             bus.log.info("held by %s: %s", who, why)
         elif status.inhibits:
             told = "; ".join(inhibit.told for inhibit in status.inhibits)

@@ -4,6 +4,7 @@ import ast
 import importlib
 import re
 import subprocess
+import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -253,3 +254,14 @@ def test_no_packages_import_each_other_in_a_circle() -> None:
 
 def test_circles_are_seen() -> None:
     assert cycles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
+
+
+@pytest.mark.parametrize("does", [
+    "import services.camera_simulator, common.sim.kinematic",
+    "import common.supervision.supervisor, common.supervision.collector, common.operation.operation as o\n"
+    "o.Operation('panda', connect='tcp/127.0.0.1:9')",
+], ids=["camera", "supervisor"])
+def test_process_that_plans_nothing_loads_no_planner(does: str) -> None:
+    told = f"{does}\nimport sys\nprint(*{{'pinocchio', 'coal', 'ompl', 'viser'}} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", told], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.stdout.strip(), done.stderr) == ("", "")

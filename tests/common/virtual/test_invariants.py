@@ -9,6 +9,7 @@ from common.messages import (
     ExecuteRequest,
     GripperCommand,
     GripperState,
+    HoldRequest,
     JointGoal,
     JointTrajectory,
     MotionStatus,
@@ -73,6 +74,16 @@ def test_goal_that_was_stopped_before_it_was_heard_of_never_moves(seen, known):
     moving = encode(MotionStatus(id="a-1", state="active"))
     invariants.on_put("executor", "executor 1", RawSample("panda/motion/status", moving, "application/msgpack", b""))
     assert invariants.broken == ([] if known else [f"1.000 s: {NEVER}: a-1"])
+
+
+@pytest.mark.parametrize(("goal", "held", "holds"), [
+    ("", True, True), ("", False, False), ("a-1", False, False), ("a-0", False, True),
+])
+def test_arm_is_held_for_whoever_asks_but_not_for_a_goal_that_is_over(seen, goal, held, holds):
+    invariants, requests = seen
+    request = HoldRequest(hold=True, reason="a mug is in the way", by="scene_monitor", goal=goal)
+    requests.on_answer("motion_planner", request, MotionStatus(id="a-1", state="active", held=held))
+    assert (invariants.broken == []) == holds
 
 
 @pytest.mark.parametrize(("begun_later", "seconds", "holds"), [
