@@ -1,4 +1,4 @@
-"""Answers motion/plan: trajectories that were checked against the planning scene. Plans one request at a time.
+"""Answers motion/plan: trajectories that were checked against the planning scene. Plans several requests at a time.
 
 It also watches the motion that runs, and holds the arm while the newest scene has something in its way.
 """
@@ -6,8 +6,10 @@ It also watches the motion that runs, and holds the arm while the newest scene h
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 from pydantic import Field
@@ -27,12 +29,13 @@ from common.messages import (
     PlanResponse,
     PointCloud2,
 )
+from common.planning.helper import Helper, HelperLost, fork_helpers
 from common.planning.pipeline import PlanningPipeline
 from common.planning.points import PointObstacle
 from common.planning.problem import Cancel
 from common.planning.seeing import Camera, JointHistory, PointsOptions, Seeing, Seen
 from common.planning.watching import NotWatched, SceneMonitor
-from common.process.pace import come_last
+from common.process.pace import NICENESS, come_last
 from common.process.service import main
 from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
@@ -55,20 +58,26 @@ class Config(Parameters):
     watch: bool = Field(True, description="hold the arm while something in the newest planning scene is in the way of "
                                           "the motion that runs; one planner of a cell does so")
     points: PointsOptions | None = Field(None, description="cameras whose points are obstacles")
+    helpers: int = Field(3, ge=0, le=3, description="other processes at most that plan what comes while this one is "
+                                                    "at work; not more than leave half of the cores to others, at "
+                                                    "least one; none with points")
 
 
-async def run(bus: Bus, config: Config) -> None:
+Planner = Callable[..., PlanResponse]  # of request, scene, joints, cancel, points and width
+
+
+async def run(bus: Bus, config: Config, helpers: Sequence[Helper] = ()) -> None:
     """Serve plan requests on the newest planning scene, from the newest joint states unless a start is given."""
     scenes = bus.reader(topics.PLANNING_SCENE)
     states = bus.reader(topics.JOINT_STATES)
     display = bus.writer(topics.DISPLAY_TRAJECTORY)
     eyes = None if config.points is None else Eyes(bus, config.points)
     watcher = Watcher(bus, scenes) if config.watch else None
-    one_at_a_time = asyncio.Lock()
+    crew = Crew()
     loaded: list[PlanningPipeline] = []
 
-    async def handle(request: PlanRequest) -> PlanResponse:
-        async with one_at_a_time:
+    async def plan(request: PlanRequest) -> tuple[PlanResponse, PlanningScene, float | None]:
+        async with crew.one() as planner:
             scene, pipeline = scenes.latest, loaded[0]
             if scene is None:
                 raise Refused("no_scene", f"{request.stage or request.id}: there is no planning scene yet")
@@ -79,7 +88,14 @@ async def run(bus: Bus, config: Config) -> None:
             see = None if eyes is None else eyes.look(scene, request.stage or request.id)
             width = None if state is None else measured_width(config.robot.gripper, state.name, state.position)
             joints = None if current is None else current.tolist()
-            response = await _plan(pipeline, request, scene, joints, width, see)
+            return await _plan(planner, request, scene, joints, width, see), scene, width
+
+    async def handle(request: PlanRequest) -> PlanResponse:
+        try:
+            response, scene, width = await plan(request)
+        except HelperLost as lost:
+            bus.log.error("%s: %s is planned again, by one fewer from now on", lost, request.stage or request.id)
+            return await handle(request)
         response.header = bus.header()
         if response.trajectory is not None:
             response.trajectory.header = bus.header()
@@ -92,6 +108,12 @@ async def run(bus: Bus, config: Config) -> None:
 
     bus.serve(topics.MOTION_PLAN, handle)
     loaded.append(await asyncio.to_thread(_load, config))
+    for helper in helpers[config.helpers if config.points is None else 0:]:
+        helper.close()
+    for helper in helpers[:config.helpers if config.points is None else 0]:
+        helper.set_up(config.robot, config.motion, config.pipeline, seed=config.run.seed)
+        crew.join(partial(_of_helper, helper))
+    crew.join(loaded[0].plan)
     if eyes is not None:
         await asyncio.to_thread(eyes.load, loaded[0])
     if watcher is not None:
@@ -112,6 +134,42 @@ def _load(config: Config) -> PlanningPipeline:
     pipeline = PlanningPipeline(RobotModel.load(config.robot), config.motion, config.pipeline, seed=config.run.seed)
     require_free_home(config.robot, config.world, pipeline.geometry)
     return pipeline
+
+
+def _of_helper(
+    helper: Helper, request: PlanRequest, scene: PlanningScene, current: list[float] | None, cancel: Cancel,
+    points: Sequence[PointObstacle], width: float | None,
+) -> PlanResponse:
+    assert not points
+    return helper.plan(request, scene, current, cancel, width)
+
+
+class Crew:
+    """Those who plan, each one request at a time; who joined last is asked first."""
+
+    def __init__(self) -> None:
+        self._free: list[Planner] = []
+        self._some_free = asyncio.Semaphore(0)
+
+    def join(self, planner: Planner) -> None:
+        """Be asked from now on."""
+        self._free.append(planner)
+        self._some_free.release()
+
+    @asynccontextmanager
+    async def one(self) -> AsyncIterator[Planner]:
+        """Whoever is free first; requests have their turns in the order in which they came. Who is lost is out."""
+        await self._some_free.acquire()
+        planner = self._free.pop()
+        stays = True
+        try:
+            yield planner
+        except HelperLost:
+            stays = False
+            raise
+        finally:
+            if stays:
+                self.join(planner)
 
 
 class Watcher:
@@ -235,20 +293,20 @@ def _readers(
 
 
 async def _plan(
-    pipeline: PlanningPipeline,
+    planner: Planner,
     request: PlanRequest,
     scene: PlanningScene,
     current: list[float] | None,
     width: float | None,
     see: Callable[[], list[PointObstacle]] | None,
 ) -> PlanResponse:
-    """Plan in a thread; when this is cancelled the planner is told and waited for: never two at once."""
+    """Plan in a thread; when this is cancelled the planner is told and waited for: it is free only then."""
     cancel = Cancel()
 
     def plan() -> PlanResponse:
         come_last()
         points = [] if see is None else see()
-        return pipeline.plan(request, scene, current, cancel, points, width)
+        return planner(request, scene, current, cancel, points, width)
 
     planning = asyncio.create_task(asyncio.to_thread(plan))
     try:
@@ -260,4 +318,4 @@ async def _plan(
 
 
 if __name__ == "__main__":
-    main(run, Config)
+    main(partial(run, helpers=fork_helpers(NICENESS)), Config)

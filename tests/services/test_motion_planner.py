@@ -1,4 +1,7 @@
 import asyncio
+import threading
+from contextlib import asynccontextmanager
+from functools import partial
 
 import pytest
 
@@ -18,6 +21,8 @@ from common.messages import (
     PoseGoal,
     Vector3,
 )
+from common.planning.helper import HelperLost
+from common.planning.pipeline import PlanningPipeline
 from common.process.in_process import running_service
 from common.process.wiring import wiring
 from common.robot.model import RobotModel
@@ -71,8 +76,8 @@ async def planner():
         yield user
 
 
-def to_home(**more) -> PlanRequest:
-    return PlanRequest(id="1", goal=JointGoal(named="home"), **more)
+def to_home(id="1", **more) -> PlanRequest:
+    return PlanRequest(id=id, goal=JointGoal(named="home"), **more)
 
 
 async def test_request_is_answered_with_a_trajectory_that_is_also_displayed(planner):
@@ -145,6 +150,68 @@ async def test_requests_at_the_same_time_are_all_answered(planner):
     assert all(answer.ok for answer in answers)
     starts = [answer.trajectory.points[0].positions[0] for answer in answers]
     assert starts == pytest.approx([HOME[0] + 0.01 * i for i in range(5)], abs=1e-6)
+
+
+class HelperDouble:
+    """A helper in this process, which plans when all of `together` have been asked; one that is lost has no answer."""
+
+    def __init__(self, together: threading.Barrier, *, lost: bool = False):
+        self.together, self.lost, self.asked, self.closed = together, lost, [], False
+
+    def set_up(self, robot, motion, pipeline, *, seed):
+        self.pipeline = PlanningPipeline(RobotModel.load(robot), motion, pipeline, seed=seed)
+
+    def plan(self, request, scene, current, cancel, width):
+        self.asked.append(request.id)
+        if self.lost:
+            raise HelperLost("the second planner has ended")
+        self.together.wait(20)
+        return self.pipeline.plan(request, scene, current, cancel, (), width)
+
+    def close(self):
+        self.closed = True
+
+
+@asynccontextmanager
+async def planner_with(others, **config):
+    network = LocalNetwork()
+    user = Planner(network.bus("tester", cell="test", clock=Clock()))
+    config = motion_planner.Config.model_validate(CONFIG.model_dump() | config)
+    run = partial(motion_planner.run, helpers=others)
+    async with asyncio.timeout(60), running_service(network, run, config, name="motion_planner"):
+        await user.plan.wait_available(20)
+        user.scenes.put(scene())
+        user.stand_at(HOME + 0.1)
+        yield user
+
+
+async def test_helpers_plan_at_the_same_time_what_is_asked_for_at_once():
+    together = threading.Barrier(2)
+    helpers = [HelperDouble(together), HelperDouble(together)]  # each plans only while the other does
+    async with planner_with(helpers) as user:
+        requests = [to_home(str(i), start=list(HOME + 0.01 * i)) for i in range(3)]
+        answers = await asyncio.gather(*(user.plan.call(request, timeout=30) for request in requests))
+    assert [answer.trajectory.points[0].positions[0] for answer in answers] == pytest.approx(
+        [HOME[0] + 0.01 * i for i in range(3)], abs=1e-6)
+    assert sorted(helpers[0].asked + helpers[1].asked) == ["1", "2"]  # the first is the planner's own
+
+
+async def test_request_of_a_helper_that_is_lost_is_planned_by_another_and_the_lost_one_is_asked_no_more():
+    helper = HelperDouble(threading.Barrier(1), lost=True)
+    async with planner_with([helper]) as user:
+        for turn in range(2):
+            requests = [to_home(f"{turn}-{i}", start=list(HOME + 0.01 * i)) for i in range(3)]
+            answers = await asyncio.gather(*(user.plan.call(request, timeout=30) for request in requests))
+            assert all(answer.ok for answer in answers)
+    assert helper.asked == ["0-1"]
+
+
+@pytest.mark.parametrize("config", [{"helpers": 0}, {"points": {"cameras": [{"points": "depth_camera/points"}]}}],
+                         ids=["none wanted", "with points"])
+async def test_helpers_that_are_not_wanted_are_let_go_of(config):
+    helper = HelperDouble(threading.Barrier(1))
+    async with planner_with([helper], **config):
+        assert helper.closed
 
 
 async def test_service_that_is_stopped_ends_a_running_plan():

@@ -1,0 +1,74 @@
+"""Ten plan requests at once against ten one after the other, through a planner's own process and the network.
+
+    python -m benchmarks.at_once [--cell panda] [--rounds N]
+
+The requests are those of 60 random pairs of positions that take longest to plan in the cell's own scene, each from a
+start and to a goal of its own. Both ways take turns; printed are medians of wall time and of the ratio of neighbours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import time
+from statistics import median
+
+import numpy as np
+
+from common.config import load_cell
+from common.messages import JointGoal, PlanRequest, PlanResponse
+from common.robot.model import RobotModel
+from common.topics import MOTION_PLAN
+from zencell import Cell
+
+PAIRS, COUNT, TIMEOUT = 60, 10, 60.0
+
+
+async def measure(name: str, rounds: int) -> None:
+    """Measure, and print a line for each way."""
+    robot = RobotModel.load(load_cell(name).robot)
+    rng = np.random.default_rng(0)
+    async with Cell.start(name, overrides=["autostart=false"]) as cell:
+
+        async def plan(request: PlanRequest) -> PlanResponse | None:
+            try:
+                return await cell.call(MOTION_PLAN.key, request, timeout=TIMEOUT)
+            except Exception:  # noqa: BLE001 - one that touches something at its start or goal is another's business
+                return None
+
+        timed = []
+        for number in range(20 * PAIRS):
+            start, goal = rng.uniform(robot.lower, robot.upper), rng.uniform(robot.lower, robot.upper)
+            request = PlanRequest(id=f"pair-{number}", start=start.tolist(), goal=JointGoal(positions=goal.tolist()))
+            began = time.perf_counter()
+            answer = await plan(request)
+            if answer is not None and answer.ok:
+                timed.append((time.perf_counter() - began, request))
+            if len(timed) == PAIRS:
+                break
+        hardest = [request for _, request in sorted(timed, key=lambda pair: -pair[0])[:COUNT]]
+        rows: list[tuple[float, float]] = []
+        for _ in range(rounds + 1):
+            began = time.perf_counter()
+            for request in hardest:
+                await plan(request)
+            between = time.perf_counter()
+            await asyncio.gather(*map(plan, hardest))
+            rows.append((between - began, time.perf_counter() - between))
+        rows.pop(0)  # a helper loads the robot when it is asked for the first time
+        print(f"{name}: {COUNT} of {PAIRS}: one after the other {1e3 * median(one for one, _ in rows):.1f} ms, at once "
+              f"{1e3 * median(two for _, two in rows):.1f} ms, ratio {median(two / one for one, two in rows):.2f} "
+              f"({rounds} rounds)")
+
+
+def main() -> None:
+    """Measure what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cell", default="panda")
+    parser.add_argument("--rounds", type=int, default=20)
+    options = parser.parse_args()
+    asyncio.run(measure(options.cell, options.rounds))
+
+
+if __name__ == "__main__":
+    main()

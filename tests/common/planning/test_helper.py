@@ -1,0 +1,95 @@
+"""The second planner in a process of its own; forked where nothing else runs yet, so by programs of their own."""
+
+import contextlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+
+ROOT = Path(__file__).resolve().parents[3]
+
+BEGIN = """
+import json, os, signal, sys, threading, time
+from common.config import load_cell
+from common.messages import CollisionObject, Header, JointGoal, PlanningScene, PlanRequest, Pose, Vector3
+from common.planning.helper import Helper, HelperLost
+from common.planning.pipeline import PlanningPipeline
+from common.planning.problem import Cancel
+from common.robot.model import RobotModel
+
+cell = load_cell("panda", ["pipeline.planners=[{name: ompl, options: {algorithm: AORRTC, improving_time: 60}}]"]
+                 if "long" in sys.argv else [])
+setup = cell.robot, cell.motion, cell.pipeline
+helper = Helper(1)
+helper.set_up(*setup, seed=3)
+wall = CollisionObject(id="wall", role="fixture", shape="box", dimensions=[0.3, 0.02, 0.4],
+                       pose=Pose(position=Vector3(x=0.55, z=0.2)))
+scene = PlanningScene(header=Header(frame_id="world"), objects=[wall])
+down = RobotModel.load(cell.robot).named("home") + [0.0, 0.5, 0, 0.1, 0, 0, 0]
+left, right = [0.6, *down.tolist()[1:]], [-0.6, *down.tolist()[1:]]
+
+def asked(id, seconds=20.0):
+    return PlanRequest(id=id, start=left, goal=JointGoal(positions=right), planning_time=seconds)
+"""
+
+
+def told(script: str, *arguments: str) -> list[object]:
+    """What a program printed, line by line, as JSON."""
+    done = subprocess.run([sys.executable, "-c", BEGIN + script, *arguments], cwd=ROOT, capture_output=True, text=True,
+                          check=False, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_helper_plans_as_the_pipeline_itself_does_also_on_the_next_scene() -> None:
+    answers, own = told("""
+own = PlanningPipeline(RobotModel.load(cell.robot), *setup[1:], seed=3)
+empty = PlanningScene(header=Header(frame_id="world"))
+for plan in (helper.plan, own.plan):
+    answers = [plan(asked(name), where, None, Cancel()) for name, where in (("a", scene), ("b", scene), ("c", empty))]
+    print(json.dumps([[p.positions for p in each.trajectory.points] for each in answers]))
+""")
+    assert answers == own
+    assert isinstance(answers, list) and answers[0] != answers[2]
+
+
+def test_helper_gives_up_when_it_is_told_to_and_is_there_for_the_next_request() -> None:
+    first, seconds, second = told("""
+cancel = Cancel()
+threading.Timer(2.0, cancel.set).start()
+began = time.monotonic()
+print(json.dumps(helper.plan(asked("a", 300.0), scene, None, cancel).error))
+print(json.dumps(time.monotonic() - began))
+cancel = Cancel()
+cancel.set()
+print(json.dumps(helper.plan(asked("b", 300.0), scene, None, cancel).error))
+""", "long")
+    assert first == second == "cancelled"
+    assert isinstance(seconds, float) and seconds < 30
+
+
+def test_helper_that_was_killed_is_said_to_be_lost() -> None:
+    assert told("""
+import multiprocessing
+process, = multiprocessing.active_children()
+os.kill(process.pid, signal.SIGKILL)
+try:
+    helper.plan(asked("a"), scene, None, Cancel())
+except HelperLost as lost:
+    print(json.dumps(str(lost)))
+""") == ["the second planner has ended"]
+
+
+def test_helper_ends_with_its_parent_however_that_ends() -> None:
+    pids = told("""
+import multiprocessing
+print(json.dumps(multiprocessing.active_children()[0].pid), flush=True)
+threading.Thread(target=helper.plan, args=(asked("a", 300.0), scene, None, Cancel()), daemon=True).start()
+time.sleep(0.5)
+os._exit(0)
+""", "long")
+    assert isinstance(pids[0], int)
+    with contextlib.suppress(psutil.NoSuchProcess):
+        psutil.Process(pids[0]).wait(20)
