@@ -9,6 +9,8 @@ from common.application import find_application
 from common.checking.finding import Finding, refusal
 from common.config import Cell, Surroundings
 from common.errors import ConfigError
+from common.hardware.loading import is_simulated
+from common.sim.interface import require_simulator
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
@@ -32,8 +34,11 @@ def require_safe(cell: Cell) -> None:
     """Return when nothing is known because of which the arm or its fingers would move wrongly.
 
     Raises:
-        ConfigError: something is; as `zencell check` says it.
+        ConfigError: something is; as `zencell check` says it. Or the simulator cannot simulate.
+        UnknownName: there is no such simulator.
     """
+    if is_simulated(cell.robot):
+        require_simulator(cell.world.simulator)
     for found in refused(cell):
         field, _, rest = found.line.partition(": ")
         raise ConfigError(field, ..., rest)

@@ -12,6 +12,7 @@ def examine(endpoint: str) -> Iterator[Finding]:
     """All findings; the router and its cells are looked for at an endpoint."""
     yield software.python()
     yield from software.packages()
+    yield software.extras()
     yield software.kernel()
     yield from configuration.robots()
     yield from configuration.cells()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import platform
 import sys
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from common.planning.kernel.library import library_path
 INSTALL = "pip install -c constraints.txt -e ."
 CONSTRAINTS = Path(__file__).resolve().parents[2] / "constraints.txt"
 OLDEST = (3, 11)
+_OF_DEVELOPERS = ("dev",)
 
 
 def python() -> Finding:
@@ -47,6 +49,21 @@ def packages() -> Iterator[Finding]:
         yield warn(f"packages other than those tested: {', '.join(other)}", INSTALL)
     else:
         yield ok(f"packages: {', '.join(found)}")
+
+
+def extras() -> Finding:
+    """Which of what is installed on demand is there."""
+    found, known = [], []
+    with contextlib.suppress(PackageNotFoundError):
+        known = requires("zencell") or []
+    for text in known:
+        name, _, condition = text.partition(";")
+        name = "".join(c if c.isalnum() or c in "-_." else " " for c in name).split()[0]
+        extra = condition.partition("extra ==")[2].strip(" \"'")
+        if extra and extra not in _OF_DEVELOPERS:
+            with contextlib.suppress(PackageNotFoundError):
+                found.append(f"{name} {version(name)} ({extra})")
+    return ok(f"extras: {', '.join(found) or 'none'}")
 
 
 def kernel() -> Finding:

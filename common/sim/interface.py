@@ -167,6 +167,19 @@ def load_world(
     return cast(Simulator, module).create(world, objects, tolerances or GraspTolerances(), gripper)
 
 
+def require_simulator(name: str) -> None:
+    """Return when there is a simulator of that name, with what it says by its own `require`, if any, that it needs.
+
+    Raises:
+        UnknownName: no such simulator; lists the choices.
+        ConfigError: a module that cannot be imported, or something that is not installed.
+    """
+    if name != SIMULATORS[0]:
+        require = getattr(_module(name), "require", None)
+        if require is not None:
+            require()
+
+
 class Renderer(Protocol):
     """Draws what one camera sees. Its calls may block and may come from any thread, one at a time."""
 

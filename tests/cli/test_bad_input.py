@@ -10,6 +10,8 @@ from cli.main import app
 from tests.harness import ask, command_line, environment
 
 CASES: dict[str, tuple[list[str], list[str]]] = {
+    "simulator": (["run", "panda", "--set", "world.simulator=mujocco"], ["'mujocco'", "did you mean 'mujoco'?"]),
+    "no simulator": (["run", "panda", "--set", "world.simulator=no.such"], ["world.simulator", "cannot be imported"]),
     "unknown cell": (["run", "pnada"], ["unknown cell 'pnada'", "did you mean 'panda'?", "choices:"]),
     "cell file that is not there": (["up", "nowhere.yaml"], ["nowhere.yaml", "is not a file"]),
     "unknown world": (["run", "panda", "--world", "moon"], ["unknown world 'moon'", "balls"]),

@@ -105,6 +105,21 @@ def test_project_that_is_not_installed_is_a_warning(monkeypatch: pytest.MonkeyPa
     not_well(finding, "not installed", "pip install")
 
 
+def test_what_is_installed_on_demand_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = ["numpy>=1", 'mujoco<4,>=3; extra == "physics"', 'ur-rtde>=1; extra == "ur"', 'ruff; extra == "dev"']
+
+    def version(name: str) -> str:
+        if name == "ur-rtde":
+            raise software.PackageNotFoundError(name)
+        return "3.2"
+
+    monkeypatch.setattr(software, "requires", lambda name: wanted)
+    monkeypatch.setattr(software, "version", version)
+    assert software.extras().what == "extras: mujoco 3.2 (physics)"
+    monkeypatch.setattr(software, "requires", lambda name: [])
+    assert software.extras().what == "extras: none"
+
+
 def test_planning_kernel_that_is_not_compiled_is_named(monkeypatch):
     monkeypatch.setattr(software, "library_path", lambda: software.Path("planning_kernel_avx2.so"))
     assert software.kernel().level == "ok" and "planning_kernel_avx2.so" in software.kernel().what
