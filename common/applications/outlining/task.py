@@ -60,6 +60,7 @@ class Outline(Task[OutlineView]):
         self._forgotten = 0  # motions since the last that ended well
         self._up: Move | None = None  # the first motion of the way home from anywhere
         self._excused: tuple[str, str] | None = None  # contact from which the arm has to be freed
+        self._named: set[str] = set()  # what the scene held when the motions were made, as it was called then
 
     # --- what to do next -------------------------------------------------------------------------------------
 
@@ -111,6 +112,7 @@ class Outline(Task[OutlineView]):
         status.points, status.length_m, status.fraction, status.closed = len(path.poses), length(points), 0.0, False
         status.invalid_depth, status.standoff = path.invalid_depth, self.p.standoff
         self._cycle = Cycle(path.object)
+        self._named = _names(view)
         if view.gripper.width > SHUT:
             self.row.append(Grip("close", "PLANNING", self._cycle, width=0.0))
         self.row += [*self._legs.outline(points, solid, self._cycle), Look()]
@@ -183,6 +185,8 @@ class Outline(Task[OutlineView]):
         elif move is self._up:
             self.clear()
             self.row += [self._legs.home(self._cycle), Look()]
+        elif not self._error and set(response.colliding or ()) & (_names(view) - self._named):
+            self.displaced(move, view, response.message)  # of something that was not there, or had another name
         elif not self._error:
             subject = self.status.subject
             self.fail(f"{subject}: {response.message}" if subject else response.message, view)
@@ -225,3 +229,7 @@ class Outline(Task[OutlineView]):
     def time_limit(self, stage: Stage) -> float:
         """A stage that takes longer is stopped [s]."""
         return self.p.overtime + (stage.seconds if isinstance(stage, Move) else 0.0)
+
+
+def _names(view: OutlineView) -> set[str]:
+    return {thing.id for thing in view.scene.objects} if view.scene is not None else set()

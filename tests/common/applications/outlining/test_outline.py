@@ -111,6 +111,23 @@ def test_way_that_can_not_be_planned_ends_in_error_before_the_arm_moves(stage: s
         assert cell.status.fraction == 0.5
 
 
+def test_object_that_got_another_name_while_motions_were_planned_is_traced_under_that_name() -> None:
+    double = OutlineDouble()
+
+    def collides(request: m.PlanRequest) -> str:
+        if request.stage != "descend" or double.objects[0].id != "Object_1":
+            return ""
+        assert double.path is not None
+        double.objects[0] = double.objects[0].model_copy(update={"id": "Object_7"})
+        double.path = double.path.model_copy(update={"object": "Object_7"})
+        double.colliding = ("tip", "Object_7")
+        return "collision"
+
+    double.unplannable = collides
+    double.until("DONE", "ERROR")
+    assert (double.status.state, double.status.subject, double.status.failures) == ("DONE", "Object_7", 1)
+
+
 def test_motion_that_fails_brings_the_arm_home_and_ends_in_error() -> None:
     cell = OutlineDouble()
     cell.abort = "trace"
