@@ -314,6 +314,7 @@ async def _plan(
     except asyncio.CancelledError:
         cancel.set()
         await asyncio.wait({planning})
+        planning.exception()  # of a helper that was ended together with us: no news
         raise
 
 

@@ -93,3 +93,67 @@ os._exit(0)
     assert isinstance(pids[0], int)
     with contextlib.suppress(psutil.NoSuchProcess):
         psutil.Process(pids[0]).wait(20)
+
+
+def test_helpers_end_with_their_parent_also_while_one_of_them_is_stopped() -> None:
+    pids = told("""
+import multiprocessing
+second = Helper(1)
+for process in multiprocessing.active_children():
+    print(json.dumps(process.pid), flush=True)
+    while os.getpriority(os.PRIO_PROCESS, process.pid) == os.getpriority(os.PRIO_PROCESS, 0):
+        pass  # it has just been forked
+os.kill(second._process.pid, signal.SIGSTOP)
+os._exit(0)
+""")
+    for pid in pids:
+        assert isinstance(pid, int)
+        with contextlib.suppress(psutil.NoSuchProcess):
+            psutil.Process(pid).wait(20)
+
+
+def test_helper_that_is_stopped_is_ended_and_said_to_be_lost_though_the_scene_does_not_fit_into_the_pipe() -> None:
+    assert told("""
+import common.planning.helper
+common.planning.helper.PATIENCE = 0.1
+scene = scene.model_copy(update={"header": Header.model_construct(frame_id="x" * 10_000_000)})
+os.kill(helper._process.pid, signal.SIGSTOP)
+try:
+    helper.plan(asked("a", 0.1), scene, None, Cancel())
+except HelperLost as lost:
+    print(json.dumps([str(lost), helper._process.exitcode]))
+""") == [["the second planner has ended", -9]]
+
+
+def test_helper_that_is_stopped_is_ended_when_giving_up_is_told_to_it() -> None:
+    assert told("""
+import common.planning.helper
+common.planning.helper.PATIENCE = 0.1
+cancel = Cancel()
+cancel.set()
+os.kill(helper._process.pid, signal.SIGSTOP)
+try:
+    helper.plan(asked("a", 300.0), scene, None, cancel)
+except HelperLost as lost:
+    print(json.dumps(str(lost)))
+""") == ["the second planner has ended"]
+
+
+def test_helper_that_is_let_go_of_leaves_no_process_behind() -> None:
+    assert told("""
+second = Helper(1)
+helper.close()
+print(json.dumps([helper._process.exitcode, second._process.exitcode]))
+""") == [[-9, None]]
+
+
+def test_helper_finds_a_planner_that_lies_where_only_its_parent_looks_by_now(tmp_path: Path) -> None:
+    (tmp_path / "of_a_person").mkdir()
+    (tmp_path / "of_a_person/planner.py").write_text(
+        "from common.planning.planners.joint_move import Options, plan\n", encoding="utf-8")
+    assert told("""
+sys.path.append(sys.argv[1])
+cell = load_cell("panda", ["pipeline.planners=[{name: of_a_person.planner}]"])
+helper.set_up(cell.robot, cell.motion, cell.pipeline, seed=3)
+print(json.dumps(helper.plan(asked("a"), scene, None, Cancel()).planner))
+""", str(tmp_path)) == ["planner"]
