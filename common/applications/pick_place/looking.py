@@ -31,7 +31,7 @@ class Looking:
         return next(iter(self._all()), [])
 
     def found(self) -> None:
-        """Everything was seen: the next time it begins with the first again."""
+        """Everything was seen, or is to be tried anew: the next time it begins with the first again."""
         self._tried = 0
 
     def _all(self) -> list[list[float]]:

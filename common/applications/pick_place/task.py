@@ -75,6 +75,8 @@ class PickPlace(Task[PickPlaceView]):
         assert view.gripper is not None
         if min(view.stamps) <= self.look_after or self.unseen(view):
             return False
+        if self.running is None and not (view.seen and view.seen.unseen):
+            self._looking.found()
         running = _pick_of(self.running.stage) if self.running else None
         box = self._around.container
         cycle = self._choice.next(view, (box.x, box.y) if running else view.tool, [running] if running else [])
@@ -141,6 +143,8 @@ class PickPlace(Task[PickPlaceView]):
     def note(self, view: PickPlaceView) -> None:
         """Count what lies in the container, and what is on the table while nothing is in the hand or in the air."""
         status = self.status
+        if not self._waits(view):  # how long it could not see is counted while it does nothing but wait to
+            self._hidden.reset()
         status.skipped = self._choice.rejections()
         # What lies in the container was put there before a restart of this task, or by somebody else. The scene may
         # tell of it only later, when it was started again as well. A ball that is let go counts when it is: until then
@@ -153,6 +157,18 @@ class PickPlace(Task[PickPlaceView]):
         looked = not self._around.on_hand or min(view.stamps) > self.look_after
         if status.stage not in ("close", "lift", "across", "release") and looked:
             status.total = status.done + len(view.targets)
+
+    def _waits(self, view: PickPlaceView) -> bool:
+        """Whether nothing is under way, and nobody keeps the task from deciding what comes next."""
+        assert view.motion is not None
+        idle = self.running is None and not self.row and view.motion.state != "active"
+        kept = self.status.paused or view.motion.held or view.motion.fault or view.motion.stopped
+        return idle and self.status.started and not kept
+
+    def began_anew(self) -> None:
+        """What was in the way of looking before may be gone."""
+        self._looking.found()
+        self._hidden.reset()
 
     def succeeded(self, stage: Stage, view: PickPlaceView) -> None:
         """A ball that was let go is done."""

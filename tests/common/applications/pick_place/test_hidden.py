@@ -119,6 +119,70 @@ def test_task_that_cannot_see_never_ends_as_done_and_says_what_it_could_not_see(
     assert (len(cell.stages()) == 0) if blind else (set(cell.stages()) == {"look"})
 
 
+def test_what_each_look_brings_to_light_is_taken_and_the_next_look_begins_with_the_first_pose_again() -> None:
+    cell = Behind([])
+    clear, moved, left = False, False, [(0.4, -0.05 * k) for k in range(6)]
+    cell.tcp_away = lambda: clear  # type: ignore[method-assign]
+    while cell.task.status.state not in ("DONE", "ERROR"):
+        running = cell.task.running
+        if running is not None:
+            moved, clear = running.stage.name == "look", False
+        elif moved:  # from there the camera sees past the arm
+            moved, clear = False, True
+            cell.balls |= {f"found_{len(left)}": (*left.pop(), 0.03)} if left else {}
+        cell.step()
+    assert (cell.task.status.state, cell.task.status.done) == ("DONE", 6)
+
+
+def test_two_moments_without_sight_are_not_all_the_time_between_them() -> None:
+    cell = Behind([(0.4, 0.0), (0.4, -0.1)])
+    cell.tcp_away = lambda: True  # type: ignore[method-assign]
+    for done in (1, 2):
+        cell.until("across")
+        cell.is_blind = True
+        for _ in range(15):
+            cell.step()
+        status = cell.task.status
+        assert (status.done, status.state) == (done, "IDLE") and "nothing can be seen" in status.message
+        cell.is_blind = False
+        for _ in range(4):
+            cell.step()
+        cell._arrival += 2 * cell.task.p.look_timeout  # the next motion takes its time
+    cell.until("DONE")
+
+
+@pytest.mark.parametrize("blind", [True, False])
+def test_task_that_is_started_again_after_it_could_not_see_looks_for_as_long_as_before(blind: bool) -> None:
+    cell = Behind([])
+    cell.is_blind = blind
+    cell.tcp_away = lambda: False  # type: ignore[method-assign]
+    cell.until("ERROR")
+    looks = len(cell.stages())
+    for _ in range(5 * int(cell.task.p.look_timeout)):  # a person comes
+        cell.step()
+    cell.tell("start")
+    for _ in range(100):
+        cell.step()
+        assert cell.task.status.state != "ERROR"
+    cell.until("ERROR")
+    assert len(cell.stages()) == 2 * looks
+
+
+def test_time_for_which_a_person_keeps_the_task_from_looking_does_not_count() -> None:
+    cell = Behind([])
+    cell.is_blind = True
+    cell.tcp_away = lambda: False  # type: ignore[method-assign]
+    for _ in range(20):
+        cell.step()
+    cell.tell("pause")
+    for _ in range(20 * int(cell.task.p.look_timeout)):
+        cell.step()
+    cell.tell("resume")
+    for _ in range(20):
+        cell.step()
+    assert cell.task.status.state == "IDLE"
+
+
 def test_task_begins_nothing_by_a_picture_that_shows_nothing() -> None:
     cell = Behind([(0.4, 0.0)])
     cell.is_blind = True
