@@ -7,6 +7,8 @@ What it brings lies in modules of these names within the package, or else in the
                 STATUS     on which its task says how far it is: a `Topic` of a `TaskStatus`
                 DECIDED_BY (optional) a stream whose stamp is that of the picture by which the task decides
                 REJECTED   (optional) a `Topic` of `Rejections`: what the task is not offered, and why
+                DETECTED   (optional) a `Topic` of `MarkerArray`: what was found, in world; a rejection of what is found
+                           there no more is over
                 ANNOTATED  (optional) a `Topic` of `Image`: the picture with what was found in it
                 MASK       (optional) a `Topic` of `Image`: white where that was looked for
                 VIEWS      (optional) {Topic: function(WorldObjects) -> message}: truth as the application calls it,

@@ -117,7 +117,7 @@ PLATFORM_SERVICES = (
     "camera_opencv", "real_depth_camera", "router",
 )
 APPLICATIONS = [path.parent.name for path in sorted((ROOT / "common" / "applications").glob("*/__init__.py"))]
-PARTS_ALL_LOOK_FOR = ("STATUS", "DECIDED_BY", "REJECTED", "ANNOTATED", "MASK", "VIEWS")
+PARTS_ALL_LOOK_FOR = ("STATUS", "DECIDED_BY", "REJECTED", "DETECTED", "ANNOTATED", "MASK", "VIEWS")
 SHORT_FORMS = (  # where the fields of older world files are read, and the arguments of an older function
     "common/config/short_forms.py", "common/sim/drawing.py",
 )

@@ -107,7 +107,7 @@ class Topics:
     """What the page has to do with: what every cell has, what the application names, and what layers show.
 
     Attributes:
-        status, rejected, decided_by: of the application, if it has them.
+        status, rejected, detected, decided_by: of the application, if it has them.
         images: pictures as the cameras send them, with what was found in them, what was looked at, and depth.
         requests: what the application asks.
         on_demand: what is read while somebody looks at it.
@@ -127,6 +127,7 @@ class Topics:
             return [each for topic in found if topic is not None for each in under_all_keys(topic, keys)]
 
         self.rejected: list[Topic[Rejections]] = everywhere(named("topics", "REJECTED"))
+        self.detected: list[Topic[Any]] = everywhere(named("topics", "DETECTED"))
         self.decided_by: list[Topic[Any]] = everywhere(named("topics", "DECIDED_BY"))
         self.images: dict[str, list[Topic[Image]]] = {
             LIVE: everywhere(topics.CAMERA_IMAGE, topics.DEPTH_CAMERA_IMAGE),
@@ -143,7 +144,8 @@ class Topics:
     @property
     def always(self) -> list[Topic[Any]]:
         """What is read all the time: small or seldom."""
-        return [*ALWAYS, *([self.status] if self.status is not None else []), *self.rejected, *self.decided_by]
+        return [*ALWAYS, *([self.status] if self.status is not None else []), *self.rejected,
+                *self.detected, *self.decided_by]
 
 
 class Latest(Protocol):

@@ -34,6 +34,7 @@ class Viewpoint(Section):
 class Layout(Section):
     """What is on when the page opens."""
 
+    version: Literal[2] = Field(2, description="of the file; one without it may be from before there was the tab Time")
     dark: bool = Field(True, description="light letters on a dark ground")
     panel_width: Annotated[int, Field(ge=280, le=1200)] = Field(470, description="[px]")
     tabs: list[Tab] = Field([*TABS], description="in order; the first is open")
@@ -88,7 +89,10 @@ def load_layout(given: str, tell: Callable[[str], None]) -> Layout:
 
 
 def _read(path: Path) -> Layout:
-    return check(Layout, read_yaml(path), str(path))
+    layout = check(Layout, read_yaml(path), str(path))
+    if "version" not in layout.model_fields_set and set(layout.tabs) == {*TABS} - {"Time"}:
+        return layout.model_copy(update={"tabs": [*layout.tabs, "Time"]})
+    return layout
 
 
 def save_layout(given: str, layout: Layout) -> Path:

@@ -24,7 +24,7 @@ from common.application import Application
 from common.config import Members, RobotConfig, check
 from common.errors import ZencellError
 from common.messages import Image, PointCloud2, Rejections, TaskStatus
-from common.reporting.summary import Rejected
+from common.reporting.summary import NOT_LEFT_BEHIND
 from common.topics import Topic
 from common.viewer import words
 from common.viewer.arm_panel import ArmPanel
@@ -43,6 +43,7 @@ from common.viewer.past import Memory
 from common.viewer.pictures import PicturePanel
 from common.viewer.plots import SECONDS, Limits, PlotPanel
 from common.viewer.recorded import RecordedPast, Watch, recordings_in
+from common.viewer.rejections import RejectedPlaces
 from common.viewer.task_panel import TaskPanel
 from common.viewer.time_panel import TimePanel
 from common.viewer.timeline import Timeline
@@ -100,7 +101,7 @@ class Page:
         self._remembered = [topic for topic in feeds.topics
                             if topic.kind != "event" and not issubclass(topic.message, Image | PointCloud2)]
         self._shown, self._editing = layers_shown(layout.layers, layers), layout.edit_world
-        self._rejected, self._line, self._losses = Rejected(), line, Losses()
+        self._rejected, self._line, self._losses = RejectedPlaces(), line, Losses()
         self._memory, self._watch = Memory(), Watch(self._words.states)
         self.timeline = Timeline(feeds.latest, self._memory)
         self._happened: list[tuple[Topic[Any], Any]] = []  # before there is a scene: an event does not come again
@@ -170,7 +171,7 @@ class Page:
             on_shadows=lambda on: self._server.scene.configure_default_lights(cast_shadow=on))
         gui.add_divider()
         self._world = WorldPanel(gui, self.console, editing=self._editing, on_editing=self._set_editing,
-                                 on_reset=self._rejected.places.clear)
+                                 on_reset=self._forget_rejected)
         button = gui.add_button("Save layout", icon=viser.Icon.DEVICE_FLOPPY,
                                 hint="what is on now, and this view of the scene, is how the page opens")
 
@@ -327,7 +328,8 @@ class Page:
                 self._plots.latency(age_ms(message.header.stamp), now())
 
         def reject(rejections: Rejections) -> None:
-            self._rejected.add(rejections.rejected)
+            left = [each for each in rejections.rejected if NOT_LEFT_BEHIND not in each.reason]
+            self._rejected.hear(rejections.model_copy(update={"rejected": left}))
             for said, kind in self._watch.news(rejections):
                 self._memory.happened(now(), said, kind)
 
@@ -335,9 +337,11 @@ class Page:
             topics.LOG: [self._log.add], topics.COUNTERS: [lambda counters: self._health.count(counters, now())],
         }
         for topic in self._topics.decided_by:
-            acts.setdefault(topic, []).append(older)
+            acts.setdefault(topic, []).extend((older, self._rejected.hear))
         for topic in self._topics.rejected:
             acts.setdefault(topic, []).append(reject)
+        for topic in self._topics.detected:
+            acts.setdefault(topic, []).append(self._rejected.hear)
         for topic in {topic for kind in self._kinds.values() for topic in kind.TOPICS if topic.kind == "event"}:
             acts.setdefault(topic, []).append(partial(self._happen, topic))
         others = (self._follow(*each) for each in acts.items())
@@ -404,6 +408,11 @@ class Page:
         if self._scene is not None:
             self._scene.set_shown(name, on)
         self._listen()
+
+    def _forget_rejected(self) -> None:
+        """After a reset, where no detection tells that what was rejected lies there no more."""
+        if not self._topics.detected:
+            self._rejected.places.clear()
 
     def _set_editing(self, on: bool) -> None:
         self._editing = on

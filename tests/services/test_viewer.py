@@ -31,6 +31,7 @@ from common.applications.outlining.page import choose
 from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT, OUTLINE_STATUS
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.topics import (
+    DETECTED_OBJECTS,
     DETECTION_IMAGE,
     PICK_PLACE_STATUS,
     REJECTED_TARGETS,
@@ -829,6 +830,20 @@ async def test_rejected_places_are_counted_once(panda: Played, page: BrowserDoub
         rejection = m.Rejection(position=m.Vector3(x=x), reason=reason)
         writer.put(m.Rejections(header=m.Header(), rejected=[rejection]))
     await page.until(lambda: '<div data-field="rejected"><b>2</b>' in page.text)
+
+
+async def test_rejected_places_are_counted_no_more_when_nothing_lies_there_whoever_reset_the_world(
+    panda: Played, page: BrowserDouble
+) -> None:
+    panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
+    panda.bus.writer(REJECTED_TARGETS).put(m.Rejections(header=m.Header(stamp=10), rejected=[
+        m.Rejection(position=m.Vector3(x=x, y=0.8), reason="too far") for x in (1.1, 1.3, 1.5)]))
+    detected = panda.bus.writer(DETECTED_OBJECTS)
+    lies = m.Marker(ns="balls", id=1, type="sphere", pose=m.Pose(position=m.Vector3(x=1.1, y=0.8)),
+                    scale=m.Vector3(x=0.06, y=0.06, z=0.06))
+    await page.until(lambda: '<div data-field="rejected"><b>3</b>' in page.text)
+    detected.put(m.MarkerArray(header=m.Header(stamp=5_000_000_000), markers=[lies]))
+    await page.until(lambda: '<div data-field="rejected"><b>1</b>' in page.text)
 
 
 async def test_page_looks_back_and_what_moves_the_arm_brings_it_to_now(

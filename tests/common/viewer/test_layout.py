@@ -42,6 +42,16 @@ def test_saved_layout_reads_back(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [file]
 
 
+def test_tab_that_is_newer_than_a_saved_layout_appears_but_not_where_it_was_left_out_on_purpose(tmp_path: Path) -> None:
+    file, older = tmp_path / "mine.yaml", [tab for tab in TABS if tab != "Time"]
+    file.write_text(f"tabs: {older}\n")
+    assert load_layout(str(file), print).tabs == [*older, "Time"]
+    save_layout(str(file), Layout(tabs=older))
+    assert load_layout(str(file), print).tabs == older
+    file.write_text("tabs: [Log, Move]\n")
+    assert load_layout(str(file), print).tabs == ["Log", "Move"]
+
+
 def test_save_that_fails_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "mine.yaml"
     save_layout(str(file), Layout())

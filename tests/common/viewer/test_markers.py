@@ -41,7 +41,8 @@ def test_each_target_has_a_ring(panda: Stage) -> None:
 def test_rejected_place_is_labelled_with_the_reason(panda: Stage) -> None:
     panda.say(REJECTED_TARGETS, rejection(0.82, 0.3, TOO_FAR))
     assert panda.layer("rejected").labels.texts == [TOO_FAR]
-    np.testing.assert_allclose(panda.layer("rejected").known[0].node.position, [0.82, 0.3, 0.03])
+    (_, node), = panda.layer("rejected").nodes.values()
+    np.testing.assert_allclose(node.position, [0.82, 0.3, 0.03])
 
 
 def test_newer_reason_replaces_the_old_one_of_the_place(panda: Stage) -> None:
