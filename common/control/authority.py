@@ -53,9 +53,11 @@ class Authority:
     def refused(self, request: ExecuteRequest, status: MotionStatus) -> None:
         """Take note of how a goal was answered.
 
-        A task that was kept from going on by an operator does not do so by itself once the motion is given back.
+        A task that was kept from going on by an operator does not do so by itself once the motion is given back. Asked
+        for again, when the motion has long been the task's, it is answered as before; nothing follows from that.
         """
-        if status.error == NOT_OWNER and not request.owner and self._owners.now.asked:
+        others = self._owners.now.asked and self.others(request.owner) is not None
+        if status.error == NOT_OWNER and not request.owner and others:
             self.inhibits.stop(StopRequest(reason=status.message, owner=self._owners.now.owner))
             self.tell_inhibits()
 

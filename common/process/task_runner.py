@@ -266,15 +266,16 @@ class TaskRunner(Generic[V]):
 
     async def _do(self, command: Command, before: set[asyncio.Task[None]]) -> None:
         """Send what a command stands for, after what was said before it; what is refused is an answer too."""
+        told = self._bus.clock.now_ns()
         try:
             if before:  # what lets go must not be overtaken by what it lets go of
                 await asyncio.wait(before)
-            await self._send(command)
+            await self._send(command, told)
         finally:
             if ended := self._ended.get(id(command)):
                 ended.set()
 
-    async def _send(self, command: Command) -> None:
+    async def _send(self, command: Command, told: int) -> None:
         if isinstance(command, m.PlanRequest):
             seconds = self._planning_time() + PLAN_OVERTIME
             await self._ask(self._plan, command, seconds, self._planned, lambda error: m.PlanResponse(
@@ -291,7 +292,9 @@ class TaskRunner(Generic[V]):
         elif isinstance(command, m.HoldRequest):
             if command.by == "person" and not command.hold:
                 heard = self._heard_of()
-                command.heard = heard if command.heard is None or heard is None else min(heard, command.heard)
+                if heard is None:  # of a robot that is away: what is said while it is asked again and again stays
+                    heard = told
+                command.heard = heard if command.heard is None else min(heard, command.heard)
             await self._ask(self._hold, command, GOAL_TIMEOUT, self._kept, lambda error: m.MotionStatus(
                 message=error.message))
         else:

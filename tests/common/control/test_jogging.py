@@ -356,6 +356,15 @@ def test_a_start_by_another_does_not_take_it_from_who_has_it(arm):
     assert arm.owner == ("", "none")
 
 
+def test_goal_that_was_refused_of_an_operator_and_is_asked_for_again_does_not_stop_the_task_that_was_started(arm):
+    arm.own()
+    assert arm.execute("one").error == "not_owner"
+    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="ann", stops=True))  # she starts the task
+    assert arm.own(owner="sorting", kind="task").owner == "sorting"
+    assert arm.execute("one").error == "not_owner"  # as before: an id stands for one answer
+    assert arm.execute("two").state == "active"
+
+
 def test_a_stop_and_a_hold_need_no_ownership_and_a_stop_ends_it(arm):
     arm.own()
     arm.execute("one", "ann")
