@@ -77,11 +77,15 @@ def _marker(
 
 
 def _remark(detector: Detector, service: str) -> str:
-    """What there is in the last picture that is too small to be looked at; empty without."""
-    if not (count := detector.too_small):
-        return ""
-    are = "blob is" if count == 1 else "blobs are"
-    return f"{count} red {are} smaller than {service}.min_contour_area_px = {detector.options.min_contour_area_px:g}"
+    """What there is in the last picture that is too small or too large to be a ball; empty without."""
+    parts = []
+    if count := detector.too_small:
+        parts.append(f"{count} red {'blob is' if count == 1 else 'blobs are'} smaller than "
+                     f"{service}.min_contour_area_px = {detector.options.min_contour_area_px:g}")
+    if count := detector.too_large:
+        parts.append(f"{count} round red {'thing looks' if count == 1 else 'things look'} much larger than a ball on "
+                     "the table")
+    return ", and ".join(parts)
 
 
 async def run(bus: Bus, config: Config) -> None:

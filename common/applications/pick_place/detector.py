@@ -125,6 +125,7 @@ class Detector:
         self.blind = ""  # why the last picture tells nothing
         self.odd: list[Odd] = []  # what is red in the last picture and no ball on the table
         self.too_small = 0  # blobs in the last picture that were not looked at, but for those in the container
+        self.too_large = 0  # round blobs in it that look larger than a stack, but for those in the container
         self._last: tuple[Mask, Pinhole, DetectorOptions, list[Detection]] | None = None
 
     def masks(self, picture: Picture) -> tuple[Mask, Mask]:
@@ -180,7 +181,7 @@ class Detector:
         pixel_size = abs(float(camera.position[2]) - self.resting.plane) / camera.fx  # at the plane of the balls
         offset = self.options.outline_offset_px * pixel_size
         seen: list[_Seen] = []
-        self.odd = []
+        self.odd, self.too_large = [], 0
         alone, crowded, offsets = self._alone(blobs, camera, offset, pixel_size)
         seen += alone
         # All outlines of a picture are off by as much: balls that stand alone say by how much.
@@ -245,6 +246,7 @@ class Detector:
                 continue
             best = min(tries, key=lambda one: abs(one.offset - offset))
             if best.offset - offset > FALLING:
+                self.too_large += not self.resting.shows_container(camera, blob.centroid)
                 continue
             if abs(best.offset - offset) > self.options.max_offset_px * pixel_size:
                 self.odd.append(self._odd(blob.centroid, camera, sized(best.offset, offset)))

@@ -15,7 +15,7 @@ from common.messages import Color, Vector3, WorldObject
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
 from common.sim.rendering import Renderer
-from services.vision_detector import markers
+from services.vision_detector import _remark, markers
 from tests.simulated.visited import SimulatedCell
 
 AROUND = load_cell("panda").section(Surroundings)
@@ -86,6 +86,17 @@ def test_of_a_stack_neither_ball_is_offered(place: tuple[float, float]) -> None:
     assert detector.odd
     frame = markers([], AROUND, 1, odd=detector.odd)
     assert all(marker.text for marker in frame.markers)
+
+
+@pytest.mark.parametrize("place", PLACES[:2])
+@pytest.mark.parametrize(("diameter", "below"), [(0.07, 0.0), (0.1, 0.0), (0.06, 0.17)])
+def test_what_looks_much_larger_than_a_ball_is_told_though_it_may_fall(
+    place: tuple[float, float], diameter: float, below: float,
+) -> None:
+    detector = look(red("sphere", (*place, below + diameter / 2), (diameter, diameter, diameter)))
+    assert detector.too_large == 1 and detector.odd == []
+    assert _remark(detector, "eye") == "1 round red thing looks much larger than a ball on the table"
+    assert look().too_large == 0 and _remark(look(), "eye") == ""
 
 
 class Anywhere:
