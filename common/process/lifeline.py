@@ -108,6 +108,12 @@ def wake_when_orphaned() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGCONT)
 
 
+def die_when_orphaned() -> None:
+    """Have the kernel end this process when its parent ends: for one whose answer nobody else takes."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
 def leave(code: int) -> NoReturn:
     """End the process now: neither threads that still compute nor the network can hold it."""
     flushing = threading.Thread(target=_flush, daemon=True)
