@@ -76,8 +76,20 @@ class WorldEdits:
         if not self._done:
             raise NothingToUndo("there is no edit to take back")
         done = self._done.pop()
-        for edit in done.back:
-            await self._restore(edit)
+        waiting = list(done.back)
+        while waiting:
+            taken: list[WorldEdit] = []  # places on which something else still lies, which may have its turn later
+            for edit in waiting:
+                try:
+                    await self._restore(edit)
+                except RemoteError as error:
+                    if error.code != "occupied":
+                        raise
+                    taken.append(edit)
+                    refused = error
+            if len(taken) == len(waiting):
+                raise refused
+            waiting = taken
         return done.told
 
     async def add_like(self, thing: WorldObject, x: float, y: float) -> str:

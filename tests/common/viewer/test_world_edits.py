@@ -94,3 +94,19 @@ async def test_what_was_added_by_hand_comes_back_as_it_was(world: World) -> None
     assert again.pose.position.x == pytest.approx(added.pose.position.x, abs=1e-4)
     await world.edits.add_like(again, x, y)
     assert len([thing for thing in world.truth().objects if (thing.shape, thing.size) == ("cylinder", added.size)]) == 2
+
+
+@pytest.mark.parametrize(("one", "other"), [("ball_1", "ball_2"), ("ball_2", "ball_1")])
+async def test_reset_is_taken_back_where_one_object_lay_in_the_first_place_of_another(one: str, other: str) -> None:
+    world = World("panda")
+    x, y, _ = world.places[other]
+    for at in free_places(x, y, 0.09, world.truth()):
+        with suppress(RemoteError):  # off the table
+            await world.edits.do(WorldEdit(op="move", id=other, position=Vector3(x=at[0], y=at[1])))
+            break
+    await world.edits.do(WorldEdit(op="move", id=one, position=Vector3(x=x, y=y)))
+    before = world.places
+    await world.edits.do(WorldEdit(op="reset"))
+    assert world.places != before
+    await world.edits.undo()
+    assert world.places == before
