@@ -51,7 +51,12 @@ class Watched:
         self._region: Region | None = None
 
     def unseen(self, seen: list[Seen], views: Views, most: float) -> tuple[str, bool]:
-        """In words, empty where at most that share of the table is hidden; and whether nothing is seen at all."""
+        """In words, empty where at most that share of the table is hidden; and whether nothing is seen at all.
+
+        Of several views all are needed: what only one of them sees is not known without it.
+        """
+        if missing := views.missing():
+            return f"no picture comes from {' and '.join(missing)}", False
         hiding = [one.hidden for one in seen if one.hidden is not None]
         if not hiding:
             return "", False

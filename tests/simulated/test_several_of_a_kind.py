@@ -44,6 +44,13 @@ def test_one_camera_alone_leaves_what_it_does_not_see() -> None:
     assert (outcome.state, outcome.done) == ("DONE", 2), outcome  # the third lies where only the right one looks
 
 
+def test_task_is_not_done_while_one_of_two_cameras_shows_nothing() -> None:
+    lost = "services.right_detector.topics={camera/*: nowhere/camera/*, detect*: right/detect*}"
+    outcome = Simulation(load_cell(CELL, [lost]), 1).run()
+    assert (outcome.state, outcome.done) == ("ERROR", 2), outcome
+    assert "no picture comes from right, for 20 s" in outcome.message
+
+
 def test_two_cameras_on_one_key_end_the_start_with_one_line() -> None:
     outcome = Simulation(load_cell(CELL, ["services.right_camera.topics={camera/*: left/camera/*}"]), 1).run()
     assert outcome.state == "NOT STARTED"

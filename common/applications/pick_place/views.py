@@ -76,6 +76,7 @@ class Views:
         self._radius, self._config = around.ball_radius, robot
         self._robot: tuple[RobotModel, Silhouettes] | None = None
         self._before: dict[int, RobotBefore] = {}
+        self._views = list(names)
         self._names, self._home = robot.joints, HomeWatch(robot.named_poses["home"])
         self._only_at_home = only_at_home
         self._newest: list[Seen | None] = [None for _ in keys]
@@ -115,6 +116,11 @@ class Views:
         latest = max((seen.frame.header.stamp for seen in found), default=0)
         return [seen for seen in found
                 if seen.at_times or latest - seen.frame.header.stamp <= OLDEST * 1e9]
+
+    def missing(self) -> list[str]:
+        """Names of the views of which nothing tells of now."""
+        now = {id(seen) for seen in self.newest()}
+        return [name for name, seen in zip(self._views, self._newest, strict=False) if id(seen) not in now]
 
     async def _watch_arm(self) -> None:
         if not self._watches_home:
