@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from common.applications.outlining.contours_choice import NoSuchContour, choose, described
 from common.applications.outlining.messages import Contour, OutlineSelect
 
 LARGEST_CHANGE = 2.0  # of the area of an object between two pictures
+PART = 0.9  # of the edge of a part that lies within the whole
+NEAR = 3.0  # [px] without or within
 
 
 class Following:
@@ -20,7 +23,8 @@ class Following:
     more of it is a smaller and smaller part.
 
     A choice that nothing fits yet is tried on every picture. Once it fell upon an object it stays with it: when that
-    is not seen (the arm may be before it), nothing is chosen, rather than something else.
+    is not seen (the arm may be before it), nothing is chosen, rather than something else. What was chosen by itself in
+    the first picture may have been a part of an object, with the arm before the rest: then it falls upon the whole.
     """
 
     def __init__(self, wanted: OutlineSelect | None) -> None:
@@ -28,6 +32,7 @@ class Following:
         self._wanted = wanted
         self._chosen: Contour | None = None
         self._last: Contour | None = None
+        self._by_itself = True
 
     def select(self, contours: Sequence[Contour], wanted: OutlineSelect) -> Contour:
         """The contour that a new choice falls upon; if there is none, the choice before it stays.
@@ -36,13 +41,16 @@ class Following:
             NoSuchContour: with the choices.
         """
         contour = choose(contours, wanted)
-        self._wanted, self._chosen, self._last = wanted, contour, contour
+        self._wanted, self._chosen, self._last, self._by_itself = wanted, contour, contour, False
         return contour
 
     def find(self, contours: Sequence[Contour]) -> tuple[int, str]:
         """Index of the chosen contour in a new picture, or -1 and why there is none."""
         if self._chosen is not None:
             near = min(contours, key=self._distance, default=None)
+            if self._by_itself and (near is None or not math.isfinite(self._distance(near))):
+                near = self._whole(contours)
+                self._chosen = near or self._chosen
             if near is None or not math.isfinite(self._distance(near)):
                 return -1, f"{self._chosen.label} is not seen any more; choices: {described(contours)}"
             self._last = near
@@ -50,7 +58,8 @@ class Following:
         if self._wanted is None:
             return -1, f"no object is chosen; choices: {described(contours)}"
         try:
-            return self.select(contours, self._wanted).index, ""
+            self._chosen = self._last = choose(contours, self._wanted)
+            return self._chosen.index, ""
         except NoSuchContour as error:
             return -1, str(error)
 
@@ -58,11 +67,28 @@ class Following:
         """How far a contour is from the chosen one [px]; infinite when it cannot be the same."""
         return min((distance(contour, known) for known in (self._last, self._chosen) if known), default=math.inf)
 
+    def _whole(self, contours: Sequence[Contour]) -> Contour | None:
+        """The only contour that has in it what was chosen, as far as it was seen; else None."""
+        assert self._chosen is not None
+        edge = self._chosen.pixels
+        found = [contour for contour in contours if _same_kind(contour, self._chosen)
+                 and contour.area > self._chosen.area and _share_within(edge, contour) >= PART]
+        return found[0] if len(found) == 1 else None
+
+
+def _share_within(edge: Sequence[tuple[float, float]], contour: Contour) -> float:
+    around = np.array(contour.pixels, np.float32)
+    return float(np.mean([cv2.pointPolygonTest(around, at, measureDist=True) > -NEAR for at in edge]))
+
+
+def _same_kind(contour: Contour, known: Contour) -> bool:
+    """Whether both are outer edges, or both edges of holes."""
+    return (contour.parent < 0) == (known.parent < 0)
+
 
 def distance(contour: Contour, known: Contour) -> float:
     """How far a contour is from one that is known [px]; infinite when it cannot be the same object."""
     smaller, larger = sorted((contour.area + 1, known.area + 1))
     away = float(np.linalg.norm(np.mean(contour.pixels, axis=0) - np.mean(known.pixels, axis=0)))
-    same_kind = (contour.parent < 0) == (known.parent < 0)
-    fits = same_kind and larger <= LARGEST_CHANGE * smaller and away <= math.sqrt(larger)
+    fits = _same_kind(contour, known) and larger <= LARGEST_CHANGE * smaller and away <= math.sqrt(larger)
     return away if fits else math.inf
