@@ -25,6 +25,7 @@ _CELL = 0.003  # of the grid in which votes are counted [m]
 _LEAST_VOTES = 0.06  # at a peak, as part of the votes of a whole outline
 _LEAST_SUPPORT = 0.14  # part of a whole outline that a ball must show
 _NEAR = 2.0e-3  # a point this near to a silhouette belongs to it [m]
+_HIDDEN = 0.05  # part of a whole outline that shows of a ball though another one is before it, at most
 _COVERED = 0.85  # part of a ball's silhouette that must be red
 _MOST_GOING_ON = 0.45  # part of the surroundings of a ball that may be red for no known reason
 _MOST_CANDIDATES = 40
@@ -64,7 +65,7 @@ def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: Resting, of
         if gains[best] < _LEAST_SUPPORT:
             break
         candidate = candidates.pop(best)
-        if not _clashes(candidate, chosen, resting.radius):
+        if not _clashes(candidate, chosen, outline, resting.radius):
             chosen.append(candidate)
             free &= ~candidate.points
     centers = np.array([c.center for c in chosen]).reshape(-1, 3)
@@ -147,14 +148,26 @@ def _refined(
     return list(best.values())
 
 
-def _clashes(candidate: _Candidate, chosen: list[_Candidate], radius: float) -> bool:
-    """Whether a candidate is one of the chosen again, or inside of one: solid balls on a table are apart."""
+def _clashes(candidate: _Candidate, chosen: list[_Candidate], outline: Outline, radius: float) -> bool:
+    """Whether a candidate is one of the chosen again, inside of one, or would hide what is seen of one, or one of it.
+
+    Solid balls on a table are apart.
+    """
     for other in chosen:
         distance = float(np.linalg.norm(candidate.center - other.center))
         same_layer = abs(candidate.center[2] - other.center[2]) < 0.5 * radius
         if distance < (1.6 if same_layer else 0.5) * radius:
             return True
+        lower, upper = sorted((candidate, other), key=lambda one: float(one.center[2]))
+        if not same_layer and _is_before(upper, lower, outline, radius):
+            return True
     return False
+
+
+def _is_before(upper: _Candidate, lower: _Candidate, outline: Outline, radius: float) -> bool:
+    """Whether one would hide edges that are seen of the other."""
+    distance, _ = ray_distances(outline.rays[lower.points], upper.center[None])
+    return bool(np.count_nonzero(distance < radius - 2 * _NEAR) > _HIDDEN * lower.whole)
 
 
 def _red_at(pixels: Array, mask: Mask, camera: Pinhole) -> tuple[Chosen, Chosen]:

@@ -88,6 +88,17 @@ def test_of_a_stack_neither_ball_is_offered(place: tuple[float, float]) -> None:
     assert all(marker.text for marker in frame.markers)
 
 
+@pytest.mark.parametrize("places", [
+    [(0.544, 0.265), (0.514, 0.21), (0.579, 0.216)], [(0.552, 0.273), (0.539, 0.214)],
+])
+def test_ball_that_leans_on_a_wall_of_the_container_carries_none_that_is_not_there(
+    places: list[tuple[float, float]],
+) -> None:
+    things = [ball(x, y, 0.035) for x, y in places]
+    found = Detector(AROUND).detect(Renderer(AROUND, camera=CAMERA).see(things).colour, CAMERA)
+    assert len(found) == len(places)
+
+
 @pytest.mark.parametrize("place", PLACES[:2])
 @pytest.mark.parametrize(("diameter", "below"), [(0.07, 0.0), (0.1, 0.0), (0.06, 0.17)])
 def test_what_looks_much_larger_than_a_ball_is_told_though_it_may_fall(
