@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from common.application import find_application
-from common.checking.cell import quick
 from common.completing import offers
 from common.config import load_cell
 from common.supervision.launch import Launch
@@ -37,7 +36,6 @@ def test_new_project_has_a_cell_a_task_a_test_and_five_lines_about_them(kind: st
     cell = load_cell(str(folder / "cell.yaml"))  # its modules are found beside it, wherever one stands
     assert (cell.name, cell.task, cell.application) == (name, "task", f"{name}.task")
     assert find_application(cell.application).status.key == f"{name}_status"
-    assert quick(cell) == []  # nothing to be warned of
 
 
 def test_module_beside_a_cell_file_is_found_by_its_processes_from_anywhere(tmp_path: Path) -> None:
