@@ -119,10 +119,14 @@ async def run(bus: Bus, config: Config, helpers: Sequence[Helper] = ()) -> None:
     if watcher is not None:
         watcher.loaded.append(await asyncio.to_thread(SceneMonitor, config.robot, config.motion.object_padding))
     await bus.ready()
-    async with asyncio.TaskGroup() as group:
-        group.create_task(asyncio.Event().wait() if eyes is None else eyes.follow())
-        if watcher is not None:
-            group.create_task(watcher.run())
+    try:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(asyncio.Event().wait() if eyes is None else eyes.follow())
+            if watcher is not None:
+                group.create_task(watcher.run())
+    finally:
+        for helper in helpers:  # who waits for our end finds none of them
+            helper.close()
 
 
 def _load(config: Config) -> PlanningPipeline:

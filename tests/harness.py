@@ -335,7 +335,8 @@ def processes_of(domain: int) -> dict[str, psutil.Process]:
         if "--gate" in command and "-m" in command and process.info["status"] != psutil.STATUS_ZOMBIE:
             at = command.index("--domain") + 1 if "--domain" in command else 0
             if command[at] == str(domain):
-                found[command[command.index("-m") + 1].rpartition(".")[2]] = process
+                # Helpers of a service look as it does, and began later.
+                found.setdefault(command[command.index("-m") + 1].rpartition(".")[2], process)
     return found
 
 

@@ -191,9 +191,11 @@ async def test_helpers_plan_at_the_same_time_what_is_asked_for_at_once():
     async with planner_with(helpers) as user:
         requests = [to_home(str(i), start=list(HOME + 0.01 * i)) for i in range(3)]
         answers = await asyncio.gather(*(user.plan.call(request, timeout=30) for request in requests))
+        assert not any(helper.closed for helper in helpers)
     assert [answer.trajectory.points[0].positions[0] for answer in answers] == pytest.approx(
         [HOME[0] + 0.01 * i for i in range(3)], abs=1e-6)
     assert sorted(helpers[0].asked + helpers[1].asked) == ["1", "2"]  # the first is the planner's own
+    assert all(helper.closed for helper in helpers)  # with the service
 
 
 async def test_request_of_a_helper_that_is_lost_is_planned_by_another_and_the_lost_one_is_asked_no_more():
