@@ -121,9 +121,9 @@ class Chaos:
             lasting.create_task(self._stop_and_go(fault, pid))
 
     def _note(self, fault: Fault) -> None:
-        now = monotonic() - self._began
+        now = round(monotonic() - self._began, 2)  # told and kept alike
         log.warning("CHAOS %.1f s: %s", now, fault)
-        self.happened.append(Happened(round(now, 2), fault.what, fault.target))
+        self.happened.append(Happened(now, fault.what, fault.target))
 
     async def _stop_and_go(self, fault: Fault, pid: int) -> None:
         for _ in range(fault.count):
