@@ -1,7 +1,7 @@
 """A second planner in a process of its own, for requests that come while the first one is at work.
 
-It is forked with all modules loaded, before its parent has begun anything: until it is needed it takes no time, and a
-few megabytes. Threads would not do: two thirds of an easy plan are Python's.
+It is forked with all modules loaded, before its parent has begun anything: until it is needed it takes no time, and
+30 MB. Threads would not do: two thirds of an easy plan are Python's.
 """
 
 from __future__ import annotations
