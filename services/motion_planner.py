@@ -29,13 +29,13 @@ from common.messages import (
     PlanResponse,
     PointCloud2,
 )
-from common.planning.helper import Helper, HelperLost, fork_helpers
 from common.planning.pipeline import PlanningPipeline
 from common.planning.points import PointObstacle
 from common.planning.problem import Cancel
 from common.planning.seeing import Camera, JointHistory, PointsOptions, Seeing, Seen
 from common.planning.watching import NotWatched, SceneMonitor
 from common.process.pace import NICENESS, come_last
+from common.process.planning_helper import Helper, HelperLost, fork_helpers
 from common.process.service import main
 from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel

@@ -21,9 +21,9 @@ from common.messages import (
     PoseGoal,
     Vector3,
 )
-from common.planning.helper import HelperLost
 from common.planning.pipeline import PlanningPipeline
 from common.process.in_process import running_service
+from common.process.planning_helper import HelperLost
 from common.process.wiring import wiring
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, tool_down

@@ -14,7 +14,7 @@ BEGIN = """
 import json, os, signal, sys, threading, time
 from common.config import load_cell
 from common.messages import CollisionObject, Header, JointGoal, PlanningScene, PlanRequest, Pose, Vector3
-from common.planning.helper import Helper, HelperLost
+from common.process.planning_helper import Helper, HelperLost
 from common.planning.pipeline import PlanningPipeline
 from common.planning.problem import Cancel
 from common.robot.model import RobotModel
@@ -114,8 +114,8 @@ os._exit(0)
 
 def test_helper_that_is_stopped_is_ended_and_said_to_be_lost_though_the_scene_does_not_fit_into_the_pipe() -> None:
     assert told("""
-import common.planning.helper
-common.planning.helper.PATIENCE = 0.1
+import common.process.planning_helper
+common.process.planning_helper.PATIENCE = 0.1
 scene = scene.model_copy(update={"header": Header.model_construct(frame_id="x" * 10_000_000)})
 os.kill(helper._process.pid, signal.SIGSTOP)
 try:
@@ -127,8 +127,8 @@ except HelperLost as lost:
 
 def test_helper_that_is_stopped_is_ended_when_giving_up_is_told_to_it() -> None:
     assert told("""
-import common.planning.helper
-common.planning.helper.PATIENCE = 0.1
+import common.process.planning_helper
+common.process.planning_helper.PATIENCE = 0.1
 cancel = Cancel()
 cancel.set()
 os.kill(helper._process.pid, signal.SIGSTOP)

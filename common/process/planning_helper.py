@@ -6,7 +6,6 @@ It is forked with all modules loaded, before its parent has begun anything: unti
 
 from __future__ import annotations
 
-import ctypes
 import multiprocessing
 import os
 import queue
@@ -20,12 +19,12 @@ from common.errors import ZencellError
 from common.messages import PlanningScene, PlanRequest, PlanResponse
 from common.planning.pipeline import PlanningPipeline
 from common.planning.problem import Cancel
+from common.process.lifeline import die_when_orphaned
 from common.robot.model import RobotModel
 
 LOOK = 0.005  # [s] between looks at whether somebody gave up
 PATIENCE = 30.0  # [s] beyond the time for planning, in which the robot may be loaded; also after giving up was told
 MOST = 3
-PR_SET_PDEATHSIG = 1  # of linux/prctl.h
 
 Setup = tuple[list[str], RobotConfig, Motion, Pipeline, int]  # where modules are found, and how to plan
 Job = tuple[int, Setup | None, PlanRequest, PlanningScene | None, list[float] | None, float | None]
@@ -108,8 +107,7 @@ def fork_helpers(niceness: int) -> list[Helper]:
 def _be(pipe: Connection, of_parent: Connection, niceness: int) -> None:
     """Be the process, until the other end of the pipe is gone."""
     of_parent.close()
-    if sys.platform == "linux":  # the end of the pipe tells nothing to who is stopped, and who was forked later has it
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    die_when_orphaned()  # the end of the pipe tells nothing to who is stopped, and who was forked later has it
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # meant for the parent, whose end ends us
     os.nice(niceness)
     jobs: queue.SimpleQueue[tuple[Job, Cancel]] = queue.SimpleQueue()
