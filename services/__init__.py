@@ -1,1 +1,5 @@
 """One process each: a thin shell that declares, is ready, loops, asks and publishes. What it thinks is in common/."""
+
+from common.process.environment import start_light
+
+start_light()

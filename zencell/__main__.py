@@ -8,6 +8,9 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 def main() -> None:
     """Run the verb that the process's arguments name and end the process with its code."""
+    from common.process.environment import start_light
+
+    start_light()
     from cli.main import app
 
     app()

@@ -1,0 +1,30 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from common.process.environment import VARIABLES
+
+ROOT = Path(__file__).resolve().parents[3]
+CLEAN = {name: value for name, value in os.environ.items() if name not in VARIABLES}
+SAYS = "import os, sys; print([os.environ[name] for name in %r], 'numpy' in sys.modules, 'pydantic' in sys.modules)"
+
+
+def said_after(start: str, **environment: str) -> str:
+    code = f"{start}\n{SAYS % list(VARIABLES)}"
+    return subprocess.run([sys.executable, "-c", code], env=CLEAN | environment, cwd=ROOT, capture_output=True,
+                          text=True, check=True).stdout.strip()
+
+
+def test_command_sets_it_before_any_verb_is_there():
+    said = said_after("import sys, types, zencell.__main__ as command\n"
+                      "sys.modules['cli.main'] = types.SimpleNamespace(app=lambda: None)\ncommand.main()")
+    assert said == "['1', '__all__'] False False"
+
+
+def test_service_sets_it_before_numpy_and_pydantic_are_there():
+    assert said_after("import services") == "['1', '__all__'] False False"
+
+
+def test_what_the_environment_says_stays():
+    assert said_after("import services", OPENBLAS_NUM_THREADS="4") == "['4', '__all__'] False False"
