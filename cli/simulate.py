@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,6 +42,7 @@ def simulate(
     """
     from common.config import load_cell
     from common.errors import ConfigError
+    from common.process.environment import usable_cores
     from common.virtual.doubles import settings_of, with_doubles
     from common.virtual.telling import seeds_of
     from common.virtual.watched_arm import with_watched_arm
@@ -53,7 +53,7 @@ def simulate(
         raise ConfigError("--trace", trace, "needs --seed N")
     one = options.whole("--seed", seed, 0)
     several = seeds_of(seeds or "1-20")
-    at_a_time = options.whole("--jobs", jobs, 1) or os.cpu_count() or 1
+    at_a_time = options.whole("--jobs", jobs, 1) or max(1, int(usable_cores()))
     longest = options.number("--limit", limit)
     if longest <= 0:
         raise ConfigError("--limit", limit, "must be more than 0 [s]")

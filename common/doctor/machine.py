@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 from common.doctor.finding import Finding, ok, warn
+from common.process import environment
 
 LEAST_MEMORY = 1.0  # [GB]
 LEAST_SHM = 64.0  # [MB]
@@ -17,7 +18,6 @@ LEAST_FILES = 256
 CELL_LOAD = 0.7  # [cores] that a cell takes at speed 1
 LOOK = 0.3  # [s] at how busy the processors are
 CLOCK_YEAR = 2024  # the system clock is wrong when it says an earlier year
-CONTROL_GROUP = Path("/sys/fs/cgroup")
 
 
 def shared_memory() -> Finding:
@@ -37,7 +37,7 @@ def memory() -> Finding:
     import psutil
 
     free, limit = psutil.virtual_memory().available / 1e9, ""
-    group = group_memory(CONTROL_GROUP)
+    group = group_memory(environment.CONTROL_GROUP)
     if group is not None and group < free:
         free, limit = group, " within the limit of this container"
     what = f"{free:.1f} GB of memory left{limit}"
@@ -56,21 +56,11 @@ def group_memory(group: Path) -> float | None:
     return None if most == "max" else max(0.0, (int(most) - int(used)) / 1e9)
 
 
-def group_cores(group: Path) -> float | None:
-    """Processors that a control group (v2) may use; None without a limit."""
-    try:
-        quota, period = (group / "cpu.max").read_text(encoding="ascii").split()
-    except (OSError, ValueError):
-        return None
-    return None if quota == "max" else int(quota) / int(period)
-
-
 def cores() -> Finding:
     """Whether a cell has room on the processors."""
     import psutil
 
-    count: float = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count = min(count, group_cores(CONTROL_GROUP) or count)
+    count = environment.usable_cores()
     free = max(0.0, count * (1 - psutil.cpu_percent(LOOK) / 100))
     what = f"{count:g} cores, {free:.1f} of them free, load {os.getloadavg()[0]:.1f}"
     if count < 2:

@@ -19,6 +19,7 @@ from common.errors import ZencellError
 from common.messages import PlanningScene, PlanRequest, PlanResponse
 from common.planning.pipeline import PlanningPipeline
 from common.planning.problem import Cancel
+from common.process.environment import usable_cores
 from common.process.lifeline import die_when_orphaned
 from common.robot.model import RobotModel
 
@@ -101,7 +102,7 @@ def fork_helpers(niceness: int) -> list[Helper]:
     """As many as leave half of the cores to others, at least one; none where forking is not safe."""
     if sys.platform != "linux":
         return []
-    return [Helper(niceness) for _ in range(min(MOST, max(1, (os.cpu_count() or 1) // 2 - 1)))]
+    return [Helper(niceness) for _ in range(min(MOST, max(1, int(usable_cores()) // 2 - 1)))]
 
 
 def _be(pipe: Connection, of_parent: Connection, niceness: int) -> None:

@@ -19,6 +19,7 @@ from common.doctor.examining import examine
 from common.doctor.finding import Finding
 from common.doctor.leftovers import Seen
 from common.errors import DecodeError
+from common.process import environment
 from common.transport.local import LocalNetwork
 from tests.harness import Zencell
 
@@ -344,7 +345,7 @@ def test_little_shared_memory_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_little_memory_is_a_warning_also_within_a_container(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(machine, "CONTROL_GROUP", tmp_path)
+    monkeypatch.setattr(environment, "CONTROL_GROUP", tmp_path)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: namedtuple("M", "available")(8e9))
     assert machine.memory().level == "ok"
     (tmp_path / "memory.max").write_text("2000000000\n")
@@ -357,7 +358,7 @@ def test_little_memory_is_a_warning_also_within_a_container(monkeypatch: pytest.
 
 
 def test_few_or_busy_processors_are_a_warning(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(machine, "CONTROL_GROUP", tmp_path)
+    monkeypatch.setattr(environment, "CONTROL_GROUP", tmp_path)
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1, 2, 3}, raising=False)
     monkeypatch.setattr(psutil, "cpu_percent", lambda interval: 10.0)
     assert machine.cores().level == "ok"
