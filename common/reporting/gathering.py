@@ -98,12 +98,14 @@ class Gathering:
     footprints: dict[str, Footprint] = field(default_factory=dict)
     services: dict[str, Service] = field(default_factory=dict)
     restarts: list[Event] = field(default_factory=list)
+    failures: list[Event] = field(default_factory=list)  # of the task, and what it tries again
     log: list[Event] = field(default_factory=list)
     lines_left_out: int = 0
     counters: dict[str, m.ServiceCounters] = field(default_factory=dict)
     truth: Truth = field(default_factory=Truth)  # that of the fold which feeds this
     end: float = 0.0
     _target: str = ""
+    _failed: int = 0
     _scene: dict[str, tuple[float, float, float]] = field(default_factory=dict)
 
     def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
@@ -118,6 +120,10 @@ class Gathering:
         """Take note of how far the task is."""
         self._target = status.subject or self._target
         _change(self.tasks, time, status.state, status.subject)
+        failed = status.failures + status.retries
+        if failed > self._failed:
+            self.failures.append(Event(time, f"{status.state} {status.subject}".strip(), status.message))
+        self._failed = failed  # fewer after the task was started again
         _while(self.paused, time, status.paused, "paused")
         for place in status.skipped:
             p = place.position

@@ -12,6 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from common.reporting import figures
 from common.reporting.application import Figures
+from common.reporting.film import Film
 from common.reporting.gathering import MOST_LINES, Gathering
 from common.terminal import printable
 
@@ -35,6 +36,7 @@ class Report:
         tool: (n, 3) way of the tool [m], empty when the robot is not known.
         notes: what is missing in the report, and why.
         lost: messages that did not get into the recording, by topic.
+        films: of what went wrong.
     """
 
     name: str
@@ -47,6 +49,7 @@ class Report:
     tool: Array
     notes: list[str]
     lost: dict[str, int]
+    films: list[Film]
 
 
 def page(report: Report) -> str:

@@ -32,6 +32,7 @@ def page_of(recording: Recording, cell: str | None = None) -> str:
     from common.recording.decoding import Decoder
     from common.recording.sample import RecordingError
     from common.recording.writing import ABOUT
+    from common.reporting.film import films
     from common.reporting.fold import Fold
     from common.reporting.gathering import Gathering
     from common.reporting.page import Report, page
@@ -68,7 +69,7 @@ def page_of(recording: Recording, cell: str | None = None) -> str:
     lost = dict(Counter(recording.lost("dropped")) + Counter(recording.lost("missed")))
     return page(Report(
         recording.path.name, _facts(recording, about, run), fold.summary.as_dict(), gathered, _limits(robot),
-        list(names), fold.figures, _tool(gathered, robot), notes, lost,
+        list(names), fold.figures, _tool(gathered, robot), notes, lost, films(recording, gathered),
     ))
 
 

@@ -1,7 +1,9 @@
+import base64
 import importlib
 import re
 from html.parser import HTMLParser
 
+import cv2
 import numpy as np
 import pytest
 
@@ -326,3 +328,50 @@ def test_bad_options_are_one_line(arguments, wanted, recorded, capsys, monkeypat
     assert app.execute(["report", str(recorded), *arguments]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert all(part in line for part in wanted)
+
+
+def picture(tape, seconds, at, width=720, height=400, data=None):
+    """Black, with a white square whose left edge is at a pixel."""
+    pixels = np.zeros((height, width, 3), np.uint8)
+    pixels[150:250, at : at + 100] = 255
+    return m.Image(header=tape.header(seconds), height=height, width=width, encoding="bgr8",
+                   data=pixels.tobytes() if data is None else data)
+
+
+def films_of(text):
+    found = []
+    for address in re.findall(r'<img src="data:image/webp;base64,([^"]+)"', text):
+        done, animation = cv2.imdecodeanimation(np.frombuffer(base64.b64decode(address), np.uint8))
+        assert done
+        found.append(animation)
+    return found
+
+
+def test_report_shows_what_the_camera_saw_as_something_failed(tmp_path):
+    tape = Tape(tmp_path / "run.mcap")
+    pick_and_place(tape)  # a motion is aborted at 2.2 s, and the failures are told at 2.5 s: one film
+    for k in range(60):
+        tape.put(0.1 * k, "camera/image_raw", picture(tape, 0.1 * k, 10 * k))
+    tape.put(2.05, "camera/image_raw", picture(tape, 2.05, 0, data=b"few"))
+    tape.put(2.15, "camera/image_raw", picture(tape, 2.15, 0, width=200))
+    tape.writer.close({})
+    assert app.execute(["report", str(tmp_path / "run.mcap")]) == 0
+    text = (tmp_path / "run.html").read_text()
+    (film,) = films_of(text)
+    assert "2.20 s: motion aborted: joint 3 is 0.2 rad off" in text
+    assert len(film.frames) == 22, "0.2 s apart, from 0 to 4.2 s"
+    assert film.frames[0].shape[:2] == (200, 360)
+    lefts = [np.flatnonzero(frame[100, :, 0] > 128)[0] for frame in film.frames]
+    assert lefts == pytest.approx([10 * k for k in range(22)], abs=2)
+    assert set(film.durations[:-1]) == {200}
+
+
+def test_report_of_a_run_without_failures_or_pictures_has_no_film(recorded, tmp_path):
+    tape = Tape(tmp_path / "well.mcap")
+    tape.put(0, "pick_place_status", PickPlaceStatus(header=tape.header(0), state="IDLE"))
+    for k in range(10):
+        tape.put(0.1 * k, "camera/image_raw", picture(tape, 0.1 * k, 0))
+    tape.writer.close({})
+    for path in (tmp_path / "well.mcap", recorded):
+        assert app.execute(["report", str(path), "-o", str(tmp_path / "page.html")]) == 0
+        assert not films_of((tmp_path / "page.html").read_text())
