@@ -159,8 +159,6 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     views = find_application(application).views if simulated and application else {}
     called = [(bus.writer(topic), view) for topic, view in views.items()]  # the truth in the application's words
 
-    began = bus.clock.now_ns()
-
     def too_late(header: Header) -> Refused | None:
         age, uptime = (bus.clock.age_ms(stamp) * 1e-3 for stamp in (header.stamp, began))
         return objection(age, config.request_timeout, config.clock_tolerance, uptime)
@@ -302,6 +300,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         if bus.has_process:  # nor may one of another cell of that name
             await ours.enter_async_context(sole_use(file.path, f"{bus.service} of {bus.cell}"))
         file.require_writable()
+    began = bus.clock.now_ns()  # who had the arm while we waited may have carried out what was decided until now
     decisions = Decisions(file, bus.log)
     inhibits, configured = decisions.inhibits, config.speed_scaling
     config.speed_scaling = speed_of(inhibits.speed, configured)

@@ -1,6 +1,7 @@
 """Motions that the executor is asked for."""
 
 import asyncio
+import contextlib
 import json
 
 import msgpack
@@ -23,6 +24,7 @@ from common.messages import (
 from common.process.in_process import running_service
 from common.process.wiring import wiring
 from common.robot.model import RobotModel
+from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import trajectory_executor
 from tests.services.executor_person import CELL, SPEED, Person, blocked, config, executor, goes_on, move
@@ -151,6 +153,38 @@ async def test_what_was_decided_before_it_began_may_have_been_done_and_is_not_do
         now = close.model_copy(update={"header": again.bus.header()})
         assert (await again.command.call(now.model_copy(update={"id": "c"}))).state == "active"
         assert (await again.command.call(GripperCommand(id="d", width=0.03))).state == "active", "nobody can know"
+
+
+async def test_what_was_done_while_it_waited_for_the_arm_is_not_done_again(
+    robot: RobotModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home = robot.named("home")
+    net, clock, name = LocalNetwork(), Clock(SPEED), "trajectory_executor"
+    other, waits, has_it = LocalNetwork(), asyncio.Event(), asyncio.Event()
+    owned = Bus.owned
+
+    async def once_the_other_is_gone(bus: Bus) -> None:
+        waits.set()
+        await has_it.wait()
+        await owned(bus)
+
+    first, second = contextlib.AsyncExitStack(), contextlib.AsyncExitStack()
+    async with second:
+        async with first:
+            await first.enter_async_context(
+                running_service(net, trajectory_executor.run, config(), name=name, cell=CELL, clock=clock))
+            monkeypatch.setattr(Bus, "owned", once_the_other_is_gone)
+            waiting = asyncio.create_task(second.enter_async_context(
+                running_service(other, trajectory_executor.run, config(), name=name, cell=CELL, clock=clock)))
+            await waits.wait()
+            person = Person(net, clock)
+            there = person.asks(id="a", trajectory=move(robot, home, home + 0.2))
+            assert (await person.execute.call(there)).state == "active"
+            await person.see(person.motion, lambda m: m.id == "a" and m.state == "succeeded")
+        has_it.set()
+        await waiting
+        answer = await Person(other, clock).execute.call(there)
+        assert (answer.state, answer.error) == ("rejected", "stale_request") and "began" in answer.message
 
 
 async def test_goal_outlives_its_requester(robot: RobotModel) -> None:
