@@ -217,7 +217,9 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
 
     async def command(request: GripperCommand) -> GripperState:
         late = too_late(request.header) if request.header.stamp else None
-        return cycle.command(request, bus.clock.now(), late).model_copy(update={"header": bus.header()})
+        state = cycle.command(request, bus.clock.now(), late)
+        await decisions.keep()  # whom somebody else's motion refused is stopped
+        return state.model_copy(update={"header": bus.header()})
 
     async def own(request: OwnRequest) -> MotionOwner:
         before = cycle.authority.owner

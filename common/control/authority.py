@@ -11,6 +11,7 @@ from common.hardware.interface import Vector
 from common.messages import (
     ExecuteRequest,
     GripperCommand,
+    GripperState,
     Header,
     HoldRequest,
     Inhibit,
@@ -50,8 +51,8 @@ class Authority:
         """Take note that somebody without an objection begins a motion."""
         self._owners.use(owner, monotonic())
 
-    def refused(self, request: ExecuteRequest, status: MotionStatus) -> None:
-        """Take note of how a goal was answered.
+    def refused(self, request: ExecuteRequest | GripperCommand, status: MotionStatus | GripperState) -> None:
+        """Take note of how a goal of arm or fingers was answered.
 
         A task that was kept from going on by an operator does not do so by itself once the motion is given back. Asked
         for again, when the motion has long been the task's, it is answered as before; nothing follows from that.
@@ -170,16 +171,22 @@ class Authority:
         let_go = self.inhibits.hold(request)
         if request.hold:
             self.interrupt_jogging()
-        elif request.into_stop or (
-            request.stops and (request.override or self._owners.now.owner == (request.owner or SOMEBODY))
-        ):
-            self._owners.end()  # handed over to whoever moves the robot now: the person, or the task that is started
+        elif self._hands_over(request):
+            self._owners.end()  # to whoever moves the robot now: the person, or the task that is started
         if request.by == "scene_monitor":
             self._held_goal = request.goal if request.hold else ""
         if request.by != "person":
             self._arm.hold(request.hold, request.reason, request.by)
         self.tell_inhibits()
         return self._arm.status, let_go
+
+    def _hands_over(self, request: HoldRequest) -> bool:
+        """Whether who lets go ends whose the motion was: what another person took stays theirs."""
+        now = self._owners.now
+        own = now.owner == (request.owner or SOMEBODY)
+        if request.into_stop:
+            return own or now.kind == "task"
+        return request.stops and (own or request.override)
 
     def wait(self, wait: bool, reason: str = "") -> None:
         """Bring the arm to rest on its path of our own accord, or let it go on."""

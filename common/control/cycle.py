@@ -313,6 +313,7 @@ class ControlCycle:
                      or self.authority.others(request.owner) or self._hand_fault.objection)
         try:
             state = self._gripper.command(request, now, objection)
+            self.authority.refused(request, state)
             if objection is None:
                 self.authority.use(request.owner)
             return state

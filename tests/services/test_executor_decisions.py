@@ -15,6 +15,7 @@ from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE
 from common.messages import (
     GripperCommand,
     HoldRequest,
+    OwnRequest,
     ParameterRequest,
     RobotCommand,
     StopRequest,
@@ -98,6 +99,18 @@ async def test_stopped_arm_and_fingers_stay_so_through_restarts_until_somebody_s
         assert (await person.execute.call(person.asks(id="a", trajectory=there))).state == "rejected", "as before"
         assert (await person.follow("b", there)).state == "succeeded"
         assert (await person.grip("h", 0.02)).state == "succeeded"
+
+
+async def test_task_whose_fingers_were_kept_from_moving_does_not_go_on_when_the_motion_is_given_back() -> None:
+    async with executor() as person:
+        own = person.bus.client(topics.MOTION_OWN)
+        await own.call(OwnRequest(act="take", owner="ann"))
+        refused = await person.command.call(GripperCommand(header=person.bus.header(), id="a", width=0.02))
+        assert refused.error == "not_owner"
+        await own.call(OwnRequest(act="give", owner="ann"))
+    async with executor() as person:
+        refused = await person.command.call(GripperCommand(header=person.bus.header(), id="b", width=0.02))
+        assert refused.error == "stopped" and "by ann (the motion is ann's" in refused.message
 
 
 async def test_goal_that_is_stopped_before_it_comes_never_moves_also_after_a_restart(robot: RobotModel) -> None:

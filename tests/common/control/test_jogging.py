@@ -356,6 +356,18 @@ def test_a_start_by_another_does_not_take_it_from_who_has_it(arm):
     assert arm.owner == ("", "none")
 
 
+def test_who_holds_the_arm_and_then_moves_it_does_not_take_it_from_who_has_it(arm):
+    hold = arm.cycle.authority.hold
+    arm.own()
+    arm.asked(hold, HoldRequest(hold=True, owner="bob"))
+    arm.asked(hold, HoldRequest(hold=False, owner="bob", into_stop=True, heard=arm.stamp + 1))
+    assert arm.owner == ("ann", "operator") and arm.execute("one", "bob", heard=arm.stamp + 1).error == "not_owner"
+    arm.own("give")
+    arm.own(owner="sorting", kind="task")
+    arm.asked(hold, HoldRequest(hold=False, owner="bob", into_stop=True, heard=arm.stamp + 1))
+    assert arm.execute("two", "bob", heard=arm.stamp + 1).state == "active", "a task has it through a pause only"
+
+
 def test_goal_that_was_refused_of_an_operator_and_is_asked_for_again_does_not_stop_the_task_that_was_started(arm):
     arm.own()
     assert arm.execute("one").error == "not_owner"
