@@ -281,14 +281,13 @@ class TaskRunner(Generic[V]):
             await self._ask(self._plan, command, seconds, self._planned, lambda error: m.PlanResponse(
                 id=command.id, ok=False, error=error.code, message=error.message))
         elif isinstance(command, m.GripperCommand):
-            await self._ask(self._grip, command, GOAL_TIMEOUT, self._answered, lambda error: m.GripperState(
-                id=command.id, state="rejected", message=error.message))
-        elif isinstance(command, m.ExecuteRequest):
-            answer = await persist(self._execute, command, GOAL_TIMEOUT, lambda error: m.MotionStatus(
+            gripped = await persist(self._grip, command, GOAL_TIMEOUT, lambda error: m.GripperState(
                 id=command.id, state="rejected", error=error.code, message=error.message), self._note)
-            await self._back_off(answer.state == "rejected")
-            self._answered(answer)
-            self._woken.set()
+            await self._answered(gripped)
+        elif isinstance(command, m.ExecuteRequest):
+            moved = await persist(self._execute, command, GOAL_TIMEOUT, lambda error: m.MotionStatus(
+                id=command.id, state="rejected", error=error.code, message=error.message), self._note)
+            await self._answered(moved)
         elif isinstance(command, m.HoldRequest):
             if command.by == "person" and not command.hold:
                 heard = self._heard_of()
@@ -301,11 +300,13 @@ class TaskRunner(Generic[V]):
             await self._ask(self._stop, command, GOAL_TIMEOUT, self._kept, lambda error: m.MotionStatus(
                 message=error.message))
 
-    async def _back_off(self, refused: bool) -> None:
-        """Return when a refusal may be told: what is refused again and again is not asked for as fast as one can."""
-        self._refused = self._refused + 1 if refused else 0
+    async def _answered(self, answer: m.MotionStatus | m.GripperState) -> None:
+        """Tell how a goal was answered; what is refused again and again is not asked for as fast as one can."""
+        self._refused = self._refused + 1 if answer.state == "rejected" else 0
         if self._refused > 1:
             await asyncio.sleep(min(REFUSED_AGAIN * 2 ** min(self._refused - 2, 10), LONGEST_REFUSED))
+        self._task.on_goal(answer, self._look())
+        self._woken.set()
 
     def _kept(self, answer: m.MotionStatus) -> None:
         self._newest = max(self._newest, answer.newest)
@@ -325,9 +326,6 @@ class TaskRunner(Generic[V]):
 
     def _planned(self, response: m.PlanResponse) -> None:
         self._task.on_plan(response, self._look())
-
-    def _answered(self, answer: m.MotionStatus | m.GripperState) -> None:
-        self._task.on_goal(answer, self._look())
 
 
 def _kind(command: Command) -> str:

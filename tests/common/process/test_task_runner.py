@@ -12,6 +12,7 @@ from common import messages as m
 from common import topics
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from common.errors import Refused
 from common.process.in_process import running_service
 from common.process.task_runner import TaskRunner
 from common.tasks.stages import Command, View
@@ -176,24 +177,37 @@ async def test_what_is_missing_is_told_in_the_status_and_holds_the_arm_until_it_
 
 
 async def test_motion_that_is_refused_again_and_again_is_asked_for_more_and_more_slowly() -> None:
-    net, asked = LocalNetwork(), []
+    net, asked, told = LocalNetwork(), [], set()
     loop = asyncio.get_running_loop()
     enough = asyncio.Event()
 
     class Stubborn(Script):
+        def on_goal(self, answer: m.MotionStatus | m.GripperState, view: Any) -> None:
+            super().on_goal(answer, view)
+            told.add(answer.error)
+
         def step(self, view: Any) -> list[Command]:
             again, self.status.message = not asked or self.status.message == "rejected", ""
-            return [m.ExecuteRequest(id=f"{len(asked)}", trajectory=m.JointTrajectory(joint_names=["a"], points=[]))
-                    ] if again else []
+            fingers = m.GripperCommand(id=f"{len(asked)}", width=0.0)
+            arm = m.ExecuteRequest(id=f"{len(asked)}", trajectory=m.JointTrajectory(joint_names=["a"], points=[]))
+            return [fingers if len(asked) % 2 else arm] if again else []
 
-    async def refuse(request: m.ExecuteRequest) -> m.MotionStatus:
+    def note() -> None:
         asked.append(loop.time())
         if len(asked) == 6:
             enough.set()
+
+    async def refuse(request: m.ExecuteRequest) -> m.MotionStatus:
+        note()
         return m.MotionStatus(id=request.id, state="rejected", error="clock_ahead")
+
+    async def refuse_fingers(request: m.GripperCommand) -> m.GripperState:
+        note()
+        raise Refused("clock_ahead", "the same")
 
     executor = net.bus("trajectory_executor")
     executor.serve(topics.MOTION_EXECUTE, refuse)
+    executor.serve(topics.GRIPPER_COMMAND, refuse_fingers)
     await executor.ready()
 
     async def run(bus: Bus, config: None) -> None:
@@ -203,5 +217,6 @@ async def test_motion_that_is_refused_again_and_again_is_asked_for_more_and_more
 
     async with running_service(net, run, None, name="smart_pick_place"), asyncio.timeout(30):
         await enough.wait()
+    assert told == {"clock_ahead"}
     waits = [after - before for before, after in pairwise(asked)]
     assert waits[1] >= 0.1 and waits[2] >= 0.2 and waits[3] >= 0.4 and waits[4] >= 0.8
