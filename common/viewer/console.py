@@ -16,6 +16,7 @@ from common import topics
 from common.config import Members
 from common.errors import RequestFailed
 from common.messages import (
+    Header,
     JogCommand,
     Message,
     MotionOwner,
@@ -244,6 +245,10 @@ class Console(Desk):
         """Move with velocities for the next 0.1 s, as a `JogCommand` has them; without any come to rest."""
         fields = {"header": self._bus.header(), "owner": self.doors.person, "heard": heard, **velocities}
         self._jog.put(JogCommand.model_validate(fields))
+
+    def header(self) -> Header:
+        """Of what is decided now: a motion that comes late, or again after a restart, is refused by it."""
+        return self._bus.header()
 
     def answers(self, request: Request[Any, Any]) -> bool:
         """Whether somebody serves a request now."""

@@ -60,7 +60,8 @@ class HandPanel:
         async def move() -> None:
             heard = (await self._free()).newest
             asked = check(GripperCommand, {
-                "id": f"page-{new_id()}", "owner": self._console.doors.person, "heard": heard,
+                "header": self._console.header(), "heard": heard,
+                "id": f"page-{new_id()}", "owner": self._console.doors.person,
                 "width": width() * 1e-3, "effort": self._force}, "gripper")
             self._console.tell(f"Fingers: {name} …", "busy")
             state = await self._console.ask(topics.GRIPPER_COMMAND, asked)

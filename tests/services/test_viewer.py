@@ -641,6 +641,7 @@ async def test_fingers_open_by_the_gripper_that_there_is(panda: Played, page: Br
         await page.press(button)
         await until(lambda button=button: len(asked) == 1 + ("To width", "Open", "Close").index(button))
     assert [(round(one.width, 4), one.effort) for one in asked] == [(0.03, 12.0), (0.08, 12.0), (0.0, 12.0)]
+    assert all(one.header.stamp for one in asked), "one that comes late is refused by when it was decided"
 
 
 async def test_taught_pose_is_a_goal_and_is_kept_for_the_next_page(panda: Played, page: BrowserDouble) -> None:
