@@ -13,7 +13,7 @@ from common.errors import Refused, RemoteError, RequestFailed
 from common.process.persist import persist
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
-from common.sources import monotonic, new_id
+from common.sources import monotonic, new_id, wall_ns
 from common.tasks.deciding import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.stages import Command, View
@@ -38,6 +38,9 @@ OWN_PERIOD = 0.2  # [s] wall between two times that the motion is asked for: wha
 SOMEBODY = ("", "person", "watchdog", "controller", "scene_monitor")  # whose holds are nobody's own
 
 LETS_GO = "lets go"  # of what a person said
+
+# A person's stops and holds that were not answered yet, as kind and name of who said so.
+Keeping = dict[asyncio.Task[m.MotionStatus | None], tuple[str, str]]
 
 C = TypeVar("C", bound=TaskConfig)
 S = TypeVar("S", bound=m.TaskStatus)
@@ -135,8 +138,8 @@ class TaskRunner(Generic[V]):
         self._planning_time, self._watchdog = planning_time, watchdog
         self._woken = asyncio.Event()
         self._told: list[Command] = []
-        self._asking: dict[str, asyncio.Task[None]] = {}  # the newest of each kind
-        self._keeping: set[asyncio.Task[None]] = set()  # a person's stops and holds that were not answered yet
+        self._asking: dict[str, asyncio.Task[m.MotionStatus | None]] = {}  # the newest of each kind
+        self._keeping: Keeping = {}
         self._ended: dict[int, asyncio.Event] = {}  # by the identity of a command: whether it was answered, or is void
         self._refused = 0  # motions in a row
         self._newest = 0  # `since` of the newest inhibit that we were answered with
@@ -254,28 +257,37 @@ class TaskRunner(Generic[V]):
         """Send a command; what it makes void is not asked for again, should it still be without an answer."""
         if isinstance(command, m.ExecuteRequest | m.GripperCommand):
             command.header = self._bus.header()  # of the decision, however often it is sent
-        keeps = {keeping for keeping in self._keeping if not keeping.done()}
+        keeps = {keeping: said for keeping, said in self._keeping.items() if not keeping.done()}
         lets_go = isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold
         for kind in _voided(command):
             void = self._asking.pop(kind, None)
             if void is not None:
                 void.cancel()
-        doing = self._asking[_kind(command)] = group.create_task(self._do(command, keeps if lets_go else set()))
+        doing = self._asking[_kind(command)] = group.create_task(
+            self._do(command, keeps if lets_go else {}, self._heard_of() if lets_go else None))
         if not lets_go and isinstance(command, m.HoldRequest | m.StopRequest) and command.by == "person":
-            self._keeping = {*keeps, doing}
+            kept = "stopped" if isinstance(command, m.StopRequest) else "held"
+            self._keeping = {**keeps, doing: (kept, command.owner or SOMEBODY[1])}
 
-    async def _do(self, command: Command, before: set[asyncio.Task[None]]) -> None:
-        """Send what a command stands for, after what was said before it; what is refused is an answer too."""
-        told = self._bus.clock.now_ns()
+    async def _do(self, command: Command, before: Keeping, heard: int | None) -> m.MotionStatus | None:
+        """Send what a command stands for, after what was said before it; what is refused is an answer too.
+
+        What lets go does so of what was `heard` of until it was said, and of what was said here before it.
+        """
+        heard = wall_ns() if heard is None else heard  # of a robot that is away: what is said while it is asked stays
         try:
             if before:  # what lets go must not be overtaken by what it lets go of
                 await asyncio.wait(before)
-            await self._send(command, told)
+            if isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold:
+                command.heard = _until(heard, before) if command.heard is None else min(
+                    command.heard, max(heard, self._heard_of() or 0))
+            return await self._send(command)
         finally:
             if ended := self._ended.get(id(command)):
                 ended.set()
 
-    async def _send(self, command: Command, told: int) -> None:
+    async def _send(self, command: Command) -> m.MotionStatus | None:
+        """The answer to a hold or stop, else None."""
         if isinstance(command, m.PlanRequest):
             seconds = self._planning_time() + PLAN_OVERTIME
             await self._ask(self._plan, command, seconds, self._planned, lambda error: m.PlanResponse(
@@ -289,16 +301,12 @@ class TaskRunner(Generic[V]):
                 id=command.id, state="rejected", error=error.code, message=error.message), self._note)
             await self._answered(moved)
         elif isinstance(command, m.HoldRequest):
-            if command.by == "person" and not command.hold:
-                heard = self._heard_of()
-                if heard is None:  # of a robot that is away: what is said while it is asked again and again stays
-                    heard = told
-                command.heard = heard if command.heard is None else min(heard, command.heard)
-            await self._ask(self._hold, command, GOAL_TIMEOUT, self._kept, lambda error: m.MotionStatus(
+            return await self._ask(self._hold, command, GOAL_TIMEOUT, self._kept, lambda error: m.MotionStatus(
                 message=error.message))
         else:
-            await self._ask(self._stop, command, GOAL_TIMEOUT, self._kept, lambda error: m.MotionStatus(
+            return await self._ask(self._stop, command, GOAL_TIMEOUT, self._kept, lambda error: m.MotionStatus(
                 message=error.message))
+        return None
 
     async def _answered(self, answer: m.MotionStatus | m.GripperState) -> None:
         """Tell how a goal was answered; what is refused again and again is not asked for as fast as one can."""
@@ -320,9 +328,10 @@ class TaskRunner(Generic[V]):
     async def _ask(
         self, client: Client[Q, A], request: Q, timeout: float, then: Callable[[A], None],
         refused: Callable[[RemoteError], A],
-    ) -> None:
-        then(await persist(client, request, timeout, refused, self._note))
+    ) -> A:
+        then(answer := await persist(client, request, timeout, refused, self._note))
         self._woken.set()
+        return answer
 
     def _planned(self, response: m.PlanResponse) -> None:
         self._task.on_plan(response, self._look())
@@ -333,6 +342,21 @@ def _kind(command: Command) -> str:
     if isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold:
         return LETS_GO
     return f"{type(command).__name__} {command.by if isinstance(command, m.HoldRequest) else ''}"
+
+
+def _until(heard: int, before: Keeping) -> int:
+    """`since` of the newest inhibit to let go of: one that was heard of, or that was answered meanwhile.
+
+    What somebody else said before those were answered, and all later than that, stays.
+    """
+    answers = [doing.result() for doing in before if not doing.cancelled() and doing.exception() is None]
+    inhibits = {one.since: one for answer in answers if answer is not None for one in answer.inhibits}
+    for since in sorted(inhibits):
+        if since > heard:
+            if (inhibits[since].kind, inhibits[since].by) not in before.values():
+                break
+            heard = since
+    return heard
 
 
 def _voided(command: Command) -> tuple[str, ...]:

@@ -12,9 +12,11 @@ from common import messages as m
 from common import topics
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from common.clock import Clock
 from common.errors import Refused
 from common.process.in_process import running_service
 from common.process.task_runner import TaskRunner
+from common.sources import wall_ns
 from common.tasks.stages import Command, View
 from common.tasks.watchdogs import LivenessWatchdog
 from common.transport.bus import Bus
@@ -48,7 +50,7 @@ class Script:
 
 
 @asynccontextmanager
-async def running(net: LocalNetwork, *also: Command) -> AsyncIterator[Bus]:
+async def running(net: LocalNetwork, *also: Command, clock: Clock | None = None) -> AsyncIterator[Bus]:
     async def run(bus: Bus, config: None) -> None:
         script = Script()
         script.also = list(also)
@@ -56,7 +58,7 @@ async def running(net: LocalNetwork, *also: Command) -> AsyncIterator[Bus]:
         await bus.ready()
         await runner.run(())
 
-    async with running_service(net, run, None, name="smart_pick_place") as bus:
+    async with running_service(net, run, None, name="smart_pick_place", clock=clock) as bus:
         yield bus
 
 
@@ -65,12 +67,13 @@ class Executor:
 
     def __init__(self, net: LocalNetwork) -> None:
         self.bus, self.asked = net.bus("trajectory_executor"), asyncio.Queue[m.Message]()
+        self.inhibits: list[m.Inhibit] = []
         for topic in (topics.MOTION_EXECUTE, topics.MOTION_STOP, topics.MOTION_HOLD):
             self.bus.serve(topic, self.note)  # type: ignore[arg-type]
 
     async def note(self, request: m.Message) -> m.MotionStatus:
         self.asked.put_nowait(request)
-        return m.MotionStatus(state="active")
+        return m.MotionStatus(state="active", inhibits=self.inhibits)
 
     async def next(self) -> m.Message:
         async with asyncio.timeout(30):
@@ -117,15 +120,30 @@ async def test_only_the_newest_hold_and_no_motion_after_a_stop_reach_an_executor
 
 
 async def test_start_that_waits_for_an_executor_does_not_let_go_of_what_is_said_meanwhile() -> None:
-    net = LocalNetwork()
-    async with running(net) as bus:
-        before = bus.clock.now_ns()
+    net, fast = LocalNetwork(), Clock(10.0, wall_ns() - 3_600_000_000_000)  # `since` is no cell time
+    async with running(net, clock=fast):
+        before = wall_ns()
         await tell(net, "resume")
         executor = Executor(net)
         await executor.bus.ready()
         asked = [await executor.next(), await executor.next()]
         heard = [request.heard for request in asked if isinstance(request, m.HoldRequest)]
-        assert heard[0] is not None and before <= heard[0] <= bus.clock.now_ns()
+        assert heard[0] is not None and before <= heard[0] <= wall_ns()
+
+
+async def test_start_that_waits_for_an_answer_lets_go_of_that_but_of_no_stop_that_another_said_in_between() -> None:
+    for stopped, lets_go_of in ((0, 2), (1, 0), (3, 2)):
+        net, since = LocalNetwork(), 2 * wall_ns()
+        said = [m.Inhibit(kind="held", by="person", since=since + 2)]
+        said += [m.Inhibit(kind="stopped", by="bob", since=since + stopped)] if stopped else []
+        async with running(net):
+            await tell(net, "pause", "resume")
+            executor = Executor(net)
+            executor.inhibits = said
+            await executor.bus.ready()
+            asked = [await executor.next() for _ in range(3)]
+            heard = [request.heard for request in asked if isinstance(request, m.HoldRequest) and not request.hold]
+            assert (heard == [since + lets_go_of]) if lets_go_of else (heard[0] is not None and heard[0] < since)
 
 
 async def test_a_watchdog_and_a_person_do_not_make_each_others_holds_void() -> None:
