@@ -34,6 +34,7 @@ LONGEST_REFUSED = 2.0  # [s] wall
 LONGEST_STEP = LOOK_PERIOD  # [s] wall: time passes too
 WAITS = "the arm waits: "
 ENDED = ("DONE", "ERROR")
+NOT_ANSWERED = "trajectory_executor has not answered yet: until it does, this does not outlive the task"
 OWN_PERIOD = 0.2  # [s] wall between two times that the motion is asked for: what came of it is heard meanwhile
 SOMEBODY = ("", "person", "watchdog", "controller", "scene_monitor")  # whose holds are nobody's own
 
@@ -203,18 +204,16 @@ class TaskRunner(Generic[V]):
                 request.heard = command.heard
         self._told += asked
         self._woken.set()
-        now = self._task.status
-        if not await self._carried_out(asked):
-            now.message = "trajectory_executor has not answered yet"
+        now, answered = self._task.status, await self._carried_out(asked)
         return m.TaskStatus(
             header=self._bus.header(), state=now.state, paused=now.paused, started=now.started, stage=now.stage,
-            message=now.message,
+            message=now.message if answered else NOT_ANSWERED,
         )
 
     async def _carried_out(self, asked: list[Command]) -> bool:
-        """Whether that was answered, or could not be because nobody is there to answer."""
-        if not self._hold.available or not asked:
-            return True
+        """Whether that was answered, which is not waited for while nobody is there to answer."""
+        if not self._hold.available:
+            return not asked
         events = {id(command): asyncio.Event() for command in asked}
         self._ended |= events
         try:

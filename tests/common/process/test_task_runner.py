@@ -87,10 +87,21 @@ class Executor:
         return request.heard
 
 
-async def tell(net: LocalNetwork, *commands: str) -> None:
-    client = net.bus("person").client(topics.TASK_COMMAND)
+async def tell(net: LocalNetwork, *commands: str) -> str:
+    """Tell the task so; what it said of the last one."""
+    client, said = net.bus("person").client(topics.TASK_COMMAND), ""
     for command in commands:
-        await client.call(m.TaskCommand.model_validate({"command": command}))
+        said = (await client.call(m.TaskCommand.model_validate({"command": command}))).message
+    return said
+
+
+async def test_person_is_told_that_what_they_said_was_kept_by_nobody_yet() -> None:
+    net = LocalNetwork()
+    async with running(net):
+        assert "does not outlive the task" in await tell(net, "stop")
+        await (executor := Executor(net)).bus.ready()
+        await executor.next()
+        assert "outlive" not in await tell(net, "pause")
 
 
 async def test_pause_and_resume_reach_the_executor_in_order() -> None:
