@@ -9,8 +9,8 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from common import messages as m
 from common import topics
-from common.errors import Refused, RemoteError, RequestFailed
-from common.process.persist import persist
+from common.errors import Refused, RequestFailed
+from common.process.persist import NOT_TAKEN, persist
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.sources import monotonic, new_id, wall_ns
@@ -24,7 +24,6 @@ from common.transport.reader import Reader
 from common.transport.requests import Client
 from common.transport.writer import Writer
 
-A = TypeVar("A", bound=m.Message)
 Q = TypeVar("Q", bound=m.Message)
 
 GOAL_TIMEOUT = 1.0  # [s] wall: for a goal to be accepted
@@ -288,9 +287,11 @@ class TaskRunner(Generic[V]):
     async def _send(self, command: Command) -> m.MotionStatus | None:
         """The answer to a hold or stop, else None."""
         if isinstance(command, m.PlanRequest):
-            seconds = self._planning_time() + PLAN_OVERTIME
-            await self._ask(self._plan, command, seconds, self._planned, lambda error: m.PlanResponse(
-                id=command.id, ok=False, error=error.code, message=error.message))
+            planned = await persist(
+                self._plan, command, self._planning_time() + PLAN_OVERTIME, lambda error: m.PlanResponse(
+                    id=command.id, ok=False, error=error.code, message=error.message), self._note)
+            self._task.on_plan(planned, self._look())
+            self._woken.set()
         elif isinstance(command, m.GripperCommand):
             gripped = await persist(self._grip, command, GOAL_TIMEOUT, lambda error: m.GripperState(
                 id=command.id, state="rejected", error=error.code, message=error.message), self._note)
@@ -300,11 +301,9 @@ class TaskRunner(Generic[V]):
                 id=command.id, state="rejected", error=error.code, message=error.message), self._note)
             await self._answered(moved)
         elif isinstance(command, m.HoldRequest):
-            return await self._ask(self._hold, command, GOAL_TIMEOUT, self._kept, lambda error: m.MotionStatus(
-                message=error.message))
+            return await self._keep(self._hold, command)
         else:
-            return await self._ask(self._stop, command, GOAL_TIMEOUT, self._kept, lambda error: m.MotionStatus(
-                message=error.message))
+            return await self._keep(self._stop, command)
         return None
 
     async def _answered(self, answer: m.MotionStatus | m.GripperState) -> None:
@@ -315,25 +314,19 @@ class TaskRunner(Generic[V]):
         self._task.on_goal(answer, self._look())
         self._woken.set()
 
-    def _kept(self, answer: m.MotionStatus) -> None:
+    async def _keep(self, client: Client[Q, m.MotionStatus], request: Q) -> m.MotionStatus:
+        """The answer to a stop or hold, which is asked for until it was taken."""
+        answer = await persist(client, request, GOAL_TIMEOUT, lambda error: m.MotionStatus(message=error.message),
+                               self._note, NOT_TAKEN)
         self._newest = max(self._newest, answer.newest)
+        self._woken.set()
+        return answer
 
     def _heard_of(self) -> int | None:
         """`since` of the newest inhibit that we know of; None when we know nothing of the robot."""
         view = self._look()
         motion = view.motion if view else None
         return self._newest or None if motion is None else max(self._newest, motion.newest)
-
-    async def _ask(
-        self, client: Client[Q, A], request: Q, timeout: float, then: Callable[[A], None],
-        refused: Callable[[RemoteError], A],
-    ) -> A:
-        then(answer := await persist(client, request, timeout, refused, self._note))
-        self._woken.set()
-        return answer
-
-    def _planned(self, response: m.PlanResponse) -> None:
-        self._task.on_plan(response, self._look())
 
 
 def _kind(command: Command) -> str:

@@ -157,6 +157,26 @@ async def test_start_that_waits_for_an_answer_lets_go_of_that_but_of_no_stop_tha
             assert (heard == [since + lets_go_of]) if lets_go_of else (heard[0] is not None and heard[0] < since)
 
 
+async def test_stop_and_pause_that_were_not_taken_for_want_of_time_are_asked_for_again() -> None:
+    net, asked = LocalNetwork(), asyncio.Queue[m.Message]()
+    codes = {m.StopRequest: ["busy", "internal"], m.HoldRequest: ["busy"]}
+
+    async def note(request: m.StopRequest | m.HoldRequest) -> m.MotionStatus:
+        if codes[type(request)]:
+            raise Refused(codes[type(request)].pop(), "not now")
+        asked.put_nowait(request)
+        return m.MotionStatus()
+
+    executor = net.bus("trajectory_executor")
+    executor.serve(topics.MOTION_STOP, note)
+    executor.serve(topics.MOTION_HOLD, note)
+    await executor.ready()
+    async with running(net), asyncio.timeout(30):
+        for said, request in (("pause", HOLD["pause"]), ("stop", m.StopRequest(reason="stop"))):
+            assert "outlive" not in await tell(net, said)
+            assert await asked.get() == request
+
+
 async def test_a_watchdog_and_a_person_do_not_make_each_others_holds_void() -> None:
     net = LocalNetwork()
     watchdog = m.HoldRequest(hold=True, reason="no joint states", by="watchdog")
