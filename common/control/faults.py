@@ -23,9 +23,9 @@ def asked(doing: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -
     """
     try:
         return call(*args, **kwargs)
-    except HardwareFault:
-        raise
     except Exception as error:
+        if isinstance(error, HardwareFault) and str(error):
+            raise
         said = str(error).partition("\n")[0]
         raise HardwareFault(f"{doing}: {type(error).__name__}{': ' if said else ''}{said}") from error
 

@@ -237,7 +237,8 @@ class Broken(MockHardware):
 
 
 @pytest.mark.parametrize("failing", ["read", "write"])
-@pytest.mark.parametrize("error", [HardwareFault("cable is off"), OSError(5, "no route"), KeyError("q"), TypeError()])
+@pytest.mark.parametrize("error", [
+    HardwareFault("cable is off"), HardwareFault(), OSError(5, "no route"), KeyError("q"), TypeError()])
 def test_whatever_a_backend_raises_it_is_left_alone_and_recovers_by_itself(limits, rest_to_rest, failing, error):
     hardware = Broken()
     rig = Rig(limits, hardware)
@@ -283,6 +284,9 @@ def test_gripper_that_fails_brakes_the_arm_which_stays_held_and_refuses_goals(li
     def fail(*_):
         raise TimeoutError("no answer")
 
+    def fail_without_a_word(*_):
+        raise HardwareFault
+
     with monkeypatch.context() as broken:
         broken.setattr(rig.hardware.gripper, "read", fail)
         notes = [note for _ in range(100) for note in rig.step().notes]
@@ -296,6 +300,10 @@ def test_gripper_that_fails_brakes_the_arm_which_stays_held_and_refuses_goals(li
     with monkeypatch.context() as broken:
         broken.setattr(rig.hardware.gripper, "command", fail)
         assert "no answer" in rig.grip("again", 0.08).message
+    rig.run(6.0)
+    with monkeypatch.context() as broken:
+        broken.setattr(rig.hardware.gripper, "command", fail_without_a_word)
+        assert rig.grip("still", 0.08).message == "moving the gripper: HardwareFault"
     rig.run(6.0)
     assert rig.grip("now", 0.08).state == "active"
     assert rig.execute("c", rest_to_rest(rig.joints[-1].position[:2], [0.5, 0.5])).state == "active"
