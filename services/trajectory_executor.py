@@ -251,6 +251,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     async def order(request: RobotCommand) -> RobotStatus:
         who = request.owner or SOMEBODY
         bus.log.info("%s asks the arm: %s", who, request.act + (f" {request.value:g}" if request.value else ""))
+        if request.header.stamp and (late := too_late(request.header)):
+            raise late  # what has stopped the arm since is not what this recovers from
         ordered[number := cycle.order(request)] = asyncio.get_running_loop().create_future()
         if outcome := await ordered[number]:
             raise Refused("robot", f"{request.act}: {outcome}")

@@ -329,7 +329,8 @@ class Arm(Part):
 
     async def order(self, act: str, value: float = 0.0, **more: Any) -> RobotStatus:
         """Have the arm's own controller enable, recover, freedrive (1 or 0), payload [kg] or set an output."""
-        asked = check(RobotCommand, {"act": act, "value": value, "owner": self.owner, **more}, act)
+        asked = check(RobotCommand, {
+            "header": self._bus.header(), "act": act, "value": value, "owner": self.owner, **more}, act)
         return await self._bus.client(topics.ROBOT_COMMAND).call(asked, POWER)
 
 

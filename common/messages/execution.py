@@ -226,12 +226,16 @@ class RobotStatus(Message):
 
 
 class RobotCommand(Message):
-    """Have the arm's own controller do something that is no motion."""
+    """Have the arm's own controller do something that is no motion.
+
+    The header says when that was decided: one that comes too late is refused; one without a stamp never is.
+    """
 
     most_bytes: ClassVar[int] = SMALL
 
-    later: ClassVar[tuple[str, ...]] = ("output", "com")
+    later: ClassVar[tuple[str, ...]] = ("header", "output", "com")
 
+    header: Header = Header()
     act: Literal["enable", "recover", "freedrive", "payload", "output"] = Field(
         description="enable: power and brakes; recover: from a protective stop; freedrive: moved by hand, value 1 or "
                     "0; payload: what the tool carries, value in kg; output: a digital output, value 1 or 0"

@@ -44,7 +44,8 @@ class ArmPanel:
             self._state.content = content
 
     async def _act(self, chosen: str) -> None:
-        order = RobotCommand.model_validate({"act": ACTS[chosen], "owner": self._console.doors.person})
+        order = RobotCommand.model_validate({
+            "header": self._console.header(), "act": ACTS[chosen], "owner": self._console.doors.person})
         self._console.tell(f"{chosen}: asked", "busy")
         answer = await self._console.ask(topics.ROBOT_COMMAND, order, PATIENCE)
         self._console.tell(f"{chosen}: {words.arm_mode(answer)[0].lower()}", "good")

@@ -247,7 +247,7 @@ class Console(Desk):
         self._jog.put(JogCommand.model_validate(fields))
 
     def header(self) -> Header:
-        """Of what is decided now: a motion that comes late, or again after a restart, is refused by it."""
+        """Of what is decided now: what comes late, or again after a restart, is refused by it."""
         return self._bus.header()
 
     def answers(self, request: Request[Any, Any]) -> bool:

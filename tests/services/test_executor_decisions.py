@@ -10,7 +10,7 @@ from common import topics
 from common.clock import Clock
 from common.control import decisions, sole_use
 from common.control.record_file import RecordFile
-from common.errors import ConfigError
+from common.errors import ConfigError, RemoteError
 from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE
 from common.messages import (
     GripperCommand,
@@ -251,10 +251,15 @@ async def test_a_stop_for_safety_outlives_the_executor_until_somebody_has_the_ar
         assert not stopping_arm.made[-1].stopped
         stopping_arm.made[-1].stopped = True
         await person.see(person.motion, lambda m: "stopped for safety" in m.fault)
+        asked = person.bus.header()
     async with executor(own, speed=1.0) as person:  # the stop was ended at the pendant meanwhile
         arm, told = stopping_arm.made[-1], person.bus.reader(topics.ROBOT_STATUS)
         assert (await person.see(told, lambda status: True)).mode == "protective_stop" and arm.stopped
-        answer = await person.bus.client(topics.ROBOT_COMMAND).call(RobotCommand(act="recover", owner="tester"))
+        order = person.bus.client(topics.ROBOT_COMMAND)
+        with pytest.raises(RemoteError, match="before the controller began"):  # of a stop of before
+            await order.call(RobotCommand(header=asked, act="recover", owner="tester"))
+        assert arm.stopped
+        answer = await order.call(RobotCommand(header=person.bus.header(), act="recover", owner="tester"))
         assert answer.mode == "running"
         await person.see(told, lambda status: status.mode == "running")
     async with executor(own, speed=1.0) as person:
