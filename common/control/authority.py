@@ -52,13 +52,12 @@ class Authority:
         self._owners.use(owner, monotonic())
 
     def refused(self, request: ExecuteRequest | GripperCommand, status: MotionStatus | GripperState) -> None:
-        """Take note of how a goal of arm or fingers was answered.
+        """Take note of how a goal of arm or fingers was answered that was not heard of before.
 
         A task that was kept from going on by an operator does not do so by itself once the motion is given back. Asked
-        for again, when the motion has long been the task's, it is answered as before; nothing follows from that.
+        for again, when the motion has long been another's, it is answered as before; nothing follows from that.
         """
-        others = self._owners.now.asked and self.others(request.owner) is not None
-        if status.error == NOT_OWNER and not request.owner and others:
+        if status.error == NOT_OWNER and not request.owner and self._owners.now.asked:
             self.inhibits.stop(StopRequest(reason=status.message, owner=self._owners.now.owner))
             self.tell_inhibits()
 

@@ -240,13 +240,14 @@ class ControlCycle:
         self, request: ExecuteRequest, now: float, objection: Refused | None = None, judged: Judged | None = None
     ) -> MotionStatus:
         """The state of the goal: active, or rejected with the reason; for a known id what became of it."""
-        authority = self.authority
+        authority, known = self.authority, self._arm.knows(request.id)
         objection = (authority.inhibited(request, request.id) or objection or authority.others(request.owner)
                      or self._unfit)
         status = self._arm.accept(
             request.id, request.trajectory, now, self._q, objection, judged, request.plan, request.scene_stamp,
         )
-        authority.refused(request, status)
+        if not known:
+            authority.refused(request, status)
         if request.id == self._arm.goal and (self._followed is None or self._followed.id != request.id):
             self._followed = request
             authority.use(request.owner)
@@ -312,8 +313,10 @@ class ControlCycle:
         objection = (self.authority.inhibited(request, request.id) or late
                      or self.authority.others(request.owner) or self._hand_fault.objection)
         try:
+            known = self._gripper.knows(request.id)
             state = self._gripper.command(request, now, objection)
-            self.authority.refused(request, state)
+            if not known:
+                self.authority.refused(request, state)
             if objection is None:
                 self.authority.use(request.owner)
             return state

@@ -73,6 +73,10 @@ class GripperController:
         self.state = GripperState.model_validate({**reading, "moving": True, "id": request.id, "state": "active"})
         return self._memory.put(request.id, self.state)
 
+    def knows(self, goal: str) -> bool:
+        """Whether a goal was heard of."""
+        return self._memory.get(goal) is not None
+
     def fault(self, message: str) -> None:
         """End the goal of the fingers, which do not work."""
         if self.state.state == "active":

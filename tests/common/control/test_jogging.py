@@ -375,6 +375,10 @@ def test_goal_that_was_refused_of_an_operator_and_is_asked_for_again_does_not_st
     assert arm.own(owner="sorting", kind="task").owner == "sorting"
     assert arm.execute("one").error == "not_owner"  # as before: an id stands for one answer
     assert arm.execute("two").state == "active"
+    arm.run(3.0)
+    arm.own("give", "sorting")
+    arm.own(owner="bob")
+    assert arm.execute("one").error == "not_owner" and not arm.cycle.authority.inhibits.all
 
 
 def test_a_stop_and_a_hold_need_no_ownership_and_a_stop_ends_it(arm):
