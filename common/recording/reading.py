@@ -21,6 +21,7 @@ from common.recording.writing import ABOUT, ENDED, RUN, TRACES_SCHEMA
 Wanted = Callable[[str], bool]  # is given a topic: the key without the cell
 CELL_NAME = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
 MOST_SPEED = 1000.0
+LAST = 2**64 - 1  # [ns] no log time is later
 MOST_TEXT = 1000  # [characters] of a value, or values of a list
 
 
@@ -64,6 +65,7 @@ class Recording:
             raise
         self._schemas: dict[int, Schema] = dict(self.layout.schemas)
         self._channels: dict[int, Channel] = dict(self.layout.channels)
+        self._described = self.layout.finished  # whether all channels are known; else they stand among the messages
 
     def __enter__(self) -> Recording:
         return self
@@ -170,16 +172,19 @@ class Recording:
 
     # --- what is in it --------------------------------------------------------------------------------------------
 
-    def samples(self, wants: Wanted = _all, since: int = 0) -> Iterator[Sample]:
-        """The messages of wanted topics from a log time [ns] on, in the order in which they came.
+    def samples(self, wants: Wanted = _all, since: int = 0, until: int = LAST) -> Iterator[Sample]:
+        """The messages of wanted topics from a log time [ns] on, up to another, in the order in which they came.
 
         Raises:
             RecordingError: a chunk is damaged; names where.
         """
         for place in self.layout.chunks:
-            if self.finished and (place.end < since or not self._may_have(place, wants)):
+            if self._described and (place.end < since or place.start > until):
                 continue
-            yield from self.samples_of(self._records(place), wants, since)
+            if self.finished and not self._may_have(place, wants):
+                continue
+            yield from self.samples_of(self._records(place), wants, since, until)
+        self._described = True
 
     def states_before(self, time: int, wants: Wanted = _all) -> list[Sample]:
         """The last value of each wanted state before a log time [ns], oldest first.
@@ -218,7 +223,9 @@ class Recording:
             where = f"{self.path}: is damaged at byte {place.offset}"
             raise RecordingError(f"{where}; keep the rest with: zencell recover {self.path}") from None
 
-    def samples_of(self, records: list[Any], wants: Wanted = _all, since: int = 0) -> Iterator[Sample]:
+    def samples_of(
+        self, records: list[Any], wants: Wanted = _all, since: int = 0, until: int = LAST
+    ) -> Iterator[Sample]:
         """The wanted messages among the records of a chunk; its schemas and channels are remembered."""
         messages: list[Message] = []
         traces: dict[tuple[int, int], str] = {}
@@ -234,7 +241,7 @@ class Recording:
                     messages.append(record)
         for message in messages:
             channel = self._channels[message.channel_id]
-            if message.log_time >= since and wants(_topic(channel.topic)):
+            if since <= message.log_time <= until and wants(_topic(channel.topic)):
                 yield Sample(
                     channel.topic, message.data, message.log_time, message.publish_time,
                     self._name(message.channel_id), channel.metadata.get("kind", "stream"),

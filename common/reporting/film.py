@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -12,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.messages import Image
+from common.messages import Image, Message
 from common.perception.intake import Unusable, colour_picture
 from common.recording.decoding import Decoder
 from common.recording.pictures import image_topics
@@ -24,9 +23,10 @@ if TYPE_CHECKING:
 Picture = npt.NDArray[np.uint8]
 
 BEFORE, AFTER = 4.0, 2.0  # [s] that a film shows about the moment
-MOST = 3  # films in a page, the first ones
+MOST = 3  # moments in a page, the first ones
+MOST_CAMERAS = 4  # that have a film of a moment, by their names
 PERIOD = 0.2  # [s] between two pictures, at the least
-WIDTH = 360  # [px] at most
+WIDTH, HEIGHT = 360, 480  # [px] at most
 MOST_PIXELS = 4e6  # of a picture; a larger one takes too long to be made small
 RAW = "image_raw"  # how the key of a camera's pictures ends, whatever the camera is called; depth has no colours
 QUALITY = 60  # of WebP, 1 to 100
@@ -79,39 +79,36 @@ def films(recording: Recording, run: Gathering) -> list[Film]:
         RecordingError: a chunk is damaged.
     """
     wanted = moments(run)
-    topics = image_topics(recording, lambda topic: topic.endswith(RAW))
-    if not wanted or not topics:
+    if not wanted:
         return []
+    topics = image_topics(recording, lambda topic: topic.endswith(RAW))[:MOST_CAMERAS]
     found = [Film(at, what, topic) for at, what in wanted for topic in topics]
-    since = recording.start + round((wanted[0][0] - BEFORE) * 1e9)
-    for at, topic, picture in _pictures(recording, topics, max(since, 0), wanted[-1][0] + AFTER):
-        for film in found:
-            last = film.pictures[-1][0] if film.pictures else -np.inf
-            if film.topic == topic and film.at - BEFORE <= at <= film.at + AFTER and at - last >= PERIOD - 1e-3:
-                film.pictures.append((at, picture))
+    for at, _ in wanted if topics else ():
+        _fill({film.topic: film for film in found if film.at == at}, recording, at)
     return [film for film in found if len(film.pictures) > 1]
 
 
-def _pictures(
-    recording: Recording, topics: list[str], since: int, until: float
-) -> Iterator[tuple[float, str, Picture]]:
-    """Time [s], topic and the small picture of what can be shown."""
-    decoder, sizes = Decoder([Image]), dict[str, tuple[int, int]]()
-    for sample in recording.samples(lambda topic: topic in topics, since):
-        at = (sample.log_time - recording.start) * 1e-9
-        if at > until:
-            return
-        message = decoder.message(sample)
-        if not isinstance(message, Image) or message.width * message.height > MOST_PIXELS:
+def _fill(films_of: dict[str, Film], recording: Recording, moment: float) -> None:
+    """Put the pictures about a moment [s] into the film of each topic; only those that it shows are looked at."""
+    decoder = Decoder([Image])
+    since, until = (max(0, recording.start + round(1e9 * at)) for at in (moment - BEFORE, moment + AFTER))
+    for sample in recording.samples(lambda topic: topic in films_of, since, until):
+        film, at = films_of[sample.topic], (sample.log_time - recording.start) * 1e-9
+        if film.pictures and at - film.pictures[-1][0] < PERIOD - 1e-3:
             continue
-        size = sizes.setdefault(sample.topic, (message.width, message.height))
-        if size != (message.width, message.height):
-            continue  # one film has pictures of one size
-        try:
-            picture = colour_picture(message)
-        except Unusable:
-            continue
-        scale = min(1.0, WIDTH / message.width)
-        yield at, sample.topic, np.asarray(cv2.resize(
-            picture, (max(1, round(scale * message.width)), max(1, round(scale * message.height))),
-            interpolation=cv2.INTER_AREA), np.uint8)
+        picture = _small(decoder.message(sample))
+        if picture is not None and (not film.pictures or picture.shape == film.pictures[0][1].shape):
+            film.pictures.append((at, picture))  # one film has pictures of one size
+
+
+def _small(message: Message | None) -> Picture | None:
+    """The picture of a message, small; None for what cannot be shown."""
+    if not isinstance(message, Image) or message.width * message.height > MOST_PIXELS:
+        return None
+    try:
+        picture = colour_picture(message)
+    except Unusable:
+        return None
+    scale = min(1.0, WIDTH / message.width, HEIGHT / message.height)
+    size = max(1, round(scale * message.width)), max(1, round(scale * message.height))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -105,7 +105,7 @@ class Gathering:
     truth: Truth = field(default_factory=Truth)  # that of the fold which feeds this
     end: float = 0.0
     _target: str = ""
-    _failed: int = 0
+    _failed: int | None = None  # so far; what there was before the recording began is no event of it
     _scene: dict[str, tuple[float, float, float]] = field(default_factory=dict)
 
     def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
@@ -121,7 +121,7 @@ class Gathering:
         self._target = status.subject or self._target
         _change(self.tasks, time, status.state, status.subject)
         failed = status.failures + status.retries
-        if failed > self._failed:
+        if self._failed is not None and failed > self._failed:
             self.failures.append(Event(time, f"{status.state} {status.subject}".strip(), status.message))
         self._failed = failed  # fewer after the task was started again
         _while(self.paused, time, status.paused, "paused")

@@ -13,6 +13,7 @@ from common.applications.outlining.messages import OutlinePoints, OutlineStatus
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.recording.sample import Sample
 from common.recording.writing import RUN, RecordingWriter
+from common.reporting import film as filming
 from common.transport.codec import encode
 
 BEGIN = 1_700_000_000_000_000_000  # [ns]
@@ -364,6 +365,40 @@ def test_report_shows_what_the_camera_saw_as_something_failed(tmp_path):
     lefts = [np.flatnonzero(frame[100, :, 0] > 128)[0] for frame in film.frames]
     assert lefts == pytest.approx([10 * k for k in range(22)], abs=2)
     assert set(film.durations[:-1]) == {200}
+
+
+def failures(tape, *times):
+    """The task fails at these times [s]."""
+    for k, at in enumerate([0, *times]):
+        tape.put(at, "pick_place_status", PickPlaceStatus(header=tape.header(at), state="GRASPING", failures=k))
+
+
+def test_only_pictures_that_a_film_shows_are_looked_at_and_each_film_has_the_size_of_its_own(tmp_path, monkeypatch):
+    tape, looked_at = Tape(tmp_path / "cut.mcap"), []
+    small = filming._small
+    monkeypatch.setattr(filming, "_small", lambda message: looked_at.append(message) or small(message))
+    failures(tape, 10, 50)
+    for k in range(60):
+        tape.put(k, "camera/image_raw", picture(tape, k, k, *((100, 80) if k < 30 else (80, 60))))
+    tape.writer.flush()
+    tape.writer.abandon()
+    assert app.execute(["report", str(tmp_path / "cut.mcap")]) == 0
+    found = films_of((tmp_path / "cut.html").read_text())
+    assert [film.frames[0].shape[:2] for film in found] == [(80, 100), (60, 80)]
+    assert len(looked_at) == 2 * 7, "from 4 s before to 2 s after"
+
+
+def test_tall_pictures_are_made_small_and_of_many_cameras_some_are_shown(tmp_path):
+    tape = Tape(tmp_path / "run.mcap")
+    failures(tape, 2)
+    for k in range(3):
+        for camera in range(filming.MOST_CAMERAS + 3):
+            data = np.full((16384, 1, 3), 100 * k, np.uint8).tobytes()
+            tape.put(k, f"{camera}/image_raw", picture(tape, k, 0, 1, 16384, data))
+    tape.writer.close({})
+    assert app.execute(["report", str(tmp_path / "run.mcap")]) == 0
+    found = films_of((tmp_path / "run.html").read_text())
+    assert [(len(film.frames), film.frames[0].shape[:2]) for film in found] == [(3, (480, 1))] * filming.MOST_CAMERAS
 
 
 def test_report_of_a_run_without_failures_or_pictures_has_no_film(recorded, tmp_path):

@@ -22,6 +22,14 @@ def test_states_of_the_task_follow_each_other_without_gaps():
     ]
 
 
+def test_failures_are_events_but_for_those_from_before_the_recording_or_another_life_of_the_task():
+    run = Gathering()
+    for time, failures, retries in ((1, 4, 1), (2, 4, 1), (3, 4, 2), (4, 5, 2), (5, 0, 0), (6, 1, 0), (7, 1, 0)):
+        run.on_task(time, status("GRASPING", "ball_1", failures=failures, retries=retries, message=f"at {time}"))
+    assert [(e.time, e.what, e.note) for e in run.failures] == [
+        (3, "GRASPING ball_1", "at 3"), (4, "GRASPING ball_1", "at 4"), (6, "GRASPING ball_1", "at 6")]
+
+
 def test_a_motion_lasts_from_its_first_status_to_the_one_that_ends_it():
     run = Gathering()
     for time, goal, state in ((0, "", "none"), (1, "a", "active"), (2, "a", "active"), (3, "a", "succeeded"),
