@@ -141,6 +141,7 @@ class Page:
             self._time = TimePanel(gui, console, self.timeline, names=partial(recordings_in, recordings),
                                    open_one=partial(self._open_recording, recordings))
         self.timeline.moved = partial(self._periods.hurry_to, "plots", "picture")
+        self.timeline.told = console.tell
         console.operated = self.timeline.now
         with place["Health"]:
             self._health = HealthPanel(gui, members.services)
@@ -214,6 +215,7 @@ class Page:
             scene.happened(topic, event)
         self._happened.clear()
         self._scene = scene
+        self.timeline.picture_anew()
 
     def refresh(self, now: float, alive: frozenset[str], connected: bool = True) -> None:
         """Show what is new at a wall time [s], monotonic; without a browser only what plots need is kept.
@@ -396,6 +398,7 @@ class Page:
             for name, sources in self._topics.images.items():
                 wanted += sources if self._pictures.shown[name] else ()
         self._feeds.listen(wanted)
+        self.timeline.picture_anew()
 
     async def _home(self) -> None:
         if self._move is None:

@@ -20,7 +20,7 @@ M = TypeVar("M", bound=Message)
 SUFFIX = ".mcap"
 MOST_BYTES = 200 << 20  # of messages that are kept
 MOST_FILES = 30  # that are offered
-_PICTURE_WITHIN = 2.0  # [s] before a time in which a picture may have come
+_PICTURE_WITHIN = (0.2, 2.0)  # [s] before a time in which a picture may have come: most do so often
 
 
 def folder_of(given: str) -> Path:
@@ -105,11 +105,13 @@ class RecordedPast:
             return None
         until = self._recording.start + round(at * 1e9)
         newest = None
-        for sample in self._recording.samples(lambda key: key == topic.key, until - round(_PICTURE_WITHIN * 1e9)):
-            if sample.log_time > until:
-                break
-            newest = sample
-        return self._message(newest) if newest is not None else None
+        for within in _PICTURE_WITHIN:
+            since = max(0, until - round(within * 1e9))
+            for sample in self._recording.samples(lambda key: key == topic.key, since, until):
+                newest = sample
+            if newest is not None:
+                return self._message(newest)
+        return None
 
     def _message(self, sample: Sample) -> Any:
         """The message of a sample, always the same object while it is the newest of its topic that was asked for."""

@@ -39,7 +39,7 @@ class TimePanel:
         """
         self._console, self._timeline, self._names, self._open_one = console, timeline, names, open_one
         self._listed, self._shown_at = 0.0, 0.0
-        self._opened: Past | None = None
+        self._name = self._wanted = THIS  # what is looked at, or was chosen and is still being read
         self._source = gui.add_dropdown("Look at", [THIS], hint="or a recording of this cell")
         console.on_change(self._source, self._choose, "look")
         self._slider = gui.add_slider("Back [s]", -SECONDS, 0.0, 0.1, 0.0, hint="how long ago")
@@ -71,14 +71,16 @@ class TimePanel:
 
     def show(self, now: float) -> None:
         """Bring the panel up to date at a wall time [s], monotonic."""
+        timeline, past = self._timeline, self._timeline.past
+        if timeline.recording is None and self._wanted == self._name:
+            self._name = self._wanted = THIS  # somebody went back to now
         if now - self._listed >= _LISTS:
             self._listed = now
-            options = [THIS, *self._names()]
+            options = list(dict.fromkeys([THIS, *self._names(), self._name, self._wanted]))
             if options != list(self._source.options):
                 self._source.options = options
-        timeline, past = self._timeline, self._timeline.past
-        if timeline.recording is None and self._source.value != THIS:
-            assign(self._source, THIS)
+        if self._source.value != self._wanted:
+            assign(self._source, self._wanted)
         self._move_slider()
         _set(self._buttons, buttons(
             press("‹ event", "time:before", "" if timeline.event(-1) else "nothing happened before"),
@@ -152,15 +154,22 @@ class TimePanel:
                 timeline.seek(timeline.past.start)
 
     async def _choose(self, name: str) -> None:
+        self._wanted = name
         if name == THIS:
+            self._name = THIS
             self._timeline.open(None)
             return
         self._console.tell(f"Reading {name} …", "busy")
         try:
             past = await asyncio.to_thread(self._open_one, name)
         except BaseException:
-            assign(self._source, THIS)
+            if self._wanted == name:
+                self._wanted = self._name
             raise
+        if self._wanted != name:  # another was chosen meanwhile
+            past.close()
+            return
+        self._name = name
         self._timeline.open(past)
         self._console.tell(f"{name} is shown; what moves the arm, and Now, bring the page back", "good")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from common.errors import ZencellError
 from common.messages import Message
 from common.topics import Topic
 from common.viewer.feeds import Latest
@@ -25,6 +26,7 @@ class Timeline:
         speed: by how much per second.
         recording: what is looked at, in place of the last minutes.
         moved: called when another time is looked at that does not follow from playing on.
+        told: called with why there is something that cannot be shown.
     """
 
     def __init__(self, live: Latest, memory: Past) -> None:
@@ -35,6 +37,8 @@ class Timeline:
         self.speed = 1.0
         self.recording: Past | None = None
         self.moved: Callable[[], None] = lambda: None
+        self.told: Callable[[str], None] = lambda _why: None
+        self._pictured: dict[str, float] = {}  # the times of which pictures were given last
         self._stepped: float | None = None
 
     @property
@@ -52,14 +56,29 @@ class Timeline:
         return self._live(topic) if self.at is None else self.past.latest(topic, self.at)
 
     def picture(self, topic: Topic[Any]) -> Any:
-        """The newest picture at the time that is looked back at, as a message, or None."""
-        return None if self.at is None else self.past.picture(topic, self.at)
+        """The newest picture at the time that is looked back at, as a message; None for none, or the one of before.
+
+        While nobody looks at another time it is not read and sent anew: those take the time of whoever presses STOP.
+        """
+        if self.at is None or self._pictured.get(topic.key) == self.at:
+            return None
+        self._pictured[topic.key] = self.at
+        try:
+            return self.past.picture(topic, self.at)
+        except ZencellError as error:  # a recording that is damaged there
+            self.told(str(error))
+            return None
+
+    def picture_anew(self) -> None:
+        """Give pictures once more: there are others to see them."""
+        self._pictured.clear()
 
     def open(self, recording: Past | None) -> None:
         """Look at a recording from its beginning, stopped; None: at the last minutes again, at now."""
         if self.recording is not None:
             self.recording.close()
         self.recording, self.playing = recording, False
+        self.picture_anew()
         self.at = recording.start if recording is not None else None
         self.moved()
 

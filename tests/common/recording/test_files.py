@@ -84,6 +84,25 @@ def test_wanted_topics_from_a_time_on(tmp_path: Path) -> None:
         assert recording.seconds == pytest.approx(0.29)
 
 
+def test_of_one_that_was_cut_no_more_is_read_than_is_asked_for_once_its_channels_are_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
+    for number in range(20):
+        writer.add(joints(number))
+        writer.flush()
+    writer.abandon()
+    read = []
+    with Recording(tmp_path / "a.mcap") as recording:
+        records = recording._records
+        monkeypatch.setattr(recording, "_records", lambda place: read.append(place) or records(place))
+        for asked, most in (("first", 20), ("again", 4)):
+            read.clear()
+            found = recording.samples(since=START + 8 * STEP, until=START + 11 * STEP)
+            assert [sample.sequence for sample in found] == [9, 10, 11, 12], asked
+            assert len(read) == most
+
+
 def test_states_before_a_time_are_the_last_of_each_whoever_wrote_it(tmp_path: Path) -> None:
     restarted = status(3, writer="task.2", sequence=1)
     other = status(1, key="panda/gripper/state", message="GripperState")

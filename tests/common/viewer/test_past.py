@@ -155,6 +155,34 @@ def test_what_task_and_motion_say_becomes_events_once() -> None:
     assert watch.news(aborted) == [] and watch.news(m.MotionStatus(id="h", state="active")) == []
 
 
+class Shelf(Memory):
+    """Something to look back at that cannot be read from some time on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._begun, self.now, self.asked = 0.0, 10.0, 0
+
+    def picture(self, topic: Topic[Any], at: float) -> Any:
+        self.asked += 1
+        if at > 5.0:
+            raise RecordingError("run.mcap: is damaged")
+        return at
+
+
+def test_picture_is_given_once_for_a_time_and_what_is_damaged_is_told(timeline: Timeline) -> None:
+    shelf, told = Shelf(), []
+    timeline.told = told.append
+    assert timeline.picture(topics.CAMERA_IMAGE) is None
+    timeline.open(shelf)
+    timeline.seek(3.0)
+    assert [timeline.picture(topics.CAMERA_IMAGE) for _ in range(3)] == [3.0, None, None]
+    timeline.picture_anew()
+    assert timeline.picture(topics.CAMERA_IMAGE) == 3.0 and shelf.asked == 2
+    timeline.seek(6.0)
+    assert [timeline.picture(topics.CAMERA_IMAGE) for _ in range(3)] == [None] * 3
+    assert told == ["run.mcap: is damaged"]
+
+
 def recording(path: Path, cell: str = "panda") -> Path:
     writer = RecordingWriter(path, {"cell": cell})
 
