@@ -12,7 +12,6 @@ from common import topics
 from common.errors import ZencellError
 from common.messages import Image
 from common.perception.hand_eye_views import ViewCollector
-from common.perception.image import image_to_array
 from common.transport.bus import Bus
 from common.transport.reader import Reader
 
@@ -43,14 +42,14 @@ async def collect_views(bus: Bus, key: str, collector: ViewCollector, wanted: in
     async def take_note() -> None:
         async for state in joints:
             q = dict(zip(state.name, state.position, strict=True))
-            collector.joints(state.header.stamp * 1e-9, np.array([q[name] for name in collector.joint_names]))
+            if all(name in q for name in collector.joint_names):  # else it is of another robot
+                collector.joints(state.header.stamp * 1e-9, np.array([q[name] for name in collector.joint_names]))
 
     noting, said = asyncio.create_task(take_note()), ""
     try:
         while collector.count < wanted:
             image = await _next_of(pictures, noting)
-            why = await asyncio.to_thread(
-                collector.picture, image.header.stamp * 1e-9, np.ascontiguousarray(image_to_array(image)))
+            why = await asyncio.to_thread(collector.look, image)
             line = why or f"view {collector.count} of {wanted}; {collector.hint}"
             if line != said:
                 tell(line)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,13 @@ from pydantic import Field
 
 from common.config import Number, Parameters, check, load_robot, read_yaml
 from common.errors import ConfigError
+from common.messages import Image
 from common.perception.calibration_board import Board, NotSeen
 from common.perception.calibration_file import CameraFile
 from common.perception.calibration_hand_eye import View
 from common.perception.calibration_pose import sightings_of
+from common.perception.image import ImageError, image_to_array
+from common.perception.intake import Unusable, colour_picture
 from common.robot.model import RobotModel
 
 Array = npt.NDArray[np.float64]
@@ -55,6 +59,7 @@ class ViewCollector:
             self._file = _read(folder)
             if self._file.joints != robot.joint_names:
                 raise ConfigError("FOLDER", str(folder), f"has views of another robot: {self._file.robot}")
+            _require_joints(folder, self._file, robot)
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -76,6 +81,15 @@ class ViewCollector:
         """Take note of where the joints were (dof,) [rad] at a stamp [s]."""
         self._recent.append((stamp, q))
 
+    def look(self, image: Image) -> str:
+        """Keep a picture as it came: empty if it is, else why not."""
+        try:
+            grey = image.encoding == "mono8"
+            picture = np.asarray(image_to_array(image), np.uint8) if grey else colour_picture(image)
+        except (ImageError, Unusable) as error:
+            return str(error)
+        return self.picture(image.header.stamp * 1e-9, np.ascontiguousarray(picture))
+
     def picture(self, stamp: float, picture: Picture) -> str:
         """Keep a bgr8 picture of a stamp [s]: empty if it is, else why not."""
         around = [q for at, q in self._recent if stamp - RESTS <= at <= stamp]
@@ -91,12 +105,15 @@ class ViewCollector:
             return sighting.reason
         if sighting.blur > MOST_BLUR:
             return f"edges are smeared over {sighting.blur:.1f} px"
-        name = f"view_{self.count:03d}.png"
+        names = (f"view_{number:03d}.png" for number in count(self.count))  # who left one out has others behind it
+        name = next(name for name in names if name not in self._file.pictures)
         if not cv2.imwrite(str(self._folder / name), picture):
             raise ConfigError("FOLDER", str(self._folder), "cannot be written")
+        q = [round(float(value), 9) for value in around[-1]]
+        said = self._file.model_copy(update={"pictures": {**self._file.pictures, name: q}})
+        _write(self._folder, said)
+        self._file = said
         self._hands.append(hand)
-        self._file.pictures[name] = [round(float(value), 9) for value in around[-1]]
-        _write(self._folder, self._file)
         return ""
 
     @property
@@ -135,13 +152,12 @@ def load_views(
     robot = moved or RobotModel.load(load_robot(said.robot))
     if said.joints != robot.joint_names:
         raise ConfigError(f"{folder / JOINTS_FILE}: joints", said.joints, f"are not those of {said.robot}")
+    _require_joints(folder, said, robot)
     views, why = [], []
     for name, q in said.pictures.items():
         picture: Any = cv2.imread(str(folder / Path(name).name))
         if picture is None:
             raise ConfigError(f"{folder / JOINTS_FILE}: pictures", name, "is no picture in that folder")
-        if len(q) != robot.dof:
-            raise ConfigError(f"{folder / JOINTS_FILE}: {name}", q, f"must be {robot.dof} joints")
         found, reasons = sightings_of(board, [(name, picture)], camera, MOST_BLUR)
         why += [f"{name}: {reason}" for reason in reasons]
         views += [View(sighting, robot.fk(q)) for sighting in found]
@@ -157,8 +173,29 @@ def _read(folder: Path) -> JointsFile:
     return check(JointsFile, read_yaml(folder / JOINTS_FILE), str(folder / JOINTS_FILE))
 
 
+def _require_joints(folder: Path, said: JointsFile, robot: RobotModel) -> None:
+    """Return when each picture comes with as many joints as the robot has.
+
+    Raises:
+        ConfigError: one does not.
+    """
+    for name, q in said.pictures.items():
+        if len(q) != robot.dof:
+            raise ConfigError(f"{folder / JOINTS_FILE}: {name}", q, f"must be {robot.dof} joints")
+
+
 def _write(folder: Path, said: JointsFile) -> None:
+    """Write the file, all of it or nothing: without it no picture is a view.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
     import yaml
 
     text = yaml.safe_dump(said.model_dump(), sort_keys=False, default_flow_style=None, width=110)
-    (folder / JOINTS_FILE).write_text(text, encoding="utf-8")
+    part = folder / f".{JOINTS_FILE}.part"
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(folder / JOINTS_FILE)
+    except OSError as error:
+        raise ConfigError("FOLDER", str(folder), f"cannot be written: {error.strerror}") from None

@@ -20,7 +20,6 @@ from common.perception.calibration_file import CameraFile
 from common.perception.calibration_hand_eye import LEAST_VIEWS, calibrate_hand_eye
 from common.perception.calibration_record import with_hand_eye
 from common.perception.hand_eye_views import AXES, ViewCollector, load_views
-from common.perception.image import image_to_array
 from common.robot.model import RobotModel
 
 Mount = Literal["hand", "beside"]
@@ -92,7 +91,7 @@ class HandEye:
 
     def take(self, image: Image) -> str:
         """Keep a picture as a view: empty if it is, else why not."""
-        return self._collector.picture(image.header.stamp * 1e-9, np.ascontiguousarray(image_to_array(image)))
+        return self._collector.look(image)
 
     def calibrate(self, info: CameraInfo) -> Result:
         """Where the camera is by all views; writes the file that a cell takes. Takes seconds.

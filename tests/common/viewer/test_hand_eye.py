@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 
 from common.config import load_cell
 from common.errors import ConfigError
 from common.messages import CameraInfo, Header, Image, JointState
 from common.perception.calibration import CalibrationFailed
+from common.perception.calibration_board import Board
 from common.perception.calibration_file import CameraFile
 from common.perception.image import array_to_image
 from common.planning.ik import solve_ik
@@ -87,3 +90,54 @@ def test_picture_that_is_no_view_says_why_and_views_are_there_the_next_time() ->
 def test_views_are_kept_nowhere_else(name: str) -> None:
     with pytest.raises(ConfigError, match="must be letters"):
         folder_of(name)
+
+
+def resting() -> Arm:
+    arm = Arm(HandEye("wrist", CONFIG, BOARD, "hand"))
+    arm.rest(ROBOT.named("home"))
+    return arm
+
+
+@pytest.mark.parametrize(("encoding", "kind", "why"), [
+    ("mono8", np.uint8, "no marker is seen"), ("32FC1", np.float32, "'32FC1' is no colour picture"),
+    ("16UC1", np.uint16, "'16UC1' is no colour picture"), ("bgr8", None, "too few for 64x48")])
+def test_picture_of_another_kind_is_no_view_and_says_why(encoding: str, kind: type | None, why: str) -> None:
+    arm = resting()
+    image = (array_to_image(np.zeros((48, 64), kind), encoding) if kind
+             else Image(header=Header(), width=64, height=48, encoding=encoding, data=b"few"))
+    image.header.stamp = round(arm.now * 1e9)
+    assert why in arm.views.take(image)
+
+
+@pytest.mark.parametrize("q", [[], [0.0] * 3, [0.0] * 9])
+def test_views_with_other_numbers_of_joints_are_refused_by_their_name(q: list[float]) -> None:
+    file = HandEye("wrist", CONFIG, BOARD, "hand").folder / "joints.yaml"
+    file.write_text(yaml.safe_dump({"robot": "panda", "joints": ROBOT.joint_names, "pictures": {"view_000.png": q}}))
+    with pytest.raises(ConfigError, match=r"joints.yaml: view_000.png.* must be 7 joints"):
+        HandEye("wrist", CONFIG, BOARD, "hand")
+
+
+def test_view_that_somebody_left_out_has_no_other_written_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Board, "find", lambda *_: SimpleNamespace(blur=0.5))
+    views = HandEye("wrist", CONFIG, BOARD, "hand")
+    arm, home = Arm(views), ROBOT.named("home")
+    turned = [home + 0.3 * np.eye(7)[joint] for joint in range(4)]
+    for q in turned[:3]:
+        assert views.take(arm.rest(q)) == ""
+    file = views.folder / "joints.yaml"
+    said = yaml.safe_load(file.read_text())
+    del said["pictures"]["view_001.png"]
+    file.write_text(yaml.safe_dump(said))
+    arm.views = HandEye("wrist", CONFIG, BOARD, "hand")
+    assert arm.views.take(arm.rest(turned[3])) == "" and arm.views.count == 3
+    pictures = yaml.safe_load(file.read_text())["pictures"]
+    assert [pictures[name] for name in said["pictures"]] == [*said["pictures"].values()] and len(pictures) == 3
+
+
+def test_view_that_cannot_be_kept_is_told_and_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Board, "find", lambda *_: SimpleNamespace(blur=0.5))
+    arm = resting()
+    (arm.views.folder / ".joints.yaml.part").mkdir()  # as a full disk would have it
+    with pytest.raises(ConfigError, match="cannot be written"):
+        arm.views.take(arm.rest(ROBOT.named("home")))
+    assert arm.views.count == 0
