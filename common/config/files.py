@@ -37,6 +37,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
         where = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "not valid YAML"
         raise ConfigError("file", str(path), f"does not parse{where}: {problem}") from None
+    except ValueError as error:  # such as a date that there is not
+        raise ConfigError("file", str(path), f"does not parse: {error}") from None
     if not isinstance(loaded, dict):
         raise ConfigError("file", str(path), "must hold a mapping")
     return loaded

@@ -14,6 +14,8 @@ from common.viewer.console import Desk
 from common.viewer.markup import block, buttons, press, span, text
 from common.viewer.taught import MOST, Taught, load_taught, save_taught, taught_file
 
+Poses = dict[str, dict[str, float]]
+
 
 class TaughtPanel:
     """A field for a name, one for the names of a row, and buttons."""
@@ -54,8 +56,8 @@ class TaughtPanel:
 
     @property
     def names(self) -> list[str]:
-        """Of the poses that there are."""
-        return list(self._taught.poses)
+        """Of the poses that there are, but for those that mean something else: nothing is to be offered twice."""
+        return [name for name in self._taught.poses if name not in self._taken]
 
     def positions(self, name: str) -> list[float]:
         """Joints in a pose [rad, m].
@@ -63,19 +65,23 @@ class TaughtPanel:
         Raises:
             ConfigError: there is none of that name.
         """
+        if name in self._taken:
+            raise ConfigError("pose", name, "is a name that means something else already")
         return self._taught.named(name, self._joints)
 
     def show(self, why: str) -> None:
         """Have what moves the arm off for a reason, or on without one."""
         listed = ", ".join(self.names) or "none yet"
         file = self._problem
+        twice = [name for name in self._taught.poses if name in self._taken]
+        said = file or (f"not offered, for they mean something else: {', '.join(twice)}" if twice else "")
         content = block(buttons(
             press("Teach", "taught:teach", file or ("" if self._name else "give it a name first")),
             press("Forget", "taught:forget", file or (
                 "" if self._name in self._taught.poses else "there is no such pose")),
             press("Go through", "taught:through", why or ("" if self._row.strip() else "name the waypoints first"),
                   arm=True)) + f"<div>{span('Taught:', 'dim')} {text(listed)}</div>"
-            + (f"<div>{span(file, 'bad')}</div>" if file else ""), "taught")
+            + (f"<div>{span(said, 'bad')}</div>" if said else ""), "taught")
         if content != self._html.content:
             self._html.content = content
 
@@ -86,19 +92,24 @@ class TaughtPanel:
         pose = {name: round(float(value), 6) for name, value in zip(self._joints, q, strict=True)}
         if self._name in self._taken:
             raise ConfigError("pose", self._name, "is a name that means something else already")
-        if len(self._taught.poses) >= MOST and self._name not in self._taught.poses:
-            raise ConfigError("pose", self._name, f"is one too many: {MOST} are kept")
-        self._keep({**self._taught.poses, self._name: pose}, f"{self._name} is taught, kept in")
+
+        def with_it(poses: Poses) -> Poses:
+            if len(poses) >= MOST and self._name not in poses:
+                raise ConfigError("pose", self._name, f"is one too many: {MOST} are kept")
+            return {**poses, self._name: pose}
+
+        self._keep(with_it, f"{self._name} is taught, kept in")
 
     def _forget(self) -> None:
-        self._keep({name: pose for name, pose in self._taught.poses.items() if name != self._name},
+        self._keep(lambda poses: {name: pose for name, pose in poses.items() if name != self._name},
                    f"{self._name} is forgotten, in")
 
-    def _keep(self, poses: dict[str, dict[str, float]], line: str) -> None:
+    def _keep(self, changed: Callable[[Poses], Poses], line: str) -> None:
+        """Change what is in the file now: another page, or a person, may have written it since it was read."""
         if self._problem:
             raise ConfigError("pose", self._name, self._problem)
-        taught = check(Taught, {"poses": poses}, "pose")
         try:
+            taught = check(Taught, {"poses": changed(load_taught(self._file).poses)}, "pose")
             save_taught(self._file, taught)
         except OSError as error:
             self._desk.tell(f"{error.filename or self._file} cannot be written: {error.strerror}")

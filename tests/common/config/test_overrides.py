@@ -48,6 +48,7 @@ def test_a_service_goes_by_the_last_part_of_its_module(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("text", "said"), [
     ("- 1\n", "must hold a mapping"), ("a: [1\nb: }", "does not parse at line 2"),
+    ("made: 2026-13-01", "does not parse: month must be in 1..12"),
 ])
 def test_a_file_that_can_not_be_used_is_named(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
