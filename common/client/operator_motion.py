@@ -85,13 +85,17 @@ class OperatorMotion:
         request = check(m.PlanRequest, fields, "plan")
         return await self._plan.call(request, (request.planning_time or PLANNING_TIME) + SLOWER)
 
-    async def move(self, goal: Goal, *, timeout: float = PATIENCE, **more: Any) -> m.MotionStatus:
+    async def move(
+        self, goal: Goal, *, timeout: float = PATIENCE, heard: int | None = None, **more: Any
+    ) -> m.MotionStatus:
         """The last status of a motion to the goal, once it has succeeded. When cancelled, the robot is stopped.
 
         Args:
             goal: where to.
             more: as `plan` takes it.
             timeout: give up and stop after so long without progress, but for the time that the robot is held [s, wall].
+            heard: `newest` of the motion status as this was asked for, where it is the second or later of a row: what
+                the same person said since keeps the robot. Left out: it is asked for now.
 
         Raises:
             MotionFailed: a task has the robot, there is no way, or the motion ended otherwise.
@@ -101,7 +105,8 @@ class OperatorMotion:
         response = await self.plan(goal, **more)
         if not response.ok or response.trajectory is None:
             raise MotionFailed(response.error, response.message)
-        return await self._follow(response.trajectory, timeout, before.newest, response)
+        known = before.newest if heard is None else heard
+        return await self._follow(response.trajectory, timeout, known, response)
 
     async def follow(
         self, trajectory: m.JointTrajectory, *, timeout: float = PATIENCE, plan: m.PlanResponse | None = None

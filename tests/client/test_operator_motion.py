@@ -180,6 +180,12 @@ async def test_what_is_said_while_a_motion_is_planned_is_not_known_to_who_asked_
     assert isinstance(execute, m.ExecuteRequest) and (execute.owner, execute.heard) == ("anna", 7)
 
 
+async def test_what_is_said_between_the_motions_of_a_row_is_not_known_to_the_later_ones(cell: Cell) -> None:
+    cell.say(inhibits=[said("stopped", "anna", 8)])
+    await OperatorMotion(cell.bus, owner="anna").move(HOME, heard=7)
+    assert isinstance(cell.asked[-1], m.ExecuteRequest) and cell.asked[-1].heard == 7
+
+
 async def test_motion_of_somebody_else_is_not_touched(
     cell: Cell, person: OperatorMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
