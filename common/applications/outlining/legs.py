@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
 from pydantic import Field
 
 from common import messages as m
@@ -61,6 +62,14 @@ def closed(path: OutlinePoints) -> list[Place]:
     """The points of a path [m] and the first once more."""
     points = [place_of(pose) for pose in path.poses]
     return [*points, points[0]]
+
+
+def same_place(path: OutlinePoints, other: OutlinePoints | None) -> bool:
+    """Whether the boxes about two paths are the same, as exactly as is perceived."""
+    if other is None or not path.poses or not other.poses:
+        return False
+    a, b = (np.array([place_of(pose) for pose in each.poses]) for each in (path, other))
+    return bool(np.abs([a.min(axis=0) - b.min(axis=0), a.max(axis=0) - b.max(axis=0)]).max() <= NEAR)
 
 
 def length(points: list[Place]) -> float:

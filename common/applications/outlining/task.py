@@ -6,15 +6,18 @@ camera sees the arm. What goes wrong ends in ERROR with one line, the arm at res
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 from pydantic import Field
 
 from common import messages as m
-from common.applications.outlining.legs import Legs, OutlineView, TracingParameters, closed, length
+from common.applications.outlining.legs import NEAR, Legs, OutlineView, TracingParameters, closed, length, same_place
 from common.applications.outlining.messages import OutlinePoints, OutlineStatus
 from common.config import Tunable
 from common.tasks.deciding import TaskConfig
 from common.tasks.engine import Task
-from common.tasks.stages import Cycle, Grip, Look, Move, Stage
+from common.tasks.stages import Cycle, Grip, Look, Move, Place, Stage, place_of
 
 AT_HOME = 0.01  # [rad] from it
 MOST_FORGOTTEN = 5  # motions in a row, each by a controller that was started again
@@ -60,7 +63,8 @@ class Outline(Task[OutlineView]):
         self._forgotten = 0  # motions since the last that ended well
         self._up: Move | None = None  # the first motion of the way home from anywhere
         self._excused: tuple[str, str] | None = None  # contact from which the arm has to be freed
-        self._named: set[str] = set()  # what the scene held when the motions were made, as it was called then
+        self._path: OutlinePoints | None = None  # for which the motions were made
+        self._named: dict[str, Place] = {}  # where what stood when they were made, as it was called then
 
     # --- what to do next -------------------------------------------------------------------------------------
 
@@ -112,7 +116,7 @@ class Outline(Task[OutlineView]):
         status.points, status.length_m, status.fraction, status.closed = len(path.poses), length(points), 0.0, False
         status.invalid_depth, status.standoff = path.invalid_depth, self.p.standoff
         self._cycle = Cycle(path.object)
-        self._named = _names(view)
+        self._path, self._named = path, _places(view)
         if view.gripper.width > SHUT:
             self.row.append(Grip("close", "PLANNING", self._cycle, width=0.0))
         self.row += [*self._legs.outline(points, solid, self._cycle), Look()]
@@ -139,10 +143,13 @@ class Outline(Task[OutlineView]):
             self.status.fraction = response.fraction
 
     def may_begin(self, stage: Stage, view: OutlineView) -> bool:
-        """Without a fresh picture nothing begins: what was planned around may have moved."""
+        """Without a fresh picture nothing begins, nor where it shows the contour elsewhere than was planned."""
         if isinstance(stage, Move) and stage.fresh and self.unseen(view):
             self.clear()
             self.patience.reset()
+            return False
+        if isinstance(stage, Move) and stage.fresh and self._path and not same_place(self._path, view.path):
+            self.displaced(stage, view, f"{self.status.subject or 'the contour'} is not where it was")
             return False
         if isinstance(stage, Move):
             self._returned = False
@@ -185,13 +192,18 @@ class Outline(Task[OutlineView]):
         elif move is self._up:
             self.clear()
             self.row += [self._legs.home(self._cycle), Look()]
-        elif not self._error and set(response.colliding or ()) & (_names(view) - self._named):
-            self.displaced(move, view, response.message)  # of something that was not there, or had another name
+        elif not self._error and self._is_new(response.colliding or (), view):
+            self.displaced(move, view, response.message)
         elif not self._error:
             subject = self.status.subject
             self.fail(f"{subject}: {response.message}" if subject else response.message, view)
         else:
             self._give_up(f"{self._error}; the arm stays where it is: {response.message}")
+
+    def _is_new(self, names: Sequence[str], view: OutlineView) -> bool:
+        """Whether one of these was not there when the motions were made, or something else was called so."""
+        now, before = _places(view), self._named
+        return any(name in now and (name not in before or math.dist(now[name], before[name]) > NEAR) for name in names)
 
     def fail(self, message: str, view: OutlineView, *, go_home: bool = True) -> None:
         """End in ERROR, by way of home when the arm is somewhere else."""
@@ -231,5 +243,5 @@ class Outline(Task[OutlineView]):
         return self.p.overtime + (stage.seconds if isinstance(stage, Move) else 0.0)
 
 
-def _names(view: OutlineView) -> set[str]:
-    return {thing.id for thing in view.scene.objects} if view.scene is not None else set()
+def _places(view: OutlineView) -> dict[str, Place]:
+    return {thing.id: place_of(thing.pose) for thing in view.scene.objects} if view.scene is not None else {}

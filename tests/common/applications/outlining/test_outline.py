@@ -128,6 +128,62 @@ def test_object_that_got_another_name_while_motions_were_planned_is_traced_under
     assert (double.status.state, double.status.subject, double.status.failures) == ("DONE", "Object_7", 1)
 
 
+def test_objects_that_changed_their_names_while_motions_were_planned_are_told_apart_by_where_they_are() -> None:
+    double = OutlineDouble()
+
+    def collides(request: m.PlanRequest) -> str:
+        if request.stage != "descend" or double.objects[0].id != "Object_1":
+            return ""
+        assert double.path is not None
+        double.objects = [prism("Object_2", 0.5, 0.0, 0.05), prism("Object_1", 0.5, 0.3, 0.02)]
+        double.path = double.path.model_copy(update={"object": "Object_2"})
+        double.colliding = ("tip", "Object_2")
+        return "collision"
+
+    double.unplannable = collides
+    double.until("DONE", "ERROR")
+    assert (double.status.state, double.status.subject, double.status.failures) == ("DONE", "Object_2", 1)
+
+
+def moved(double: OutlineDouble, dy: float) -> None:
+    """The object stands elsewhere from now on."""
+    double.objects[0] = prism("Object_1", 0.5, dy, 0.05)
+    double.path = outline_of([(x, y + dy) for x, y in SQUARE], double.stamp)
+
+
+def test_object_that_was_moved_while_its_motions_were_planned_is_traced_where_it_is() -> None:
+    double = OutlineDouble()
+    double.unplannable = lambda request: (request.stage == "home" and moved(double, -0.2)) or ""
+    double.until("DONE", "ERROR")
+    trace = [r.goal for r in double.plans() if r.stage == "trace"][-1]
+    assert isinstance(trace, m.PathGoal) and double.moves() == WHOLE
+    assert [p.position.y for p in trace.waypoints[:4]] == [y - 0.2 for _, y in SQUARE]
+    assert double.status.state == "DONE" and double.status.failures == 1
+
+
+def test_object_that_was_taken_away_while_its_motions_were_planned_is_not_traced_in_the_air() -> None:
+    double = OutlineDouble()
+
+    def taken(request: m.PlanRequest) -> str:
+        if request.stage == "home":
+            gone = {"poses": [], "message": "Object_1 is not seen any more", "object": ""}
+            double.path = outline_of([], double.stamp).model_copy(update=gone)
+        return ""
+
+    double.unplannable = taken
+    double.until("DONE", "ERROR")
+    assert (double.status.state, double.moves()) == ("ERROR", [])
+    assert double.status.message == "Object_1 is not seen any more"
+
+
+def test_object_that_never_stands_still_ends_in_error_before_the_arm_moves() -> None:
+    double, places = OutlineDouble(), iter(range(1, 100))
+    double.unplannable = lambda request: (request.stage == "home" and moved(double, 0.02 * next(places))) or ""
+    double.until("DONE", "ERROR")
+    assert (double.status.state, double.moves()) == ("ERROR", [])
+    assert "Object_1 is not where it was" in double.status.message
+
+
 def test_motion_that_fails_brings_the_arm_home_and_ends_in_error() -> None:
     cell = OutlineDouble()
     cell.abort = "trace"
