@@ -1,7 +1,12 @@
 from __future__ import annotations
 
+from typing import Any
+
+import cv2
+import numpy as np
 import pytest
 
+from common.applications.outlining.contours import ContourOptions, find_contours
 from common.applications.outlining.contours_following import Following
 from common.applications.outlining.messages import Contour, OutlineSelect
 
@@ -33,6 +38,46 @@ def test_part_that_was_chosen_by_itself_while_the_arm_hid_the_rest_becomes_the_w
     index, why = following.find(others)
     assert (index, why[:len(found[1])]) == found
     assert following.find([square(0, 110, 110, 90), square(1, 300, 100, 200)])[0] == (-1 if by_person else 0)
+
+
+def drawn(*boxes: tuple[int, int, int, int, tuple[int, int, int]]) -> list[Contour]:
+    """The contours of boxes (u, v, width, height, bgr8) on grey, later ones before earlier ones."""
+    picture = np.full((480, 640, 3), 128, np.uint8)
+    for u, v, width, height, colour in boxes:
+        cv2.rectangle(picture, (u, v), (u + width, v + height), colour, -1)
+    return find_contours(picture, ContourOptions(subpixel=False))
+
+
+RED, GREEN, GREY = (0, 0, 255), (0, 255, 0), (128, 128, 128)
+FRAME = [(0, 50, 400, 380, RED), (50, 100, 300, 280, GREY)]
+
+
+@pytest.mark.parametrize("inner", [(150, 180, 100, 100, RED), (60, 110, 280, 260, RED)], ids=["small", "large"])
+def test_hole_in_which_the_chosen_object_lay_is_not_taken_for_it(inner: tuple[int, int, int, int, Any]) -> None:
+    following = Following(OutlineSelect())
+    assert following.find(drawn(*FRAME, inner)) == (2, "")
+    assert following.find(drawn(*FRAME))[0] == -1
+    assert following.find(drawn(*FRAME, inner)) == (2, "")
+
+
+@pytest.mark.parametrize("arm", [200, 130], ids=["much", "little"])
+def test_object_that_goes_on_outside_of_the_picture_is_not_chosen_when_the_arm_hid_that(arm: int) -> None:
+    whole = (0, 100, 300, 100, RED)
+    following = Following(OutlineSelect())
+    assert following.find(drawn(whole, (0, 100, arm, 100, GREY))) == (0, "")
+    assert following.find(drawn(whole))[0] == -1
+    assert following.find(drawn(whole, (0, 100, arm, 100, GREY))) == (0, "")
+    by_index = Following(OutlineSelect(rule="index", index=0))
+    assert [by_index.find(drawn(whole))[0] for _ in range(2)] == [0, 0]
+
+
+@pytest.mark.parametrize("size", [60, 160])
+def test_object_of_another_colour_in_its_place_is_not_the_chosen_one(size: int) -> None:
+    following = Following(OutlineSelect(rule="colour", colour="red"))
+    red, green = ((230 - s // 2, 230 - s // 2, s, s, colour) for s, colour in ((60, RED), (size, GREEN)))
+    assert following.find(drawn(red)) == (0, "")
+    assert following.find(drawn(green))[0] == -1
+    assert following.find(drawn(red)) == (0, "")
 
 
 def test_object_that_moves_and_grows_slowly_stays_chosen() -> None:
