@@ -57,7 +57,8 @@ class RecordedPast:
             if self._recording.cell not in ("", cell):
                 raise RecordingError(f"{path.name}: is of the cell {self._recording.cell}, not of {cell}")
             self.name = path.name
-            self._told, self._decoder = told, Decoder()
+            self._told, self._decoder = told, Decoder(topic.message for topic in wanted)
+            self._classes = {topic.key: topic.message for topic in wanted}
             self._kept: dict[str, tuple[list[float], list[Sample]]] = {}
             self._decoded: dict[str, tuple[Sample, Any]] = {}
             self._pictures = {topic.key for topic in wanted if topic.message is Image}
@@ -96,8 +97,8 @@ class RecordedPast:
         """The messages of a topic that came after a time, up to another [s]."""
         times, samples = self._kept.get(topic.key, ([], []))
         chosen = range(bisect_right(times, start), bisect_right(times, end))
-        found = [(times[i], self._decoder.message(samples[i])) for i in chosen]
-        return [(at, message) for at, message in found if message is not None]  # type: ignore[misc]
+        found = [(times[i], self._decoded_as_told(samples[i])) for i in chosen]
+        return [(at, message) for at, message in found if message is not None]
 
     def picture(self, topic: Topic[Any], at: float) -> Any:
         """The newest picture of a topic at a time [s], as a message; None where none is known."""
@@ -117,8 +118,13 @@ class RecordedPast:
         """The message of a sample, always the same object while it is the newest of its topic that was asked for."""
         known = self._decoded.get(sample.key)
         if known is None or known[0] != sample:
-            known = self._decoded[sample.key] = (sample, self._decoder.message(sample))
+            known = self._decoded[sample.key] = (sample, self._decoded_as_told(sample))
         return known[1]
+
+    def _decoded_as_told(self, sample: Sample) -> Any:
+        """The message of a sample; None for one of another class than its topic has, which nothing here can show."""
+        message = self._decoder.message(sample)
+        return message if isinstance(message, self._classes[sample.topic]) else None
 
     def _read(self, wanted: set[str]) -> None:
         size = 0
@@ -126,7 +132,7 @@ class RecordedPast:
             times, samples = self._kept.setdefault(sample.topic, ([], []))
             at = (sample.log_time - self._recording.start) * 1e-9
             least = OFTEN if sample.topic in OFTEN_KEPT else SELDOM if sample.kind == "stream" else 0.0
-            if times and at - times[-1] < least:
+            if times and 0 <= at - times[-1] < least:
                 continue
             if samples and sample.kind == "state" and samples[-1].payload == sample.payload:
                 continue  # states are said again each second
@@ -136,6 +142,9 @@ class RecordedPast:
                                      "than the page looks at; `zencell play` plays it")
             times.append(at)
             samples.append(sample)
+        for key, (times, samples) in self._kept.items():  # the clock of who recorded may have been set back
+            order = sorted(range(len(times)), key=times.__getitem__)
+            self._kept[key] = [times[i] for i in order], [samples[i] for i in order]
 
     def _found(self) -> list[Event]:
         """The events that are in it."""

@@ -217,6 +217,35 @@ def test_recording_answers_as_the_last_minutes_do(tmp_path: Path) -> None:
         past.close()
 
 
+def test_what_came_after_the_clock_was_set_back_is_there(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap", {"cell": "panda"})
+    for number, second in enumerate((0.0, 1.0, 30.0, 2.0, 3.0)):
+        writer.add(Sample("panda/joint_states", msgpack.packb(joints(second).model_dump()), round(1e18 + second * 1e9),
+                          message="JointState", kind="stream", writer="w", sequence=number))
+    writer.close()
+    past = RecordedPast(tmp_path / "run.mcap", "panda", [topics.JOINT_STATES], NAMES)
+    try:
+        for second in (1.0, 2.0, 3.0, 30.0):
+            assert past.latest(topics.JOINT_STATES, second + 0.1) == joints(second)
+    finally:
+        past.close()
+
+
+def test_message_of_another_class_than_its_topic_has_is_none(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap", {"cell": "panda"})
+    for second, message in enumerate((joints(1.0), task("DONE"))):
+        writer.add(Sample("panda/joint_states", msgpack.packb(message.model_dump()), round(1e18 + second * 1e9),
+                          message=type(message).__name__, kind="stream", writer="w", sequence=second))
+    writer.close()
+    past = RecordedPast(tmp_path / "run.mcap", "panda", [topics.JOINT_STATES], NAMES)
+    try:
+        assert past.latest(topics.JOINT_STATES, 0.5) == joints(1.0)
+        assert past.latest(topics.JOINT_STATES, 1.0) is None
+        assert [at for at, _ in past.between(topics.JOINT_STATES, -1.0, 2.0)] == [0.0]
+    finally:
+        past.close()
+
+
 def test_recording_of_another_cell_is_refused(tmp_path: Path) -> None:
     path = recording(tmp_path / "run.mcap", "ur5")
     with pytest.raises(RecordingError, match=r"run.mcap: is of the cell ur5, not of panda"):
