@@ -48,6 +48,7 @@ class HandEyePanel:
         self._values: dict[str, Any] = {"name": "", "camera": next(iter(self._images), ""), "mount": "on the hand",
                                         "columns": 7, "rows": 5, "square": 36.0, "auto": True}
         self._views: HandEye | None = None
+        self._camera = next(iter(self._images))  # that the views are of: another one's pictures are none of them
         self._busy, self._said, self._due = False, "", 0.0
         self._seen: tuple[Image | None, JointState | None] = (None, None)
         self._result: Result | None = None
@@ -72,8 +73,8 @@ class HandEyePanel:
     @property
     def wanted(self) -> list[Topic[Any]]:
         """What is to be read now."""
-        topic = self._images.get(self._values["camera"])
-        return [topic, self._info(topic)] if self._views is not None and topic is not None else []
+        topic = self._images[self._camera]
+        return [topic, self._info(topic)] if self._views is not None else []
 
     @staticmethod
     def _info(topic: Topic[Any]) -> Topic[CameraInfo]:
@@ -90,7 +91,7 @@ class HandEyePanel:
             views.joints(state)
         if self._values["auto"] and now >= self._due:
             self._due = now + PERIOD
-            image = self._latest(self._images[self._values["camera"]])
+            image = self._latest(self._images[self._camera])
             if image is not None and image is not self._seen[0]:
                 self._seen = (image, self._seen[1])
                 self._console.put(self._take)
@@ -124,7 +125,7 @@ class HandEyePanel:
         turned = {f"turned about {axis}": f"{degrees:.0f}°" for axis, degrees in views.turned.items()}
         missing = views.missing
         todo = span(f"Missing: {missing}", "busy") if missing else span("Nothing is missing: calibrate", "good")
-        lines = [fields({"views": views.count, **turned}), f"<div>{todo}</div>",
+        lines = [fields({"views": views.count, "of": self._camera, **turned}), f"<div>{todo}</div>",
                  f"<div>{span(self._said, 'dim')}</div>"]
         if (result := self._result) is not None:
             kinds = ["good" if result.good else "bad", *["" for _ in result.lines[1:]]]
@@ -139,8 +140,6 @@ class HandEyePanel:
 
     def _set(self, name: str, value: Any) -> None:
         self._values[name] = value.strip() if isinstance(value, str) else value
-        if name == "camera":
-            self._on_listen()
 
     async def _begin(self) -> None:
         from common.perception.calibration_board import Board, BoardOptions
@@ -150,9 +149,10 @@ class HandEyePanel:
         board = Board(check(BoardOptions, {"columns": round(self._values["columns"]), "square": square,
                                            "rows": round(self._values["rows"]), "marker": round(0.75 * square, 6)},
                             "board"))
+        camera = self._values["camera"]
         self._views = await asyncio.to_thread(
             HandEye, self._values["name"], self._robot, board, MOUNTS[self._values["mount"]])
-        self._said, self._result = "", None
+        self._camera, self._said, self._result = camera, "", None
         self._on_listen()
         self._console.tell(f"Views are kept in {self._views.folder}", "good")
 
@@ -161,7 +161,7 @@ class HandEyePanel:
         self._on_listen()
 
     async def _take(self) -> None:
-        views, image = self._views, self._latest(self._images[self._values["camera"]])
+        views, image = self._views, self._latest(self._images[self._camera])
         if views is None or self._busy:
             return
         if image is None:
@@ -175,11 +175,11 @@ class HandEyePanel:
         self._said = f"not taken: {why}" if why else f"view {views.count} is taken"
 
     async def _calibrate(self) -> None:
-        views, info = self._views, self._latest(self._info(self._images[self._values["camera"]]))
+        views, info = self._views, self._latest(self._info(self._images[self._camera]))
         if views is None or self._busy:
             return
         if info is None:
-            raise ConfigError("Camera", self._values["camera"], "does not say how its lens is")
+            raise ConfigError("Camera", self._camera, "does not say how its lens is")
         self._busy = True
         try:
             self._result = await asyncio.to_thread(views.calibrate, info)
