@@ -407,7 +407,7 @@ async def test_chosen_object_is_traced_once_its_path_is_known() -> None:
         await page.until(lambda: page.label("● Object_0"))
         await page.click("Object_1")
         await until(lambda: played.selects)
-        assert played.selects == [OutlineSelect(rule="index", index=1)] and played.commands == []
+        assert played.selects == [OutlineSelect(rule="index", index=1, at=(5 / 3, 4 / 3))] and played.commands == []
         played.bus.writer(CONTOUR_PATH).put(OutlinePoints(object="Object_1"))
         await until(lambda: played.commands)
         assert played.commands == ["start"]

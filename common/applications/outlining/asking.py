@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from common import topics
 from common.applications.outlining import stage_files
-from common.applications.outlining.contours_choice import NoSuchContour, described, parse_choice
+from common.applications.outlining.contours_choice import NoSuchContour, described, middle_of, parse_choice
 from common.applications.outlining.messages import Contours, OutlinePoints, OutlineSelect
 from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
 from common.errors import ConfigError, RemoteError, ZencellError
@@ -57,6 +57,8 @@ async def ask_person(bus: Bus, folder: Path) -> None:
         try:
             wanted = parse_choice(await _line())
             if wanted is not None:
+                if wanted.index is not None and wanted.index < len(found.contours):
+                    wanted.at = middle_of(found.contours[wanted.index])  # in the picture that the person looks at
                 answer = await select.call(wanted)
                 say(f"{answer.label} is chosen")
                 return

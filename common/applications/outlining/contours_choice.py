@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import math
 from collections.abc import Sequence
 
 from common.applications.outlining.contours import is_hole
@@ -11,6 +12,7 @@ from common.errors import ZencellError
 from common.messages import Color
 
 HUES = {"red": 0, "orange": 30, "yellow": 60, "green": 120, "cyan": 180, "blue": 240, "magenta": 300}  # [degrees]
+SAME_MIDDLE = 3.0  # [px] contours whose middles are this near lie in one another
 NAMES = [*HUES, "white", "grey", "black"]
 
 
@@ -71,7 +73,7 @@ def choose(contours: Sequence[Contour], wanted: OutlineSelect) -> Contour:
     """The contour that a request means.
 
     auto: the largest object that does not touch the border of the picture; colour: the largest such of that colour;
-    index: exactly that one, whatever it is.
+    index: exactly that one, whatever it is; where it is told where that was seen, the one that is there.
 
     Raises:
         NoSuchContour: with the choices.
@@ -79,6 +81,8 @@ def choose(contours: Sequence[Contour], wanted: OutlineSelect) -> Contour:
     if wanted.rule == "index":
         if wanted.index is None:
             raise NoSuchContour("index", f"no index is given; choices: {described(contours)}")
+        if wanted.at is not None:
+            return _seen_at(contours, wanted.index, wanted.at)
         if wanted.index >= len(contours):
             raise NoSuchContour("index", f"there is no contour {wanted.index}; choices: {described(contours)}")
         return contours[wanted.index]
@@ -98,3 +102,23 @@ def choose(contours: Sequence[Contour], wanted: OutlineSelect) -> Contour:
         choices = described(contours, objects)
         raise NoSuchContour("border", f"{which} contour touches the border of the picture: {choices}")
     return max(whole, key=lambda contour: contour.area)
+
+
+def middle_of(contour: Contour) -> tuple[float, float]:
+    """The mean of its pixels."""
+    us, vs = zip(*contour.pixels, strict=True)
+    return sum(us) / len(us), sum(vs) / len(vs)
+
+
+def _seen_at(contours: Sequence[Contour], index: int, at: tuple[float, float]) -> Contour:
+    """The contour with its middle at a pixel; of several that have one middle the one with that index.
+
+    Raises:
+        NoSuchContour: there is none.
+    """
+    away = {contour.index: math.dist(middle_of(contour), at) for contour in contours}
+    near = [each for each in contours if away[each.index] ** 2 <= each.area + 1
+            and away[each.index] <= min(away.values()) + SAME_MIDDLE]
+    if not near:
+        raise NoSuchContour("index", f"contour {index} is not where it was seen; choices: {described(contours)}")
+    return min(near, key=lambda each: (each.index != index, away[each.index]))

@@ -41,9 +41,14 @@ class OutlineSelect(Message):
     """Choose an object: the largest that does not touch the border, one of a colour, or one by its index."""
 
     most_bytes: ClassVar[int] = SMALL
+    later: ClassVar[tuple[str, ...]] = ("at",)
 
     rule: Literal["auto", "colour", "index"] = "auto"
     index: Count | None = None
+    at: tuple[Finite, Finite] | None = Field(
+        None, description="where the middle of its contour was seen to have that index [px]: another picture may count "
+                          "otherwise, and then what is there counts"
+    )
     colour: Label = Field("", description="red, green, blue, yellow, ... of the object's inside")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common import topics
+from common.applications.outlining.contours_choice import middle_of
 from common.applications.outlining.messages import Contour, OutlineSelect, OutlineStatus
 from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT, OUTLINE_STATUS
 from common.config import Fixture
@@ -54,6 +55,11 @@ def progress(status: TaskStatus, motion: MotionStatus | None) -> float:
     return motion.progress if motion is not None and motion.state == "active" else 0.0
 
 
+def choice_of(contour: Contour) -> OutlineSelect:
+    """The choice of what is seen here, however later pictures count."""
+    return OutlineSelect(rule="index", index=contour.index, at=middle_of(contour))
+
+
 async def choose(console: Console, choice: OutlineSelect) -> None:
     """Have an object outlined: it is chosen, and the task starts once its path is known. Tells which it is."""
     console.tell("")
@@ -79,22 +85,21 @@ class Controls:
     def __init__(self, gui: viser.GuiApi, console: Console) -> None:
         """Lay the buttons out where the GUI stands."""
         self._console = console
-        self._labels: list[str] = []
+        self._offered: dict[str, Contour] = {}
         self._buttons = gui.add_button_group("Outline", (LARGEST,), hint="choose an object: it is traced")
         console.on_choice(self._buttons, self._choose)
 
     def show(self, topic: Topic[Any], message: Any) -> None:
         """Offer the objects of a picture."""
-        self._labels = [contour.label for contour in message.contours]
+        self._offered = {contour.label: contour for contour in message.contours}
         marked = (f"{'● ' if c.index == message.selected else ''}{c.label}" for c in message.contours)
         options = (*marked, LARGEST)
         if options != self._buttons.options:
             self._buttons.options = options
 
     async def _choose(self, chosen: str) -> None:
-        label = chosen.removeprefix("● ")
-        await choose(self._console, OutlineSelect(rule="index", index=self._labels.index(label))
-                     if label in self._labels else OutlineSelect(rule="auto"))
+        contour = self._offered.get(chosen.removeprefix("● "))
+        await choose(self._console, choice_of(contour) if contour is not None else OutlineSelect(rule="auto"))
 
 
 class Outline(Layer):
@@ -170,7 +175,7 @@ class ContourChoice(Layer):
         line = add_line(self.scene, f"{name}_line", points, color, 2.0, closed=True)
         x, y = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
         pin = self.scene.add_icosphere(f"{name}_pin", _PIN, color, position=(x, y, height + 2 * _PIN), **FLAT)
-        console, choice = self.stage.console, OutlineSelect(rule="index", index=contour.index)
+        console, choice = self.stage.console, choice_of(contour)
 
         @pin.on_click
         async def _(_event: object) -> None:

@@ -84,10 +84,12 @@ def test_each_contour_has_a_pin_and_a_label_and_the_chosen_one_is_white(stage: S
 async def test_click_on_a_pin_chooses_its_contour(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen: list[OutlineSelect] = []
     monkeypatch.setattr("common.applications.outlining.page.choose", lambda _console, choice: chosen.append(choice))
-    stage.say(CONTOURS, contours(("red_1", square(0.45, 0, 1.0)), ("blue_1", square(0.55, 0, 1.0))))
+    shown = contours(("red_1", square(0.45, 0, 1.0)), ("blue_1", square(0.55, 0, 1.0)))
+    stage.say(CONTOURS, shown)
     for entry in nodes(stage)["1_pin"]._impl.click_cb:
         await entry.callback(None)
-    assert chosen == [OutlineSelect(rule="index", index=1)]
+    at = np.mean(shown.contours[1].pixels, axis=0)
+    assert [(choice.rule, choice.index, choice.at) for choice in chosen] == [("index", 1, pytest.approx(tuple(at)))]
 
 
 def test_same_contours_are_not_sent_again(stage: Stage) -> None:

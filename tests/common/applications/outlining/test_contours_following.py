@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from common.applications.outlining.contours import ContourOptions, find_contours
+from common.applications.outlining.contours_choice import NoSuchContour, middle_of
 from common.applications.outlining.contours_following import Following
 from common.applications.outlining.messages import Contour, OutlineSelect
 
@@ -78,6 +79,24 @@ def test_object_of_another_colour_in_its_place_is_not_the_chosen_one(size: int) 
     assert following.find(drawn(red)) == (0, "")
     assert following.find(drawn(green))[0] == -1
     assert following.find(drawn(red)) == (0, "")
+
+
+def test_what_was_seen_somewhere_is_chosen_there_however_the_newest_picture_counts() -> None:
+    seen = [square(0, 100, 300, 50), square(1, 400, 100, 50)]
+    now = [square(0, 300, 400, 50), square(1, 101, 300, 50), square(2, 400, 100, 50)]
+    following = Following(None)
+    for contour, index in zip(seen, (1, 2), strict=True):
+        choice = OutlineSelect(rule="index", index=contour.index, at=middle_of(contour))
+        assert following.select(now, choice).index == index == following.find(now)[0]
+    with pytest.raises(NoSuchContour, match="contour 1 is not where it was seen"):
+        following.select(now[:2], OutlineSelect(rule="index", index=1, at=middle_of(seen[1])))
+
+
+def test_of_an_object_and_the_hole_in_its_middle_the_one_of_that_number_is_chosen() -> None:
+    contours = [square(0, 100, 100, 100), square(1, 130, 131, 40)]
+    for contour in contours:
+        choice = OutlineSelect(rule="index", index=contour.index, at=middle_of(contour))
+        assert Following(None).select(contours, choice) is contour
 
 
 def test_object_that_moves_and_grows_slowly_stays_chosen() -> None:
