@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 import multiprocessing
 import os
 import signal
-import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -14,11 +12,11 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 
 from common.config import Cell
+from common.process.lifeline import die_when_orphaned
 from common.virtual.simulation import Outcome, Simulation
 
 ENOUGH = 0.99  # share of the seeds that must end DONE
 SEEDS_A_PROCESS = 50  # after which a process is begun anew
-PR_SET_PDEATHSIG = 1
 
 
 @dataclass
@@ -97,8 +95,7 @@ _work: list[tuple[Cell, bool, float]] = []
 
 def _begin(cell: Cell, faults: bool, limit: float) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # who began us ends us
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    die_when_orphaned()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     _work[:] = [(cell, faults, limit)]
 

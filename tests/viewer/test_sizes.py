@@ -1,0 +1,51 @@
+"""Every tab at four sizes: the same things are there, none sticks out, and STOP stays where it is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from common.viewer.layout import TABS
+from tests.viewer.conftest import IN_BROWSER, Bring, Watched
+from tests.viewer.test_bar import PANDA, SIZES, look
+from tests.viewer.test_panels import NAMELESS, tab
+
+if TYPE_CHECKING:
+    from playwright.async_api import Page
+
+pytestmark = IN_BROWSER
+
+# What can be pressed or set in the panel, by the words that are beside it, and what of it sticks out sideways.
+CONTROLS = """() => {
+  const seen = [...document.querySelectorAll("#root button, #root input, #root label, #root [role=tab]")]
+    .filter(each => each.offsetParent);
+  const words = each => (each.getAttribute("aria-label") || each.textContent || "").trim();
+  const out = seen.filter(each => { const at = each.getBoundingClientRect();
+    return at.width > 0 && (at.right > innerWidth + 1 || at.left < -1); });
+  return {words: [...new Set(seen.map(words).filter(Boolean))].sort(),
+    out: out.map(each => each.outerHTML.slice(0, 120))};
+}"""
+
+
+async def controls(page: Page) -> list[str]:
+    """The words of what the panel offers now; nothing of it sticks out, and all of it has a name."""
+    seen = await page.evaluate(CONTROLS)
+    assert not seen["out"], seen["out"]
+    await page.wait_for_function(f"() => ({NAMELESS})().length === 0")
+    return list(seen["words"])
+
+
+async def test_every_tab_has_the_same_at_every_size_and_nothing_sticks_out(bring: Bring, watched: Watched) -> None:
+    cell = await bring(*PANDA)
+    offered: dict[str, dict[str, list[str]]] = {}
+    page = await watched.open(cell.address)
+    for size, (width, height) in SIZES.items():
+        await page.set_viewport_size({"width": width, "height": height})
+        await page.reload()
+        await page.get_by_role("button", name="Start").wait_for()
+        for name in TABS:
+            await tab(page, name)
+            await look(page)
+            offered.setdefault(name, {})[size] = await controls(page)
+    for name, at_sizes in offered.items():
+        assert at_sizes["large"] and all(words == at_sizes["large"] for words in at_sizes.values()), (name, at_sizes)
+    assert not watched.errors
