@@ -1,15 +1,17 @@
 """Ten plan requests at once against ten one after the other, through a planner's own process and the network.
 
-    python -m benchmarks.at_once [--cell panda] [--rounds N]
+    python -m benchmarks.at_once [--cell panda] [--rounds N] [--boxes N]
 
 The requests are those of 60 random pairs of positions that take longest to plan in the cell's own scene, each from a
-start and to a goal of its own. Both ways take turns; printed are medians of wall time and of the ratio of neighbours.
+start and to a goal of its own; with `--boxes`, among so many boxes that float about the arm. Both ways take turns;
+printed are medians of wall time and of the ratio of neighbours.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import json
 import time
 from statistics import median
 
@@ -24,11 +26,23 @@ from zencell import Cell
 PAIRS, COUNT, TIMEOUT = 60, 10, 60.0
 
 
-async def measure(name: str, rounds: int) -> None:
+def crowded(name: str, boxes: int) -> str:
+    """An override that adds boxes of 0.1 m to the cell's fixtures, 0.35 to 0.8 m from the arm's foot and above it."""
+    rng = np.random.default_rng(1)
+    fixtures = [fixture.model_dump(mode="json", exclude_defaults=True) for fixture in load_cell(name).world.fixtures]
+    for number in range(boxes):
+        turn, away, up = rng.uniform((-np.pi, 0.35, 0.2), (np.pi, 0.8, 1.0))
+        place = [round(float(value), 3) for value in (away * np.cos(turn), away * np.sin(turn), up)]
+        fixtures.append({"id": f"floating_{number}", "dimensions": [0.1, 0.1, 0.1], "position": place})
+    return f"world.fixtures={json.dumps(fixtures)}"
+
+
+async def measure(name: str, rounds: int, boxes: int) -> None:
     """Measure, and print a line for each way."""
     robot = RobotModel.load(load_cell(name).robot)
     rng = np.random.default_rng(0)
-    async with Cell.start(name, overrides=["autostart=false"]) as cell:
+    overrides = ["autostart=false", *([crowded(name, boxes)] if boxes else [])]
+    async with Cell.start(name, overrides=overrides) as cell:
 
         async def plan(request: PlanRequest) -> PlanResponse | None:
             try:
@@ -56,8 +70,8 @@ async def measure(name: str, rounds: int) -> None:
             await asyncio.gather(*map(plan, hardest))
             rows.append((between - began, time.perf_counter() - between))
         rows.pop(0)  # a helper loads the robot when it is asked for the first time
-        print(f"{name}: {COUNT} of {PAIRS}: one after the other {1e3 * median(one for one, _ in rows):.1f} ms, at once "
-              f"{1e3 * median(two for _, two in rows):.1f} ms, ratio {median(two / one for one, two in rows):.2f} "
+        print(f"{name}, {boxes} boxes: {COUNT} of {PAIRS}: one after the other "
+              f"{1e3 * median(one for one, _ in rows):.1f} ms, at once {1e3 * median(two for _, two in rows):.1f} ms, ratio {median(two / one for one, two in rows):.2f} "
               f"({rounds} rounds)")
 
 
@@ -66,8 +80,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cell", default="panda")
     parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--boxes", type=int, default=0)
     options = parser.parse_args()
-    asyncio.run(measure(options.cell, options.rounds))
+    asyncio.run(measure(options.cell, options.rounds, options.boxes))
 
 
 if __name__ == "__main__":
