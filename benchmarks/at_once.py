@@ -71,8 +71,8 @@ async def measure(name: str, rounds: int, boxes: int) -> None:
             rows.append((between - began, time.perf_counter() - between))
         rows.pop(0)  # a helper loads the robot when it is asked for the first time
         print(f"{name}, {boxes} boxes: {COUNT} of {PAIRS}: one after the other "
-              f"{1e3 * median(one for one, _ in rows):.1f} ms, at once {1e3 * median(two for _, two in rows):.1f} ms, ratio {median(two / one for one, two in rows):.2f} "
-              f"({rounds} rounds)")
+              f"{1e3 * median(one for one, _ in rows):.1f} ms, at once {1e3 * median(two for _, two in rows):.1f} ms, "
+              f"ratio {median(two / one for one, two in rows):.2f} ({rounds} rounds)")
 
 
 def main() -> None:
