@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
+from pydantic import BaseModel
 
 from common.control.limiter import SLACK
 from common.control.trajectory import Trajectory
@@ -15,7 +16,7 @@ from common.errors import Refused
 from common.hardware.interface import Limits, Vector
 from common.hardware.pace import Pace
 
-S = TypeVar("S")
+S = TypeVar("S", bound=BaseModel)
 V = TypeVar("V", float, Vector)
 
 REMEMBERED = 1000  # goals that were followed, and as many that were refused; older requests are refused for their age
@@ -133,23 +134,44 @@ class Judged:
 
 
 class GoalMemory(Generic[S]):
-    """The newest states of the last goals; those that were refused push out none that was followed."""
+    """The newest states of the last goals; those that were refused push out none that was followed.
+
+    All but the newest are kept as JSON, a sixth of the memory: that of an arm that works is full for all of its time.
+    """
 
     def __init__(self, most: int = REMEMBERED) -> None:
         """Remember at most so many goals of either kind; the one heard of longest ago is forgotten first."""
         self._most = most
-        self._followed: OrderedDict[str, S] = OrderedDict()
-        self._refused: OrderedDict[str, S] = OrderedDict()
+        self._followed: OrderedDict[str, S | _Packed[S]] = OrderedDict()
+        self._refused: OrderedDict[str, S | _Packed[S]] = OrderedDict()
+        self._newest = "", self._followed
 
     def get(self, goal: str) -> S | None:
         """The state of a goal, or None for an id that was never heard of."""
-        return self._followed.get(goal) or self._refused.get(goal)
+        state = self._followed.get(goal) or self._refused.get(goal)
+        return state.unpacked() if isinstance(state, _Packed) else state
 
     def put(self, goal: str, state: S, *, refused: bool = False) -> S:
         """Remember and return the state of a goal."""
         states = self._refused if refused else self._followed
+        before, among = self._newest
+        if before != goal or among is not states:
+            last = among.get(before)
+            if last is not None and not isinstance(last, _Packed):
+                among[before] = _Packed(type(last), last.model_dump_json().encode())
+            self._newest = goal, states
         states[goal] = state
         states.move_to_end(goal)
         while len(states) > self._most:
             states.popitem(last=False)
         return state
+
+
+class _Packed(NamedTuple, Generic[S]):
+    """A state as JSON."""
+
+    kind: type[S]
+    text: bytes
+
+    def unpacked(self) -> S:
+        return self.kind.model_validate_json(self.text)

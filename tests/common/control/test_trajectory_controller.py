@@ -1,4 +1,5 @@
 import re
+import tracemalloc
 from collections import deque
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from common.control.goals import REMEMBERED, GoalMemory
 from common.control.trajectory import Trajectory
 from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware
+from common.messages import Header, Inhibit, MotionStatus
 from tests.common.hardware.rig import START, STEP, T0, Rig
 from tests.harness import ROOT
 
@@ -99,8 +101,28 @@ def test_as_many_goals_are_remembered_as_the_docs_say():
     assert said is not None and int(said[1]) == REMEMBERED
     memory = GoalMemory()
     for number in range(REMEMBERED + 1):
-        memory.put(f"{number}", number + 1)
-    assert memory.get("0") is None and memory.get("1") == 2
+        memory.put(f"{number}", MotionStatus(id=f"{number}"))
+    assert memory.get("0") is None and memory.get("1") == MotionStatus(id="1")
+
+
+def test_old_goals_are_remembered_in_full_and_take_little_memory():
+    def state(number):
+        inhibit = Inhibit(kind="held", by="anna", reason="an \u00e4rm\n", since=1_700_000_000_000_000_000 + number)
+        return MotionStatus(header=Header(stamp=number), id=f"{number}", state="aborted", progress=1 / 3,
+                            error="path_tolerance", message="joint 3", speed_scaling=0.1, inhibits=[inhibit])
+
+    memory = GoalMemory()
+    tracemalloc.start()
+    before, _ = tracemalloc.get_traced_memory()
+    for number in range(500):
+        memory.put(f"{number}", state(number), refused=number % 3 == 0)
+    taken = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    assert all(memory.get(f"{number}") == state(number) for number in range(500))
+    assert taken < 500 * 1000, "of 6 kB that it takes as an object"
+    memory.put("7", state(8))
+    memory.put("9", state(9))
+    assert memory.get("7") == state(8), "what was packed changes too"
 
 
 @given(fraction=st.floats(0.02, 0.98), end=st.floats(0.1, 1.0))
