@@ -8,8 +8,8 @@ load of 20 on two cores nothing is lost, but joint states are written at 89 Hz.
 Memory is what a process has for itself (anonymous and shared pages, also those swapped out): pages of files, such as
 libraries, come and go with whatever else runs on the machine. Growth is the lower quartile of the last fifth of the
 looks against that of the first fifth, of those after the first minutes: what a process holds between two pictures, and
-not the two or three of 0.9 MB that happen to be under way. Of descriptors the most of either fifth counts: the router has
-one more while the stuck subscriber is connected.
+not the two or three of 0.9 MB that happen to be under way. Of descriptors the most of either fifth counts: the router
+has one more while the stuck subscriber is connected.
 """
 
 from __future__ import annotations
