@@ -36,6 +36,8 @@ class RejectedPlaces:
 
         Forgotten is where a target is by now, or where nothing has been detected for a while: whoever took it away.
         """
+        if isinstance(message, Rejections | PoseArray | MarkerArray):
+            self._keep_up(message.header.stamp)
         if isinstance(message, Rejections):
             self._add(message)
         elif isinstance(message, PoseArray):
@@ -47,6 +49,12 @@ class RejectedPlaces:
                 if _near(place.at, found):
                     place.seen = max(place.seen, message.header.stamp)
             self.places = [place for place in self.places if message.header.stamp - place.seen <= FORGET_AFTER]
+
+    def _keep_up(self, stamp: int) -> None:
+        """Count from a stamp [ns] that is long before what was seen: the clock was set back."""
+        for place in self.places:
+            if place.seen - stamp > FORGET_AFTER:
+                place.since = place.seen = stamp
 
     def _add(self, message: Rejections) -> None:
         """Add these; one at a known place replaces it."""
