@@ -57,7 +57,7 @@ class ViewCollector:
         self._file = JointsFile(robot=name, joints=robot.joint_names)
         if file.exists():
             self._file = _read(folder)
-            if self._file.joints != robot.joint_names:
+            if self._file.joints != robot.joint_names or _differ(self._file.robot, name):
                 raise ConfigError("FOLDER", str(folder), f"has views of another robot: {self._file.robot}")
             _require_joints(folder, self._file, robot)
         try:
@@ -171,6 +171,11 @@ def _near(a: Array, b: Array) -> bool:
 
 def _read(folder: Path) -> JointsFile:
     return check(JointsFile, read_yaml(folder / JOINTS_FILE), str(folder / JOINTS_FILE))
+
+
+def _differ(robot: str, other: str) -> bool:
+    """Whether two names are those of different robots, whose joints may well be called the same; of paths who knows."""
+    return robot != other and not any(name.endswith((".yaml", ".yml")) for name in (robot, other))
 
 
 def _require_joints(folder: Path, said: JointsFile, robot: RobotModel) -> None:

@@ -117,6 +117,17 @@ def test_views_with_other_numbers_of_joints_are_refused_by_their_name(q: list[fl
         HandEye("wrist", CONFIG, BOARD, "hand")
 
 
+@pytest.mark.parametrize(("robot", "fits"), [("panda", True), ("robots/panda.yaml", True), ("panda_long", False)])
+def test_views_of_another_robot_with_joints_of_the_same_names_are_refused(robot: str, fits: bool) -> None:
+    file = HandEye("wrist", CONFIG, BOARD, "hand").folder / "joints.yaml"
+    file.write_text(yaml.safe_dump({"robot": robot, "joints": ROBOT.joint_names}))
+    if fits:
+        assert HandEye("wrist", CONFIG, BOARD, "hand").count == 0
+        return
+    with pytest.raises(ConfigError, match="has views of another robot: panda_long"):
+        HandEye("wrist", CONFIG, BOARD, "hand")
+
+
 def test_view_that_somebody_left_out_has_no_other_written_over(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Board, "find", lambda *_: SimpleNamespace(blur=0.5))
     views = HandEye("wrist", CONFIG, BOARD, "hand")
