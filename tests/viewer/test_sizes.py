@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 from common.viewer.layout import TABS
@@ -42,6 +43,8 @@ async def test_every_tab_has_the_same_at_every_size_and_nothing_sticks_out(bring
         await page.set_viewport_size({"width": width, "height": height})
         await page.reload()
         await page.get_by_role("button", name="Start").wait_for()
+        if size == "phone":
+            await page.get_by_text(re.compile("Health · ")).click()  # opens the tabs
         for name in TABS:
             await tab(page, name)
             await look(page)
