@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from common import topics
 from common.applications.outlining import stage_files
@@ -23,8 +23,11 @@ if TYPE_CHECKING:
     from common.transport.bus import Bus, Reader
 
 TIMEOUT = 30.0  # [s] for a picture and its outline
+KEPT = 100  # pictures of which contours and points are known until their path comes
 ALL_WITHIN = 3.0  # [s, cell time] after the first picture for a contour to be chosen
 CHOOSE_BY_HAND = ("services.contour_detector.select=none", "services.contour_tracer.selection_timeout=0")
+
+M = TypeVar("M", Contours, OutlinePoints)
 
 
 class NoOutline(ZencellError):
@@ -113,12 +116,15 @@ async def store(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
     pictures, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
     contours, points = bus.reader(CONTOURS), bus.reader(CONTOUR_POINTS)
     paths = bus.reader(CONTOUR_PATH)
+    seen_in, found_in = dict[int, Contours](), dict[int, OutlinePoints]()
+    noting: list[asyncio.Task[None]] = []
     try:
         async with asyncio.timeout(TIMEOUT):
             first = await pictures.next()
             if wanted is not None and wanted.rule != "auto":
                 await contours.next()
                 await bus.client(OUTLINE_SELECT).call(wanted)
+            noting += [asyncio.create_task(_note(contours, seen_in)), asyncio.create_task(_note(points, found_in))]
             picture, depth = await _pair(pictures, depths)
             stage_files.write_pictures(folder, colour_picture(picture), depth_of(depth))
             path = await paths.next()
@@ -128,7 +134,11 @@ async def store(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
                 path = await paths.next()
     except TimeoutError:
         raise NoOutline(f"no outline came within {TIMEOUT:g} s: does the cell have a depth camera?") from None
-    found, seen = points.latest, contours.latest
+    finally:
+        for task in noting:
+            task.cancel()
+    # Of the path's own picture: in another the object may have another label.
+    found, seen = found_in.get(path.header.stamp), seen_in.get(path.header.stamp)
     chosen = next((c for c in seen.contours if c.label == path.object), None) if seen else None
     if chosen is not None:
         stage_files.write_points(folder / stage_files.PIXELS, chosen.pixels)
@@ -136,6 +146,14 @@ async def store(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
         stage_files.write_points(folder / stage_files.COORDINATES, _points(found))
     stage_files.write_points(folder / stage_files.CLEARED, _points(path))
     return f"{path.object}, {len(path.poses)} points: the picture and the stages are in {folder}"
+
+
+async def _note(reader: Reader[M], kept: dict[int, M]) -> None:
+    """Keep the newest messages by the stamps of their pictures."""
+    async for message in reader:
+        kept[message.header.stamp] = message
+        while len(kept) > KEPT:
+            del kept[next(iter(kept))]
 
 
 async def _pair(pictures: Reader[Image], depths: Reader[Image]) -> tuple[Image, Image]:
