@@ -17,6 +17,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import termios
 import threading
 import time
@@ -54,7 +55,9 @@ SUMMARY, LOG = "summary.json", "cell.log"
 
 
 def free_domain() -> int:
-    """A domain whose port is free. Tests that run beside each other have shares of their own, so that none meet.
+    """A domain whose port is free, and which no other process that asks here gets while this one lives.
+
+    Tests that run beside each other have shares of their own; a suite and a benchmark, or two suites, have not.
 
     Raises:
         RuntimeError: none is.
@@ -68,9 +71,22 @@ def free_domain() -> int:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             with suppress(OSError):
                 probe.bind(("127.0.0.1", BASE_PORT + number))
+                _take(number)
                 _given.append(number)
                 return number
     raise RuntimeError(f"no domain from {domains[0]} to {domains[-1]} is free")
+
+
+def _take(domain: int) -> None:
+    """Have the domain for as long as this process lives; an OSError if another one has it."""
+    folder = Path(tempfile.gettempdir(), f"zencell-test-domains-{os.getuid()}")
+    folder.mkdir(exist_ok=True)
+    lock = os.open(folder / str(domain), os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(lock)
+        raise
 
 
 def folder_for(parent: Path, label: str) -> Path:
