@@ -51,6 +51,7 @@ DOMAINS = range(60, 233)
 PATIENCE = 60.0  # [s] until a test gives up waiting for an event
 logging.getLogger("watcher").addHandler(logging.NullHandler())  # that the router goes at the end is no news
 _given: deque[int] = deque(maxlen=len(DOMAINS) // 4)  # lately, and perhaps not yet listened at
+_locks: dict[int, int] = {}  # descriptors by the domains that this process has
 SUMMARY, LOG = "summary.json", "cell.log"
 
 
@@ -79,6 +80,8 @@ def free_domain() -> int:
 
 def _take(domain: int) -> None:
     """Have the domain for as long as this process lives; an OSError if another one has it."""
+    if domain in _locks:
+        return
     folder = Path(tempfile.gettempdir(), f"zencell-test-domains-{os.getuid()}")
     folder.mkdir(exist_ok=True)
     lock = os.open(folder / str(domain), os.O_RDWR | os.O_CREAT, 0o600)
@@ -87,6 +90,7 @@ def _take(domain: int) -> None:
     except OSError:
         os.close(lock)
         raise
+    _locks[domain] = lock
 
 
 def folder_for(parent: Path, label: str) -> Path:

@@ -28,8 +28,10 @@ def tell():
     main = sys.modules.get("__main__")
     loaded = [[name, module.__file__, id(module)] for name, module in list(sys.modules.items())
               if isinstance(getattr(module, "__file__", None), str)]
-    with open(os.path.join(os.environ["PROBE"], f"{os.getpid()}.json"), "w") as file:
+    path = os.path.join(os.environ["PROBE"], f"{os.getpid()}.json")
+    with open(path + ".part", "w") as file:  # who is killed meanwhile has told nothing
         json.dump({"main": str(getattr(getattr(main, "__spec__", None), "name", None)), "loaded": loaded}, file)
+    os.replace(path + ".part", path)
 def leave(code):
     tell()
     at_once(code)

@@ -100,7 +100,7 @@ def _waits_without_end():
 
 
 def _never_asked_again():
-    async def once(client, request, timeout, refused, note):
+    async def once(client, request, timeout, refused, note, again=()):
         try:
             return await client.call(request, timeout=timeout)
         except Exception as error:
