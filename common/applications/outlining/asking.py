@@ -114,53 +114,63 @@ async def store(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
         StageFileError: a file cannot be written.
     """
     pictures, depths = bus.reader(topics.DEPTH_CAMERA_IMAGE), bus.reader(topics.DEPTH_CAMERA_DEPTH)
-    contours, points = bus.reader(CONTOURS), bus.reader(CONTOUR_POINTS)
-    paths = bus.reader(CONTOUR_PATH)
-    seen_in, found_in = dict[int, Contours](), dict[int, OutlinePoints]()
+    contours, points, paths = bus.reader(CONTOURS), bus.reader(CONTOUR_POINTS), bus.reader(CONTOUR_PATH)
+    seen, found, cleared = dict[int, Contours](), dict[int, OutlinePoints](), dict[int, OutlinePoints]()
+    more = asyncio.Event()
     noting: list[asyncio.Task[None]] = []
     try:
         async with asyncio.timeout(TIMEOUT):
             first = await pictures.next()
+            chosen_at = -1  # stamp of the newest picture that may have had another choice
             if wanted is not None and wanted.rule != "auto":
                 await contours.next()
                 await bus.client(OUTLINE_SELECT).call(wanted)
-            noting += [asyncio.create_task(_note(contours, seen_in)), asyncio.create_task(_note(points, found_in))]
-            picture, depth = await _pair(pictures, depths)
-            stage_files.write_pictures(folder, colour_picture(picture), depth_of(depth))
-            path = await paths.next()
-            while path.header.stamp < picture.header.stamp or not path.poses:
-                if path.message and path.header.stamp - first.header.stamp > ALL_WITHIN * 1e9:
-                    raise NoOutline(f"{path.message}; the picture is in {folder}")
-                path = await paths.next()
+                chosen_at = max(each.latest.header.stamp for each in (pictures, contours) if each.latest is not None)
+            noting += [asyncio.create_task(_note(*each, more))  # what comes while files are written, too
+                       for each in ((points, found), (paths, cleared))]
+            noting.append(asyncio.create_task(_note(contours, seen, more)))
+            picture, depth = await _pair(pictures, depths, chosen_at)
+            # Beside the loop: of what comes while it is held up all but the newest would be lost.
+            await asyncio.to_thread(stage_files.write_pictures, folder, colour_picture(picture), depth_of(depth))
+            while True:
+                more.clear()
+                since = [path for stamp, path in sorted(cleared.items()) if stamp >= picture.header.stamp]
+                # All of the path's own picture: in another the object may have another label.
+                whole = [path for path in since if path.poses and path.header.stamp in seen.keys() & found.keys()]
+                if whole:
+                    break
+                late = [path for path in since if path.header.stamp - first.header.stamp > ALL_WITHIN * 1e9]
+                if late and late[-1].message and not late[-1].poses:
+                    raise NoOutline(f"{late[-1].message}; the picture is in {folder}")
+                await more.wait()
     except TimeoutError:
         raise NoOutline(f"no outline came within {TIMEOUT:g} s: does the cell have a depth camera?") from None
     finally:
         for task in noting:
             task.cancel()
-    # Of the path's own picture: in another the object may have another label.
-    found, seen = found_in.get(path.header.stamp), seen_in.get(path.header.stamp)
-    chosen = next((c for c in seen.contours if c.label == path.object), None) if seen else None
+    path, stamp = whole[0], whole[0].header.stamp
+    chosen = next((contour for contour in seen[stamp].contours if contour.label == path.object), None)
     if chosen is not None:
         stage_files.write_points(folder / stage_files.PIXELS, chosen.pixels)
-    if found is not None:
-        stage_files.write_points(folder / stage_files.COORDINATES, _points(found))
+    stage_files.write_points(folder / stage_files.COORDINATES, _points(found[stamp]))
     stage_files.write_points(folder / stage_files.CLEARED, _points(path))
     return f"{path.object}, {len(path.poses)} points: the picture and the stages are in {folder}"
 
 
-async def _note(reader: Reader[M], kept: dict[int, M]) -> None:
+async def _note(reader: Reader[M], kept: dict[int, M], more: asyncio.Event) -> None:
     """Keep the newest messages by the stamps of their pictures."""
     async for message in reader:
         kept[message.header.stamp] = message
         while len(kept) > KEPT:
             del kept[next(iter(kept))]
+        more.set()
 
 
-async def _pair(pictures: Reader[Image], depths: Reader[Image]) -> tuple[Image, Image]:
-    """A picture and the depth image that was taken with it."""
+async def _pair(pictures: Reader[Image], depths: Reader[Image], after: int) -> tuple[Image, Image]:
+    """A picture later than a stamp, and the depth image that was taken with it."""
     while True:
         picture, depth = await pictures.next(), depths.latest
-        if depth is not None and depth.header.stamp == picture.header.stamp:
+        if depth is not None and depth.header.stamp == picture.header.stamp > after:
             return picture, depth
 
 

@@ -6,6 +6,7 @@ import asyncio
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from common import messages as m
 from common import topics
@@ -33,7 +34,9 @@ def outline(stamp: int, x: float) -> OutlinePoints:
     return OutlinePoints(header=header(stamp), poses=[m.Pose(position=at) for at in places], object="Object_0")
 
 
-async def test_stages_are_those_of_the_picture_of_the_path(tmp_path: Path) -> None:
+@pytest.mark.parametrize("path_is", ["first", "last"])
+async def test_stages_are_those_of_the_picture_of_the_path(tmp_path: Path, path_is: str) -> None:
+    """Three services tell of one picture: what they say comes in any order."""
     bus = LocalNetwork().bus()
     picture, depth = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
     seen, found, paths = bus.writer(CONTOURS), bus.writer(CONTOUR_POINTS), bus.writer(CONTOUR_PATH)
@@ -49,11 +52,15 @@ async def test_stages_are_those_of_the_picture_of_the_path(tmp_path: Path) -> No
         await soon()
         picture.put(array_to_image(np.zeros((12, 16, 3), np.uint8), "bgr8", header(stamp)))
         await soon()
+    if path_is == "first":
+        paths.put(outline(2, 0.5))
+        await soon()
     for stamp, pixels, x in ((2, RIGHT, 0.5), (3, WRONG, 0.9)):
         seen.put(contours(stamp, pixels))
         found.put(outline(stamp, x))
         await soon()
-    paths.put(outline(2, 0.5))
+    if path_is == "last":
+        paths.put(outline(2, 0.5))
     said = await storing
     assert said.startswith("Object_0, 3 points")
     assert stage_files.read_pixels(tmp_path / stage_files.PIXELS).tolist() == [list(each) for each in RIGHT]
