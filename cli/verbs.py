@@ -164,10 +164,9 @@ def own_applications(arguments: Sequence[str]) -> Iterator[str]:
     for argument in arguments:
         path = Path(argument.rpartition("=")[2])
         if path.suffix == ".yaml" and path.is_file():
-            import yaml
+            from common.config import read_yaml  # completion is to be quick
 
-            with contextlib.suppress(OSError, UnicodeDecodeError, yaml.YAMLError):
-                values = yaml.safe_load(path.read_text(encoding="utf-8"))
-                name = values.get("application") if isinstance(values, dict) else None
+            with contextlib.suppress(ConfigError):
+                name = read_yaml(path).get("application")
                 if isinstance(name, str) and "." in name:
                     yield name

@@ -11,7 +11,7 @@ from __future__ import annotations
 from common.config.basics import Coordinate, Length, Number, Parameters, Point, Rgb, Section, Tunable
 from common.config.cell import Cell, Members, Reach, ServiceEntry
 from common.config.checking import check
-from common.config.files import config_root, find_file, names_of, read_robot, read_yaml
+from common.config.files import config_root, find_file, names_of, parse_yaml, read_robot, read_yaml
 from common.config.light import Light
 from common.config.loading import load_cell, load_robot, service_config, service_names
 from common.config.motion import Grasp, Motion, Pipeline, PlannerEntry, Run, Watchdogs

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import yaml
 
 from common.errors import ConfigError, UnknownName
+
+DEEPEST = 64  # levels of a YAML text: no file of a cell has ten
+MOST_NODES = 1_000_000  # of one, also where names stand for many of them
 
 
 def config_root() -> Path:
@@ -22,6 +26,57 @@ def names_of(kind: str) -> list[str]:
     return sorted(path.stem for path in (config_root() / kind).glob("*.yaml"))
 
 
+def parse_yaml(text: str, loader: type = yaml.SafeLoader) -> Any:
+    """What a YAML text says.
+
+    Args:
+        text: of a person or a file.
+        loader: libyaml's is faster, and does not take `{a:}` as the other does.
+
+    Raises:
+        yaml.YAMLError: it does not parse, contains itself, is nested deeper than `DEEPEST` or stands for more than
+            `MOST_NODES`.
+        ValueError: it parses and says what there is not, such as a date.
+    """
+    _require_modest(yaml.parse(text, Loader=loader))
+    return yaml.load(text, Loader=loader)
+
+
+def _require_modest(events: Iterable[yaml.Event]) -> None:
+    """Return when the values can be built, which libyaml does by recursion: too deep a text would end the process."""
+    sizes: dict[str, int] = {}  # nodes that a name stands for, with those that names in it stand for
+    within: list[tuple[str | None, int]] = []  # name and nodes so far of each collection that we are in
+
+    def refuse(problem: str, event: yaml.Event) -> NoReturn:
+        error = yaml.MarkedYAMLError(problem=problem)
+        error.problem_mark = event.start_mark  # type: ignore[assignment]  # libyaml's has line and column, too
+        raise error
+
+    for event in events:
+        if isinstance(event, yaml.CollectionStartEvent):
+            within.append((event.anchor, 1))
+            if len(within) > DEEPEST:
+                refuse(f"nested deeper than {DEEPEST} levels", event)
+            continue
+        if isinstance(event, yaml.CollectionEndEvent):
+            name, size = within.pop()
+        elif isinstance(event, yaml.AliasEvent):
+            if any(name == event.anchor for name, _ in within):
+                refuse(f"{event.anchor!r} contains itself", event)
+            name, size = None, sizes.get(event.anchor or "", 1)
+        elif isinstance(event, yaml.ScalarEvent):
+            name, size = event.anchor, 1
+        else:
+            continue
+        if name is not None:
+            sizes[name] = size
+        if size > MOST_NODES:
+            refuse(f"stands for more than {MOST_NODES} values", event)
+        if within:
+            above, so_far = within[-1]
+            within[-1] = above, so_far + size
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """A mapping from a YAML file.
 
@@ -29,7 +84,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         ConfigError: the file is not there, does not parse (with line and column), or holds no mapping.
     """
     try:
-        loaded = yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        loaded = parse_yaml(path.read_text(encoding="utf-8"), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError("file", str(path), f"cannot be read: {error}") from None
     except yaml.YAMLError as error:

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 from pydantic_core import to_jsonable_python
 
-from common.config.files import read_yaml
+from common.config.files import parse_yaml, read_yaml
 from common.errors import ConfigError
 
 
@@ -20,8 +20,8 @@ def parse_override(text: str, given_as: str = "--set") -> tuple[list[str], Any]:
     if not found or not path.strip():
         raise ConfigError(given_as, text, "must be PATH=VALUE, for example world.count=5, or @FILE.yaml")
     try:
-        return path.strip().split("."), yaml.safe_load(value)
-    except yaml.YAMLError:
+        return path.strip().split("."), parse_yaml(value)
+    except (yaml.YAMLError, ValueError):  # a date that there is not
         raise ConfigError(f"{given_as} {path}", value, "is not a YAML value") from None
 
 

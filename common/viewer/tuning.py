@@ -11,6 +11,7 @@ import viser
 import yaml
 from pydantic import JsonValue, TypeAdapter
 
+from common.config import parse_yaml
 from common.errors import ConfigError
 from common.messages import Parameter
 from common.viewer.console import SLIDING, Console, assign
@@ -151,8 +152,8 @@ class Knob:
         if not self.as_text:
             return given  # type: ignore[no-any-return]
         try:
-            value: JsonValue = _JSON.validate_python(yaml.safe_load(given))
-        except (yaml.YAMLError, ValueError, RecursionError):  # a date there never was is a ValueError
+            value: JsonValue = _JSON.validate_python(parse_yaml(given))
+        except (yaml.YAMLError, ValueError):  # a date there never was is a ValueError
             raise ConfigError(self.parameter.path, given, "is not a YAML value") from None
         return value
 

@@ -37,6 +37,17 @@ def test_a_file_changes_what_it_names_and_the_last_word_counts(tmp_path: Path) -
     assert cell.services["scene_manager"].parameters == {}
 
 
+def test_names_in_a_file_stand_for_what_they_name(tmp_path: Path) -> None:
+    given = file(tmp_path, "motion: {velocity_scaling: &half 0.5, acceleration_scaling: *half}\n")
+    assert expanded([given]) == ["motion.velocity_scaling=0.5", "motion.acceleration_scaling=0.5"]
+
+
+@pytest.mark.parametrize("value", [100_000 * "[", "2026-13-01", "&a [*a]"])
+def test_a_value_that_is_none_is_refused(value: str) -> None:
+    with pytest.raises(ConfigError, match=r"--set world\.count.*is not a YAML value"):
+        parse_override(f"world.count={value}")
+
+
 def test_a_whole_cell_file_can_be_given(tmp_path: Path) -> None:
     given = file(tmp_path, "world: w3\nrobot: panda\n")
     assert load_cell("panda", [given]).world == load_cell("panda", world="w3").world
@@ -49,6 +60,10 @@ def test_a_service_goes_by_the_last_part_of_its_module(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("text", "said"), [
     ("- 1\n", "must hold a mapping"), ("a: [1\nb: }", "does not parse at line 2"),
     ("made: 2026-13-01", "does not parse: month must be in 1..12"),
+    ("a: " + 100_000 * "[", "does not parse at line 1, column 67: nested deeper than 64 levels"),
+    ("a: " + 100_000 * "{b: ", "nested deeper than 64 levels"), ("a:\n  " + 100_000 * "- ", "nested deeper"),
+    ("a: &a {b: *a}", "does not parse at line 1, column 11: 'a' contains itself"),
+    ("".join(f"a{n}: &a{n} [{','.join(10 * [f'*a{n - 1}' if n else '0'])}]\n" for n in range(9)), "more than 1000000"),
 ])
 def test_a_file_that_can_not_be_used_is_named(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
