@@ -10,10 +10,10 @@ from typing import Any, Generic, Protocol, TypeVar
 from common import messages as m
 from common import topics
 from common.errors import Refused, RequestFailed
-from common.process.persist import NOT_TAKEN, persist
+from common.process.orders import GOAL_TIMEOUT, PERSON, Answered, Orders
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
-from common.sources import monotonic, new_id, wall_ns
+from common.sources import monotonic, new_id
 from common.tasks.deciding import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.stages import Command, View
@@ -21,26 +21,14 @@ from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
 from common.topics import Topic
 from common.transport.bus import Bus
 from common.transport.reader import Reader
-from common.transport.requests import Client
 from common.transport.writer import Writer
 
-Q = TypeVar("Q", bound=m.Message)
-
-GOAL_TIMEOUT = 1.0  # [s] wall: for a goal to be accepted
-PLAN_OVERTIME = 5.0  # [s] wall: that a plan may take beyond its planning time
-REFUSED_AGAIN = 0.1  # [s] wall: what is told of the second refusal of a motion in a row; it doubles with each
-LONGEST_REFUSED = 2.0  # [s] wall
 LONGEST_STEP = LOOK_PERIOD  # [s] wall: time passes too
 WAITS = "the arm waits: "
 ENDED = ("DONE", "ERROR")
 NOT_ANSWERED = "trajectory_executor has not answered yet: until it does, this does not outlive the task"
 OWN_PERIOD = 0.2  # [s] wall between two times that the motion is asked for: what came of it is heard meanwhile
-SOMEBODY = ("", "person", "watchdog", "controller", "scene_monitor")  # whose holds are nobody's own
-
-LETS_GO = "lets go"  # of what a person said
-
-# A person's stops and holds that were not answered yet, as kind and name of who said so.
-Keeping = dict[asyncio.Task[m.MotionStatus | None], tuple[str, str]]
+SOMEBODY = ("", PERSON, "watchdog", "controller", "scene_monitor")  # whose holds are nobody's own
 
 C = TypeVar("C", bound=TaskConfig)
 S = TypeVar("S", bound=m.TaskStatus)
@@ -92,7 +80,7 @@ async def run_task(
     await runner.run((*own.values(), scene, gripper, motion))
 
 
-class Stepped(Protocol[V_contra]):
+class Stepped(Answered[V_contra], Protocol[V_contra]):
     """A state machine that is fed with what is known and answers with what it wants done, as `Task` is."""
 
     @property
@@ -105,15 +93,9 @@ class Stepped(Protocol[V_contra]):
     def command(self, command: str, view: V_contra) -> list[Command]:
         """Do what a person says."""
 
-    def on_plan(self, response: m.PlanResponse, view: V_contra) -> None:
-        """Take in a plan."""
-
-    def on_goal(self, answer: m.MotionStatus | m.GripperState, view: V_contra) -> None:
-        """Take in whether a goal was accepted."""
-
 
 class TaskRunner(Generic[V]):
-    """Steps a task, sends what it asks for and brings the answers back."""
+    """Steps a task, has sent what it asks for, and tells it what persons say and how far it is to others."""
 
     def __init__(
         self, bus: Bus, task: Stepped[V], look: Callable[[], V], status: Writer[Any],
@@ -130,19 +112,12 @@ class TaskRunner(Generic[V]):
             watchdog: holds the arm while those are missing that the task relies on.
         """
         self._task, self._look, self._status, self._bus = task, look, status, bus
-        self._plan, self._execute = bus.client(topics.MOTION_PLAN), bus.client(topics.MOTION_EXECUTE)
-        self._stop, self._grip = bus.client(topics.MOTION_STOP), bus.client(topics.GRIPPER_COMMAND)
-        self._hold, self._own = bus.client(topics.MOTION_HOLD), bus.client(topics.MOTION_OWN)
-        self._owner = bus.reader(topics.MOTION_OWNER)
-        self._owning: asyncio.Task[None] | None = None
-        self._planning_time, self._watchdog = planning_time, watchdog
         self._woken = asyncio.Event()
+        self._orders = Orders(bus, task, look, planning_time, self._note, self._woken.set)
+        self._own, self._owner = bus.client(topics.MOTION_OWN), bus.reader(topics.MOTION_OWNER)
+        self._owning: asyncio.Task[None] | None = None
+        self._watchdog = watchdog
         self._told: list[Command] = []
-        self._asking: dict[str, asyncio.Task[m.MotionStatus | None]] = {}  # the newest of each kind
-        self._keeping: Keeping = {}
-        self._ended: dict[int, asyncio.Event] = {}  # by the identity of a command: whether it was answered, or is void
-        self._refused = 0  # motions in a row
-        self._newest = 0  # `since` of the newest inhibit that we were answered with
         self._before: m.TaskStatus | None = None
         bus.serve(topics.TASK_COMMAND, self._obey)
 
@@ -160,7 +135,7 @@ class TaskRunner(Generic[V]):
                 view = self._look()
                 holds = self._mind(view)
                 for command in [*told, *holds, *self._task.step(view)]:
-                    self._begin(group, command)
+                    self._orders.begin(group, command)
                 self._tell()
                 self._have_motion(group, view.motion if view else None)
 
@@ -185,8 +160,7 @@ class TaskRunner(Generic[V]):
         """The holds to ask for, because something is missing or is back again; the view has what is missing."""
         if self._watchdog is None:
             return []
-        serving = {client.server: client.available for client in (self._plan, self._execute)}
-        holds = self._watchdog.look(monotonic(), serving, view.motion)
+        holds = self._watchdog.look(monotonic(), self._orders.serving, view.motion)
         view.trouble = self._watchdog.trouble
         return holds
 
@@ -203,28 +177,11 @@ class TaskRunner(Generic[V]):
                 request.heard = command.heard
         self._told += asked
         self._woken.set()
-        now, answered = self._task.status, await self._carried_out(asked)
+        now, answered = self._task.status, await self._orders.carried_out(asked)
         return m.TaskStatus(
             header=self._bus.header(), state=now.state, paused=now.paused, started=now.started, stage=now.stage,
             message=now.message if answered else NOT_ANSWERED,
         )
-
-    async def _carried_out(self, asked: list[Command]) -> bool:
-        """Whether that was answered, which is not waited for while nobody is there to answer."""
-        if not self._hold.available:
-            return not asked
-        events = {id(command): asyncio.Event() for command in asked}
-        self._ended |= events
-        try:
-            async with asyncio.timeout(GOAL_TIMEOUT):
-                for event in events.values():
-                    await event.wait()
-            return True
-        except TimeoutError:
-            return False
-        finally:
-            for number in events:
-                self._ended.pop(number, None)
 
     def _tell(self) -> None:
         """Publish the status when more of it has changed than the time."""
@@ -251,118 +208,6 @@ class TaskRunner(Generic[V]):
         async for _ in reader:
             self._woken.set()
 
-    def _begin(self, group: asyncio.TaskGroup, command: Command) -> None:
-        """Send a command; what it makes void is not asked for again, should it still be without an answer."""
-        if isinstance(command, m.ExecuteRequest | m.GripperCommand):
-            command.header = self._bus.header()  # of the decision, however often it is sent
-        keeps = {keeping: said for keeping, said in self._keeping.items() if not keeping.done()}
-        lets_go = isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold
-        for kind in _voided(command):
-            void = self._asking.pop(kind, None)
-            if void is not None:
-                void.cancel()
-        doing = self._asking[_kind(command)] = group.create_task(
-            self._do(command, keeps if lets_go else {}, self._heard_of() if lets_go else None))
-        if not lets_go and isinstance(command, m.HoldRequest | m.StopRequest) and command.by == "person":
-            kept = "stopped" if isinstance(command, m.StopRequest) else "held"
-            self._keeping = {**keeps, doing: (kept, command.owner or SOMEBODY[1])}
-
-    async def _do(self, command: Command, before: Keeping, heard: int | None) -> m.MotionStatus | None:
-        """Send what a command stands for, after what was said before it; what is refused is an answer too.
-
-        What lets go does so of what was `heard` of until it was said, and of what was said here before it.
-        """
-        heard = wall_ns() if heard is None else heard  # of a robot that is away: what is said while it is asked stays
-        try:
-            if before:  # what lets go must not be overtaken by what it lets go of
-                await asyncio.wait(before)
-            if isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold:
-                command.heard = _until(heard, before) if command.heard is None else min(
-                    command.heard, max(heard, self._heard_of() or 0))
-            return await self._send(command)
-        finally:
-            if ended := self._ended.get(id(command)):
-                ended.set()
-
-    async def _send(self, command: Command) -> m.MotionStatus | None:
-        """The answer to a hold or stop, else None."""
-        if isinstance(command, m.PlanRequest):
-            planned = await persist(
-                self._plan, command, self._planning_time() + PLAN_OVERTIME, lambda error: m.PlanResponse(
-                    id=command.id, ok=False, error=error.code, message=error.message), self._note)
-            self._task.on_plan(planned, self._look())
-            self._woken.set()
-        elif isinstance(command, m.GripperCommand):
-            gripped = await persist(self._grip, command, GOAL_TIMEOUT, lambda error: m.GripperState(
-                id=command.id, state="rejected", error=error.code, message=error.message), self._note)
-            await self._answered(gripped)
-        elif isinstance(command, m.ExecuteRequest):
-            moved = await persist(self._execute, command, GOAL_TIMEOUT, lambda error: m.MotionStatus(
-                id=command.id, state="rejected", error=error.code, message=error.message), self._note)
-            await self._answered(moved)
-        elif isinstance(command, m.HoldRequest):
-            return await self._keep(self._hold, command)
-        else:
-            return await self._keep(self._stop, command)
-        return None
-
-    async def _answered(self, answer: m.MotionStatus | m.GripperState) -> None:
-        """Tell how a goal was answered; what is refused again and again is not asked for as fast as one can."""
-        self._refused = self._refused + 1 if answer.state == "rejected" else 0
-        if self._refused > 1:
-            await asyncio.sleep(min(REFUSED_AGAIN * 2 ** min(self._refused - 2, 10), LONGEST_REFUSED))
-        self._task.on_goal(answer, self._look())
-        self._woken.set()
-
-    async def _keep(self, client: Client[Q, m.MotionStatus], request: Q) -> m.MotionStatus:
-        """The answer to a stop or hold, which is asked for until it was taken."""
-        answer = await persist(client, request, GOAL_TIMEOUT, lambda error: m.MotionStatus(message=error.message),
-                               self._note, NOT_TAKEN)
-        self._newest = max(self._newest, answer.newest)
-        self._woken.set()
-        return answer
-
-    def _heard_of(self) -> int | None:
-        """`since` of the newest inhibit that we know of; None when we know nothing of the robot."""
-        view = self._look()
-        motion = view.motion if view else None
-        return self._newest or None if motion is None else max(self._newest, motion.newest)
-
-
-def _kind(command: Command) -> str:
-    """What a command is of which only the newest counts; a watchdog's hold is not a person's."""
-    if isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold:
-        return LETS_GO
-    return f"{type(command).__name__} {command.by if isinstance(command, m.HoldRequest) else ''}"
-
-
-def _until(heard: int, before: Keeping) -> int:
-    """`since` of the newest inhibit to let go of: one that was heard of, or that was answered meanwhile.
-
-    What somebody else said before those were answered, and all later than that, stays.
-    """
-    answers = [doing.result() for doing in before if not doing.cancelled() and doing.exception() is None]
-    inhibits = {one.since: one for answer in answers if answer is not None for one in answer.inhibits}
-    for since in sorted(inhibits):
-        if since > heard:
-            if (inhibits[since].kind, inhibits[since].by) not in before.values():
-                break
-            heard = since
-    return heard
-
-
-def _voided(command: Command) -> tuple[str, ...]:
-    """The kinds of command that are void from now on.
-
-    By a stop the motion before it, by a person's also what was to let go; by a hold the one before it.
-    """
-    if isinstance(command, m.StopRequest):
-        return f"{m.ExecuteRequest.__name__} ", *((LETS_GO,) if command.by == "person" else ())
-    if not isinstance(command, m.HoldRequest):
-        return ()
-    return _kind(command), *((LETS_GO,) if command.by == "person" else ())
-
-
 def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owner: m.MotionOwner | None) -> None:
     """Return when a person may say that.
 
@@ -373,7 +218,7 @@ def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owne
         raise Refused("stopped", f"the robot is {motion.stopped}: start the task to go on")
     if command.override or command.command not in ("start", "resume"):
         return
-    if owner is not None and owner.asked and owner.kind != "task" and owner.owner not in (SOMEBODY[1], command.by):
+    if owner is not None and owner.asked and owner.kind != "task" and owner.owner not in (PERSON, command.by):
         raise Refused("not_owner", f"the motion is {owner.told}: only they hand it over, unless you override that")
     if motion is None:
         return

@@ -6,7 +6,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("control", "hardware", "planning", "perception", "robot", "scene", "sim", "tasks", "applications")
 SINGLE = (
-    "common/clock.py", "common/process/task_runner.py", "common/process/persist.py", "common/process/pace.py",
+    "common/clock.py", "common/process/task_runner.py", "common/process/orders.py", "common/process/persist.py",
+    "common/process/pace.py",
     "common/transport/bus.py", "common/transport/reader.py", "common/transport/writer.py",
     "common/transport/requests.py", "common/transport/tokens.py", "common/transport/trace.py",
     "common/supervision/supervisor.py", "common/supervision/operation.py",
