@@ -11,7 +11,7 @@ import yaml
 
 from common.errors import ConfigError, UnknownName
 
-DEEPEST = 64  # levels of a YAML text: no file of a cell has ten
+DEEPEST = 64  # levels of a YAML text, with those that names stand for: no file of a cell has ten
 MOST_NODES = 1_000_000  # of one, also where names stand for many of them
 
 
@@ -38,14 +38,17 @@ def parse_yaml(text: str, loader: type = yaml.SafeLoader) -> Any:
             `MOST_NODES`.
         ValueError: it parses and says what there is not, such as a date.
     """
-    _require_modest(yaml.parse(text, Loader=loader))
-    return yaml.load(text, Loader=loader)
+    try:
+        _require_modest(yaml.parse(text, Loader=loader))
+        return yaml.load(text, Loader=loader)
+    except (ArithmeticError, AttributeError, LookupError):  # PyYAML takes what has a tag for what the tag says
+        raise ValueError("a value is not of its kind, or too large") from None
 
 
 def _require_modest(events: Iterable[yaml.Event]) -> None:
     """Return when the values can be built, which libyaml does by recursion: too deep a text would end the process."""
-    sizes: dict[str, int] = {}  # nodes that a name stands for, with those that names in it stand for
-    within: list[tuple[str | None, int]] = []  # name and nodes so far of each collection that we are in
+    named: dict[str, tuple[int, int]] = {}  # nodes and levels that a name stands for, with those of names in it
+    within: list[tuple[str | None, int, int]] = []  # name, nodes and levels so far of each collection that we are in
 
     def refuse(problem: str, event: yaml.Event) -> NoReturn:
         error = yaml.MarkedYAMLError(problem=problem)
@@ -54,27 +57,29 @@ def _require_modest(events: Iterable[yaml.Event]) -> None:
 
     for event in events:
         if isinstance(event, yaml.CollectionStartEvent):
-            within.append((event.anchor, 1))
+            within.append((event.anchor, 1, 1))
             if len(within) > DEEPEST:
                 refuse(f"nested deeper than {DEEPEST} levels", event)
             continue
         if isinstance(event, yaml.CollectionEndEvent):
-            name, size = within.pop()
+            name, size, levels = within.pop()
         elif isinstance(event, yaml.AliasEvent):
-            if any(name == event.anchor for name, _ in within):
+            if any(name == event.anchor for name, _, _ in within):
                 refuse(f"{event.anchor!r} contains itself", event)
-            name, size = None, sizes.get(event.anchor or "", 1)
+            name, (size, levels) = None, named.get(event.anchor or "", (1, 0))
+            if len(within) + levels > DEEPEST:
+                refuse(f"nested deeper than {DEEPEST} levels", event)
         elif isinstance(event, yaml.ScalarEvent):
-            name, size = event.anchor, 1
+            name, size, levels = event.anchor, 1, 0
         else:
             continue
         if name is not None:
-            sizes[name] = size
+            named[name] = size, levels
         if size > MOST_NODES:
             refuse(f"stands for more than {MOST_NODES} values", event)
         if within:
-            above, so_far = within[-1]
-            within[-1] = above, so_far + size
+            above, so_far, deep = within[-1]
+            within[-1] = above, so_far + size, max(deep, levels + 1)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -42,7 +42,10 @@ def test_names_in_a_file_stand_for_what_they_name(tmp_path: Path) -> None:
     assert expanded([given]) == ["motion.velocity_scaling=0.5", "motion.acceleration_scaling=0.5"]
 
 
-@pytest.mark.parametrize("value", [100_000 * "[", "2026-13-01", "&a [*a]"])
+@pytest.mark.parametrize("value", [
+    100_000 * "[", "2026-13-01", "&a [*a]", "!!bool x", "!!int ''", "!!timestamp x", f"1{200 * ':0'}.5",
+    r'"\UFFFFFFFF"',
+])
 def test_a_value_that_is_none_is_refused(value: str) -> None:
     with pytest.raises(ConfigError, match=r"--set world\.count.*is not a YAML value"):
         parse_override(f"world.count={value}")
@@ -63,6 +66,8 @@ def test_a_service_goes_by_the_last_part_of_its_module(tmp_path: Path) -> None:
     ("a: " + 100_000 * "[", "does not parse at line 1, column 67: nested deeper than 64 levels"),
     ("a: " + 100_000 * "{b: ", "nested deeper than 64 levels"), ("a:\n  " + 100_000 * "- ", "nested deeper"),
     ("a: &a {b: *a}", "does not parse at line 1, column 11: 'a' contains itself"),
+    ("a0: &a0 [0]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}]\n" for n in range(1, 1000)), "line 64, .* than 64 levels"),
+    ("made: !!bool x", "does not parse: a value is not of its kind"),
     ("".join(f"a{n}: &a{n} [{','.join(10 * [f'*a{n - 1}' if n else '0'])}]\n" for n in range(9)), "more than 1000000"),
 ])
 def test_a_file_that_can_not_be_used_is_named(tmp_path: Path, text: str, said: str) -> None:
