@@ -19,6 +19,7 @@ from common.control.gripper_controller import GripperController
 from common.control.inhibits import Inhibits
 from common.control.jogging import Jogging, ToolKinematics
 from common.control.payload import Payload
+from common.control.readings import read_fingers, read_joints
 from common.errors import ConfigError, Refused
 from common.hardware.interface import (
     ControlledArm,
@@ -168,11 +169,8 @@ class ControlCycle:
         Raises:
             HardwareFault: the arm does not work.
         """
-        q, dq = asked("reading joints", self._hardware.read, now)
-        for what, values in (("positions", q), ("velocities", dq)):
-            if np.shape(values) != self._q.shape or not np.isfinite(values).all():
-                raise HardwareFault(f"reading joints: {what} are not {len(self._q)} finite numbers: {values}")
-        self._q, self._found = q, True
+        self._q, dq = read_joints(self._hardware, len(self._q), now)
+        self._found = True
         try:
             self._step_gripper(now)
         except HardwareFault as fault:
@@ -380,11 +378,11 @@ class ControlCycle:
         if self._gripper is None or gripper is None or self._hand_fault.waits(now):
             return
         if self._felt is None or self._kinematics is None or self._obstructible is None or self.apart:
-            reading = asked("reading the gripper", gripper.read, now)
+            reading = read_fingers(gripper, now)
         else:
             T_world_tcp = self._kinematics.fk(self._q)
             self._obstructible.obstruct(self._felt.obstruction(T_world_tcp, self._gripper.state.width))
-            reading = asked("reading the gripper", gripper.read, now)
+            reading = read_fingers(gripper, now)
             tick = partial(self._felt.tick, now, T_world_tcp, reading.width, reading.holding)
             takes_long = getattr(self._felt, "takes_long", None)
             if self.beside and takes_long is not None and takes_long(reading.width, reading.holding):

@@ -6,12 +6,22 @@ from common.config import Fixture, GripperConfig, World
 from common.control.cycle import ControlCycle
 from common.errors import ConfigError, Refused
 from common.hardware.fingers import Fingers
-from common.hardware.interface import HardwareFault
+from common.hardware.interface import GripperReading, HardwareFault
 from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware
-from common.messages import ExecuteRequest, GripperCommand, Header, HoldRequest, StopRequest, Vector3, WorldEdit
+from common.messages import (
+    ExecuteRequest,
+    GripperCommand,
+    GripperState,
+    Header,
+    HoldRequest,
+    StopRequest,
+    Vector3,
+    WorldEdit,
+)
 from common.robot.transforms import tool_down
 from common.sim.kinematic import KinematicWorld
+from common.transport.codec import decode, encode
 
 START = np.zeros(2)
 GRIPPER = GripperConfig(joints=["left", "right"], links=[])
@@ -262,7 +272,7 @@ def test_whatever_a_backend_raises_it_is_left_alone_and_recovers_by_itself(limit
     assert rig.execute("c", rest_to_rest([0.3, -0.2], [0.5, 0.5])).state == "active"
 
 
-@pytest.mark.parametrize("strange", [np.zeros(3), np.array([np.nan, 0.0]), None])
+@pytest.mark.parametrize("strange", [np.zeros(3), np.array([np.nan, 0.0]), np.array([1e300, 0.0]), None, [None, 0.0]])
 def test_what_is_no_position_is_a_fault_and_moves_nothing(limits, strange):
     hardware = Broken()
     rig = Rig(limits, hardware)
@@ -271,6 +281,40 @@ def test_what_is_no_position_is_a_fault_and_moves_nothing(limits, strange):
     report = rig.step()
     assert "reading joints: positions are not 2 finite numbers" in report.notes[0] and report.joints is None
     assert "hardware fault" in rig.motions[-1].message
+
+
+@pytest.mark.parametrize("strange", [None, (START,), (["a", "b"], START)])
+def test_what_is_no_reading_of_joints_at_all_is_a_fault(limits, strange):
+    hardware = Broken()
+    rig = Rig(limits, hardware)
+    rig.step()
+    hardware.read = lambda now: strange
+    assert rig.step().notes[0].startswith("the arm does not work: reading joints: ")
+
+
+@pytest.mark.parametrize("strange", [
+    GripperReading(np.nan, 0.0, False, False), GripperReading(0.05, np.inf, True, False), None,
+    GripperReading(0.05, 0.0, False, False, np.inf), GripperReading(None, 0.0, False, False),
+])
+def test_what_is_no_reading_of_fingers_is_a_fault_of_the_gripper(limits, rest_to_rest, monkeypatch, strange):
+    rig = Rig(limits)
+    rig.step()
+    rig.execute("a", rest_to_rest([0, 0], [0.5, 0.5], 2.0))
+    with monkeypatch.context() as broken:
+        broken.setattr(rig.hardware.gripper, "read", lambda now: strange)
+        notes = [note for _ in range(100) for note in rig.step().notes]
+        assert len(notes) == 1 and notes[0].startswith("the gripper does not work: reading the gripper: ")
+        assert (rig.motions[-1].state, rig.motions[-1].error) == ("aborted", "hardware_fault")
+    rig.run(6.0)
+    assert rig.grip("again", 0.08).state == "active"
+
+
+def test_numbers_of_numpy_are_readings_of_fingers_too(limits, monkeypatch):
+    rig = Rig(limits)
+    said = GripperReading(np.float32(0.05), np.float32(0.0), np.bool_(False), np.bool_(True), np.float32(1.0))
+    monkeypatch.setattr(rig.hardware.gripper, "read", lambda now: said)
+    rig.step()
+    assert decode(GripperState, encode(rig.grippers[-1])).width == pytest.approx(0.05)
 
 
 def test_gripper_that_fails_brakes_the_arm_which_stays_held_and_refuses_goals(limits, rest_to_rest, monkeypatch):
