@@ -77,6 +77,7 @@ class Orders(Generic[V]):
         if isinstance(command, m.ExecuteRequest | m.GripperCommand):
             command.header = self._bus.header()  # of the decision, however often it is sent
         keeps = {keeping: said for keeping, said in self._keeping.items() if not keeping.done()}
+        self._asking = {kind: doing for kind, doing in self._asking.items() if not doing.done()}
         lets_go = isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold
         for kind in _voided(command):
             void = self._asking.pop(kind, None)
@@ -168,10 +169,12 @@ class Orders(Generic[V]):
 
 
 def _kind(command: Command) -> str:
-    """What a command is of which only the newest counts; a watchdog's hold is not a person's."""
-    if isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold:
-        return LETS_GO
-    return f"{type(command).__name__} {command.by if isinstance(command, m.HoldRequest) else ''}"
+    """What a command is of which only the newest counts; a watchdog's hold is not a person's, nor that another's."""
+    if not isinstance(command, m.HoldRequest):
+        return f"{type(command).__name__} "
+    if command.by == "person":
+        return f"{type(command).__name__} person {command.owner}" if command.hold else LETS_GO
+    return f"{type(command).__name__} {command.by}"
 
 
 def _until(heard: int, before: Keeping) -> int:
@@ -192,7 +195,7 @@ def _until(heard: int, before: Keeping) -> int:
 def _voided(command: Command) -> tuple[str, ...]:
     """The kinds of command that are void from now on.
 
-    By a stop the motion before it, by a person's also what was to let go; by a hold the one before it.
+    By a stop the motion before it, by a person's also what was to let go; by a hold that person's one before it.
     """
     if isinstance(command, m.StopRequest):
         return f"{m.ExecuteRequest.__name__} ", *((LETS_GO,) if command.by == "person" else ())

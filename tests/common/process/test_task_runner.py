@@ -130,6 +130,18 @@ async def test_only_the_newest_hold_and_no_motion_after_a_stop_reach_an_executor
         assert executor.asked.empty()
 
 
+async def test_pauses_of_two_persons_both_reach_an_executor_that_comes_up_late() -> None:
+    net = LocalNetwork()
+    async with running(net):
+        client = net.bus("person").client(topics.TASK_COMMAND)
+        for person in ("alice", "bob"):
+            await client.call(m.TaskCommand(command="pause", by=person))
+        executor = Executor(net)
+        await executor.bus.ready()
+        asked = [await executor.next() for _ in range(3)]
+        assert {request.owner for request in asked if isinstance(request, m.HoldRequest)} == {"alice", "bob"}
+
+
 async def test_start_that_waits_for_an_executor_does_not_let_go_of_what_is_said_meanwhile() -> None:
     net, fast = LocalNetwork(), Clock(10.0, wall_ns() - 3_600_000_000_000)  # `since` is no cell time
     async with running(net, clock=fast):
