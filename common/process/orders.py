@@ -20,6 +20,7 @@ REFUSED_AGAIN = 0.1  # [s] wall: what is told of the second refusal of a motion 
 LONGEST_REFUSED = 2.0  # [s] wall
 LETS_GO = "lets go"  # of what a person said
 PERSON = "person"  # who says so without a name
+BY_THEMSELVES = ("watchdog", "controller", "scene_monitor")  # let go of their holds: no person does
 
 # A person's stops and holds that were not answered yet, as kind and name of who said so.
 Keeping = dict[asyncio.Task[m.MotionStatus | None], tuple[str, str]]
@@ -183,7 +184,8 @@ def _until(heard: int, before: Keeping) -> int:
     What somebody else said before those were answered, and all later than that, stays.
     """
     answers = [doing.result() for doing in before if not doing.cancelled() and doing.exception() is None]
-    inhibits = {one.since: one for answer in answers if answer is not None for one in answer.inhibits}
+    inhibits = {one.since: one for answer in answers if answer is not None for one in answer.inhibits
+                if one.kind == "stopped" or one.by not in BY_THEMSELVES}
     for since in sorted(inhibits):
         if since > heard:
             if (inhibits[since].kind, inhibits[since].by) not in before.values():

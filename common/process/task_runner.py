@@ -10,7 +10,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from common import messages as m
 from common import topics
 from common.errors import Refused, RequestFailed
-from common.process.orders import GOAL_TIMEOUT, PERSON, Answered, Orders
+from common.process.orders import BY_THEMSELVES, GOAL_TIMEOUT, PERSON, Answered, Orders
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.sources import monotonic, new_id
@@ -28,7 +28,7 @@ WAITS = "the arm waits: "
 ENDED = ("DONE", "ERROR")
 NOT_ANSWERED = "trajectory_executor has not answered yet: until it does, this does not outlive the task"
 OWN_PERIOD = 0.2  # [s] wall between two times that the motion is asked for: what came of it is heard meanwhile
-SOMEBODY = ("", PERSON, "watchdog", "controller", "scene_monitor")  # whose holds are nobody's own
+SOMEBODY = ("", PERSON, *BY_THEMSELVES)  # whose holds are nobody's own
 
 C = TypeVar("C", bound=TaskConfig)
 S = TypeVar("S", bound=m.TaskStatus)
@@ -207,6 +207,7 @@ class TaskRunner(Generic[V]):
     async def _wake_on(self, reader: Reader[Any]) -> None:
         async for _ in reader:
             self._woken.set()
+
 
 def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owner: m.MotionOwner | None) -> None:
     """Return when a person may say that.

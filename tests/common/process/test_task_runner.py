@@ -169,6 +169,19 @@ async def test_start_that_waits_for_an_answer_lets_go_of_that_but_of_no_stop_tha
             assert (heard == [since + lets_go_of]) if lets_go_of else (heard[0] is not None and heard[0] < since)
 
 
+async def test_a_resume_lets_go_of_the_pause_that_it_waited_for_whatever_watchdogs_held_meanwhile() -> None:
+    net, since = LocalNetwork(), 2 * wall_ns()
+    async with running(net):
+        await tell(net, "pause", "resume")
+        executor = Executor(net)
+        executor.inhibits = [m.Inhibit(kind="held", by="watchdog", since=since),
+                             m.Inhibit(kind="held", by="person", since=since + 1)]
+        await executor.bus.ready()
+        asked = [await executor.next() for _ in range(3)]
+        heard = [request.heard for request in asked if isinstance(request, m.HoldRequest) and not request.hold]
+        assert heard == [since + 1]
+
+
 async def test_stop_and_pause_that_were_not_taken_for_want_of_time_are_asked_for_again() -> None:
     net, asked = LocalNetwork(), asyncio.Queue[m.Message]()
     codes = {m.StopRequest: ["busy", "internal"], m.HoldRequest: ["busy"]}
