@@ -86,6 +86,7 @@ class Orders(Generic[V]):
                 void.cancel()
         doing = self._asking[_kind(command)] = group.create_task(
             self._do(command, keeps if lets_go else {}, self._heard_of() if lets_go else None))
+        doing.add_done_callback(lambda _: self._over(command))
         if not lets_go and isinstance(command, m.HoldRequest | m.StopRequest) and command.by == "person":
             kept = "stopped" if isinstance(command, m.StopRequest) else "held"
             self._keeping = {**keeps, doing: (kept, command.owner or PERSON)}
@@ -113,16 +114,17 @@ class Orders(Generic[V]):
         What lets go does so of what was `heard` of until it was said, and of what was said here before it.
         """
         heard = wall_ns() if heard is None else heard  # of a robot that is away: what is said while it is asked stays
-        try:
-            if before:  # what lets go must not be overtaken by what it lets go of
-                await asyncio.wait(before)
-            if isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold:
-                command.heard = _until(heard, before) if command.heard is None else min(
-                    command.heard, max(heard, self._heard_of() or 0))
-            return await self._send(command)
-        finally:
-            if ended := self._ended.get(id(command)):
-                ended.set()
+        if before:  # what lets go must not be overtaken by what it lets go of
+            await asyncio.wait(before)
+        if isinstance(command, m.HoldRequest) and command.by == "person" and not command.hold:
+            command.heard = _until(heard, before) if command.heard is None else min(
+                command.heard, max(heard, self._heard_of() or 0))
+        return await self._send(command)
+
+    def _over(self, command: Command) -> None:
+        """Take note that a command was answered, or is void: that may be so before its first turn."""
+        if ended := self._ended.get(id(command)):
+            ended.set()
 
     async def _send(self, command: Command) -> m.MotionStatus | None:
         """The answer to a hold or stop, else None."""

@@ -182,6 +182,18 @@ async def test_a_resume_lets_go_of_the_pause_that_it_waited_for_whatever_watchdo
         assert heard == [since + 1]
 
 
+async def test_who_says_what_a_stop_makes_void_at_once_is_not_told_that_it_is_still_asked_for() -> None:
+    net = LocalNetwork()
+    executor = Executor(net)
+    await executor.bus.ready()
+    async with running(net):
+        client = net.bus("person").client(topics.TASK_COMMAND)
+        async with asyncio.TaskGroup() as group:
+            resumed = group.create_task(client.call(m.TaskCommand(command="resume")))
+            group.create_task(client.call(m.TaskCommand(command="stop")))
+        assert "outlive" not in resumed.result().message
+
+
 async def test_stop_and_pause_that_were_not_taken_for_want_of_time_are_asked_for_again() -> None:
     net, asked = LocalNetwork(), asyncio.Queue[m.Message]()
     codes = {m.StopRequest: ["busy", "internal"], m.HoldRequest: ["busy"]}
