@@ -27,6 +27,7 @@ from common.errors import Refused
 from common.hardware.interface import HardwareFault, Limits, Vector
 from common.hardware.pace import Pace
 from common.messages import GoalState, Holder, Inhibit, JointTrajectory, MotionStatus
+from common.messages.basics import clean
 
 PERIOD = 0.01  # cell time between cycles, unless told otherwise [s]
 LATE = 2  # periods: a cycle that comes later moves the arm by no more, and
@@ -406,7 +407,7 @@ class TrajectoryController:
 
     def fault(self, message: str) -> None:
         """End the running goal: the hardware does not work. Goals are rejected until `update` is called again."""
-        self._fault = message
+        self._fault = clean(message)
         if self._goal is not None:
             self._finish("aborted", "hardware_fault", message, "hardware")
 

@@ -7,6 +7,7 @@ from typing import ParamSpec, TypeVar
 
 from common.errors import Refused
 from common.hardware.interface import HardwareFault
+from common.messages.basics import clean
 
 SHORTEST, LONGEST = 0.2, 5.0  # cell time for which a device that failed is left alone [s]
 CALM = 2.0  # cell time that it works, after which all is forgotten [s]
@@ -24,9 +25,10 @@ def asked(doing: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -
     try:
         return call(*args, **kwargs)
     except Exception as error:
-        if isinstance(error, HardwareFault) and str(error):
-            raise
-        said = str(error).partition("\n")[0]
+        told = clean(str(error))  # what a device says of itself may be anything
+        if isinstance(error, HardwareFault) and told:
+            raise HardwareFault(told) from error
+        said = told.partition("\n")[0]
         raise HardwareFault(f"{doing}: {type(error).__name__}{': ' if said else ''}{said}") from error
 
 

@@ -15,6 +15,7 @@ from common.messages import (
     GripperState,
     Header,
     HoldRequest,
+    MotionStatus,
     StopRequest,
     Vector3,
     WorldEdit,
@@ -281,6 +282,23 @@ def test_what_is_no_position_is_a_fault_and_moves_nothing(limits, strange):
     report = rig.step()
     assert "reading joints: positions are not 2 finite numbers" in report.notes[0] and report.joints is None
     assert "hardware fault" in rig.motions[-1].message
+
+
+@pytest.mark.parametrize("part", ["arm", "fingers"])
+def test_whatever_a_device_says_of_its_fault_can_be_told(limits, rest_to_rest, monkeypatch, part):
+    rig = Rig(limits)
+    rig.step()
+    rig.execute("a", rest_to_rest([0, 0], [0.5, 0.5], 2.0))
+    rig.grip("close", 0.0)
+
+    def fail(*_):
+        raise HardwareFault(b"\xff\x1b[2J".decode(errors="surrogateescape"))
+
+    monkeypatch.setattr(rig.hardware if part == "arm" else rig.hardware.gripper, "read", fail)
+    rig.run(1.0)
+    told = decode(MotionStatus, encode(rig.motions[-1]))
+    assert told.message == r"\udcff\x1b[2J" and told == rig.motions[-1]
+    assert decode(GripperState, encode(rig.grippers[-1])) == rig.grippers[-1]
 
 
 @pytest.mark.parametrize("strange", [None, (START,), (["a", "b"], START)])
