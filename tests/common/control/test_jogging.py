@@ -356,6 +356,12 @@ def test_a_start_by_another_does_not_take_it_from_who_has_it(arm):
     assert arm.owner == ("", "none")
 
 
+def test_everybodys_start_takes_it_from_who_took_it_without_a_name(arm):
+    arm.own(owner="person")
+    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
+    assert arm.owner == ("", "none") and arm.execute("one").state == "active"
+
+
 def test_who_holds_the_arm_and_then_moves_it_does_not_take_it_from_who_has_it(arm):
     hold = arm.cycle.authority.hold
     arm.own()
