@@ -14,7 +14,8 @@ A = TypeVar("A", bound=Message)
 Q = TypeVar("Q", bound=Message)
 
 NOT_YET = ("no_scene", "no_state", "no_points")  # the planner has not heard enough to answer
-NOT_TAKEN = (*NOT_YET, "busy", "internal", "bad_answer")  # too many ask, the server ends, its answer came damaged
+# Too many ask, the server ends, the request or its answer came damaged.
+NOT_TAKEN = (*NOT_YET, "busy", "internal", "invalid", "bad_answer")
 AGAIN_AFTER = 0.1  # [s] wall
 
 

@@ -194,9 +194,9 @@ async def test_who_says_what_a_stop_makes_void_at_once_is_not_told_that_it_is_st
         assert "outlive" not in resumed.result().message
 
 
-async def test_stop_and_pause_that_were_not_taken_for_want_of_time_are_asked_for_again() -> None:
+async def test_stop_and_pause_that_were_not_taken_or_came_damaged_are_asked_for_again() -> None:
     net, asked = LocalNetwork(), asyncio.Queue[m.Message]()
-    codes = {m.StopRequest: ["busy", "internal"], m.HoldRequest: ["busy"]}
+    codes = {m.StopRequest: ["busy", "internal", "invalid"], m.HoldRequest: ["invalid", "busy"]}
 
     async def note(request: m.StopRequest | m.HoldRequest) -> m.MotionStatus:
         if codes[type(request)]:
