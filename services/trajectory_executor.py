@@ -179,8 +179,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         return await kept_answer(cycle.authority.stop(request, bus.clock.now()))
 
     async def hold(request: HoldRequest) -> MotionStatus:
-        before = len(inhibits.all)
-        status, let_go = cycle.authority.hold(request)
+        before, owned = len(inhibits.all), cycle.authority.owner
+        status, let_go = cycle.authority.hold(request, bus.clock.now())
         who = (request.owner or SOMEBODY) if request.by == "person" else request.by
         why = request.reason or "asked to"
         if request.hold and not status.held:
@@ -196,6 +196,8 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         for inhibit in let_go:
             if inhibit.by != who:
                 bus.log.warning("%s let go of what another said: %s", who, inhibit.told)
+        if owned.kind not in ("none", "task", cycle.authority.owner.kind) and owned.owner != who:
+            bus.log.warning("%s has the task move the arm: the motion was %s", who, owned.told)
         return await kept_answer(status)
 
     async def kept_answer(status: MotionStatus) -> MotionStatus:

@@ -110,12 +110,16 @@ class Authority:
         if request.over and request.kind != "task":
             self.inhibits.stop(StopRequest(reason=reason, owner=request.owner))  # also of who is just being restarted
         if before or request.over:
-            self.interrupt_jogging()
-            if goal := self._arm.goal:
-                self.inhibits.never([goal])
-                self._arm.cancel(goal, reason, now)
+            self._end_motion(reason, now)
             self.tell_inhibits()
         return self.owner
+
+    def _end_motion(self, reason: str, now: float) -> None:
+        """Bring what moves the arm to rest; its goal never moves again."""
+        self.interrupt_jogging()
+        if goal := self._arm.goal:
+            self.inhibits.never([goal])
+            self._arm.cancel(goal, reason, now)
 
     def disown(self) -> None:
         """Have the motion be nobody's once what moves has ended: the task that had it is gone."""
@@ -160,8 +164,8 @@ class Authority:
             return status
         return status.model_copy(update={"message": f"{status.message}; it is refused if it comes"})
 
-    def hold(self, request: HoldRequest) -> tuple[MotionStatus, list[Inhibit]]:
-        """The status, and what was let go of.
+    def hold(self, request: HoldRequest, now: float = 0.0) -> tuple[MotionStatus, list[Inhibit]]:
+        """The status, and what was let go of; cell time [s].
 
         The arm is being brought to rest on its path, or goes on when nobody holds it; the fingers finish their motion.
         """
@@ -171,6 +175,9 @@ class Authority:
         if request.hold:
             self.interrupt_jogging()
         elif self._hands_over(request):
+            owner = self._owners.now
+            if owner.kind not in ("none", "task") and owner.owner != (request.owner or SOMEBODY):
+                self._end_motion(f"{request.owner or SOMEBODY} started the task; the motion was {owner.told}", now)
             self._owners.end()  # to whoever moves the robot now: the person, or the task that is started
         if request.by == "scene_monitor":
             self._held_goal = request.goal if request.hold else ""
@@ -185,7 +192,7 @@ class Authority:
         own = now.owner == (request.owner or SOMEBODY)
         if request.into_stop:
             return own or now.kind == "task"
-        return request.stops and (own or now.owner == SOMEBODY or request.override)
+        return request.stops and (own or (now.asked and now.owner == SOMEBODY) or request.override)
 
     def wait(self, wait: bool, reason: str = "") -> None:
         """Bring the arm to rest on its path of our own accord, or let it go on."""

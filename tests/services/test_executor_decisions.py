@@ -84,6 +84,15 @@ async def test_log_says_whose_hold_stays_when_another_asks_to_let_go(caplog) -> 
         assert told()[2:] == ["let go by anna: done"]
 
 
+async def test_log_names_both_when_somebody_starts_the_task_although_another_has_the_motion(caplog) -> None:
+    async with executor() as person:
+        await person.bus.client(topics.MOTION_OWN).call(OwnRequest(act="take", owner="anna"))
+        await person.hold.call(HoldRequest(hold=False, owner="bert", stops=True))
+        await person.hold.call(HoldRequest(hold=False, owner="bert", stops=True, override=True))
+        told = [text for text in (record.getMessage() for record in caplog.records) if "has the task" in text]
+        assert len(told) == 1 and told[0].startswith("bert has the task move the arm: the motion was anna's (operator)")
+
+
 async def test_stopped_arm_and_fingers_stay_so_through_restarts_until_somebody_starts_them(robot: RobotModel) -> None:
     home = robot.named("home")
     there = move(robot, home, home + 0.2)

@@ -356,6 +356,21 @@ def test_a_start_by_another_does_not_take_it_from_who_has_it(arm):
     assert arm.owner == ("", "none")
 
 
+def test_motion_of_whom_a_start_takes_it_from_comes_to_rest_for_good(arm):
+    arm.own()
+    arm.execute("one", "ann")
+    arm.run(0.5)
+    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True, override=True))
+    assert arm.own(owner="sorting", kind="task").owner == "sorting"
+    arm.run(0.5)
+    assert arm.rests() and arm.cycle.goal == "" and arm.reports[-1].owner is None
+    assert arm.execute("one", "ann").state == "cancelled" and "one" in arm.cycle._inhibits.record.goals
+    assert arm.execute("two").state == "active"
+    arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True, override=True))
+    arm.run(0.5)
+    assert arm.cycle.goal == "two", "a task that is started once more goes on"
+
+
 def test_everybodys_start_takes_it_from_who_took_it_without_a_name(arm):
     arm.own(owner="person")
     arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
