@@ -17,6 +17,7 @@ from common.messages import Color
 
 Picture = npt.NDArray[np.uint8]
 Channel = Literal["saturation", "maximum", "grey"]
+MOST, MOST_POINTS, MOST_ALONG_ONE = 1000, 100_000, 65_536  # contours and points that a message has room for
 
 
 class ContourOptions(Parameters):
@@ -53,6 +54,7 @@ def channel_of(picture: Picture, channel: Channel) -> Picture:
 def find_contours(picture: Picture, options: ContourOptions) -> list[Contour]:
     """All contours of a bgr8 picture, outer edges and edges of holes, with their hierarchy.
 
+    Of more than a message has room for, as of a picture full of noise, the largest.
     Without sub-pixel refinement the pixels are those of the object that lie along the edge, as the seed has them.
     """
     channel = channel_of(picture, options.channel)
@@ -62,7 +64,7 @@ def find_contours(picture: Picture, options: ContourOptions) -> list[Contour]:
         return []
     parents = [int(parent) for parent in hierarchy[0, :, 3]]
     areas = [float(cv2.contourArea(chain)) for chain in chains]
-    kept = [i for i, area in enumerate(areas) if area >= options.min_area]
+    kept = _with_room([i for i, area in enumerate(areas) if area >= options.min_area], chains, areas, parents)
     index_of = {-1: -1} | {old: new for new, old in enumerate(kept)}
     height, width = above.shape
     found = []
@@ -77,6 +79,20 @@ def find_contours(picture: Picture, options: ContourOptions) -> list[Contour]:
             touches_border=bool((u == 0).any() or (v == 0).any() or (u == width - 1).any() or (v == height - 1).any()),
         ))
     return found
+
+
+def _with_room(
+    wanted: Sequence[int], chains: Sequence[npt.NDArray[np.int32]], areas: Sequence[float], parents: Sequence[int]
+) -> list[int]:
+    """Those of the contours that a message has room for, the largest first: none without the one around it."""
+    kept, points = set[int](), 0
+    for index in sorted(wanted, key=lambda i: -areas[i]):  # a thin ring is before its hole, which is as large
+        size = len(chains[index])
+        inside = parents[index] in kept or parents[index] < 0
+        if inside and size <= MOST_ALONG_ONE and points + size <= MOST_POINTS and len(kept) < MOST:
+            kept.add(index)
+            points += size
+    return sorted(kept)
 
 
 def is_hole(contours: Sequence[Contour], index: int) -> bool:

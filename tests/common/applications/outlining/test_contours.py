@@ -16,8 +16,9 @@ from common.applications.outlining.contours_choice import (
 from common.applications.outlining.contours_drawing import CHOSEN, annotate_contours
 from common.applications.outlining.contours_following import Following
 from common.applications.outlining.contours_refinement import normals
-from common.applications.outlining.messages import OutlineSelect
-from common.messages import Color
+from common.applications.outlining.messages import Contours, OutlineSelect
+from common.messages import Color, Header
+from common.transport.codec import decode, encode
 from tests.common.applications.outlining.outline_scenes import WORLDS, seen_world, world
 
 SEED = ContourOptions(subpixel=False)
@@ -39,6 +40,29 @@ def test_default_sees_every_object_and_nothing_else(name):
     contours = find_contours(seen_world(name)[1], ContourOptions())
     assert len([c for c in contours if not is_hole(contours, c.index)]) == len(world(name).objects)
     assert not any(c.touches_border for c in contours)
+
+
+def test_hole_of_a_ring_as_thin_as_a_pixel_is_told():
+    seen = picture()
+    for u, v in ((50, 49), (49, 50), (51, 50), (50, 51)):
+        seen[v, u] = RED
+    found = find_contours(seen, SEED)
+    assert [is_hole(found, each.index) for each in sorted(found, key=lambda each: each.parent)] == [False, True]
+
+
+@pytest.mark.parametrize("spots", ["small ones", "rings, each in another"])
+def test_of_more_contours_than_a_message_has_room_for_the_largest_are_told(spots):
+    seen = picture((4, 4, 40, 30, BLUE), size=(1400, 1500))
+    if spots == "small ones":
+        seen[60::6, 60::6] = RED
+    else:
+        for at in range(60, 700, 4):
+            cv2.rectangle(seen, (at, at), (1499 - at, 1399 - at), RED)
+    found = find_contours(seen, SEED)
+    told = decode(Contours, encode(Contours(header=Header(), width=1500, height=1400, contours=found)))
+    assert 10 < len(told.contours) <= 1000
+    assert all(is_hole(found, each.index) == (colour_name(each.color) == "black") for each in found)
+    assert choose(found, OutlineSelect(rule="colour", colour="blue")).area == 39 * 29
 
 
 @pytest.mark.parametrize("channel, seen", [("grey", ["green"]), ("maximum", ["blue", "green", "red"])])
