@@ -50,10 +50,9 @@ async def ask_person(bus: Bus, folder: Path) -> None:
     """Store the picture with its contours in a folder, and ask until one of them is chosen."""
     contours, images = bus.reader(CONTOURS), bus.reader(CONTOUR_IMAGE)
     select = bus.client(OUTLINE_SELECT)
-    while not (found := await contours.next()).contours:
-        say("no contour in the picture yet")
+    found, image = await _drawn(contours, images)
     path = folder / f"{bus.cell}_contours.png"
-    await _keep(path, found, await images.next())
+    await _keep(path, image)
     say(f"{path} shows them: {described(found.contours)}")
     while True:
         say("outline which one? ", end="")
@@ -77,7 +76,20 @@ def say(text: str, end: str = "\n") -> None:
     sys.stdout.flush()
 
 
-async def _keep(path: Path, contours: Contours, image: Image) -> None:
+async def _drawn(contours: Reader[Contours], images: Reader[Image]) -> tuple[Contours, Image]:
+    """The first contours that there are, and the picture into which they were drawn: another may count otherwise."""
+    found, image = await contours.next(), await images.next()
+    while not found.contours or found.header.stamp != image.header.stamp:
+        if not found.contours:
+            say("no contour in the picture yet")
+        if not found.contours or found.header.stamp < image.header.stamp:
+            found = await contours.next()
+        else:
+            image = await images.next()
+    return found, image
+
+
+async def _keep(path: Path, image: Image) -> None:
     import cv2
 
     written, data = cv2.imencode(".png", image_to_array(image))

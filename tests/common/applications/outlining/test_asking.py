@@ -5,15 +5,16 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from common import messages as m
 from common import topics
-from common.applications.outlining import stage_files
-from common.applications.outlining.asking import store
-from common.applications.outlining.messages import Contour, Contours, OutlinePoints
-from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS
+from common.applications.outlining import asking, stage_files
+from common.applications.outlining.asking import ask_person, store
+from common.applications.outlining.messages import Contour, Contours, OutlinePoints, OutlineSelect, OutlineSelection
+from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
 from common.perception.image import array_to_image
 from common.transport.local import LocalNetwork
 
@@ -34,16 +35,17 @@ def outline(stamp: int, x: float) -> OutlinePoints:
     return OutlinePoints(header=header(stamp), poses=[m.Pose(position=at) for at in places], object="Object_0")
 
 
+async def soon() -> None:
+    for _ in range(20):
+        await asyncio.sleep(0)
+
+
 @pytest.mark.parametrize("path_is", ["first", "last"])
 async def test_stages_are_those_of_the_picture_of_the_path(tmp_path: Path, path_is: str) -> None:
     """Three services tell of one picture: what they say comes in any order."""
     bus = LocalNetwork().bus()
     picture, depth = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
     seen, found, paths = bus.writer(CONTOURS), bus.writer(CONTOUR_POINTS), bus.writer(CONTOUR_PATH)
-
-    async def soon() -> None:
-        for _ in range(20):
-            await asyncio.sleep(0)
 
     storing = asyncio.create_task(store(bus, tmp_path, None))
     await soon()
@@ -65,3 +67,36 @@ async def test_stages_are_those_of_the_picture_of_the_path(tmp_path: Path, path_
     assert said.startswith("Object_0, 3 points")
     assert stage_files.read_pixels(tmp_path / stage_files.PIXELS).tolist() == [list(each) for each in RIGHT]
     assert stage_files.read_coordinates(tmp_path / stage_files.COORDINATES)[:, 0].tolist() == [0.5] * 3
+
+async def test_the_person_looks_at_the_picture_whose_contours_are_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The picture of the one before comes first, and the next ones come while nobody has answered yet."""
+    network = LocalNetwork()
+    bus, detector = network.bus(), network.bus(service="contour_detector")
+    seen, drawn = detector.writer(CONTOURS), detector.writer(CONTOUR_IMAGE)
+    answers: asyncio.Queue[str] = asyncio.Queue()
+    monkeypatch.setattr(asking, "_line", answers.get)
+    chosen: list[OutlineSelect] = []
+
+    async def select(wanted: OutlineSelect) -> OutlineSelection:
+        chosen.append(wanted)
+        return OutlineSelection(index=0, label="Object_0")
+
+    detector.serve(OUTLINE_SELECT, select)
+    await detector.ready()
+    asked = asyncio.create_task(ask_person(bus, tmp_path))
+    await soon()
+    for stamp, pixels in ((1, None), (2, RIGHT), (3, WRONG)):
+        seen.put(contours(stamp, pixels) if pixels else Contours(header=header(stamp), width=16, height=12))
+        await soon()
+        drawn.put(array_to_image(np.full((12, 16, 3), 50 * stamp, np.uint8), "bgr8", header(stamp)))
+        if stamp > 1:
+            await soon()
+    answers.put_nowait("0")
+    async with asyncio.timeout(5):
+        await asked
+    shown = cv2.imread(str(tmp_path / "test_contours.png"))
+    assert shown is not None
+    middles = {100: (5 / 3, 4 / 3), 150: (23 / 3, 22 / 3)}
+    assert chosen[0].at == pytest.approx(middles[int(shown[0, 0, 0])])
