@@ -36,6 +36,24 @@ class Contours(Message):
     selected: int = Field(-1, description="index of the chosen contour, or -1")
     message: Text = ""
 
+    @model_validator(mode="after")
+    def _is_a_tree(self) -> Contours:
+        places = range(len(self.contours))
+        if [contour.index for contour in self.contours] != [*places]:
+            raise ValueError("the indices of contours must be 0, 1, ... in their order")
+        if self.selected != -1 and self.selected not in places:
+            raise ValueError(f"contour {self.selected} is selected, of {len(places)}")
+        within = {-1}  # what is known to lie in no circle
+        for contour in self.contours:
+            way, at = set[int](), contour.index
+            while at not in within:
+                way.add(at)
+                at = self.contours[at].parent
+                if at in way or (at != -1 and at not in places):
+                    raise ValueError(f"contour {contour.index} lies within {contour.parent}, which cannot be")
+            within |= way
+        return self
+
 
 class OutlineSelect(Message):
     """Choose an object: the largest that does not touch the border, one of a colour, or one by its index."""

@@ -1,4 +1,5 @@
 import cv2
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -17,6 +18,7 @@ from common.applications.outlining.contours_drawing import CHOSEN, annotate_cont
 from common.applications.outlining.contours_following import Following
 from common.applications.outlining.contours_refinement import normals
 from common.applications.outlining.messages import Contours, OutlineSelect
+from common.errors import DecodeError
 from common.messages import Color, Header
 from common.transport.codec import decode, encode
 from tests.common.applications.outlining.outline_scenes import WORLDS, seen_world, world
@@ -63,6 +65,18 @@ def test_of_more_contours_than_a_message_has_room_for_the_largest_are_told(spots
     assert 10 < len(told.contours) <= 1000
     assert all(is_hole(found, each.index) == (colour_name(each.color) == "black") for each in found)
     assert choose(found, OutlineSelect(rule="colour", colour="blue")).area == 39 * 29
+
+
+@pytest.mark.parametrize("told, problem", [
+    ([(0, -1, 2)], "contour 2 is selected, of 1"), ([(0, -1, -2)], "contour -2 is selected"),
+    ([(1, -1, 0)], "indices"), ([(0, 3, 0)], "within 3"), ([(0, -2, 0)], "within -2"), ([(0, 0, 0)], "within 0"),
+    ([(0, 1, 0), (1, 2, 0), (2, 1, 0)], "contour 0 lies within 1"),
+])
+def test_contours_that_do_not_fit_together_are_refused(told, problem):
+    contours = [{"index": index, "label": "a", "pixels": [(1.0, 1.0)], "parent": parent} for index, parent, _ in told]
+    message = {"header": {}, "width": 4, "height": 4, "contours": contours, "selected": told[0][2]}
+    with pytest.raises(DecodeError, match=problem):
+        decode(Contours, msgpack.packb(message))
 
 
 @pytest.mark.parametrize("channel, seen", [("grey", ["green"]), ("maximum", ["blue", "green", "red"])])
