@@ -72,10 +72,11 @@ async def run(bus: Bus, config: Config) -> None:
         try:
             camera = await cameras.of(depth.header)
             solids = await asyncio.to_thread(perceived_solids, found.contours, image_to_array(depth), camera)
+            scene = planning_scene(config.world, solids, found.header.stamp)
         except (Unusable, ImageError) as error:
             left_out.note(error)
             return
-        out.put(planning_scene(config.world, solids, found.header.stamp))
+        out.put(scene)
 
     async with asyncio.TaskGroup() as group:
         for watch in (cameras.follow(), watch_arm(), watch_depth(), watch_contours()):

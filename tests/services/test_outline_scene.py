@@ -6,6 +6,7 @@ import numpy as np
 
 from common import messages as m
 from common import topics
+from common.applications.outlining.contours import ContourOptions, find_contours
 from common.applications.outlining.messages import Contour, Contours
 from common.applications.outlining.topics import CONTOURS
 from common.clock import Clock
@@ -97,3 +98,24 @@ async def test_picture_with_the_arm_in_it_is_left_out() -> None:
         around.see(5)
         around.arm(HOME, 10)
         assert (await around.seen(since=15)).header.stamp >= 15
+
+
+async def test_picture_with_more_in_it_than_a_scene_has_room_for_is_left_out() -> None:
+    net = LocalNetwork()
+    async with running_service(net, outline_scene.run, CONFIG, name="outline_scene"):
+        around = Neighbours(net)
+        await around.scene()
+        around.arm(HOME, 1)
+        last = (await around.seen(since=5)).header.stamp
+        noise = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+        for row in range(5):
+            for column in range(5):
+                noise[20 + row:-20:33, 20 + column:-20:33] = (0, 0, 255)
+        spots = find_contours(noise, ContourOptions())
+        depth = np.full((CAMERA.height, CAMERA.width), BASE, np.float32)
+        header = m.Header(stamp=last + 1, frame_id=AROUND.camera.frame)
+        around.depths.put(array_to_image(depth, "32FC1", header))
+        around.contours.put(Contours(header=header, width=CAMERA.width, height=CAMERA.height, contours=spots))
+        for _ in range(50):  # until it is looked at: of what comes before that only the newest is
+            await asyncio.sleep(0)
+        assert (await around.seen(since=last + 2)).header.stamp >= last + 2

@@ -1,14 +1,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from common.applications.outlining.perceived_solids import PerceivedSolid
 from common.applications.outlining.scene import collision_object, planning_scene
 from common.config import Surroundings, load_cell
-from common.messages import Color
+from common.messages import Color, PlanningScene
+from common.perception.intake import Unusable
 from common.scene.home import HomeWatch
+from common.transport.codec import decode, encode
 
 CELL = load_cell("ur5")
 HOME = CELL.robot.named_poses["home"]
@@ -35,6 +39,19 @@ def test_scene_holds_fixtures_and_solids_of_the_picture_and_no_container() -> No
     scene = planning_scene(around, [solid("Object_1"), solid("Object_2")], 7)
     assert [o.id for o in scene.objects] == ["robot_base", "target_base", "Object_1", "Object_2"]
     assert (scene.header.stamp, scene.header.frame_id) == (7, "world")
+
+
+def test_scene_that_is_as_full_as_it_may_be_can_be_read_and_a_fuller_one_is_not_made() -> None:
+    around = CELL.section(Surroundings)
+    assert isinstance(around, Surroundings)
+    turn = np.linspace(0, 2 * math.pi, 12, endpoint=False)
+    round_one = replace(solid(), outline=0.1 * np.stack([np.cos(turn), np.sin(turn)], axis=1))
+    full = [replace(round_one, label=f"Object_{index}") for index in range(400)]
+    assert len(decode(PlanningScene, encode(planning_scene(around, full, 7))).objects) == 402
+    long = replace(solid(), outline=np.resize(round_one.outline, (2001, 2)))
+    for crowd in ([*full, solid()], [*full[1:], replace(long, outline=long.outline[:300])], [long]):
+        with pytest.raises(Unusable, match="are more than a planning scene has room for"):
+            planning_scene(around, crowd, 7)
 
 
 def test_arm_that_never_left_home_was_always_there() -> None:
