@@ -64,7 +64,8 @@ def moments(run: Gathering) -> list[tuple[float, str]]:
     wrong = [(event.time, " ".join(filter(None, (event.what, event.note)))) for event in run.failures]
     wrong += [(motion.until or motion.since, f"motion {motion.note}: {motion.message or motion.error}")
               for motion in run.motions if motion.note in ("aborted", "rejected")]
-    wrong += [(span.since, f"ERROR {span.note}".strip()) for span in run.tasks if span.label == "ERROR"]
+    wrong += [(span.since, f"ERROR {span.note}".strip()) for span in run.tasks[1:]  # the first was before
+              if span.label == "ERROR"]
     kept: list[tuple[float, str]] = []
     for at, what in sorted(wrong):
         if not kept or at - kept[-1][0] > AFTER:

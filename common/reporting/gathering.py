@@ -106,6 +106,7 @@ class Gathering:
     end: float = 0.0
     _target: str = ""
     _failed: int | None = None  # so far; what there was before the recording began is no event of it
+    _before: str | None = None  # the goal that had ended by then
     _scene: dict[str, tuple[float, float, float]] = field(default_factory=dict)
 
     def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
@@ -132,6 +133,10 @@ class Gathering:
     def on_motion(self, time: float, status: m.MotionStatus) -> None:
         """Take note of the state of a goal."""
         _while(self.held, time, status.held, "held")
+        if self._before is None:
+            self._before = status.id if status.state in _ENDED else ""
+        if status.id and status.id == self._before:
+            return
         current = self.motions[-1] if self.motions else None
         if status.id and (current is None or current.label != status.id) and status.state != "none":
             current = Motion(status.id, time)

@@ -401,6 +401,22 @@ def test_tall_pictures_are_made_small_and_of_many_cameras_some_are_shown(tmp_pat
     assert [(len(film.frames), film.frames[0].shape[:2]) for film in found] == [(3, (480, 1))] * filming.MOST_CAMERAS
 
 
+def test_what_had_gone_wrong_before_the_recording_began_has_no_film(tmp_path):
+    tape = Tape(tmp_path / "run.mcap")
+    for k in range(2):  # states are said again each second
+        tape.put(0.1 + k, "motion/status", m.MotionStatus(id="a", state="aborted", message="of before", error="limit"))
+        tape.put(0.2 + k, "pick_place_status", PickPlaceStatus(
+            header=tape.header(k), state="ERROR", target="ball_0", failures=3))
+    tape.put(5, "pick_place_status", PickPlaceStatus(header=tape.header(5), state="GRASPING", failures=3))
+    tape.put(8, "motion/status", m.MotionStatus(id="b", state="rejected", message="of now", error="limit"))
+    for k in range(100):
+        tape.put(0.1 * k, "camera/image_raw", picture(tape, 0.1 * k, k))
+    tape.writer.close({})
+    assert app.execute(["report", str(tmp_path / "run.mcap")]) == 0
+    text = (tmp_path / "run.html").read_text()
+    assert re.findall(r"<figcaption[^>]*>([^(]*) \(", text) == ["8.00 s: motion rejected: of now"]
+
+
 def test_report_of_a_run_without_failures_or_pictures_has_no_film(recorded, tmp_path):
     tape = Tape(tmp_path / "well.mcap")
     tape.put(0, "pick_place_status", PickPlaceStatus(header=tape.header(0), state="IDLE"))
