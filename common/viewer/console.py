@@ -195,6 +195,7 @@ class Console(Desk):
             lambda edit: self.ask(topics.WORLD_EDIT, edit), lambda: self.latest(topics.SCENE_OBJECTS))
         self.picked: Callable[[str], None] = lambda _name: None  # an object of the simulated world, in the scene
         self._newest = 0  # `since` of the stop that was said here
+        self.stops = 0  # how often STOP was said here, heard or not
         asked: list[Request[Any, Any]] = [
             topics.TASK_COMMAND, topics.MOTION_STOP, topics.MOTION_OWN, topics.GRIPPER_COMMAND,
             topics.ROBOT_COMMAND, topics.WORLD_EDIT]
@@ -210,10 +211,18 @@ class Console(Desk):
         client: Client[Q, A] = self._clients[request.key]
         return await client.call(message, timeout)
 
-    async def command(self, command: str, override: bool = False) -> None:
-        """Tell the task to start, pause, resume or stop; to start or resume although another person holds the arm."""
+    @property
+    def heard(self) -> int | None:
+        """`since` of the newest stop or hold that the page knows of; None where nobody tells of them."""
         motion = self.latest(topics.MOTION_STATUS)
-        heard = max(motion.newest, self._newest) if motion else None
+        return max(motion.newest, self._newest) if motion else None
+
+    async def command(self, command: str, override: bool = False, heard: int | None = None) -> None:
+        """Tell the task to start, pause, resume or stop; to start or resume although another person holds the arm.
+
+        Nothing is let go of that is newer than what was `heard` of as this was decided; left out: that is now.
+        """
+        heard = self.heard if heard is None else heard
         said = {"command": command, "by": self.doors.person, "override": override, "heard": heard}
         await self.ask(topics.TASK_COMMAND, TaskCommand.model_validate(said))
 
@@ -223,6 +232,7 @@ class Console(Desk):
         Raises:
             RequestFailed: the arm could not be told; the task was, if it could.
         """
+        self.stops += 1
         arm, task = await asyncio.gather(
             self.ask(topics.MOTION_STOP, StopRequest(reason="stopped on the page", owner=self.doors.person), _SOON),
             self.ask(topics.TASK_COMMAND, TaskCommand(command="stop", by=self.doors.person), _SOON),

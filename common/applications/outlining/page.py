@@ -61,8 +61,12 @@ def choice_of(contour: Contour) -> OutlineSelect:
 
 
 async def choose(console: Console, choice: OutlineSelect) -> None:
-    """Have an object outlined: it is chosen, and the task starts once its path is known. Tells which it is."""
+    """Have an object outlined: it is chosen, and the task starts once its path is known. Tells which it is.
+
+    Whoever stops or holds the arm until then has the last word.
+    """
     console.tell("")
+    heard, stops = console.heard, console.stops
     chosen = await console.ask(OUTLINE_SELECT, choice)
     status = console.latest(OUTLINE_STATUS)
     if status is not None and (not status.started or status.state in _ENDED):  # else it traces what is chosen by itself
@@ -72,7 +76,10 @@ async def choose(console: Console, choice: OutlineSelect) -> None:
                     await asyncio.sleep(0.02)  # others read the messages themselves
         except TimeoutError:
             pass  # the task tells what is wrong with the object
-        await console.command("start")
+        if console.stops > stops or (console.heard or 0) > (heard or 0):
+            console.tell(f"{chosen.label} is chosen, but not traced: the arm was stopped or held meanwhile", "busy")
+            return
+        await console.command("start", heard=heard)
     console.tell(f"{chosen.label} is chosen", "good")
 
 
