@@ -17,7 +17,7 @@ from common import topics
 from common.application import applications
 from common.config import check
 from common.errors import RequestFailed, RequestLost, ZencellError
-from common.sources import new_id
+from common.sources import new_id, wall_ns
 from common.transport.bus import Bus
 from common.transport.reader import Reader
 
@@ -138,8 +138,10 @@ class OperatorMotion:
         """The motion status, when nothing and nobody moves the robot.
 
         Raises:
-            MotionFailed: a task or another person has it, or nobody says how it is.
+            MotionFailed: a task or another person has it, somebody stops or holds it meanwhile, or nobody says how it
+                is.
         """
+        known, asked = self._motion.latest, wall_ns()
         status = await self._known()
         self._require_no_task()
         for inhibit in status.inhibits:
@@ -151,6 +153,10 @@ class OperatorMotion:
                     status = await self._motion.next()
         except TimeoutError:
             raise MotionFailed("busy", f"the robot follows goal {status.id!r}: stop it first") from None
+        heard = max(asked, known.newest if known else 0)  # a program may have said the stop that it then moves after
+        for inhibit in status.inhibits:
+            if inhibit.since > heard and inhibit.by not in OURSELVES:
+                raise MotionFailed(inhibit.kind, f"the robot is {inhibit.told}")
         return status
 
     async def _known(self) -> m.MotionStatus:

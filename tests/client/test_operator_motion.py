@@ -12,6 +12,7 @@ from common import topics
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.client.operator_motion import MotionFailed, OperatorMotion
+from common.sources import wall_ns
 from common.transport.local import LocalNetwork
 
 HOME = m.JointGoal(named="home")
@@ -201,6 +202,29 @@ async def test_motion_that_is_being_stopped_is_waited_for(cell: Cell, person: Op
     moving = asyncio.create_task(person.move(HOME))
     await asyncio.sleep(0)
     cell.say(state="cancelled")
+    assert (await moving).state == "succeeded"
+
+
+@pytest.mark.parametrize("waited_for", ["motion", "free"])
+async def test_stop_while_the_motion_before_is_waited_for_keeps_the_robot(cell: Cell, waited_for: str) -> None:
+    person = OperatorMotion(cell.bus, [], owner="anna")
+    cell.say(id="before", state="active", inhibits=[said("stopped", "anna", 3)])
+    asked = asyncio.create_task(person.move(HOME) if waited_for == "motion" else person.require_free())
+    for _ in range(50):
+        await asyncio.sleep(0)
+    cell.say(state="cancelled", inhibits=[said("stopped", "anna", wall_ns())])
+    with pytest.raises(MotionFailed, match=r"the robot is stopped since .* by anna"):
+        await asked
+    assert kinds(cell) == []
+
+
+async def test_stop_that_the_same_person_said_before_the_motion_keeps_it_only_until_the_robot_rests(cell: Cell) -> None:
+    person, since = OperatorMotion(cell.bus, [], owner="anna"), wall_ns()
+    cell.say(id="before", state="active")
+    moving = asyncio.create_task(person.move(HOME))
+    for _ in range(50):
+        await asyncio.sleep(0)
+    cell.say(state="cancelled", inhibits=[said("stopped", "anna", since)])
     assert (await moving).state == "succeeded"
 
 
