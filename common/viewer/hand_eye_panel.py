@@ -172,7 +172,8 @@ class HandEyePanel:
             why = await asyncio.to_thread(views.take, image)
         finally:
             self._busy = False
-        self._said = f"not taken: {why}" if why else f"view {views.count} is taken"
+        if views is self._views:  # else others have begun meanwhile
+            self._said = f"not taken: {why}" if why else f"view {views.count} is taken"
 
     async def _calibrate(self) -> None:
         views, info = self._views, self._latest(self._info(self._images[self._camera]))
@@ -182,7 +183,9 @@ class HandEyePanel:
             raise ConfigError("Camera", self._camera, "does not say how its lens is")
         self._busy = True
         try:
-            self._result = await asyncio.to_thread(views.calibrate, info)
+            result = await asyncio.to_thread(views.calibrate, info)
         finally:
             self._busy = False
-        self._console.tell(self._result.lines[0], "good" if self._result.good else "bad")
+        if views is self._views:
+            self._result = result
+        self._console.tell(result.lines[0], "good" if result.good else "bad")
