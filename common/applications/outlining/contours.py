@@ -64,7 +64,8 @@ def find_contours(picture: Picture, options: ContourOptions) -> list[Contour]:
         return []
     parents = [int(parent) for parent in hierarchy[0, :, 3]]
     areas = [float(cv2.contourArea(chain)) for chain in chains]
-    kept = _with_room([i for i, area in enumerate(areas) if area >= options.min_area], chains, areas, parents)
+    kept = _with_room([i for i, area in enumerate(areas) if area >= options.min_area],
+                      [len(chain) for chain in chains], areas, parents)
     index_of = {-1: -1} | {old: new for new, old in enumerate(kept)}
     height, width = above.shape
     found = []
@@ -82,12 +83,12 @@ def find_contours(picture: Picture, options: ContourOptions) -> list[Contour]:
 
 
 def _with_room(
-    wanted: Sequence[int], chains: Sequence[npt.NDArray[np.int32]], areas: Sequence[float], parents: Sequence[int]
+    wanted: Sequence[int], lengths: Sequence[int], areas: Sequence[float], parents: Sequence[int]
 ) -> list[int]:
     """Those of the contours that a message has room for, the largest first: none without the one around it."""
     kept, points = set[int](), 0
     for index in sorted(wanted, key=lambda i: -areas[i]):  # a thin ring is before its hole, which is as large
-        size = len(chains[index])
+        size = lengths[index]
         inside = parents[index] in kept or parents[index] < 0
         if inside and size <= MOST_ALONG_ONE and points + size <= MOST_POINTS and len(kept) < MOST:
             kept.add(index)
