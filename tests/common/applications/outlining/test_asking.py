@@ -68,6 +68,7 @@ async def test_stages_are_those_of_the_picture_of_the_path(tmp_path: Path, path_
     assert stage_files.read_pixels(tmp_path / stage_files.PIXELS).tolist() == [list(each) for each in RIGHT]
     assert stage_files.read_coordinates(tmp_path / stage_files.COORDINATES)[:, 0].tolist() == [0.5] * 3
 
+
 async def test_the_person_looks_at_the_picture_whose_contours_are_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
