@@ -17,9 +17,11 @@ from statistics import median
 
 import numpy as np
 
-from common.config import load_cell
-from common.messages import JointGoal, PlanRequest, PlanResponse
+from common.config import Fixture, load_cell
+from common.messages import Header, JointGoal, PlanningScene, PlanRequest, PlanResponse
+from common.planning.collision import CollisionWorld
 from common.robot.model import RobotModel
+from common.scene.fixtures import fixture_objects
 from common.topics import MOTION_PLAN
 from zencell import Cell
 
@@ -27,13 +29,22 @@ PAIRS, COUNT, TIMEOUT = 60, 10, 60.0
 
 
 def crowded(name: str, boxes: int) -> str:
-    """An override that adds boxes of 0.1 m to the cell's fixtures, 0.35 to 0.8 m from the arm's foot and above it."""
-    rng = np.random.default_rng(1)
-    fixtures = [fixture.model_dump(mode="json", exclude_defaults=True) for fixture in load_cell(name).world.fixtures]
+    """An override that adds boxes of 0.1 m to the cell's fixtures, 0.35 to 0.8 m from the arm's foot and above it.
+
+    None is where the arm is at home: a cell in which that is so does not start.
+    """
+    cell, rng = load_cell(name), np.random.default_rng(1)
+    robot = RobotModel.load(cell.robot)
+    home = robot.named("home")
+    fixtures = [fixture.model_dump(mode="json", exclude_defaults=True) for fixture in cell.world.fixtures]
     for number in range(boxes):
         turn, away, up = rng.uniform((-np.pi, 0.35, 0.2), (np.pi, 0.8, 1.0))
         place = [round(float(value), 3) for value in (away * np.cos(turn), away * np.sin(turn), up)]
-        fixtures.append({"id": f"floating_{number}", "dimensions": [0.1, 0.1, 0.1], "position": place})
+        box = Fixture(id=f"floating_{number}", dimensions=(0.1, 0.1, 0.1), position=tuple(place))
+        boxed = fixture_objects(cell.world.model_copy(update={"fixtures": [box]}))
+        alone = PlanningScene(header=Header(stamp=0, frame_id="world"), objects=boxed)
+        if CollisionWorld(robot, alone, start=home).colliding_pair(home) is None:
+            fixtures.append(box.model_dump(mode="json", exclude_defaults=True))
     return f"world.fixtures={json.dumps(fixtures)}"
 
 
