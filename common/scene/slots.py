@@ -26,6 +26,24 @@ def slot_positions(box: Container, radius: float, table_height: float) -> Array:
     ])
 
 
+def low_columns(box: Container, places: Iterable[tuple[float, float, float]], same: float) -> list[tuple[float, float]]:
+    """(x, y) of the columns of slots in which least lies, which may be all of them [m], world.
+
+    Args:
+        box: the container.
+        places: centres of what lies in it or is about to [m], world; each is in the column that it is nearest to.
+        same: columns whose uppermost centres differ by less are as high [m].
+    """
+    d = box.slot_offset
+    heights = {(box.x + dx, box.y + dy): -np.inf for dx in (-d, d) for dy in (-d, d)}
+    for x, y, z in places:
+        if max(abs(x - box.x), abs(y - box.y)) <= box.half_side:
+            column = box.x + (d if x > box.x else -d), box.y + (d if y > box.y else -d)
+            heights[column] = max(heights[column], z)
+    least = min(heights.values())
+    return [column for column, height in heights.items() if height == least or height - least < same]
+
+
 def occupied_slots(
     pixels: Iterable[tuple[float, float]], camera: Pinhole, slots: Array, radius: float, free: Collection[int] = ()
 ) -> set[int]:

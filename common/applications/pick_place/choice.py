@@ -15,11 +15,13 @@ from common.applications.pick_place.parameters import Config, HandShape
 from common.applications.pick_place.remembered import HIDDEN
 from common.config import Container
 from common.robot.transforms import matrix_to_rpy, pose_to_matrix
+from common.scene.slots import low_columns
 from common.scene.workspace import yaw_candidates
 from common.tasks.engine import appeared
 from common.tasks.stages import Cycle, Place, View, place_of
 
-Spots = list[tuple[float, float]]
+Spot = tuple[float, float]  # (x, y) [m]
+Spots = list[Spot]
 YawRange = tuple[float, float]  # its middle, and how far it reaches to either side [rad]
 FULL = "the container is full"
 FINE = 36  # yaws in half a turn at which it is looked whether the hand is clear
@@ -71,6 +73,7 @@ class Pick(Cycle):
     yaw: float = field(default=0.0, kw_only=True)  # of the hand, of those the one that is tried
     again: bool = field(default=False, kw_only=True)  # there was no way to it from another posture of the arm
     apart: bool = field(default=False, kw_only=True)  # it was asked for a way to any of the yaws once
+    over: Spot | None = field(default=None, kw_only=True)  # where it is let go; without, anywhere above the container
     first_error: str = ""
 
     def __post_init__(self) -> None:
@@ -150,6 +153,7 @@ class Choice:
         self._given_up: list[GivenUp] = []
         self._judged_by: dict[str, Any] = {}  # values of the parameters
         self._expected = (0, 0.0)  # balls that will be in the container soon, and until when that is only expected
+        self._released: Spot | None = None  # above what the last of them was let go
 
     def next(self, view: PickPlaceView, origin: Sequence[float], under_way: Sequence[Pick]) -> Pick | None:
         """The nearest ball to `origin` (x, y) that can be taken, with its yaws; None when there is none now."""
@@ -180,8 +184,25 @@ class Choice:
                 again = self._given_up_at(ball.position) is not None
                 clear = [] if flat is not None else grasp_yaws(
                     self.p.hand, ball.position, others, self.radius, self.container, yaw_candidates(FINE))
-                return Pick(target=ball, yaws=yaws, ranges=yaw_ranges(clear), again=again)
+                return Pick(target=ball, yaws=yaws, ranges=yaw_ranges(clear), again=again,
+                            over=self._over(ball, view, under_way))
         return None
+
+    def _over(self, ball: Target, view: PickPlaceView, under_way: Sequence[Pick]) -> Spot:
+        """(x, y) in the container above which there is most room, of those the nearest to the ball [m].
+
+        An arm that lets go wherever it comes first heaps up a pile that leans to its side.
+        """
+        lie = [place_of(thing.pose) for thing in view.objects("contained")]
+        coming = [pick.over for pick in under_way]
+        if view.scene_stamp < self._expected[1]:
+            coming.insert(0, self._released)
+        for over in coming:
+            if over is not None:
+                below = [z for x, y, z in lie if math.dist((x, y), over) < self.radius]
+                lie.append((*over, max(below, default=self.p.world.table_height - self.radius) + 2 * self.radius))
+        low = low_columns(self.container, lie, self.radius)
+        return min(low, key=lambda column: math.dist(column, ball.position[:2]))
 
     def once_more(self) -> bool:
         """Open again what no plan was found for, each once while the table stays as it is; whether there is any."""
@@ -207,10 +228,10 @@ class Choice:
         count, until = self._expected
         return max(len(view.objects("contained")), count if view.scene_stamp < until else 0)
 
-    def released(self, target: Target, view: PickPlaceView) -> None:
+    def released(self, pick: Pick, view: PickPlaceView) -> None:
         """A ball was let go above the container, where it will be seen when it has come to rest."""
-        self._expected = (self._contained(view) + 1, view.now + SETTLING)
-        self._forget(target)
+        self._expected, self._released = (self._contained(view) + 1, view.now + SETTLING), pick.over
+        self._forget(pick.target)
 
     def missed(self, target: Target, view: PickPlaceView, problem: str) -> None:
         """The fingers did not take there what was seen; after `max_retries` retries the place is given up."""

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 GREY = m.Color(r=0.6, g=0.6, b=0.6)  # of what is not seen
 LEVEL = 0.005  # [m] what is seen so little above the table lies on it
+AT_REST = 0.5  # [s] for which something is seen in a slot before it is taken to lie there
 
 
 class PerceivedScene:
@@ -50,7 +51,8 @@ class PerceivedScene:
         ]
         self._occupied: dict[int, tuple[int, set[int]]] = {}  # stamp and slots by view
         self._lasts: set[int] = set()  # views that look at times
-        self._free: set[int] = set()  # slots in which nothing was when the hand took something, nor was seen since
+        self._free: set[int] = set()  # slots in which nothing was when the hand took something, nor came to rest since
+        self._since: dict[int, int] = {}  # stamp since which something is seen in a slot
         self._beside_slots: dict[int, list[Sighting]] = {}  # what else lies in the container, by view
         self._held: m.AttachedObject | None = None
         self._changed_hands_at = 0
@@ -96,8 +98,10 @@ class PerceivedScene:
             seen |= self._still_in(view, seen, hidden)
             if beside_slots or not hidden.everything:
                 self._beside_slots[view] = beside_slots
-        self._free -= seen
         self._occupied[view] = stamp, seen
+        self._since = {slot: self._since.get(slot, stamp) for slot in self._occupied_slots()}
+        # What falls and rolls is seen in one slot after the other, and is in none of them when the next covers it.
+        self._free -= {slot for slot, since in self._since.items() if (stamp - since) * 1e-9 >= AT_REST}
         if at_times:
             self._lasts.add(view)
 

@@ -89,11 +89,20 @@ class Rows:
         return [*([lift] if z < height - 0.01 else []), self._across(cycle, 0.0), self._release(cycle)]
 
     def _across(self, cycle: Pick, yaw: float) -> Move:
-        box = self.p.world.container
-        above = self._region((box.x, box.y, self.p.grasp.drop_z), yaw, self.p.place_pos_tol)
+        """Above the container: where there is most room in it, or else anywhere."""
+        box, wide = self.p.world.container, self.p.place_pos_tol
+        anywhere = Move("across", "PLACING", cycle, goal=self._above((box.x, box.y), yaw, wide), carries=True)
+        if cycle.over is None:
+            return anywhere
+        goal = self._above(cycle.over, yaw, wide / 2)
+        goal.position_tolerance.z = wide
+        return Move("across", "PLACING", cycle, goal=goal, carries=True, otherwise=[anywhere])
+
+    def _above(self, at: tuple[float, float], yaw: float, side: float) -> m.PoseGoal:
+        above = self._region((*at, self.p.grasp.drop_z), yaw, side)
         if self._takes_any:
             above.tilt_tolerance = max(above.tilt_tolerance, RELEASED)
-        return Move("across", "PLACING", cycle, goal=above, carries=True)
+        return above
 
     def _release(self, cycle: Pick) -> Grip:
         return Grip("release", "PLACING", cycle, width=self.gripper.max_width, carries=True, holds=False)

@@ -177,7 +177,7 @@ class PickPlace(Task[PickPlaceView]):
             self.status.done += 1
             if self._around.on_hand:
                 self.look_after = view.now
-            self._choice.released(pick.target, view)
+            self._choice.released(pick, view)
 
     def missed(self, stage: Grip, view: PickPlaceView) -> None:
         """The fingers closed on nothing, or on what is not as wide as it was seen: open, go up and look again."""

@@ -25,6 +25,7 @@ class CellDouble:
         self.unreachable: list[tuple[float, float]] = []
         self.held: str = ""
         self.contained = 0
+        self.fell: list[tuple[float, float, float]] = []  # where the first of them lie, of those that fell
         self.now = 100.0
         self.tcp = (0.3, 0.0, 0.5)
         self.motion = m.MotionStatus()
@@ -45,7 +46,8 @@ class CellDouble:
         if self.camera_on:
             self._stamp = self.now + self.camera_ahead
         objects = [self._sphere(name, "target", p) for name, p in self.balls.items()]
-        objects += [self._sphere(f"slot_{k}", "contained", (0.55, 0.25, 0.035)) for k in range(self.contained)]
+        fell = [*self.fell, *[(0.55, 0.25, 0.035)] * (self.contained - len(self.fell))]
+        objects += [self._sphere(f"slot_{k}", "contained", fell[k]) for k in range(self.contained)]
         attached = []
         if self.held:
             attached = [m.AttachedObject(link="panda_hand_tcp", object=self._sphere(self.held, "attached", (0, 0, 0)))]
@@ -142,7 +144,8 @@ class CellDouble:
         self.task.on_goal(self.gripper, self.view())
 
     def _fall(self) -> None:
-        if math.dist(self.tcp[:2], (0.55, 0.25)) < 0.03:
+        if max(abs(self.tcp[0] - 0.55), abs(self.tcp[1] - 0.25)) < 0.07:  # between its walls
+            self.fell.append((*self.tcp[:2], 0.035 if self.contained < 4 else 0.095))
             self.contained += 1
         else:
             self.balls[self.held] = (*self.tcp[:2], 0.03)

@@ -114,9 +114,21 @@ def test_ball_that_filled_a_free_place_carries_the_next_one() -> None:
     s.see(frame(1.0, (0.4, 0.0, 0.03)), CAMERA, AWAY)
     s.feel(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
     s.feel(gripper(2.1, False), OVER_BOX)
-    s.see(frame(2.2, LOW), CAMERA, AWAY)
-    s.see(frame(2.3, HIGH), CAMERA, AWAY)  # put there by somebody
+    for t in (2.2, 2.5, 2.8):
+        s.see(frame(t, LOW), CAMERA, AWAY)
+    s.see(frame(2.9, HIGH), CAMERA, AWAY)  # put there by somebody
     assert roles(s)["contained"] == ["slot_1", "slot_5"]
+
+
+def test_ball_that_passed_a_free_place_before_it_came_to_rest_above_is_one_ball() -> None:
+    s = scene()
+    s.see(frame(1.0, (0.4, 0.0, 0.03)), CAMERA, AWAY)
+    s.feel(gripper(1.1, True), tool_down(0.4, 0.0, 0.03))
+    s.feel(gripper(2.1, False), OVER_BOX)
+    s.see(frame(2.2, LOW), CAMERA, AWAY)  # it bounces
+    for t in (2.3, 2.6, 2.9):
+        s.see(frame(t, HIGH), CAMERA, AWAY)
+    assert roles(s)["contained"] == ["slot_5"]
 
 
 @pytest.mark.parametrize("holding", [False, True])
