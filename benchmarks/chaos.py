@@ -22,7 +22,8 @@ from tests.harness import LOG, SUMMARY, RunningCell, folder_for
 
 USUAL = "panda"
 WORLD = {USUAL: [], "ur5": ["--world", "w2"]}
-ASKED = ("cell", "speed", "balls", "rate")  # what makes a run with a seed the same as another
+ASKED = ("cell", "speed", "balls", "rate", "set")  # what makes a run with a seed the same as another
+BEFORE: dict[str, Any] = {"cell": USUAL, "set": []}  # of runs told of in a file that does not say
 MOST_OFF = 1.0  # [mm] from the true outline
 TIMEOUT = 300.0  # [s] for one run
 
@@ -35,6 +36,8 @@ async def run_once(seed: int, folder: Path, options: argparse.Namespace) -> dict
         arguments += ["--set", f"world.count={options.balls}"]
     if options.rate:
         arguments += ["--chaos-rate", f"{options.rate:g}"]
+    for setting in options.set:
+        arguments += ["--set", setting]
     outcome: dict[str, Any] = {"seed": seed, **{name: getattr(options, name) for name in ASKED}}
     with RunningCell(folder, "run", options.cell, *arguments) as cell:
         try:
@@ -107,7 +110,7 @@ def earlier(file: Path, options: argparse.Namespace) -> list[dict[str, Any]]:
         return []
     found = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
     asked = {name: getattr(options, name) for name in ASKED}
-    same = [one for one in found if all(one.get(name, USUAL) == value for name, value in asked.items())]
+    same = [one for one in found if all(one.get(name, BEFORE.get(name)) == value for name, value in asked.items())]
     return list({one["seed"]: one for one in same}.values())
 
 
@@ -150,6 +153,7 @@ def main() -> int:
     parser.add_argument("--speed", type=float, default=5.0, help="cell time per wall time")
     parser.add_argument("--balls", type=int, default=7)
     parser.add_argument("--rate", type=float, help="faults per minute of wall time")
+    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="as for `zencell run`")
     parser.add_argument("--file", help="JSON lines of what became of the runs; runs that are in there are not repeated")
     parser.add_argument("--again", action="store_true", help="repeat those that were not good")
     options = parser.parse_args()
