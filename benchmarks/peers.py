@@ -1,13 +1,14 @@
-"""Planning beside roboplan on MotionBenchMaker's problems, in turn within one run.
+"""Planning beside roboplan and OMPL on MotionBenchMaker's problems, in turn within one run.
 
-    python -m benchmarks.peers FOLDER [--robot panda|ur5] [--set NAME] [--every N] [--step RAD] [--environment DIR]
+    python -m benchmarks.peers FOLDER [--robot panda|ur5] [--set NAME] [--every N] [--step RAD] [--peers DIR]
+                                      [--only roboplan|ompl]
 
-FOLDER and problems are those of `benchmarks.mbm`. roboplan (0.7, C++ on pinocchio) gets an environment of its own, DIR
-(build/peers), which is made and filled by pip when it is not there. It gets the same robot (URDF, disabled pairs,
-fingers), solids, start and goal, RRT-Connect with edges of 1 rad checked every --step (0.05) rad, and its shortcuts;
-of its time counts the plan and the shortening. Of zencell's the planners' attempts count (`search`: straight edges,
-one attempt and its shortening), and the whole pipeline with one attempt and as configured. Every path is judged by coal
-alone at 0.01 rad.
+FOLDER and problems are those of `benchmarks.mbm`. roboplan (0.7, C++ on pinocchio) and OMPL (2.0 from Python, with
+pinocchio and coal's convex hulls) get an environment each, in DIR (build), which is made and filled by pip when it is
+not there. They get the same robot (URDF, disabled pairs, fingers), solids, start and goal; RRT-Connect with edges
+checked every --step (0.05) rad, and their own shortening; of their time counts the plan and the shortening, for which
+they have 60 s. Of zencell's the planners' attempts count (`search`: straight edges, one attempt, its shortening), and
+the whole pipeline with one attempt and as configured. Every path is judged by coal alone at 0.01 rad.
 """
 
 from __future__ import annotations
@@ -37,17 +38,18 @@ from common.robot.transforms import pose_to_matrix
 
 Array = NDArray[np.float64]
 
-ROBOPLAN = "roboplan==0.7.0"
+PEERS = {"roboplan": ["roboplan==0.7.0"], "ompl": ["ompl==2.0.1", "pin==4.1.0"]}  # what their environments hold
 JUDGED = 0.01  # [rad]
-WAYS = ("roboplan", "search", "one attempt", "configured")
+WAYS = ("search", "one attempt", "configured")
 
 
 class Peer:
-    """roboplan in its own process."""
+    """Another planner in its own process."""
 
-    def __init__(self, python: Path, hulls: RobotGeometry, step: float) -> None:
+    def __init__(self, name: str, python: Path, hulls: RobotGeometry, step: float) -> None:
         """Start it and tell it the robot."""
-        script = Path(__file__).with_name("peer_roboplan.py")
+        self.name = name
+        script = Path(__file__).with_name(f"peer_{name}.py")
         self._process = subprocess.Popen(
             [python, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
         )
@@ -69,7 +71,7 @@ class Peer:
         self._process.stdin.write(json.dumps(what) + "\n")
         line = self._process.stdout.readline()
         if not line:
-            raise SystemExit(f"roboplan ended with code {self._process.wait()}")
+            raise SystemExit(f"{self.name} ended with code {self._process.wait()}")
         answer: dict[str, Any] = json.loads(line)
         return answer
 
@@ -84,7 +86,7 @@ class Peer:
         answer = self.ask({"solids": solids, "start": start, "goal": goal, "seed": seed})
         path = answer["path"]
         if answer["error"]:
-            print(f"  {problem.name}: roboplan: {answer['error']}")
+            print(f"  {problem.name}: {self.name}: {answer['error']}")
         return answer["seconds"], None if path is None else np.array(path)
 
 
@@ -112,22 +114,23 @@ def _fixed(urdf: str, locked: dict[str, float]) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-def environment(folder: Path) -> Path:
-    """The interpreter of an environment with roboplan, made if it is not there."""
+def environment(folder: Path, packages: list[str]) -> Path:
+    """The interpreter of an environment with these packages, made if it is not there."""
     python = folder / "bin" / "python"
     if not python.exists():
-        print(f"making {folder} with {ROBOPLAN}", flush=True)
+        print(f"making {folder} with {', '.join(packages)}", flush=True)
         venv.create(folder, with_pip=True)
-        subprocess.run([python, "-m", "pip", "install", "--quiet", ROBOPLAN], check=True)
+        subprocess.run([python, "-m", "pip", "install", "--quiet", *packages], check=True)
     return python
 
 
 def ways(
-    pipeline: PlanningPipeline, peer: Peer, problem: Problem, seed: int
+    pipeline: PlanningPipeline, peers: list[Peer], problem: Problem, seed: int
 ) -> Iterator[tuple[str, float, Array | None]]:
     """Seconds of each, and the path (N, dof) [rad] as it is judged."""
-    seconds, path = peer.plan(problem, seed)
-    yield "roboplan", seconds, None if path is None else interpolate(path, JUDGED)
+    for peer in peers:
+        seconds, path = peer.plan(problem, seed)
+        yield peer.name, seconds, None if path is None else interpolate(path, JUDGED)
     for name, attempts in (("one attempt", 1), ("configured", None)):
         began = perf_counter()
         response = pipeline.plan(problem.request(attempts, seed), problem.scene)
@@ -147,14 +150,16 @@ def _path(response: PlanResponse) -> Array | None:
 def main() -> None:
     """Compare on one robot."""
     parser = arguments(__doc__, every=5)
-    parser.add_argument("--step", type=float, default=0.05, help="of roboplan's checks [rad]")
-    parser.add_argument("--environment", type=Path, default=Path("build/peers"))
+    parser.add_argument("--step", type=float, default=0.05, help="of the peers' checks [rad]")
+    parser.add_argument("--peers", type=Path, default=Path("build"), help="where their environments are")
+    parser.add_argument("--only", choices=PEERS, help="one of them")
     given = parser.parse_args()
     if not has_problems(given):
         return
     cell, robot = load_robot(given.robot)
     pipeline, hulls = PlanningPipeline(robot, cell.motion, cell.pipeline), RobotGeometry(robot)
-    peer = Peer(environment(given.environment), hulls, given.step)
+    peers = [Peer(name, environment(given.peers / f"peer_{name}", packages), hulls, given.step)
+             for name, packages in PEERS.items() if given.only in (None, name)]
     print(f"{given.robot}, wall ms median / 95 %, way [rad], found, colliding when judged at {JUDGED} rad")
     for name, problems in read(given.folder, robot, given.robot, given.set or list(SETS), given.every, False):
         seconds: dict[str, list[float]] = defaultdict(list)
@@ -164,12 +169,12 @@ def main() -> None:
             referee = Referee(hulls, problem.scene)
             if referee.collides(problem.start) or referee.collides(problem.goal):
                 continue
-            for way, took, path in ways(pipeline, peer, problem, seed):
+            for way, took, path in ways(pipeline, peers, problem, seed):
                 seconds[way].append(took)
                 if path is not None:
                     lengths[way].append(float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()))
                     colliding[way] += any(referee.collides(q) for q in path)
-        for way in WAYS:
+        for way in (*(peer.name for peer in peers), *WAYS):
             median, high = np.percentile(1e3 * np.array(seconds[way]), [50, 95])
             length = np.median(lengths[way]) if lengths[way] else np.nan
             print(f"{name:18} {way:12} {median:9.2f} / {high:9.2f}  {length:6.3f}  {len(lengths[way]):3} of "
