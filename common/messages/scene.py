@@ -30,7 +30,7 @@ class CollisionObject(Message):
     prism has the convex hull of `outline` [m] as its cross-section and, as all shapes, its pose at half its length.
     """
 
-    later: ClassVar[tuple[str, ...]] = ("grip_effort", "mass", "kind")
+    later: ClassVar[tuple[str, ...]] = ("grip_effort", "mass", "kind", "unseen")
 
     id: Name
     role: Literal["fixture", "container", "target", "contained", "attached"]
@@ -44,6 +44,7 @@ class CollisionObject(Message):
     )
     mass: Annotated[float, Field(ge=0, le=1000)] = Field(0.0, description="[kg]; 0: not known")
     kind: Label = Field("", description="what it is, as the detector that saw it calls it; empty: not known")
+    unseen: bool = Field(False, description="taken to be there by what is seen: something has to carry that")
 
     @model_validator(mode="after")
     def _dimensions_fit_shape(self) -> CollisionObject:

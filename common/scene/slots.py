@@ -46,8 +46,8 @@ def low_columns(box: Container, places: Iterable[tuple[float, float, float]], sa
 
 def occupied_slots(
     pixels: Iterable[tuple[float, float]], camera: Pinhole, slots: Array, radius: float, free: Collection[int] = ()
-) -> set[int]:
-    """Which slots hold a sphere, as indices.
+) -> tuple[set[int], set[int]]:
+    """Which slots hold a sphere that is seen, and which one that cannot be, as indices.
 
     Each seen sphere belongs to the slot whose centre is imaged nearest to it, the nearest pairs first, one to one.
     Below one that is seen stand those that carry it, though they are hidden; but none in a slot that is known to be
@@ -74,4 +74,4 @@ def occupied_slots(
         taken.add(slot)
         matched.add(number)
     carriers = {slot - 4 * below for slot in taken for below in range(1, slot // 4 + 1)}
-    return taken | carriers.difference(free)
+    return taken, carriers - taken - set(free)

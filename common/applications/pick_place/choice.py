@@ -6,7 +6,7 @@ The nearest that is seen, validated, not given up, and that the open fingers can
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -140,15 +140,18 @@ class PickPlaceView(View):
 class Choice:
     """Chooses targets and remembers which places were missed or given up."""
 
-    def __init__(self, config: Config, container: Container, radius: float) -> None:
+    def __init__(
+        self, config: Config, container: Container, radius: float, counted: Callable[[], int] = lambda: 0
+    ) -> None:
         """Start with nothing given up.
 
         Args:
             config: shape of the open fingers, what counts as moved, and how often a place is tried.
             container: where balls go.
             radius: of a ball [m].
+            counted: how many balls are known to have come into the container, seen there now or not.
         """
-        self.p, self.container, self.radius = config, container, radius
+        self.p, self.container, self.radius, self._counted = config, container, radius, counted
         self._misses: list[tuple[Place, int]] = []
         self._given_up: list[GivenUp] = []
         self._judged_by: dict[str, Any] = {}  # values of the parameters
@@ -226,7 +229,9 @@ class Choice:
 
     def _contained(self, view: PickPlaceView) -> int:
         count, until = self._expected
-        return max(len(view.objects("contained")), count if view.scene_stamp < until else 0)
+        lie = view.objects("contained")
+        sure = max(sum(not thing.unseen for thing in lie), self._counted())
+        return max(min(len(lie), sure), count if view.scene_stamp < until else 0)
 
     def released(self, pick: Pick, view: PickPlaceView) -> None:
         """A ball was let go above the container, where it will be seen when it has come to rest."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,15 @@ Array = NDArray[np.float64]
 GREY = m.Color(r=0.6, g=0.6, b=0.6)  # of what is not seen
 LEVEL = 0.005  # [m] what is seen so little above the table lies on it
 AT_REST = 0.5  # [s] for which something is seen in a slot before it is taken to lie there
+
+
+@dataclass
+class Occupied:
+    """Slots in which a view showed something at a stamp [ns], and those beneath that it could not show."""
+
+    stamp: int
+    seen: set[int]
+    beneath: set[int]
 
 
 class PerceivedScene:
@@ -49,7 +58,7 @@ class PerceivedScene:
             self._ball(f"slot_{k}", "contained", m.Pose(position=m.Vector3(x=x, y=y, z=z)))
             for k, (x, y, z) in enumerate(self._slots.tolist(), 1)
         ]
-        self._occupied: dict[int, tuple[int, set[int]]] = {}  # stamp and slots by view
+        self._occupied: dict[int, Occupied] = {}  # by view
         self._lasts: set[int] = set()  # views that look at times
         self._free: set[int] = set()  # slots in which nothing was when the hand took something, nor came to rest since
         self._since: dict[int, int] = {}  # stamp since which something is seen in a slot
@@ -91,28 +100,30 @@ class PerceivedScene:
         radius = self.around.ball_radius
         self._tracks.update(on_table, stamp * 1e-9, view, at_times, None if hidden is None else (
             lambda place: bool(hidden.hides([place], radius)[0])))
-        seen = occupied_slots(in_container, camera, self._slots, radius, self._free)
+        now = Occupied(stamp, *occupied_slots(in_container, camera, self._slots, radius, self._free))
         if hidden is None:
             self._beside_slots[view] = beside_slots
         else:
-            seen |= self._still_in(view, seen, hidden)
+            self._keep_hidden(view, now, hidden)
             if beside_slots or not hidden.everything:
                 self._beside_slots[view] = beside_slots
-        self._occupied[view] = stamp, seen
-        self._since = {slot: self._since.get(slot, stamp) for slot in self._occupied_slots()}
+        self._occupied[view] = now
+        self._since = {slot: self._since.get(slot, stamp) for slot in self._occupied_slots(beneath=False)}
         # What falls and rolls is seen in one slot after the other, and is in none of them when the next covers it.
         self._free -= {slot for slot, since in self._since.items() if (stamp - since) * 1e-9 >= AT_REST}
         if at_times:
             self._lasts.add(view)
 
-    def _still_in(self, view: int, seen: set[int], hidden: Hidden) -> set[int]:
-        """Slots in which something was and which cannot be judged now."""
-        before = self._occupied.get(view, (0, set()))[1] - seen
-        if not before:
-            return set()
-        slots = sorted(before)
+    def _keep_hidden(self, view: int, now: Occupied, hidden: Hidden) -> None:
+        """Slots in which something was and which cannot be judged now stay as they were."""
+        before = self._occupied.get(view)
+        slots = sorted((before.seen | before.beneath) - now.seen - now.beneath) if before else []
+        if not before or not slots:
+            return
         behind = hidden.hides(self._slots[slots], self.around.ball_radius)
-        return {slot for slot, away in zip(slots, behind, strict=True) if away}
+        kept = {slot for slot, away in zip(slots, behind, strict=True) if away}
+        now.seen |= kept & before.seen
+        now.beneath |= kept - before.seen
 
     def feel(self, gripper: m.GripperState, T_world_tcp: Array | None) -> None:
         """Take in whether the hand holds something: the nearest ball moves into it with its id, or leaves it."""
@@ -150,7 +161,9 @@ class PerceivedScene:
     def scene(self) -> m.PlanningScene:
         """What is believed now; its stamp is that of the newest frame in it."""
         table = [self._object(t.id, "target", t.sighting, _pose(t)) for t in self._tracks.confirmed()]
-        contained = [self._in_slots[k] for k in sorted(self._occupied_slots())]
+        seen = self._occupied_slots(beneath=False)
+        contained = [self._in_slots[k] if k in seen else self._in_slots[k].model_copy(update={"unseen": True})
+                     for k in sorted(self._occupied_slots())]
         beside: list[Sighting] = []
         for things in self._beside_slots.values():
             beside = things if len(things) > len(beside) else beside
@@ -179,10 +192,10 @@ class PerceivedScene:
                     "dimensions": [*thing.dimensions[:-1], gap]}))
         return columns
 
-    def _occupied_slots(self) -> set[int]:
-        """Slots in which any view shows something now."""
-        return {slot for view, (stamp, slots) in self._occupied.items() for slot in slots
-                if view in self._lasts or (self._stamp - stamp) * 1e-9 <= self.p.forget_after}
+    def _occupied_slots(self, *, beneath: bool = True) -> set[int]:
+        """Slots in which any view shows something now, with those that have to carry it or without."""
+        return {slot for view, one in self._occupied.items() for slot in one.seen | (one.beneath if beneath else set())
+                if view in self._lasts or (self._stamp - one.stamp) * 1e-9 <= self.p.forget_after}
 
     def _ball(self, name: str, role: str, pose: m.Pose) -> m.CollisionObject:
         return m.CollisionObject.model_validate({

@@ -35,8 +35,8 @@ class PickPlace(Task[PickPlaceView]):
         super().__init__(config, status, prefix, speed)
         self._around = config.world
         self._rows = Rows(config, self.gripper)
-        self._choice = Choice(config, config.world.container, config.world.ball_radius)
-        self._contained = Patience()
+        self._choice = Choice(config, config.world.container, config.world.ball_radius, lambda: self.status.done)
+        self._contained, self._released = Patience(), False
         self._looking, self._hidden = Looking(config), Patience()
 
     # --- what to do next -------------------------------------------------------------------------------------
@@ -106,7 +106,7 @@ class PickPlace(Task[PickPlaceView]):
             # Time of pictures, not of the clock: that nobody looks any more is no sign of an empty table.
             seen = max(self.look_after, min(view.stamps))
             done = self.patience.lasts(bool(left), seen) >= (self.p.grace if left else self.p.empty)
-            done = done and len(view.objects("contained")) <= self.status.done  # else it is about to be counted
+            done = done and self._counted(view) <= self.status.done  # else it is about to be counted
             remark = view.seen.remark if view.seen else ""
             message = f"{left} objects are left that cannot be taken" if left else "the table looks empty"
             self.status.overlooked = f"{message}{':' if left else ', but'} {remark}"[:MOST] if remark else ""
@@ -149,7 +149,7 @@ class PickPlace(Task[PickPlaceView]):
         # What lies in the container was put there before a restart of this task, or by somebody else. The scene may
         # tell of it only later, when it was started again as well. A ball that is let go counts when it is: until then
         # it may hang over others, and a picture of it shows one more.
-        contained = len(view.objects("contained"))
+        contained = self._counted(view)
         if status.stage == "release":
             self._contained.reset()
         elif self._contained.lasts(contained, view.scene_stamp) >= min(CONTAINED_FOR, self.p.empty):
@@ -157,6 +157,15 @@ class PickPlace(Task[PickPlaceView]):
         looked = not self._around.on_hand or min(view.stamps) > self.look_after
         if status.stage not in ("close", "lift", "across", "release") and looked:
             status.total = status.done + len(view.targets)
+
+    def _counted(self, view: PickPlaceView) -> int:
+        """How many lie in the container. Once this task put some there itself, no more than are seen.
+
+        Before that something must carry what is seen on top. What rolls about is seen in one slot and then in another,
+        so that what carries it was counted already, or is none.
+        """
+        contained = view.objects("contained")
+        return sum(not (self._released and thing.unseen) for thing in contained)
 
     def _waits(self, view: PickPlaceView) -> bool:
         """Whether nothing is under way, and nobody keeps the task from deciding what comes next."""
@@ -175,6 +184,7 @@ class PickPlace(Task[PickPlaceView]):
         pick = _pick_of(stage)
         if stage.name == "release" and pick is not None:
             self.status.done += 1
+            self._released = True
             if self._around.on_hand:
                 self.look_after = view.now
             self._choice.released(pick, view)

@@ -25,6 +25,7 @@ class CellDouble:
         self.unreachable: list[tuple[float, float]] = []
         self.held: str = ""
         self.contained = 0
+        self.beneath = 0  # more of them, that nobody sees
         self.fell: list[tuple[float, float, float]] = []  # where the first of them lie, of those that fell
         self.now = 100.0
         self.tcp = (0.3, 0.0, 0.5)
@@ -48,6 +49,8 @@ class CellDouble:
         objects = [self._sphere(name, "target", p) for name, p in self.balls.items()]
         fell = [*self.fell, *[(0.55, 0.25, 0.035)] * (self.contained - len(self.fell))]
         objects += [self._sphere(f"slot_{k}", "contained", fell[k]) for k in range(self.contained)]
+        objects += [self._sphere(f"beneath_{k}", "contained", (0.55, 0.25, 0.035), unseen=True)
+                    for k in range(self.beneath)]
         attached = []
         if self.held:
             attached = [m.AttachedObject(link="panda_hand_tcp", object=self._sphere(self.held, "attached", (0, 0, 0)))]
@@ -59,10 +62,10 @@ class CellDouble:
         return PickPlaceView(self.now, scene, self.gripper, self.motion, [0.0], tcp, seen=seen)
 
     @staticmethod
-    def _sphere(name: str, role: str, p: tuple[float, float, float]) -> m.CollisionObject:
+    def _sphere(name: str, role: str, p: tuple[float, float, float], unseen: bool = False) -> m.CollisionObject:
         return m.CollisionObject.model_validate({
             "id": name, "role": role, "shape": "sphere", "dimensions": [0.03],
-            "pose": m.Pose(position=m.Vector3(x=p[0], y=p[1], z=p[2])),
+            "pose": m.Pose(position=m.Vector3(x=p[0], y=p[1], z=p[2])), "unseen": unseen,
         })
 
     def tell(self, command: str) -> list[m.Message]:

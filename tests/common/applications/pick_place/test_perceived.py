@@ -137,6 +137,7 @@ def test_after_a_restart_a_ball_that_is_hidden_in_the_box_is_taken_to_be_there(h
     s.feel(gripper(1.0, holding), OVER_BOX)
     s.see(frame(1.1, HIGH), CAMERA, OVER_BOX)
     assert roles(s)["contained"] == ["slot_1", "slot_5"]
+    assert [thing.id for thing in s.scene().objects if thing.unseen] == ["slot_1"]
 
 
 def test_perceived_place_is_where_the_ball_was_seen() -> None:

@@ -409,6 +409,26 @@ def test_every_ball_counts_once_when_the_task_was_started_again_in_any_stage(sta
     assert (cell.contained, cell.task.status.placed, cell.task.status.targets) == (7, 7, 7)
 
 
+def test_what_must_carry_what_is_seen_counts_until_the_task_has_put_a_ball_there_itself() -> None:
+    cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
+    cell.contained, cell.beneath = 1, 1
+    cell.until("close")
+    assert cell.task.status.placed == 2
+    cell.until("release")
+    cell.until("pre-grasp")
+    cell.beneath = 3  # a ball rolls off one and lies above the place of another
+    cell.until("DONE")
+    assert (cell.contained, cell.task.status.placed) == (3, 4)
+
+
+def test_container_is_not_full_of_balls_that_nobody_sees_nor_has_put_there() -> None:
+    cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
+    cell.until("release")
+    cell.beneath = 7
+    cell.until("DONE")
+    assert (cell.contained, cell.task.status.placed) == (2, 2)
+
+
 def test_what_is_seen_in_the_container_for_a_moment_only_does_not_count() -> None:
     cell = CellDouble([(0.40, -0.30)])
     for k in range(300):
