@@ -13,6 +13,7 @@ from common.planning.free_axes import ALL
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down, transform
 from common.tasks.stages import Grip, Move, Place, Stage
 
+OFF_WALLS = 0.003  # [m] between them and what falls
 ANY_YAW = 3.1  # [rad] a tolerance of so much leaves the hand any yaw
 
 
@@ -94,7 +95,10 @@ class Rows:
         anywhere = Move("across", "PLACING", cycle, goal=self._above((box.x, box.y), yaw, wide), carries=True)
         if cycle.over is None:
             return anywhere
-        goal = self._above(cycle.over, yaw, wide / 2)
+        room = box.half_side - box.wall_thickness - self.p.world.ball_radius - OFF_WALLS - wide / 4
+        x, y = (middle + min(max(at - middle, -room), room) if room > 0 else middle
+                for at, middle in zip(cycle.over, (box.x, box.y), strict=True))
+        goal = self._above((x, y), yaw, wide / 2)
         goal.position_tolerance.z = wide
         return Move("across", "PLACING", cycle, goal=goal, carries=True, otherwise=[anywhere])
 

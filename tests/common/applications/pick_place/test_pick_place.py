@@ -53,8 +53,13 @@ def test_balls_are_let_go_above_the_columns_in_which_least_lies() -> None:
     assert all(isinstance(end, m.PoseGoal) and end.position_tolerance.x == pytest.approx(0.03) for end in ends)
     columns = [(round(end.pose.position.x, 3), round(end.pose.position.y, 3)) for end in ends
                if isinstance(end, m.PoseGoal)]
-    assert set(columns[:4]) == {(0.517, 0.217), (0.517, 0.283), (0.583, 0.217), (0.583, 0.283)}
-    assert columns[0] == (0.517, 0.217)  # the nearest to where the first ball lay
+    assert set(columns[:4]) == {(0.526, 0.226), (0.526, 0.274), (0.574, 0.226), (0.574, 0.274)}
+    assert columns[0] == (0.526, 0.226)  # the nearest to where the first ball lay
+    box = cell.task.p.world.container
+    for end in ends:
+        assert isinstance(end, m.PoseGoal)
+        off = max(abs(end.pose.position.x - box.x), abs(end.pose.position.y - box.y)) + end.position_tolerance.x / 2
+        assert off + cell.task.p.world.ball_radius < box.half_side - box.wall_thickness, "it falls clear of the walls"
 
 
 def test_where_there_is_no_way_to_the_emptiest_column_a_ball_is_let_go_anywhere_above_the_container() -> None:
