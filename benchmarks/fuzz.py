@@ -2,8 +2,8 @@
 
 `python -m benchmarks.fuzz` changes payloads of all messages by a seed and decodes them; then it puts and asks what it
 made under every key of both cells, on the virtual clock. With `--live SECONDS` it does so to a cell of real processes
-as well, and compares the gaps in its joint states with those of as long a time in between without. Of each gap it says
-whether the executor computed, waited for a processor, which is the machine's load, or was held up by something else.
+as well, and compares the gaps in its joint states with those of a cell beside it that is left alone. Of each gap it
+tells whether the executor computed, waited for a processor, which is the machine's load, or was held up by something.
 Exit code 1 if anything but DecodeError was raised, a process ended, or there were more gaps without those in which the
 executor waited for a processor.
 """
@@ -15,10 +15,12 @@ import asyncio
 import tempfile
 import time
 from collections import Counter
-from contextlib import suppress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from benchmarks.soak import Seen, keep_busy
 from common import topics
 from common.application import all_topics
 from common.config import load_cell
@@ -32,7 +34,8 @@ from tests.gaps import Gaps, Side
 from tests.harness import RunningCell, beside, until
 from tests.mutations import Mutations, models
 
-ROUND = 60.0  # [s] of each side at once
+CELL = "panda"  # of real processes
+ROUND = 60.0  # [s] for which gaps are gathered before they are counted
 AFTER = 1.0  # [s]
 TOLD = 10  # findings that are printed in full
 PAUSE = 0.002  # [s] of virtual time between two payloads
@@ -139,39 +142,45 @@ def simulated(name: str, seed: int) -> list[str]:
     return [f"{name}, seed {seed}: {crash}" for crash in outcome.crashes]
 
 
-async def live(options: argparse.Namespace, folder: Path) -> list[str]:
-    """Compare a cell that is attacked with itself in between; a line for each thing that is worse."""
-    rounds = max(1, round(options.live / ROUND))
-    seconds = options.live / rounds
-    calm, attacked = Side("left alone"), Side("attacked")
-    mutations = Mutations(options.seed)
-    with RunningCell(folder, "up", "panda") as cell:
-        async with cell.listen() as bus, cell.listen() as attacker:
+@asynccontextmanager
+async def working(folder: Path, name: str) -> AsyncIterator[tuple[RunningCell, Bus]]:
+    """A cell of real processes that clears its table again and again, in a folder of its own, and who listens to it."""
+    (folder / name).mkdir()
+    with RunningCell(folder / name, "up", CELL) as cell:
+        async with cell.listen() as bus:
             await until(bus.reader(topics.MOTION_STATUS), lambda status: status.progress > 0, 120.0)
-            before = cell.processes()
-            memory = {name: process.memory_info().rss for name, process in before.items()}
-            executor = before["trajectory_executor"].pid
-            for _ in range(rounds):
-                gaps = Gaps(bus, "panda", executor)
-                await asyncio.sleep(seconds)
-                gaps.add_to(calm)
-                gaps = Gaps(bus, "panda", executor)
-                async with beside(attack(attacker, mutations, "panda", options.pause, acts=options.acts)):
-                    await asyncio.sleep(seconds)
-                gaps.add_to(attacked)
-                await asyncio.sleep(AFTER)  # until what was asked last is answered
-            after = cell.processes()
-            print(calm, attacked, *calm.own, *attacked.own, sep="\n")
-            print("memory [MB]: " + ", ".join(
-                f"{name} {memory[name] * 1e-6:.0f} -> {process.memory_info().rss * 1e-6:.0f}"
-                for name, process in after.items() if name in memory), flush=True)
-        wrong = [f"{name} ended: {folder}" for name, process in before.items()
-                 if name not in after or after[name].pid != process.pid]
-        own, own_before = len(attacked.own) + attacked.lost, len(calm.own) + calm.lost
-        if own > own_before:
-            wrong.append(f"{own} gaps in joint states without waiting for a processor, {own_before} when left alone")
+            async with beside(keep_busy(bus, Seen())):
+                yield cell, bus
         cell.interrupt()
         await cell.ended(30.0)
+
+
+async def live(options: argparse.Namespace, folder: Path) -> list[str]:
+    """Compare a cell that is attacked with one that is left alone beside it; a line for each thing that is worse."""
+    rounds = max(1, round(options.live / ROUND))
+    calm, attacked = Side("left alone"), Side("attacked")
+    async with working(folder, "alone") as (alone, quiet), working(folder, "attacked") as (cell, bus):
+        async with cell.listen() as attacker:
+            before = cell.processes()
+            memory = {name: process.memory_info().rss for name, process in before.items()}
+            executors = [one.processes()["trajectory_executor"].pid for one in (alone, cell)]
+            async with beside(attack(attacker, Mutations(options.seed), CELL, options.pause, acts=options.acts)):
+                for _ in range(rounds):
+                    both = [Gaps(one, CELL, executor) for one, executor in zip((quiet, bus), executors, strict=True)]
+                    await asyncio.sleep(options.live / rounds)
+                    for gaps, side in zip(both, (calm, attacked), strict=True):
+                        gaps.add_to(side)
+            await asyncio.sleep(AFTER)  # until what was asked last is answered
+            after = cell.processes()
+        print(calm, attacked, *calm.own, *attacked.own, sep="\n")
+        print("memory of what was attacked [MB]: " + ", ".join(
+            f"{name} {memory[name] * 1e-6:.0f} -> {process.memory_info().rss * 1e-6:.0f}"
+            for name, process in after.items() if name in memory), flush=True)
+    wrong = [f"{name} ended: {folder}" for name, process in before.items()
+             if name not in after or after[name].pid != process.pid]
+    own, own_before = len(attacked.own) + attacked.lost, len(calm.own) + calm.lost
+    if own > own_before:
+        wrong.append(f"{own} gaps in joint states without waiting for a processor, {own_before} when left alone")
     return wrong
 
 

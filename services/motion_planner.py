@@ -222,7 +222,7 @@ class Watcher:
         status, scene = self._motion.latest, self._scenes.latest
         if status is not None and self._answer is not None and self._answer.header.stamp > status.header.stamp:
             status = self._answer
-        if status is None or scene is None or status.state != "active":
+        if status is None or scene is None or status.state != "active" or not status.id:
             self.monitor.forget()
             return
         if status.id != self.monitor.goal:

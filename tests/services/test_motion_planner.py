@@ -9,12 +9,15 @@ from common import topics
 from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.config import load_cell, service_config
-from common.errors import RemoteError
+from common.errors import Refused, RemoteError
 from common.messages import (
     CollisionObject,
+    ExecuteRequest,
+    FollowedRequest,
     Header,
     JointGoal,
     JointState,
+    MotionStatus,
     PlanningScene,
     PlanRequest,
     Pose,
@@ -248,3 +251,22 @@ async def test_wiring_reads_no_truth():
     assert found.reads == {topics.PLANNING_SCENE, topics.JOINT_STATES, topics.MOTION_STATUS}
     assert found.serves == {topics.MOTION_PLAN}
     assert found.writes == {topics.DISPLAY_TRAJECTORY}
+
+
+async def test_motion_without_an_id_is_not_watched_and_the_next_one_is(planner: Planner) -> None:
+    asked: asyncio.Queue[str] = asyncio.Queue()
+
+    async def followed(request: FollowedRequest) -> ExecuteRequest:
+        await asked.put(request.id)
+        raise Refused("unknown_goal", "not followed here")
+
+    planner.bus.serve(topics.MOTION_FOLLOWED, followed)
+    motion = planner.bus.writer(topics.MOTION_STATUS)
+    await planner.bus.ready()
+    planner.scenes.put(scene())
+    for name in ("x", "", "y"):  # no executor leaves it empty, but anybody on the network can
+        motion.put(MotionStatus(id=name, state="active"))
+        if name:
+            assert await asyncio.wait_for(asked.get(), 10) == name
+        answer = await planner.plan.call(to_home(name or "none", start=[0.0]), timeout=30)  # it is there
+        assert answer.error == "bad_start"
