@@ -43,7 +43,8 @@ class Config(TaskConfig):
         0.04, gt=0, le=0.2, description="side of the goal box of pre-grasp and lift [m]"
     )
     place_pos_tol: Tunable[float] = Field(
-        0.06, gt=0, le=0.2, description="side of the goal box above the container [m]"
+        0.06, gt=0, le=0.2, description="side of the goal box above the container; half of it where one of its columns "
+                                         "is meant [m]"
     )
     orient_tol_rad: Tunable[float] = Field(0.25, ge=0, le=1.5, description="tilt of the tool that a goal allows [rad]")
     orient_yaw_tol_rad: Tunable[float] = Field(
