@@ -160,12 +160,11 @@ class Detector:
             for center, pixel, outline, whole in zip(centers.tolist(), pixels.tolist(), outlines, inside, strict=True):
                 place, seen = (center[0], center[1], center[2]), (pixel[0], pixel[1])
                 found.append(Detection(place, seen, area, not whole, outline))
-        self.odd = [
+        self.odd = self._on_table(camera, [
             self._odd(np.array(middle), camera, NOT_ROUND)
             for middle, contour in middles(closed, self.options.min_contour_area_px)
             if not any(cv2.pointPolygonTest(contour, one.pixel, False) >= 0 for one in found)
-            and not self.resting.shows_container(camera, middle)
-        ]
+        ])
         self.blind, self.too_small = "" if found else blindness(picture), 0
         return sorted(found, key=lambda d: (d.pixel[1], d.pixel[0]))
 
@@ -199,7 +198,7 @@ class Detector:
                 seen += [_Seen(center, blob.area / len(centers), blob.border) for center in fit.centers]
             elif not len(blob.border):
                 self.odd.append(self._odd(blob.centroid, camera, NOT_ROUND))
-        self.odd = [one for one in self.odd if not self.resting.shows_container(camera, one.pixel)]
+        self.odd = self._on_table(camera, self.odd)
         return sorted(self._detections(seen, camera), key=lambda d: (d.pixel[1], d.pixel[0]))
 
     def _alone(
@@ -268,6 +267,11 @@ class Detector:
         if len(blob.border) or self.resting.shows_container(camera, blob.centroid):
             return True
         return float(np.mean(owner >= 0)) >= EXPLAINED
+
+    def _on_table(self, camera: Pinhole, odd: list[Odd]) -> list[Odd]:
+        """Those that are not in the container, nor above the horizon, where no ray meets the table."""
+        return [one for one in odd
+                if np.isfinite(one.position).all() and not self.resting.shows_container(camera, one.pixel)]
 
     def _odd(self, pixel: Array, camera: Pinhole, reason: str) -> Odd:
         return Odd.at(camera, pixel, self.resting.plane, reason)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from common.applications.pick_place.detector import Detector
 from common.applications.pick_place.odd import FLAT, NOT_ROUND
 from common.applications.pick_place.validation import Validation
-from common.config import Surroundings, load_cell
+from common.config import CameraConfig, Surroundings, load_cell
 from common.messages import Color, Vector3, WorldObject
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
@@ -115,6 +117,20 @@ class Anywhere:
 
     def known(self, _place: object) -> str:
         return ""
+
+
+@pytest.mark.parametrize("depth", [None, 1.5])
+@pytest.mark.parametrize("height", [40, 100])
+def test_red_thing_above_the_horizon_has_no_place_on_the_table(height: int, depth: float | None) -> None:
+    camera = Pinhole.from_config(CameraConfig(position=(-1.0, 0.0, 0.6), rpy=(-math.pi / 2 - 0.2, 0.0, -math.pi / 2)))
+    picture = np.full((camera.height, camera.width, 3), 128, np.uint8)
+    cv2.rectangle(picture, (280, height - 20), (380, height + 20), (0, 0, 255), -1)
+    detector = Detector(AROUND)
+    if depth is None:
+        found = detector.detect(picture, camera)
+    else:
+        found = detector.detect_in_depth(picture, np.full(picture.shape[:2], depth, np.float32), camera)
+    assert found == [] and markers(found, AROUND, 0, odd=detector.odd).markers == []
 
 
 def test_what_is_odd_is_rejected_with_the_reason_of_the_detector() -> None:
