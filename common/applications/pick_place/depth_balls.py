@@ -23,6 +23,7 @@ JUMP = 0.015  # [m] neighbours further apart than this belong to different thing
 CELL = 0.01  # [m] of the grid in which votes are counted
 GATE = 0.006  # [m] a point this near to a ball's surface is of it
 AGREEING = 0.65  # part of the points on its surface that put the centre there
+SPREAD = 0.7  # of the votes of a ball's points, as part of their own, at most: on what is flat they are as far apart
 LEAST = 0.15  # part of a whole ball's points that must be seen
 GATES = (0.012, 0.009, 0.006, 0.005, 0.004, 0.004, 0.004)  # [m] in each step of Gauss-Newton
 
@@ -84,7 +85,8 @@ def _balls(points: Array, votes: Array, camera: Pinhole, radius: float) -> Itera
         whole = np.pi * camera.fx * camera.fy * (radius / depth) ** 2
         if np.count_nonzero(own) >= LEAST * whole:
             agreeing = np.linalg.norm(votes[own] - center, axis=1) < 1.5 * CELL
-            if np.mean(agreeing) >= AGREEING:  # on what is flat each point has a centre of its own
+            # On what is flat each point has a centre of its own, however small it is.
+            if np.mean(agreeing) >= AGREEING and _spread(votes[own]) <= SPREAD * _spread(points[own]):
                 yield center
             left = distance > radius + GATE
         elif counts.max() < 0.02 * whole:
@@ -92,6 +94,11 @@ def _balls(points: Array, votes: Array, camera: Pinhole, radius: float) -> Itera
         else:
             left = ~(near | own)
         points, votes = points[left], votes[left]
+
+
+def _spread(points: Array) -> float:
+    """How far points (n, 3) are from their middle [m]: half of them are nearer."""
+    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
 def _fitted(points: Array, center: Array, radius: float) -> Array:

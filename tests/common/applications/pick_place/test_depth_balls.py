@@ -31,9 +31,10 @@ LAYOUTS = {
 }
 
 
-def thing(at: tuple[float, float, float], shape: str = "sphere", size: float = 2 * R) -> WorldObject:
+def thing(at: tuple[float, float, float], shape: str = "sphere", *size: float) -> WorldObject:
+    x, y, z = size or (2 * R, 2 * R, 2 * R)
     return WorldObject(id=f"{at}", shape=shape, pose=Pose(position=Vector3(x=at[0], y=at[1], z=at[2])),
-                       size=Vector3(x=size, y=size, z=size), color=Color(r=1.0, g=0.15, b=0.1))
+                       size=Vector3(x=x, y=y, z=z), color=Color(r=1.0, g=0.15, b=0.1))
 
 
 def look(things: list[WorldObject], noise: float = 0.0) -> tuple[Detector, np.ndarray]:
@@ -62,7 +63,18 @@ def test_one_that_is_hidden_below_another_is_found_once_that_is_gone() -> None:
 
 
 def test_cube_is_reported_and_is_no_ball() -> None:
-    detector, found = look([thing((0.5, -0.1, 0.025), "box", 0.05), thing((0.3, 0.1, R))])
+    detector, found = look([thing((0.5, -0.1, 0.025), "box", 0.05, 0.05, 0.05), thing((0.3, 0.1, R))])
+    assert len(found) == 1 and [one.reason for one in detector.odd] == [NOT_ROUND]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+@pytest.mark.parametrize(("shape", "size"), [
+    ("cylinder", (0.04, 0.04, 0.001)),  # as wide as the part of a ball on which depth is told from that of a plane
+    ("cylinder", (0.04, 0.04, 0.12)),
+    ("box", (0.2, 0.15, 0.001)),  # at its edges a ball would be seen only in part, too
+])
+def test_what_is_flat_is_reported_and_is_no_ball(shape: str, size: tuple[float, float, float], noise: float) -> None:
+    detector, found = look([thing((0.4, 0.0, size[2] / 2), shape, *size), thing((0.3, 0.2, R))], noise)
     assert len(found) == 1 and [one.reason for one in detector.odd] == [NOT_ROUND]
 
 
