@@ -13,8 +13,9 @@ from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IM
 from common.config import Surroundings
 from common.messages import Color, Header, Image, Marker, MarkerArray, Pose, Quaternion, Vector3
 from common.perception.boxes import BoxDetector, BoxOptions, SeenBox, outlined
-from common.perception.depth import DepthError, check_depth
-from common.perception.image import ImageError, array_to_image, image_to_array
+from common.perception.depth import DepthError, check_depth, depth_of
+from common.perception.exposure import blindness
+from common.perception.image import array_to_image
 from common.perception.intake import LeftOut, Unusable, picture_of
 from common.process.camera_reader import CameraReader
 from common.process.service import main
@@ -30,9 +31,9 @@ class Config(BoxOptions):
     world: Surroundings = Surroundings()
 
 
-def markers(found: list[SeenBox], config: Config, stamp: int) -> MarkerArray:
-    """The message of what was found in the picture that was exposed at `stamp`."""
-    return MarkerArray(header=Header(stamp=stamp, frame_id=WORLD), markers=[
+def markers(found: list[SeenBox], config: Config, stamp: int, blind: str = "") -> MarkerArray:
+    """The message of what was found in the picture that was exposed at `stamp`, or of why that tells nothing."""
+    return MarkerArray(header=Header(stamp=stamp, frame_id=WORLD), blind=blind, markers=[
         _marker(index, box, config) for index, box in enumerate(found)
     ])
 
@@ -69,9 +70,9 @@ async def run(bus: Bus, config: Config) -> None:
         newest = image.header.stamp
         try:
             camera = await cameras.of(image.header)
-            picture, metres = picture_of(image, camera), image_to_array(depth)
+            picture, metres = picture_of(image, camera), depth_of(depth)
             check_depth(metres, camera.width, camera.height)
-        except (Unusable, ImageError) as error:
+        except Unusable as error:
             left_out.note(error)
             return
         except DepthError as error:
@@ -79,7 +80,7 @@ async def run(bus: Bus, config: Config) -> None:
             return
         detector.options = config.model_copy()
         boxes = await asyncio.to_thread(detector.detect, picture, metres, camera)
-        found.put(markers(boxes, config, image.header.stamp))
+        found.put(markers(boxes, config, image.header.stamp, "" if boxes else blindness(picture)))
         if shown.matched:
             shown.put(array_to_image(outlined(picture, boxes), "bgr8", image.header))
         if masks.matched:

@@ -36,14 +36,16 @@ class Camera:
             header=m.Header(frame_id="world"), child_frame_id=FRAME, transform=matrix_to_pose(CAMERA.T_world_optical),
         )]))
 
-    def depth(self, stamp: int, *, rows: int = 240) -> None:
+    def depth(self, stamp: int, *, rows: int = 240, encoding: str = "32FC1") -> None:
         depth = np.full((rows, 320), 1.04, np.float32)
         depth[110:130, 150:170] = 1.0  # 20 pixels of 2 mm
-        self.depths.put(array_to_image(depth, "32FC1", m.Header(stamp=stamp, frame_id=FRAME)))
+        pixels = depth if encoding == "32FC1" else np.rint(1000 * depth).astype(np.uint16)
+        self.depths.put(array_to_image(pixels, encoding, m.Header(stamp=stamp, frame_id=FRAME)))
 
-    def picture(self, stamp: int) -> None:
+    def picture(self, stamp: int, *, light: float = 1.0) -> None:
         picture = np.full((240, 320, 3), 120, np.uint8)
         picture[110:130, 150:170] = (25, 25, 230)
+        picture = (light * picture).astype(np.uint8)
         self.images.put(array_to_image(picture, "bgr8", m.Header(stamp=stamp, frame_id=FRAME)))
 
 
@@ -65,6 +67,27 @@ async def test_cube_is_told_with_kind_size_place_and_the_stamp_of_its_picture_wh
         assert (shown.width, shown.height) == (320, 240)
         mask = image_to_array(await camera.masks.next())
         assert (mask[110:130, 150:170] == 255).all() and (mask == 255).sum() == 400
+
+
+async def test_depth_in_millimetres_is_told_by_its_encoding() -> None:
+    net = LocalNetwork()
+    camera = Camera(net)
+    async with running_service(net, box_detector.run, CONFIG):
+        camera.depth(5, encoding="16UC1")
+        camera.picture(5)
+        marker, = (await camera.found.next()).markers
+        assert abs(marker.pose.position.z - 0.02) < 2e-3
+
+
+async def test_dark_picture_tells_nothing_though_depth_is_measured_in_the_dark_too() -> None:
+    net = LocalNetwork()
+    camera = Camera(net)
+    async with running_service(net, box_detector.run, CONFIG):
+        for stamp, light in ((5, 1.0), (6, 0.02)):
+            camera.depth(stamp)
+            camera.picture(stamp, light=light)
+            frame = await camera.found.next()
+            assert (len(frame.markers), bool(frame.blind)) == ((1, False) if light == 1.0 else (0, True))
 
 
 async def test_picture_with_the_depth_of_another_one_or_of_another_size_is_left_out() -> None:
