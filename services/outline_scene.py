@@ -11,9 +11,10 @@ from common.applications.outlining.perceived_solids import perceived_solids
 from common.applications.outlining.scene import planning_scene
 from common.applications.outlining.topics import CONTOURS
 from common.config import Parameters, RobotConfig, Surroundings
-from common.messages import Image
-from common.perception.image import ImageError, image_to_array
+from common.messages import Image, PlanningScene
+from common.perception.depth import DepthError, check_depth, depth_of
 from common.perception.intake import LeftOut, Unusable
+from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.planning_scene import SceneWriter
 from common.process.service import main
@@ -28,6 +29,20 @@ class Config(Parameters):
 
     robot: RobotConfig
     world: Surroundings
+
+
+def seen(found: Contours, image: Image, camera: Pinhole, around: Surroundings) -> PlanningScene:
+    """What the contours of a picture and its depth show.
+
+    Raises:
+        Unusable: they show nothing: where no pixel has a depth it is not known that nothing stands there.
+    """
+    depth = depth_of(image)
+    try:
+        check_depth(depth, found.width, found.height)
+    except DepthError as error:
+        raise Unusable(error.kind, str(error)) from None
+    return planning_scene(around, perceived_solids(found.contours, depth, camera), found.header.stamp)
 
 
 async def run(bus: Bus, config: Config) -> None:
@@ -71,9 +86,8 @@ async def run(bus: Bus, config: Config) -> None:
         newest = found.header.stamp
         try:
             camera = await cameras.of(depth.header)
-            solids = await asyncio.to_thread(perceived_solids, found.contours, image_to_array(depth), camera)
-            scene = planning_scene(config.world, solids, found.header.stamp)
-        except (Unusable, ImageError) as error:
+            scene = await asyncio.to_thread(seen, found, depth, camera, config.world)
+        except Unusable as error:
             left_out.note(error)
             return
         out.put(scene)

@@ -3,6 +3,8 @@ from __future__ import annotations
 import asyncio
 
 import numpy as np
+import pytest
+from numpy.typing import NDArray
 
 from common import messages as m
 from common import topics
@@ -12,6 +14,7 @@ from common.applications.outlining.topics import CONTOURS
 from common.clock import Clock
 from common.config import Surroundings, load_cell, service_config
 from common.perception.image import array_to_image
+from common.perception.intake import Unusable
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.robot.transforms import matrix_to_pose
@@ -26,6 +29,22 @@ assert isinstance(AROUND, Surroundings)
 CAMERA = Pinhole.from_config(AROUND.camera)
 HOME = CELL.robot.named_poses["home"]
 TOP, BASE = 1.65, 1.75  # depths [m] of a cube's top and of what it stands on
+
+
+def cube_depth() -> NDArray[np.float32]:
+    """Of a cube in the middle of the picture, 200 pixels wide."""
+    depth = np.full((CAMERA.height, CAMERA.width), BASE, np.float32)
+    depth[284:485, 412:613] = TOP
+    return depth
+
+
+def cube_contours(stamp: int = 0) -> Contours:
+    side = np.arange(201)
+    pixels = [*((412 + k, 284) for k in side), *((612, 284 + k) for k in side[1:]),
+              *((612 - k, 484) for k in side[1:]), *((412, 484 - k) for k in side[1:-1])]
+    cube = Contour.model_validate({"index": 0, "label": "Object_0", "area": 4e4, "pixels": [
+        (float(u), float(v)) for u, v in pixels]})
+    return Contours(header=m.Header(stamp=stamp), width=CAMERA.width, height=CAMERA.height, contours=[cube], selected=0)
 
 
 class Neighbours:
@@ -46,17 +65,8 @@ class Neighbours:
         self.joints.put(m.JointState(header=m.Header(stamp=stamp), name=CELL.robot.joints, position=q))
 
     def see(self, stamp: int) -> None:
-        """A cube in the middle of the picture, 200 pixels wide."""
-        depth = np.full((CAMERA.height, CAMERA.width), BASE, np.float32)
-        depth[284:485, 412:613] = TOP
-        self.depths.put(array_to_image(depth, "32FC1", m.Header(stamp=stamp, frame_id=AROUND.camera.frame)))
-        side = np.arange(201)
-        pixels = [*((412 + k, 284) for k in side), *((612, 284 + k) for k in side[1:]),
-                  *((612 - k, 484) for k in side[1:]), *((412, 484 - k) for k in side[1:-1])]
-        cube = Contour.model_validate({"index": 0, "label": "Object_0", "area": 4e4, "pixels": [
-            (float(u), float(v)) for u, v in pixels]})
-        self.contours.put(Contours(header=m.Header(stamp=stamp), width=CAMERA.width, height=CAMERA.height,
-                                     contours=[cube], selected=0))
+        self.depths.put(array_to_image(cube_depth(), "32FC1", m.Header(stamp=stamp, frame_id=AROUND.camera.frame)))
+        self.contours.put(cube_contours(stamp))
 
     async def scene(self) -> m.PlanningScene:
         async with asyncio.timeout(30):
@@ -87,6 +97,24 @@ async def test_fixtures_are_known_at_once_and_what_was_seen_with_the_arm_at_home
         at, half = cube.pose.position, 200 * TOP / CAMERA.fx / 2
         assert np.allclose((at.x, at.y, at.z), (0.5, 0.0, 1.05), atol=0.002)
         assert np.allclose(np.abs(np.array(cube.outline)).max(axis=0), half, atol=0.001)
+
+
+def test_depth_in_millimetres_is_told_by_its_encoding() -> None:
+    image = array_to_image(np.rint(1000 * cube_depth()).astype(np.uint16), "16UC1")
+    cube = outline_scene.seen(cube_contours(), image, CAMERA, AROUND).objects[-1]
+    assert cube.id == "Object_0" and abs(cube.pose.position.z - 1.05) < 0.002
+
+
+def test_without_any_depth_it_is_not_known_that_nothing_stands_there() -> None:
+    image = array_to_image(np.full_like(cube_depth(), np.nan), "32FC1")
+    with pytest.raises(Unusable, match="no valid depth at all"):
+        outline_scene.seen(cube_contours(), image, CAMERA, AROUND)
+
+
+def test_depth_of_another_size_than_the_contours_is_left_out() -> None:
+    image = array_to_image(cube_depth()[::2, ::2], "32FC1")
+    with pytest.raises(Unusable, match=f"512x384, but the picture is {CAMERA.width}x{CAMERA.height}"):
+        outline_scene.seen(cube_contours(), image, CAMERA, AROUND)
 
 
 async def test_picture_with_the_arm_in_it_is_left_out() -> None:
