@@ -110,7 +110,9 @@ def make_cycle(
         objects = layout(
             seen, config.run.seed, lambda x, y, z: within_reach(robot, (x, y, z), config.grasp, bounds))
         world = load_world(config.world, objects, config.grasp_tolerances, config.robot.gripper)
-        if kept is not None and (kept.layout != world.layout or len(kept.q) != robot.dof):
+        if kept is not None and (
+            kept.simulator != config.world.simulator or kept.layout != world.layout or len(kept.q) != robot.dof
+        ):
             kept = None
         if kept is not None:
             start = np.array(kept.q)
@@ -340,6 +342,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
             keeping = asyncio.create_task(decisions.keep(), name="keep")
         move_world()
         if memory is not None and (standing := cycle.standing()) is not None:
+            standing.simulator = config.world.simulator
             memory.save(standing)
         if report.joints is not None:
             joints.put(report.joints)

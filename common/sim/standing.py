@@ -19,7 +19,7 @@ import msgpack
 from pydantic import BaseModel, ConfigDict
 
 from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE
-from common.sim.interface import StandingObject
+from common.sim.interface import SIMULATORS, StandingObject
 
 SLOT = 4 * 1024 * 1024  # [bytes] for each of the two newest states
 CLOSE_SECONDS = 0.3
@@ -27,10 +27,14 @@ _HEAD = struct.Struct("<QII")  # number of the state, its length and checksum
 
 
 class Standing(BaseModel):
-    """Joints (dof,) [rad], fingers [m] and objects at one moment; where objects were at first (x, y, z) [m]."""
+    """Joints (dof,) [rad], fingers [m] and objects at one moment; where objects were at first (x, y, z) [m].
+
+    How objects stand is told in the words of the `simulator`, which no other one knows.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
+    simulator: str = SIMULATORS[0]
     layout: dict[str, tuple[float, ...]]
     q: list[float]
     width: float | None = None

@@ -17,9 +17,10 @@ from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.scene.workspace import reach_reason
+from common.sim.interface import StandingObject
 from common.sim.kinematic import KinematicWorld
-from common.sim.standing import StateFile
-from tests.services.executor_person import blocked, executor, goes_on, move
+from common.sim.standing import Standing, StateFile, state_file
+from tests.services.executor_person import CELL, blocked, executor, goes_on, move
 
 
 @pytest.mark.parametrize("backend", ["mock", "lag"])
@@ -132,6 +133,24 @@ async def test_what_was_kept_of_another_layout_is_not_used(
         await person.follow("a", move(robot, home, home + 0.2))
     async with executor("world.balls=[[0.5, 0.0]]") as person:
         assert len((await person.see(person.balls, lambda _: True)).ids) == 1
+        found = await person.see(person.joints, lambda _: True)
+        assert found.position[: robot.dof] == pytest.approx(home)
+
+
+async def test_what_one_simulator_kept_is_not_used_by_another(
+    robot: RobotModel, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(STATE_VARIABLE, str(tmp_path))
+    home, world = robot.named("home"), load_cell("panda").world
+    layout = KinematicWorld(world).layout
+    falling = {name: StandingObject(pose=(*place, 0, 0, 0, 1), details={  # as physics has it: nobody knows where to
+        "state": "falling", "container": "", "slot": None, "grip": None, "width": 0.0, "dropped": 0.0, "since": 0.0,
+        "added": False, "rest": None}) for name, place in layout.items()}
+    file = state_file(CELL)
+    assert file is not None
+    file.save(Standing(simulator="mujoco", layout=layout, q=(home + 0.2).tolist(), objects=falling))
+    async with executor() as person:
+        assert set((await person.see(person.balls, lambda _: True)).labels) == {"table"}
         found = await person.see(person.joints, lambda _: True)
         assert found.position[: robot.dof] == pytest.approx(home)
 
