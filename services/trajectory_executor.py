@@ -325,7 +325,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     cycle.beside = True
     decisions.on_change = cycle.authority.tell_inhibits
     memory = SavedBeside(standing_file) if standing_file and bus.has_threads else standing_file
-    if kept is not None:
+    if cycle.restored:
         bus.log.info("the arm and what is about it are as they were")
     alone, task = Alone(), config.members.task
     loop = asyncio.get_running_loop()

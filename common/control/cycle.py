@@ -128,6 +128,7 @@ class ControlCycle:
         self.due: Callable[[], None] | None = None  # to be done beside the cycles: the world stands still until then
         self.apart = False  # the world is changed by somebody else, and stands still here
         self._kept: object = None
+        self.restored = False  # whether fingers and world were found as they were before a restart
         self._stood: tuple[int, dict[str, StandingObject]] | None = None  # the objects, as of a version of the world
         self._followed: ExecuteRequest | None = None  # the newest goal that was accepted
         self._inhibits = inhibits or Inhibits()
@@ -216,6 +217,7 @@ class ControlCycle:
         """Find fingers and world as they were; the arm was begun where it stood."""
         assert self._world is not None
         self._world.restore(state.objects)
+        self.restored = True
         fingers = self._hardware.gripper
         if self._gripper is None or not isinstance(fingers, PlacedGripper) or state.width is None:
             return

@@ -124,17 +124,21 @@ async def test_started_again_with_a_ball_in_the_hand_it_finds_arm_fingers_and_ba
         assert len(balls.ids) == len(before.ids)
 
 
-async def test_what_was_kept_of_another_layout_is_not_used(
-    robot: RobotModel, tmp_path, monkeypatch: pytest.MonkeyPatch
+async def test_what_was_kept_of_another_layout_is_not_used_nor_told_of(
+    robot: RobotModel, tmp_path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv(STATE_VARIABLE, str(tmp_path))
     home = robot.named("home")
+    caplog.set_level("INFO")
     async with executor() as person:
         await person.follow("a", move(robot, home, home + 0.2))
     async with executor("world.balls=[[0.5, 0.0]]") as person:
         assert len((await person.see(person.balls, lambda _: True)).ids) == 1
         found = await person.see(person.joints, lambda _: True)
         assert found.position[: robot.dof] == pytest.approx(home)
+    assert "as they were" not in caplog.text
+    async with executor("world.balls=[[0.5, 0.0]]"):
+        assert "as they were" in caplog.text
 
 
 async def test_what_one_simulator_kept_is_not_used_by_another(
