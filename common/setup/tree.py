@@ -109,16 +109,23 @@ def read_tree(root: ET.Element, source: str) -> Tree:
     """The links and joints of a URDF that was parsed.
 
     Raises:
-        ConfigError: it has no links or no root, or a joint is not whole.
+        ConfigError: it is no tree: without links or with several roots, with a link on two joints, or with links that
+            hang on each other; or a joint is not whole.
     """
     links = [link.get("name", "") for link in root.findall("link")]
     joints = [_joint(element, links, source) for element in root.findall("joint")]
     children = [joint.child for joint in joints]
     roots = [link for link in links if link not in children]
-    if len(roots) != 1 or len(set(children)) < len(children):
+    if len(roots) != 1:
         raise ConfigError("urdf", source, f"must have one root link, not {', '.join(roots) or 'none'}")
+    if twice := sorted({child for child in children if children.count(child) > 1}):
+        raise ConfigError("urdf", source, f"has more than one joint that carries {', '.join(twice)}")
     shaped = frozenset(link.get("name", "") for link in root.findall("link") if link.find("collision") is not None)
-    return Tree(root.get("name", ""), links, joints, shaped)
+    tree = Tree(root.get("name", ""), links, joints, shaped)
+    held = {roots[0], *(joint.child for joint in tree.below(roots[0]))}
+    if loose := [link for link in links if link not in held]:
+        raise ConfigError("urdf", source, f"has links that hang on each other, not on {roots[0]}: {', '.join(loose)}")
+    return tree
 
 
 def _joint(element: ET.Element, links: Sequence[str], source: str) -> Joint:

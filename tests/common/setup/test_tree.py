@@ -66,3 +66,10 @@ def test_what_is_no_arm_is_told() -> None:
 def test_a_urdf_with_two_roots_is_told() -> None:
     with pytest.raises(ConfigError, match="one root link, not a, c"):
         chain("a-b", "c-d")
+
+
+def test_a_urdf_that_is_no_tree_is_told() -> None:
+    with pytest.raises(ConfigError, match="more than one joint that carries c"):
+        chain("base-a", "base-b", "a-c", "b-c")
+    with pytest.raises(ConfigError, match="hang on each other, not on base: b, c"):
+        chain("base-a", "b-c", "c-b")
