@@ -83,7 +83,8 @@ class Folder:
         path = self._paths[self._next]
         self._next += 1
         self.name = path.name
-        picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None  # of nothing OpenCV makes an error
         if picture is None:
             raise ConfigError("source", str(path), "is no image that can be read")
         return _as_bgr8(picture)

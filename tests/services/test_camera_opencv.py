@@ -157,8 +157,9 @@ def test_a_source_that_is_nothing_is_named_with_the_choices(tmp_path, make, told
         open_source(str(make(tmp_path)), (64, 48), 10, loop=True)
 
 
-def test_a_file_in_the_folder_that_is_no_image_is_named(tmp_path):
-    (tmp_path / "a.png").write_bytes(b"not a picture")
+@pytest.mark.parametrize("content", [b"not a picture", b""])
+def test_a_file_in_the_folder_that_is_no_image_is_named(tmp_path, content):
+    (tmp_path / "a.png").write_bytes(content)
     source = open_source(str(tmp_path), (64, 48), 10, loop=True)
     with pytest.raises(ConfigError, match=r"a\.png' is no image"):
         source.read()
