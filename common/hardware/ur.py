@@ -166,6 +166,7 @@ class UrArm:
 
     def _drop(self) -> None:
         control, self._control, self._servoing = self._control, None, False
+        self._freedrive = False  # it was the program that let go of the joints
         self._ending = threading.Thread(target=control.disconnect, daemon=True)  # it waits for threads of its own
         self._ending.start()
 
@@ -216,6 +217,7 @@ class UrArm:
                 time.sleep(1 / self.rate)
         with self._using:
             if self._control is None:
+                self._freedrive = False
                 raise ValueError(f"cannot {act}: {self._mode()[1] or 'the arm is not ready'}")
             if act == "freedrive":
                 self._rest()
