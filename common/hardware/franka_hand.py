@@ -9,6 +9,7 @@ from common.hardware.driven_gripper import Fingers
 
 ANY = 1.0  # [m] that what is grasped may be wider or narrower: the controller judges the width
 HOMED = 0.01  # [m] that the fingers of one that is homed open at least
+MET = 1e-3  # [m] no further apart, fingers have met: where any width will do, the hand takes that for a grasp as well
 NARROWER = 5e-4  # [m] less than the fingers are apart, they are closed
 
 
@@ -36,7 +37,8 @@ class FrankaHand:
         """The newest state."""
         state = self._gripper.read_once()
         self._width = state.width
-        return Fingers(state.width, False, state.is_grasped, self._effort if state.is_grasped else 0.0)
+        holding = state.is_grasped and state.width > MET
+        return Fingers(state.width, False, holding, self._effort if holding else 0.0)
 
     def move(self, width: float, effort: float) -> None:
         """Open to a width [m]; or close, on whatever is there, and press with an effort [N].
