@@ -108,8 +108,9 @@ def _add_joint(body: Any, joint: ET.Element, robot: RobotModel) -> None:
                                               f"{', '.join(_JOINTS)}")
     limit, dynamics = joint.find("limit"), joint.find("dynamics")
     made = body.add_joint(name=name, type=_JOINTS[kind], axis=_numbers(joint.find("axis"), "xyz", "1 0 0"))
-    if limit is not None and kind != "continuous":
-        made.range, made.limited = [float(limit.get(end, 0.0)) for end in ("lower", "upper")], True
+    low, high = (float(limit.get(end, 0.0)) if limit is not None else 0.0 for end in ("lower", "upper"))
+    if low < high and kind != "continuous":  # one without any room is no joint of the arm, and held where it is
+        made.range, made.limited = [low, high], True
     made.damping = [float(dynamics.get("damping", 0.0)) if dynamics is not None else 0.0, 0.0, 0.0]
     made.frictionloss = float(dynamics.get("friction", 0.0)) if dynamics is not None else 0.0
     made.armature = ARMATURE if name in robot.joint_names else 1e-4  # of fingers it depends on their linkage

@@ -57,6 +57,21 @@ def test_every_link_is_where_the_planner_has_it(cell: str) -> None:
             assert data.body(link).xmat == pytest.approx(T[:3, :3].ravel(), abs=1e-9), link
 
 
+def test_a_joint_without_any_room_between_its_limits_is_held() -> None:
+    config = load_cell("panda")
+    robot = RobotModel.load(config.robot)
+    robot.urdf = robot.urdf.replace("</robot>", '<link name="lid"><inertial><mass value="1"/><inertia ixx="0.01" '
+                                    'iyy="0.01" izz="0.01"/></inertial></link><joint name="latch" type="revolute">'
+                                    '<parent link="panda_link7"/><child link="lid"/><axis xyz="1 0 0"/><limit lower="0"'
+                                    ' upper="0" effort="1" velocity="1"/></joint></robot>')
+    made = build_model(robot, config.world, [])
+    data = mujoco.MjData(made.model)
+    data.qpos[:] = made.start
+    data.qvel[made.dofs["latch"]] = 1.0
+    mujoco.mj_step(made.model, data, 100)
+    assert data.qpos[made.joints["latch"]] == pytest.approx(0.0, abs=1e-3)
+
+
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
 def test_nothing_touches_at_home_but_what_stands_on_something(cell: str) -> None:
     _, made = model_of(cell)
