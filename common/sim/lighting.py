@@ -11,6 +11,7 @@ Array = NDArray[np.float64]
 
 REFERENCE = 500.0  # [lx] of a well lit table: in this light a surface looks as its colour says
 DAYLIGHT = 6500.0  # [K] white
+CUTOFF = 45.0  # [deg] off its axis to which a lamp shines
 OVERHEAD = Light()  # of a world that names no light, with its ambient light
 XYZ_TO_BGR = np.array(  # of linear sRGB, IEC 61966-2-1
     [[0.0557, -0.2040, 1.0570], [-0.9689, 1.8758, 0.0415], [3.2406, -1.5372, -0.4986]]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from common.config import Scenery
 from common.perception.pinhole import Pinhole
-from common.sim.lighting import ambient, lamps, tint
+from common.sim.lighting import CUTOFF, ambient, lamps, tint
 from common.sim.ray_caster import View
 
 Array = NDArray[np.float64]
@@ -45,7 +47,9 @@ def ray_view(
         else:
             towards = np.asarray(lamp.position) - points
             away = np.maximum(np.linalg.norm(towards, axis=1), 1e-6)
-            towards, strength = towards / away[:, None], (length / away) ** 2
+            towards = towards / away[:, None]
+            inside = -(towards @ way) / length >= math.cos(math.radians(CUTOFF))
+            strength = inside * (length / away) ** 2
         turned = np.maximum(np.sum(normals * towards, axis=1), 0.0) * strength
         light += turned[:, None] * (lamp.illuminance * tint(lamp.temperature))
     colours = np.zeros((count, 3))

@@ -19,7 +19,7 @@ from common.config import Scenery, Surroundings
 from common.messages import JointState, WorldObject
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
-from common.sim.lighting import ambient, flat_level, lamps, tint
+from common.sim.lighting import CUTOFF, ambient, flat_level, lamps, tint
 from common.sim.mujoco.drawn import DrawnModel
 from common.sim.mujoco.gl import OneThread, gl_context
 from common.sim.mujoco.rays import ray_view
@@ -34,7 +34,6 @@ logging.getLogger("OpenGL.acceleratesupport").setLevel(logging.WARNING)  # of no
 
 NEAR, FAR = 0.02, 12.0  # [m] between which there is something to see
 FAR_OFF = 3.0  # [m] from its aim at which parallel light begins
-CUTOFF = 45.0  # [deg] off its axis to which a lamp shines
 SHINE = 0.1  # share of the light that what is smooth reflects as a mirror does
 MOST_GEOMS = 4000
 

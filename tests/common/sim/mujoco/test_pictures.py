@@ -169,6 +169,15 @@ def test_one_lamp_gets_darker_than_the_others():
     assert one[:, right].mean() < 0.6 * both[:, right].mean() < one[:, left].mean()
 
 
+@pytest.mark.parametrize("gl", [pytest.param(GL, marks=needs_gl), ""])
+def test_lamp_shines_within_its_cone_only(gl):
+    low = Light(position=(0.4, 0.0, 0.25), aim=(0.4, 0.0, 0.0), parallel=False)
+    picture = drawn([], gl=gl, scenery=Scenery(lights={"low": low}, ambient=50)).colour[..., 1]
+    inside, outside = ((round(float(v)), round(float(u))) for u, v in SMALL.project(np.array([
+        (0.4, -0.1, 0.0), (0.4, -0.35, 0.0)])))
+    assert 0 < picture[outside] < 0.2 * picture[inside], "of light from everywhere alone"
+
+
 def test_what_is_out_of_sight_is_not_drawn_and_what_stands_still_is_not_drawn_again():
     renderer = PhysicsRenderer(CELL.world, Scenery(), ROBOT, SMALL, depth=False, gl="")
     things = balls()
