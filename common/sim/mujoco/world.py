@@ -110,6 +110,8 @@ class PhysicsWorld(News):
             _copy(*before, cell, data)
         mujoco.mj_forward(cell.model, data)
         self._cell, self._data, self._contacts = cell, data, Contacts(cell, self._robot)
+        for name in self._slippery:
+            self._touchable(name, False)
         self._qpos = np.array([at for place in cell.things.values() for at in range(place.qpos, place.qpos + 7)], int)
         self._touching, self._looked_at = None, np.full(len(self._qpos), np.inf)
         self._arm.attach(cell, data)

@@ -254,7 +254,8 @@ def test_edits_add_move_remove_and_reset() -> None:
     assert rig.world.ids == ["thing_1", "thing_2"] and rig.place() == pytest.approx((0.45, 0.0, 0.03), abs=1e-3)
 
 
-def test_what_a_person_lets_slip_falls_out_of_the_fingers() -> None:
+@pytest.mark.parametrize("meanwhile", [None, WorldEdit(op="add", position=Vector3(x=0.3, y=-0.3, z=0.0))])
+def test_what_a_person_lets_slip_falls_out_of_the_fingers(meanwhile: WorldEdit | None) -> None:
     rig = Rig(BALL)
     with pytest.raises(Refused, match="between the fingers"):
         rig.world.edit(WorldEdit(op="drop"), rig.now)
@@ -262,6 +263,8 @@ def test_what_a_person_lets_slip_falls_out_of_the_fingers() -> None:
     rig.grip(0.0)
     rig.move(rig.above(0.45, 0.0, 0.2))
     assert rig.world.edit(WorldEdit(op="drop"), rig.now) == "thing_1"
+    if meanwhile is not None:
+        rig.world.edit(meanwhile, rig.now)
     rig.wait(1.5)
     assert rig.place()[2] == pytest.approx(0.03, abs=2e-3) and not rig.fingers.read(rig.now).holding
 
