@@ -24,6 +24,7 @@ CELL = 0.01  # [m] of the grid in which votes are counted
 GATE = 0.006  # [m] a point this near to a ball's surface is of it
 AGREEING = 0.65  # part of the points on its surface that put the centre there
 SPREAD = 0.7  # of the votes of a ball's points, as part of their own, at most: on what is flat they are as far apart
+MISSES = 20  # in a row that are no ball: what is left is something else, such as a red cloth
 LEAST = 0.15  # part of a whole ball's points that must be seen
 GATES = (0.012, 0.009, 0.006, 0.005, 0.004, 0.004, 0.004)  # [m] in each step of Gauss-Newton
 
@@ -73,10 +74,14 @@ def _votes(
 
 def _balls(points: Array, votes: Array, camera: Pinhole, radius: float) -> Iterator[Array]:
     """Centres (3,) [m] on which many votes agree, the most agreed on first."""
-    while len(points):
+    misses = 0
+    while len(points) and misses < MISSES:
         cells = np.floor(votes / CELL).astype(np.int64)
-        _, which, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-        center = votes[which.ravel() == np.argmax(counts)].mean(axis=0)
+        cells -= cells.min(axis=0)
+        numbers = np.ravel_multi_index((cells[:, 0], cells[:, 1], cells[:, 2]), cells.max(axis=0) + 1)
+        _, which, counts = np.unique(numbers, return_inverse=True, return_counts=True)
+        center = votes[which == np.argmax(counts)].mean(axis=0)
+        misses += 1
         near = np.linalg.norm(votes - center, axis=1) < 1.5 * CELL
         center = _fitted(points, votes[near].mean(axis=0), radius)
         distance = np.linalg.norm(points - center, axis=1)
@@ -87,6 +92,7 @@ def _balls(points: Array, votes: Array, camera: Pinhole, radius: float) -> Itera
             agreeing = np.linalg.norm(votes[own] - center, axis=1) < 1.5 * CELL
             # On what is flat each point has a centre of its own, however small it is.
             if np.mean(agreeing) >= AGREEING and _spread(votes[own]) <= SPREAD * _spread(points[own]):
+                misses = 0
                 yield center
             left = distance > radius + GATE
         elif counts.max() < 0.02 * whole:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from common import messages as m
+from common.applications.pick_place import depth_balls
 from common.applications.pick_place.choice import Choice, Target, lies_below
 from common.applications.pick_place.detector import Detector
 from common.applications.pick_place.odd import NOT_ROUND
@@ -76,6 +77,18 @@ def test_cube_is_reported_and_is_no_ball() -> None:
 def test_what_is_flat_is_reported_and_is_no_ball(shape: str, size: tuple[float, float, float], noise: float) -> None:
     detector, found = look([thing((0.4, 0.0, size[2] / 2), shape, *size), thing((0.3, 0.2, R))], noise)
     assert len(found) == 1 and [one.reason for one in detector.odd] == [NOT_ROUND]
+
+
+def test_balls_on_a_large_red_cloth_are_found_and_no_more_is_tried_than_it_takes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tries, fitted = [], depth_balls._fitted
+    monkeypatch.setattr(depth_balls, "_fitted", lambda *given: tries.append(1) or fitted(*given))
+    places = [(0.4, -0.1, 0.002 + R), (0.5, 0.05, 0.002 + R)]
+    cloth = thing((0.45, -0.05, 0.001), "box", 0.6, 0.5, 0.002)
+    _, found = look([cloth, *map(thing, places)])
+    assert all(np.linalg.norm(found - np.array(at), axis=1).min() < 0.001 for at in places)
+    assert len(found) == len(places) and len(tries) < 40
 
 
 def test_nothing_red_gives_nothing() -> None:
