@@ -32,6 +32,8 @@ from common.sim.mujoco.things import Thing, add_thing
 
 Array = NDArray[np.float64]
 
+AWAY = 10.0  # [m]
+
 
 class Place(NamedTuple):
     """Where an object is in a model: its body, and the first of its 7 positions and 6 velocities."""
@@ -50,7 +52,7 @@ class CellModel:
         joints, dofs: index into qpos and qvel of each joint of the robot, by name.
         actuators: index of the servo of each joint that has one, by the name of the joint.
         things: by id.
-        start: qpos with the arm at home and fingers open; objects are at the origin.
+        start: qpos with the arm at home and fingers open; objects are far away, and from each other.
     """
 
     spec: mujoco.MjSpec
@@ -138,11 +140,13 @@ def compiled(spec: mujoco.MjSpec, robot: RobotModel, things: Iterable[str]) -> C
         joint, body = model.joint(f"thing:{thing}"), model.body(f"thing:{thing}")
         places[thing] = Place(int(body.id), int(joint.qposadr[0]), int(joint.dofadr[0]))
     actuators = {model.actuator(number).name: number for number in range(model.nu)}
-    return CellModel(spec, model, joints, dofs, actuators, places, _start(model, robot, joints))
+    return CellModel(spec, model, joints, dofs, actuators, places, _start(model, robot, joints, places))
 
 
-def _start(model: mujoco.MjModel, robot: RobotModel, joints: Mapping[str, int]) -> Array:
+def _start(model: mujoco.MjModel, robot: RobotModel, joints: Mapping[str, int], places: Mapping[str, Place]) -> Array:
     start = np.array(model.qpos0)
+    for number, place in enumerate(places.values()):  # else all would touch all
+        start[place.qpos: place.qpos + 3] = 0.0, 0.0, (1 + number) * AWAY
     for name, position in robot.config.locked_joints.items():
         if name in joints:
             start[joints[name]] = position

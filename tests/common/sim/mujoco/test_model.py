@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from common.config import World, load_cell
+from common.config import ObjectConfig, World, load_cell
 from common.messages import Header, WorldObject
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
@@ -17,7 +17,7 @@ from common.sim.kinematic import KinematicWorld
 from common.sim.mujoco.kept_meshes import kept
 from common.sim.mujoco.model import CellModel, build_model
 from common.sim.mujoco.things import Thing
-from common.sim.objects import solid_of_message
+from common.sim.objects import solid_of, solid_of_message
 
 SHAPES = [
     {"id": "ball", "shape": "sphere", "radius": 0.03, "x": 0.3, "y": 0.0},
@@ -55,6 +55,18 @@ def test_every_link_is_where_the_planner_has_it(cell: str) -> None:
         for link, T in robot.link_poses(q, others).items():
             assert data.body(link).xpos == pytest.approx(T[:3, 3], abs=1e-9), link
             assert data.body(link).xmat == pytest.approx(T[:3, :3].ravel(), abs=1e-9), link
+
+
+def test_many_objects_do_not_touch_each_other_before_they_are_put_anywhere() -> None:
+    config = load_cell("panda")
+    box = solid_of(ObjectConfig.model_validate({"id": "box", "shape": "box", "size": [0.02, 0.02], "height": 0.02,
+                                                "x": 0.0, "y": 0.0}))
+    made = build_model(RobotModel.load(config.robot), config.world, [
+        Thing(f"box_{k}", box, (1.0, 0.0, 0.0)) for k in range(100)])
+    data = mujoco.MjData(made.model)
+    data.qpos[:] = made.start
+    mujoco.mj_forward(made.model, data)
+    assert data.ncon == 0
 
 
 def test_a_joint_without_any_room_between_its_limits_is_held() -> None:
