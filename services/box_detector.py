@@ -16,7 +16,7 @@ from common.perception.boxes import BoxDetector, BoxOptions, SeenBox, outlined
 from common.perception.depth import DepthError, check_depth, depth_of
 from common.perception.exposure import blindness
 from common.perception.image import array_to_image
-from common.perception.intake import LeftOut, Unusable, picture_of
+from common.perception.intake import LeftOut, Unusable, picture_of, require_room
 from common.process.camera_reader import CameraReader
 from common.process.service import main
 from common.transport.bus import Bus
@@ -32,7 +32,12 @@ class Config(BoxOptions):
 
 
 def markers(found: list[SeenBox], config: Config, stamp: int, blind: str = "") -> MarkerArray:
-    """The message of what was found in the picture that was exposed at `stamp`, or of why that tells nothing."""
+    """The message of what was found in the picture that was exposed at `stamp`, or of why that tells nothing.
+
+    Raises:
+        Unusable: that is more than there is room for.
+    """
+    require_room(len(found))
     return MarkerArray(header=Header(stamp=stamp, frame_id=WORLD), blind=blind, markers=[
         _marker(index, box, config) for index, box in enumerate(found)
     ])
@@ -80,7 +85,10 @@ async def run(bus: Bus, config: Config) -> None:
             return
         detector.options = config.model_copy()
         boxes = await asyncio.to_thread(detector.detect, picture, metres, camera)
-        found.put(markers(boxes, config, image.header.stamp, "" if boxes else blindness(picture)))
+        try:
+            found.put(markers(boxes, config, image.header.stamp, "" if boxes else blindness(picture)))
+        except Unusable as error:
+            left_out.note(error)
         if shown.matched:
             shown.put(array_to_image(outlined(picture, boxes), "bgr8", image.header))
         if masks.matched:

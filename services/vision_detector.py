@@ -22,7 +22,7 @@ from common.config.basics import Rgb
 from common.messages import Color, Header, Image, Marker, MarkerArray, Pose, Vector3
 from common.perception.depth import Depth, DepthError, check_depth, depth_of
 from common.perception.image import array_to_image
-from common.perception.intake import LeftOut, Unusable, picture_of
+from common.perception.intake import LeftOut, Unusable, picture_of, require_room
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.service import main
@@ -48,7 +48,11 @@ def markers(
     """The message of what was found in the frame that was exposed at `stamp`, or of why that tells nothing.
 
     What is `odd` is among it with the reason as its text: it stands in the way, and is not to be taken.
+
+    Raises:
+        Unusable: that is more than there is room for.
     """
+    require_room(len(detections) + len(odd))
     return MarkerArray(
         header=Header(stamp=stamp, frame_id=WORLD),
         remark=remark,
@@ -140,7 +144,10 @@ async def run(bus: Bus, config: Config) -> None:
             else:
                 detections = await asyncio.to_thread(detector.detect_in_depth, picture, depth, camera)
             remark = _remark(detector, bus.service)
-            found.put(markers(detections, config.world, image.header.stamp, remark, detector.blind, detector.odd))
+            try:
+                found.put(markers(detections, config.world, image.header.stamp, remark, detector.blind, detector.odd))
+            except Unusable as error:
+                left_out.note(error)
             if shown.matched:
                 shown.put(array_to_image(annotate(picture, detections), "bgr8", image.header))
             if masks.matched:

@@ -17,6 +17,7 @@ from common.robot.transform_history import NoTransform, TransformHistory
 Picture = npt.NDArray[np.uint8]
 
 UNKNOWN_CAMERA = "unknown_camera"
+MOST_THINGS = 250  # found in a picture: neither a list of targets nor a planning scene has room for many more
 
 
 class Unusable(ZencellError):
@@ -25,6 +26,17 @@ class Unusable(ZencellError):
     def __init__(self, kind: str, message: str) -> None:
         super().__init__(message)
         self.kind = kind
+
+
+def require_room(things: int) -> None:
+    """Return when so many things that were found in a picture can be told of; some of them are never left out.
+
+    Raises:
+        Unusable: they are too many.
+    """
+    if things > MOST_THINGS:
+        raise Unusable("crowded", f"{things} things in it are more than a planning scene has room for: is the picture "
+                                  "full of noise?")
 
 
 class LeftOut:

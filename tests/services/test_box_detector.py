@@ -3,14 +3,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 from common import messages as m
 from common import topics
 from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common.clock import Clock
 from common.config import CameraConfig
-from common.perception.boxes import BoxKind
+from common.perception.boxes import BoxKind, SeenBox
 from common.perception.image import array_to_image, image_to_array
+from common.perception.intake import MOST_THINGS, Unusable
 from common.perception.pinhole import Pinhole
 from common.process.in_process import running_service
 from common.robot.transforms import matrix_to_pose
@@ -88,6 +90,13 @@ async def test_dark_picture_tells_nothing_though_depth_is_measured_in_the_dark_t
             camera.picture(stamp, light=light)
             frame = await camera.found.next()
             assert (len(frame.markers), bool(frame.blind)) == ((1, False) if light == 1.0 else (0, True))
+
+
+def test_more_boxes_than_there_is_room_for_are_not_told_of_in_part() -> None:
+    box = SeenBox("red", (0.5, 0.0, 0.02), 0.0, np.zeros((4, 2)), False)
+    assert len(box_detector.markers([box] * MOST_THINGS, CONFIG, 0).markers) == MOST_THINGS
+    with pytest.raises(Unusable, match=f"{MOST_THINGS + 1} things in it are more than"):
+        box_detector.markers([box] * (MOST_THINGS + 1), CONFIG, 0)
 
 
 async def test_picture_with_the_depth_of_another_one_or_of_another_size_is_left_out() -> None:

@@ -30,6 +30,14 @@ def picture(places=PLACES, stamp=1_000):
     return array_to_image(draw_spheres(places, camera, around), "bgr8", Header(stamp=stamp, frame_id=FRAME))
 
 
+def chequered(side):
+    pixels = np.full((480, 640, 3), 200, np.uint8)
+    for v in range(4, 480, side + 8):
+        for u in range(4, 640, side + 8):
+            pixels[v:v + side, u:u + side] = (0, 0, 255)
+    return pixels
+
+
 def tf(T=camera.T_world_optical, child=FRAME):
     header = Header(frame_id="world")
     return TFMessage(transforms=[TransformStamped(header=header, child_frame_id=child, transform=matrix_to_pose(T))])
@@ -110,6 +118,7 @@ async def test_intrinsics_come_from_camera_info():
         (Image(header=Header(frame_id=FRAME), width=640, height=480, encoding="yuv", data=bytes(9)), "'yuv'"),
         (Image(header=Header(frame_id=FRAME), width=640, height=480, encoding="mono8", data=bytes(307200)), "'mono8'"),
         (Image(header=Header(frame_id=FRAME), width=640, height=480, encoding="bgr8", data=bytes(99)), "too few"),
+        (array_to_image(chequered(24), "bgr8", Header(frame_id=FRAME)), "more than a planning scene has room"),
         (Image(header=Header(frame_id="nowhere"), width=640, height=480, encoding="bgr8", data=b"x"), "'nowhere'"),
     ],
 )
