@@ -130,7 +130,7 @@ class UrArm:
         mode, message = self._mode()
         if self._control is not None:
             runs = bool(self._receive.getRobotStatus() & PROGRAM_RUNS)
-            if self._began and not runs and mode == "running":
+            if self._began and not runs and mode in ("running", "freedrive"):
                 mode, message = "idle", "its program has ended, and is begun again"
             self._began = self._began or runs
         with self._using:

@@ -17,13 +17,13 @@ OFF, RUNNING, NORMAL, PROTECTIVE_STOP = 3, 7, 1, 3
 
 
 class Controller:
-    """What the three connections of the library say and do; the pendant sets `mode` and `safety`."""
+    """What the three connections of the library say and do; the pendant sets `mode`, `safety` and `program`."""
 
     FLAG_UPLOAD_SCRIPT = 1
 
     def __init__(self) -> None:
         self.mode, self.safety, self.stamp = RUNNING, NORMAL, 0.0
-        self.by_hand = False
+        self.by_hand, self.program = False, True
 
     def getTimestamp(self) -> float:  # noqa: N802
         self.stamp += 0.002
@@ -41,7 +41,7 @@ class Controller:
         self.by_hand = False
 
     def __getattr__(self, name: str) -> object:
-        answers = {"getRobotMode": self.mode, "getSafetyMode": self.safety, "getRobotStatus": 3,
+        answers = {"getRobotMode": self.mode, "getSafetyMode": self.safety, "getRobotStatus": 1 | self.program << 1,
                    "getTargetSpeedFraction": 1.0, "getActualQ": [0.0] * 6, "getActualQd": [0.0] * 6}
         return lambda *_: answers.get(name, 0)
 
@@ -87,3 +87,13 @@ def test_a_protective_stop_ends_freedrive_also_when_it_is_unlocked_at_the_pendan
     assert arm.read().mode == "freedrive"
     arm.do("freedrive", 0.0)
     assert arm.read().mode == "running" and not controller.by_hand
+
+
+def test_a_program_that_is_ended_at_the_pendant_ends_freedrive(controller: Controller, arm: UrArm) -> None:
+    arm.do("freedrive", 1.0)
+    assert arm.read().mode == "freedrive"
+    controller.program, controller.by_hand = False, False
+    state = arm.read()
+    assert (state.mode, state.message) == ("idle", "its program has ended, and is begun again")
+    controller.program = True
+    assert arm.read().mode == "running"
