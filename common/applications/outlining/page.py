@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common import topics
 from common.applications.outlining.contours_choice import middle_of
-from common.applications.outlining.messages import Contour, OutlineSelect, OutlineStatus
+from common.applications.outlining.messages import Contour, OutlineSelect, OutlineSelection, OutlineStatus
 from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT, OUTLINE_STATUS
 from common.config import Fixture
 from common.messages import CollisionObject, MotionStatus, TaskStatus
@@ -41,6 +42,8 @@ _LIFTED = 0.002  # [m] lines lie this far above the faces, so as to be seen
 _POINTS = 200  # of a contour
 _PIN = 0.006  # radius of what is clicked [m]
 
+_newest: WeakKeyDictionary[Console, OutlineSelection] = WeakKeyDictionary()  # what was chosen last on a page
+
 
 def counters(status: TaskStatus, rejected: int) -> dict[str, object]:
     """The figures of the task by their names."""
@@ -63,11 +66,11 @@ def choice_of(contour: Contour) -> OutlineSelect:
 async def choose(console: Console, choice: OutlineSelect) -> None:
     """Have an object outlined: it is chosen, and the task starts once its path is known. Tells which it is.
 
-    Whoever stops or holds the arm until then has the last word.
+    Whoever stops or holds the arm until then has the last word, and of several choices the last one counts.
     """
     console.tell("")
     heard, stops = console.heard, console.stops
-    chosen = await console.ask(OUTLINE_SELECT, choice)
+    chosen = _newest[console] = await console.ask(OUTLINE_SELECT, choice)
     status = console.latest(OUTLINE_STATUS)
     if status is not None and (not status.started or status.state in _ENDED):  # else it traces what is chosen by itself
         try:
@@ -76,6 +79,8 @@ async def choose(console: Console, choice: OutlineSelect) -> None:
                     await asyncio.sleep(0.02)  # others read the messages themselves
         except TimeoutError:
             pass  # the task tells what is wrong with the object
+        if _newest[console] is not chosen:  # that one starts the task, if anything
+            return
         if console.stops > stops or (console.heard or 0) > (heard or 0):
             console.tell(f"{chosen.label} is chosen, but not traced: the arm was stopped or held meanwhile", "busy")
             return

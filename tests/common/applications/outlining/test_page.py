@@ -31,7 +31,7 @@ class Cell:
         self.motion = self.bus.writer(topics.MOTION_STATUS)
         self.status, self.path = self.bus.writer(OUTLINE_STATUS), self.bus.writer(CONTOUR_PATH)
         self.commands: list[tuple[str, int | None]] = []
-        self.executor_answers = True
+        self.executor_answers, self.labels = True, ["Object_0"]
         self.bus.serve(OUTLINE_SELECT, self._select)
         self.bus.serve(topics.TASK_COMMAND, self._command)
         self.bus.serve(topics.MOTION_STOP, self._stop)
@@ -44,7 +44,7 @@ class Cell:
                 await asyncio.sleep(0)
 
     async def _select(self, _wanted: OutlineSelect) -> OutlineSelection:
-        return OutlineSelection(index=0, label="Object_0")
+        return OutlineSelection(index=0, label=self.labels.pop(0))
 
     async def _command(self, command: m.TaskCommand) -> m.TaskStatus:
         self.commands.append((command.command, command.heard))
@@ -102,3 +102,19 @@ async def test_stop_between_choice_and_path_stays_a_stop(cell: Cell, by: str) ->
 
     assert [command for command, _ in await chosen(cell, stop) if command != "stop"] == []
     assert told[-1].startswith("Object_0 is chosen, but not traced")
+
+
+async def test_of_two_objects_chosen_one_after_the_other_only_the_second_is_traced_and_once(cell: Cell) -> None:
+    told: list[str] = []
+    cell.console.tell = lambda line, _kind="bad": told.append(line)
+    cell.labels = ["Object_0", "Object_1"]
+    first = asyncio.create_task(choose(cell.console, OutlineSelect()))
+    await cell.until(lambda: cell.labels == ["Object_1"])
+    second = asyncio.create_task(choose(cell.console, OutlineSelect()))
+    await cell.until(lambda: not cell.labels)
+    cell.path.put(OutlinePoints(object="Object_1"))
+    await second
+    cell.path.put(OutlinePoints(object="Object_0"))  # as the next picture counts
+    await first
+    assert cell.commands == [("start", 3)]
+    assert told[-1] == "Object_1 is chosen"
