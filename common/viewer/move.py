@@ -103,6 +103,7 @@ class MovePanel:
         self._kind = MARKER
         self._found: PlanResponse | None = None
         self._other: PlanResponse | None = None  # that it is compared with
+        self._forgot = 0  # how often what was planned was forgotten
         self.compared = NOTHING
         self._reached: tuple[Pose, float, bool] | None = None  # goal, since when, whether it was looked for why not
         self.numbers = ArmNumbers(robot, console.latest)
@@ -267,8 +268,12 @@ class MovePanel:
 
     async def _plan(self, goal: PoseGoal | JointGoal) -> None:
         self._forget()
+        forgot = self._forgot
         asked = [self.planner] + ([self.compared] if self.compared != NOTHING else [])
         responses = [await self._motions.plan(goal, planner="" if name == PIPELINE else name) for name in asked]
+        if forgot != self._forgot:
+            self._tell("The plan is not kept: something else was asked for meanwhile.", "busy")
+            return
         kept = [response if response.ok and response.trajectory is not None else None for response in responses]
         self._found, self._other = kept[0], kept[1] if len(kept) > 1 else None
         if self._other is not None:
@@ -280,6 +285,7 @@ class MovePanel:
 
     def _forget(self) -> None:
         """Forget what was planned: it is for another goal, or begins elsewhere than the arm is now."""
+        self._forgot += 1
         self._found = self._other = None
         self._goal.compare(None)
 
