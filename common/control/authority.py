@@ -187,12 +187,17 @@ class Authority:
         return self._arm.status, let_go
 
     def _hands_over(self, request: HoldRequest) -> bool:
-        """Whether who lets go ends whose the motion was: what another person took stays theirs, if they have a name."""
+        """Whether who lets go ends whose the motion was: what another person took stays theirs, if they have a name.
+
+        A start that did not let go of all stops is older than one of them, and starts nothing.
+        """
         now = self._owners.now
         own = now.owner == (request.owner or SOMEBODY)
         if request.into_stop:
             return own or now.kind == "task"
-        return request.stops and (own or (now.asked and now.owner == SOMEBODY) or request.override)
+        if not request.stops or self.inhibits.stops:
+            return False
+        return own or (now.asked and now.owner == SOMEBODY) or request.override
 
     def wait(self, wait: bool, reason: str = "") -> None:
         """Bring the arm to rest on its path of our own accord, or let it go on."""

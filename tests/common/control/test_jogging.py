@@ -371,6 +371,19 @@ def test_motion_of_whom_a_start_takes_it_from_comes_to_rest_for_good(arm):
     assert arm.cycle.goal == "two", "a task that is started once more goes on"
 
 
+def test_a_start_that_comes_after_a_later_stop_takes_it_from_nobody(arm):
+    said = arm.stamp
+    arm.run(0.1)
+    arm.own(over=True)
+    arm.execute("one", "ann", heard=arm.stamp + 1)
+    arm.run(0.5)
+    late = HoldRequest(hold=False, owner="bob", stops=True, override=True, heard=said)
+    arm.asked(arm.cycle.authority.hold, late, arm.stamp * 1e-9)
+    arm.run(0.5)
+    assert arm.owner == ("ann", "operator") and arm.cycle.goal == "one" and not arm.rests()
+    assert arm.execute("two").error == "stopped"
+
+
 def test_everybodys_start_takes_it_from_who_took_it_without_a_name(arm):
     arm.own(owner="person")
     arm.asked(arm.cycle.authority.hold, HoldRequest(hold=False, owner="bob", stops=True))
