@@ -39,7 +39,7 @@ class TaskPanel:
             home: has the arm go home.
         """
         self._console, self._words = console, told
-        self._refused = ""  # command that was, because another person holds the arm
+        self._refused: object = None  # command that was, because of others, with what they had said by then
         self._speed_told = self._speed_heard = 100  # [%]
         self.note = (0, "", "")  # the newest line for persons, and how good it is
         gui.add_html(STYLE)
@@ -156,14 +156,21 @@ class TaskPanel:
         else:
             self.tell("This page does not operate")
 
+    @property
+    def _others(self) -> object:
+        """The newest that others said of the arm, and whose it is: who presses twice overrides what they were told."""
+        owner = self._console.latest(topics.MOTION_OWNER)
+        return self._console.heard, owner.owner if owner is not None else ""
+
     async def _own(self, act: Literal["take", "give"]) -> None:
-        over, self._refused = self._refused == act, ""
+        asked = act, self._others
+        over, self._refused = self._refused == asked, None
         try:
             now = await self._console.own(act, over)
         except RemoteError as error:
             if act == "give" or error.code != "not_owner":
                 raise
-            self._refused = act
+            self._refused = asked
             self.tell(f"{problem(error)}: press Take again for that")
         else:
             self.tell(f"The motion is {now.told}", "good")
@@ -171,13 +178,14 @@ class TaskPanel:
     async def _command(self, chosen: str) -> None:
         if chosen in COMMANDS:
             self.tell("")
-            override, self._refused = chosen == self._refused, ""
+            asked = chosen, self._others
+            override, self._refused = self._refused == asked, None
             try:
                 await self._console.command(chosen.lower(), override)
             except RemoteError as error:
                 if error.code not in ("held", "not_owner"):
                     raise
-                self._refused = chosen
+                self._refused = asked
                 self.tell(f"{problem(error)}: press {chosen} again for that")
 
     async def _set_speed(self, percent: float) -> None:

@@ -78,6 +78,18 @@ async def test_robot_that_another_holds_goes_on_when_that_is_said_twice(panda: P
     assert panda.commands == ["resume", "start", "start"]
 
 
+async def test_what_somebody_else_has_said_since_a_refusal_is_told_before_it_is_overridden(
+    panda: Played, page: BrowserDouble
+) -> None:
+    motion, task = panda.bus.writer(topics.MOTION_STATUS), panda.bus.writer(PICK_PLACE_STATUS)
+    task.put(PickPlaceStatus())
+    for since, panda.holder in ((5, "anna"), (9, "bob")):
+        motion.put(m.MotionStatus(held=True, inhibits=[m.Inhibit(kind="held", by=panda.holder, since=since)]))
+        await page.until(lambda: f"UTC by {panda.holder}" in page.text)
+        await page.press("Start")
+        await page.until(lambda: f"the robot is held by {panda.holder}: press Start again for that" in page.text)
+
+
 async def test_who_stopped_the_robot_is_shown_though_no_task_says_so(panda: Played, page: BrowserDouble) -> None:
     stop = m.Inhibit(kind="stopped", by="anna", reason="smoke", since=0)
     panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus(inhibits=[stop]))
