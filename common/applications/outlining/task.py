@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from common import messages as m
 from common.applications.outlining.legs import NEAR, Legs, OutlineView, TracingParameters, closed, length, same_place
@@ -110,16 +110,21 @@ class Outline(Task[OutlineView]):
     def _take(self, path: OutlinePoints, solid: str, view: OutlineView) -> None:
         """Make the motions for a contour that goes round a solid of the planning scene."""
         assert view.gripper is not None
-        points = closed(path)
+        points, cycle = closed(path), Cycle(path.object)
+        try:
+            motions = self._legs.outline(points, solid, cycle)
+        except ValidationError:  # a path may be all that a message of it can hold
+            self.fail(f"the contour of {path.object} has too many points, or lies too far away", view)
+            return
         status = self.status
         status.state, status.message, status.subject = "PLANNING", "", path.object
         status.points, status.length_m, status.fraction, status.closed = len(path.poses), length(points), 0.0, False
         status.invalid_depth, status.standoff = path.invalid_depth, self.p.standoff
-        self._cycle = Cycle(path.object)
+        self._cycle = cycle
         self._path, self._named = path, _places(view)
         if view.gripper.width > SHUT:
             self.row.append(Grip("close", "PLANNING", self._cycle, width=0.0))
-        self.row += [*self._legs.outline(points, solid, self._cycle), Look()]
+        self.row += [*motions, Look()]
         self.patience.reset()
 
     def _is_home(self, view: OutlineView) -> bool:

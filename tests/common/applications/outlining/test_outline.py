@@ -63,6 +63,16 @@ def test_path_is_closed_and_keeps_tool_standoff_and_speed() -> None:
     assert cell.status.standoff == 0.005
 
 
+@pytest.mark.parametrize("path", [
+    outline_of(5000 * SQUARE, 0), outline_of(SQUARE, 0).model_copy(update={
+        "poses": [m.Pose(position=m.Vector3(x=0.5, z=1e7))] * 4})], ids=["too long to be closed", "too far away"])
+def test_path_along_which_no_motion_can_be_asked_for_is_an_error_of_the_task(path: OutlinePoints) -> None:
+    cell = OutlineDouble()
+    cell.path = path.model_copy(update={"given": True})
+    cell.until("ERROR")
+    assert cell.moves() == [] and "Object_1 has too many points, or lies too far away" in cell.status.message
+
+
 def test_each_motion_is_planned_from_where_the_one_before_ends() -> None:
     cell = OutlineDouble()
     cell.until("DONE")
