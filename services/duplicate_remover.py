@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from common.applications.outlining.duplicates import simplified, without_duplicates
 from common.applications.outlining.messages import OutlinePoints
@@ -14,7 +14,9 @@ from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS
 from common.config import Parameters, Tunable
 from common.errors import ConfigError
 from common.messages import Pose, Vector3
+from common.messages.basics import MOST_NAME
 from common.process.service import main
+from common.terminal import printable
 from common.transport.bus import Bus
 
 
@@ -42,12 +44,16 @@ def points_of(file: Path) -> list[Pose]:
     """The points in a file.
 
     Raises:
-        ConfigError: it is missing or malformed.
+        ConfigError: it is missing or malformed, or says more than a path has room for.
     """
     try:
-        return [Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in read_coordinates(file).tolist()]
+        points = read_coordinates(file).tolist()
+        return OutlinePoints(poses=[Pose(position=Vector3(x=x, y=y, z=z)) for x, y, z in points]).poses
     except StageFileError as error:
         raise ConfigError("services.duplicate_remover.coordinates", ..., str(error)) from None
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]["msg"]
+        raise ConfigError("services.duplicate_remover.coordinates", ..., f"{file}: {problem}") from None
 
 
 async def run(bus: Bus, config: Config) -> None:
@@ -56,7 +62,7 @@ async def run(bus: Bus, config: Config) -> None:
     paths = bus.writer(CONTOUR_PATH)
     file = Path(config.coordinates)
     given = cleared(points_of(file), 0.0) if config.coordinates else []
-    name = f"{file.parent.name}/{file.name}"
+    name = printable(f"{file.parent.name}/{file.name}")[-MOST_NAME:]
     await bus.ready()
     async for seen in outlines:
         if given:
