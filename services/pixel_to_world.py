@@ -7,13 +7,14 @@ from collections import OrderedDict
 
 from common import topics
 from common.applications.outlining.contours import is_hole
-from common.applications.outlining.messages import Contours, OutlinePoints
+from common.applications.outlining.messages import MOST_POINTS, Contours, OutlinePoints
 from common.applications.outlining.top_face import TopFace, TopFaceOptions, top_face
 from common.applications.outlining.topics import CONTOUR_POINTS, CONTOURS
 from common.config import Surroundings
 from common.errors import ZencellError
 from common.messages import Header, Image, Pose, Vector3
 from common.perception.depth import check_depth, depth_of
+from common.perception.intake import Unusable
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.service import main
@@ -38,7 +39,11 @@ def outline(contours: Contours, image: Image, camera: Pinhole, config: Config) -
     depth = depth_of(image)
     check_depth(depth, contours.width, contours.height)
     chosen = contours.contours[contours.selected]
-    return top_face(chosen.pixels, depth, camera, config, hole=is_hole(contours.contours, chosen.index))
+    face = top_face(chosen.pixels, depth, camera, config, hole=is_hole(contours.contours, chosen.index))
+    if (count := len(face.outline)) > MOST_POINTS:
+        raise Unusable("crowded", f"its {count} points are more than an outline has room for: is the picture full of "
+                                  "noise?")
+    return face
 
 
 async def run(bus: Bus, config: Config) -> None:

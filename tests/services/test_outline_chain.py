@@ -8,6 +8,7 @@ import pytest
 
 from common import topics
 from common.applications.outlining.messages import OutlineSelect
+from common.applications.outlining.top_face import TopFace
 from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
 from common.config import (
     CameraConfig,
@@ -182,6 +183,17 @@ async def test_depth_that_does_not_fit_the_picture_is_told_in_one_line():
             images.put(array_to_image(picture, "bgr8", header))
             path = await until(cell.paths, lambda p, stamp=stamp: p.header.stamp == stamp)
             assert said in path.message and path.message.startswith("Object_0: ") and not path.poses
+
+
+async def test_outline_that_no_message_has_room_for_is_told_and_not_sent(monkeypatch):
+    long = TopFace(np.zeros((20_001, 3)), 1.0, 0.9, 0, True)
+    monkeypatch.setattr(pixel_to_world, "top_face", lambda *_, **__: long)
+    async with AsyncExitStack() as stack:
+        cell = Cell()
+        await running(stack, cell)
+        cell.say(W5.objects)
+        path = await until(cell.paths, lambda p: bool(p.message))
+        assert "20001 points are more than an outline has room for" in path.message and not path.poses
 
 
 async def test_the_camera_alone_reads_the_truth():

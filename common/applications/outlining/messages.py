@@ -10,6 +10,8 @@ from common.messages.basics import SMALL, Count, Finite, Header, Label, Message,
 from common.messages.geometry import Color, Pose, PoseArray
 from common.messages.task import TaskStatus
 
+MOST_POINTS = 20_000  # of an outline
+
 
 class Contour(Message):
     """One closed contour in a picture. `pixels` are (u, v) [px], every one along the edge."""
@@ -89,9 +91,9 @@ class OutlinePoints(PoseArray):
     most_bytes: ClassVar[int] = 4 * 1024 * 1024
     most_parts: ClassVar[int] = 128 * 1024
 
-    poses: list[Pose] = Field([], max_length=20_000)
-    ids: list[Label] = Field([], max_length=20_000)
-    labels: list[Label] = Field([], max_length=20_000)
+    poses: list[Pose] = Field([], max_length=MOST_POINTS)
+    ids: list[Label] = Field([], max_length=MOST_POINTS)
+    labels: list[Label] = Field([], max_length=MOST_POINTS)
     object: Label = Field("", description="label of the chosen contour")
     invalid_depth: Count = Field(0, description="pixels whose depth was filled from neighbours")
     given: bool = Field(False, description="by a file: need not be the outline of anything that was seen")
