@@ -16,6 +16,8 @@ from common.perception.pinhole import Pinhole
 Array = npt.NDArray[np.float64]
 Depth = npt.NDArray[np.float32]
 
+FARTHEST = 1e4  # [m] that a camera measures: some say the largest number there is where they measure nothing
+
 
 class DepthError(ZencellError):
     """A depth image that does not tell where an object is. `kind` is for programs: size, nothing, invalid or far."""
@@ -39,8 +41,8 @@ def check_depth(depth: npt.NDArray[np.float32], width: int, height: int) -> None
 
 
 def is_valid(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-    """Where a depth is a distance: finite and in front of the camera."""
-    return np.asarray(np.isfinite(depth) & (depth > 0))
+    """Where a depth is a distance: in front of the camera, and no farther than one measures."""
+    return np.asarray((depth > 0) & (depth < FARTHEST))
 
 
 @dataclass(frozen=True, eq=False)

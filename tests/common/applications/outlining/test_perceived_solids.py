@@ -3,6 +3,8 @@ import pytest
 
 from common.applications.outlining.contours import ContourOptions, find_contours
 from common.applications.outlining.perceived_solids import perceived_solids
+from common.applications.outlining.scene import planning_scene
+from common.config import Surroundings
 from common.sim.objects import world_object
 from tests.common.applications.outlining.outline_scenes import distances, seen, seen_world, upright, world
 
@@ -33,3 +35,13 @@ def test_an_object_that_leaves_the_picture_is_a_solid_as_far_as_it_is_seen():
     thing = upright(shape="box", x=0.5, y=0.25, size=(0.06, 0.06), height=0.05)
     solid, = solids_of(seen([thing]))
     assert solid.touches_border and solid.outline[:, 1].max() < 0.27 and solid.height == pytest.approx(0.05, abs=1e-5)
+
+
+@pytest.mark.parametrize("none", [np.inf, np.finfo(np.float32).max, 1e9])
+def test_what_a_camera_says_where_it_measures_nothing_is_no_distance(none):
+    camera, picture, depth = seen_world("w5")
+    contours = find_contours(picture, ContourOptions())
+    lies_on = depth > np.nanmax(depth) - 1e-3
+    bare, known = (np.where(lies_on, np.float32(value), depth) for value in (none, np.nan))
+    told, expected = (planning_scene(Surroundings(), perceived_solids(contours, d, camera), 1) for d in (bare, known))
+    assert told == expected and told.objects
