@@ -40,6 +40,7 @@ _ENDED = ("IDLE", "DONE", "ERROR")
 _PATH_TIMEOUT = 5.0  # [s] wall: from choosing an object until its path is known
 _LIFTED = 0.002  # [m] lines lie this far above the faces, so as to be seen
 _POINTS = 200  # of a contour
+_MOST = 100  # contours, the largest: to draw as many as noise has would keep the page from whoever presses STOP
 _PIN = 0.006  # radius of what is clicked [m]
 
 _newest: WeakKeyDictionary[Console, OutlineSelection] = WeakKeyDictionary()  # what was chosen last on a page
@@ -165,15 +166,16 @@ class ContourChoice(Layer):
             return
         scene = self.stage.latest(topics.PLANNING_SCENE)
         tops = {thing.id: _top(thing) for thing in scene.objects} if scene else {}
-        heights = [tops.get(c.label) or self._support(c, camera) for c in m.contours]
-        what = (m.contours, m.selected, m.width, heights, camera.T_world_optical.tolist(), camera.fx, camera.cx)
+        largest = sorted(m.contours, key=lambda c: (c.index != m.selected, -c.area))[:_MOST]
+        heights = [tops.get(c.label) or self._support(c, camera) for c in largest]
+        what = (largest, m.selected, m.width, heights, camera.T_world_optical.tolist(), camera.fx, camera.cx)
         if what == self._shown:
             return
         self._shown = what
         for node in self.nodes:
             node.remove()
         self.nodes = []
-        for contour, height in zip(m.contours, heights, strict=True):
+        for contour, height in zip(largest, heights, strict=True):
             self._add(contour, height + _LIFTED, camera, chosen=contour.index == m.selected)
 
     def _add(self, contour: Contour, height: float, camera: Pinhole, *, chosen: bool) -> None:

@@ -71,6 +71,14 @@ def test_contour_moves_when_its_object_becomes_known(stage: Stage) -> None:
     assert nodes(stage)["0_line"].points[0, 0, 2] == pytest.approx(TOP, abs=0.003)
 
 
+def test_of_a_picture_full_of_noise_the_largest_contours_and_the_chosen_one_are_offered(stage: Stage) -> None:
+    many = contours(*((f"Object_{i}", square(0.4 + 1e-3 * i, 0.0, 1.0, half=0.01)) for i in range(300)), selected=7)
+    for contour in many.contours:
+        contour.area = float(contour.index)
+    stage.say(CONTOURS, many)
+    assert {int(name.partition("_")[0]) for name in nodes(stage)} == {7, *range(201, 300)}
+
+
 def test_each_contour_has_a_pin_and_a_label_and_the_chosen_one_is_white(stage: Stage) -> None:
     stage.say(CONTOURS,
         contours(("red_1", square(0.45, 0, 1.0)), ("blue_1", square(0.55, 0, 1.0)), selected=1)
