@@ -172,15 +172,20 @@ class Arm(Part):
             MotionFailed: somebody else has the robot, or the motion ended otherwise: `code` and the line say how.
             RequestFailed: the executor does not answer.
         """
+        return await self._follow(plan, timeout)
+
+    async def move(self, to: Where | Through, *, timeout: float = PATIENCE, **how: Any) -> MotionStatus:
+        """Plan and execute: see there. What somebody says while it is planned keeps the arm, whoever that is."""
+        heard = (await self.require_free()).newest
+        return await self._follow(await self.plan(to, **how), timeout, heard)
+
+    async def _follow(self, plan: Plan, timeout: float, heard: int | None = None) -> MotionStatus:
+        """Follow a plan; what was said later than `heard` keeps the arm, left out: than now."""
         if not isinstance(plan, Plan) or plan.response.trajectory is None:
             raise ConfigError("plan", plan, "must be a Plan, as `arm.plan(...)` returns it")
         with self._noted():
-            return await self._motion.follow(plan.response.trajectory, timeout=timeout, plan=plan.response)
-
-    async def move(self, to: Where | Through, *, timeout: float = PATIENCE, **how: Any) -> MotionStatus:
-        """Plan and execute: see there."""
-        await self.require_free()
-        return await self.execute(await self.plan(to, **how), timeout=timeout)
+            return await self._motion.follow(
+                plan.response.trajectory, timeout=timeout, plan=plan.response, heard=heard)
 
     @contextlib.contextmanager
     def _noted(self) -> Iterator[None]:

@@ -109,10 +109,12 @@ class OperatorMotion:
         return await self._follow(response.trajectory, timeout, known, response)
 
     async def follow(
-        self, trajectory: m.JointTrajectory, *, timeout: float = PATIENCE, plan: m.PlanResponse | None = None
+        self, trajectory: m.JointTrajectory, *, timeout: float = PATIENCE, plan: m.PlanResponse | None = None,
+        heard: int | None = None,
     ) -> m.MotionStatus:
         """The last status of following a trajectory that was planned before, by that plan; as `move` otherwise."""
-        return await self._follow(trajectory, timeout, (await self.require_free()).newest, plan)
+        known = (await self.require_free()).newest if heard is None else heard
+        return await self._follow(trajectory, timeout, known, plan)
 
     async def _follow(
         self, trajectory: m.JointTrajectory, timeout: float, heard: int, plan: m.PlanResponse | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
+from typing import Any, cast
 
 import pytest
 
@@ -11,6 +12,8 @@ from common import messages as m
 from common import topics
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from common.client.arm import Arm
+from common.client.hearing import Ear
 from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.sources import wall_ns
 from common.transport.local import LocalNetwork
@@ -226,6 +229,22 @@ async def test_stop_that_the_same_person_said_before_the_motion_keeps_it_only_un
         await asyncio.sleep(0)
     cell.say(state="cancelled", inhibits=[said("stopped", "anna", since)])
     assert (await moving).state == "succeeded"
+
+
+async def test_stop_that_a_person_says_while_a_motion_of_a_program_of_theirs_is_planned_keeps_the_robot(
+    cell: Cell
+) -> None:
+    arm, note, since = Arm(Ear(cell.bus), "anna", cast(Any, None)), cell.note, wall_ns()
+
+    def stop_meanwhile(request: m.Message) -> None:
+        note(request)
+        if isinstance(request, m.PlanRequest):
+            cell.say(inhibits=[said("stopped", "anna", since)])
+
+    cell.note = stop_meanwhile  # type: ignore[method-assign]
+    await arm.move("home")
+    execute = cell.asked[-1]
+    assert isinstance(execute, m.ExecuteRequest) and execute.heard is not None and execute.heard < since
 
 
 async def test_task_that_begins_meanwhile_is_named(cell: Cell, person: OperatorMotion) -> None:
