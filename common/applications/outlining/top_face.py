@@ -164,7 +164,7 @@ def _noise(heights: Array, usable: Bools) -> float:
 
 def _plateau(heights: Array, tolerance: float) -> float:
     """Height [m] of the highest face."""
-    top = float(np.percentile(heights, HIGHEST))
+    top = float(np.percentile(heights, HIGHEST, method="lower"))  # that was measured: between two there may be none
     for _ in range(4):
         top = float(np.median(heights[np.abs(heights - top) <= tolerance]))
     return top

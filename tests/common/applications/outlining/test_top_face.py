@@ -144,6 +144,17 @@ def test_missing_depth_is_filled_from_the_object_and_counted(mode):
         top_face(pixels, holed, camera, mode[1])
 
 
+@pytest.mark.parametrize("size", [3, 5, 7])
+@pytest.mark.parametrize("mode", [SEED, FINE], ids=["seed", "fine"])
+def test_one_wrong_depth_in_an_object_of_few_pixels_is_not_its_top(size, mode):
+    camera, picture, depth = seen([])
+    part = slice(384, 384 + size), slice(512, 512 + size)
+    picture[part], depth[part] = (0, 255, 255), 1.7
+    depth[384 + size // 2, 512 + size // 2] = 1.2
+    face = top_face(find_contours(picture, mode[0])[0].pixels, depth, camera, mode[1])
+    assert face.top == pytest.approx(2.75 - 1.7, abs=1e-6) and len(face.outline) > 3
+
+
 def test_object_out_of_the_range_is_told():
     scene = camera, _, depth = seen_world("w3")
     far = np.where(depth < 1.7, np.float32(np.nan), depth)
