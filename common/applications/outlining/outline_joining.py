@@ -57,7 +57,9 @@ def joined(points: Array, contour: Array, is_foot: Bools, pixel: float, edge: Ar
 
 
 def _farthest(line: Array, edge: Array, pixel: float) -> float:
-    """How far a line (n, 3) [m] goes astray from an edge (m, 3) [m] at most [px]."""
+    """How far a line (n, 3) [m] goes astray from an edge (m, 3) [m] at most [px]; infinite where it is far longer."""
+    if np.linalg.norm(np.diff(line, axis=0), axis=1).sum() > 2 * (len(edge) + RUN) * pixel:
+        return math.inf
     parts = [a + (b - a) * np.linspace(0, 1, 2 + int(np.linalg.norm(b - a) / pixel))[:, None]
              for a, b in itertools.pairwise(line)]
     distances = np.linalg.norm(np.concatenate(parts)[:, None] - edge, axis=2).min(axis=1)
