@@ -175,6 +175,25 @@ def test_stop_of_ones_own_is_ended_by_the_next_motion_and_that_of_others_is_not(
     run(program)
 
 
+def test_stop_of_ones_own_that_comes_while_a_motion_is_planned_keeps_the_arm() -> None:
+    async def program(cell: Cell) -> None:
+        before, plan = await cell.arm.joints(), cell.arm._motion.plan
+
+        async def stopped_meanwhile(*goal: Any, **more: Any) -> Any:
+            found = await plan(*goal, **more)
+            await Cell.on(cell.bus, owner="program").arm.stop("wait")  # the same person, in another terminal
+            return found
+
+        cell.arm._motion.plan = stopped_meanwhile  # type: ignore[method-assign]
+        with pytest.raises(MotionFailed, match="wait") as refused:
+            await cell.arm.move(pose(0.45, 0.1, 0.4))
+        assert refused.value.code == "stopped"
+        assert "wait" in (await cell.arm.status()).stopped
+        assert np.allclose(await cell.arm.joints(), before, atol=1e-6)
+
+    run(program)
+
+
 def test_hold_keeps_a_motion_on_its_path_until_it_is_released() -> None:
     async def program(cell: Cell) -> None:
         moving = asyncio.create_task(cell.arm.move(pose(0.4, 0.4, 0.3), speed=0.2))
