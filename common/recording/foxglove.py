@@ -37,7 +37,7 @@ from common.recording.decoding import Decoder, schema_of
 from common.recording.foxglove_scene import of_markers, of_scene, of_world, time_of
 from common.recording.foxglove_schemas import SCHEMAS
 from common.recording.reading import Recording, Wanted
-from common.recording.writing import AppendedFile
+from common.recording.writing import AppendedFile, NotMade, WritingFailed
 
 JPEG_QUALITY = 90
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "critical": 5}
@@ -47,7 +47,7 @@ CHUNK_BYTES = 1024 * 1024
 
 
 def export(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) -> int:
-    """Number of messages that were written to a new file.
+    """Number of messages that were written to a new file, which is whole or not there.
 
     Colour pictures become JPEG. What Foxglove has no schema for is written as JSON of its own.
 
@@ -55,32 +55,41 @@ def export(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) 
         RecordingError: the target is there already or cannot be written, or the recording is damaged.
     """
     file = AppendedFile(target)
-    count = 0
     try:
-        writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
-        writer.start()
-        schemas: dict[str, int] = {}
-        channels: dict[str, int] = {}
-        for sample in recording.samples(wants):
-            message = decoder.message(sample)
-            if message is None:
-                continue
-            try:
-                name, value = convert(message)
-            except CANNOT_BE_CONVERTED:
-                decoder.skipped[sample.topic] += 1
-                continue
-            if name not in schemas:
-                text = json.dumps(SCHEMAS[name]).encode() if name in SCHEMAS else sample.schema or schema_of(name)
-                schemas[name] = writer.register_schema(name, "jsonschema", text)
-            if sample.key not in channels:
-                channels[sample.key] = writer.register_channel(sample.key, "json", schemas[name])
-            data = json.dumps(value, separators=(",", ":")).encode()
-            writer.add_message(channels[sample.key], sample.log_time, data, sample.publish_time, sample.sequence)
-            count += 1
-        writer.finish()  # type: ignore[no-untyped-call]
+        return _written(recording, file, wants, decoder)
+    except BaseException as error:
+        target.unlink(missing_ok=True)
+        if isinstance(error, WritingFailed):
+            raise NotMade(target, error.why) from None
+        raise
     finally:
         file.close()
+
+
+def _written(recording: Recording, file: AppendedFile, wants: Wanted, decoder: Decoder) -> int:
+    count = 0
+    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+    writer.start()
+    schemas: dict[str, int] = {}
+    channels: dict[str, int] = {}
+    for sample in recording.samples(wants):
+        message = decoder.message(sample)
+        if message is None:
+            continue
+        try:
+            name, value = convert(message)
+        except CANNOT_BE_CONVERTED:
+            decoder.skipped[sample.topic] += 1
+            continue
+        if name not in schemas:
+            text = json.dumps(SCHEMAS[name]).encode() if name in SCHEMAS else sample.schema or schema_of(name)
+            schemas[name] = writer.register_schema(name, "jsonschema", text)
+        if sample.key not in channels:
+            channels[sample.key] = writer.register_channel(sample.key, "json", schemas[name])
+        data = json.dumps(value, separators=(",", ":")).encode()
+        writer.add_message(channels[sample.key], sample.log_time, data, sample.publish_time, sample.sequence)
+        count += 1
+    writer.finish()  # type: ignore[no-untyped-call]
     return count
 
 

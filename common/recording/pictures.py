@@ -18,6 +18,7 @@ from common.recording.decoding import Decoder
 from common.recording.names import file_names
 from common.recording.reading import Recording, Wanted
 from common.recording.sample import RecordingError
+from common.recording.writing import NotMade
 
 COLOURS = ("bgr8", "rgb8", "mono8")
 CODEC = "mp4v"
@@ -93,7 +94,7 @@ def export_video(recording: Recording, target: Path, topic: str, decoder: Decode
     """Number of pictures in a new MP4 file of a topic, and their rate [Hz], which is the median of the recording.
 
     Raises:
-        RecordingError: no codec is there, no picture can be shown, or the recording is damaged.
+        RecordingError: no codec is there, no picture can be shown, the recording is damaged, or the disk takes no more.
     """
     times = [sample.log_time for sample in recording.samples(lambda name: name == topic)]
     gaps = [(later - earlier) * 1e-9 for earlier, later in pairwise(times) if later > earlier]
@@ -119,7 +120,19 @@ def export_video(recording: Recording, target: Path, topic: str, decoder: Decode
             writer.release()
     if not count:
         raise RecordingError(f"{recording.path}: {topic} has no colour picture; for depth use --images DIR")
+    if _pictures_in(target) != count:  # OpenCV says nothing of what it could not write
+        target.unlink(missing_ok=True)
+        raise NotMade(target, "the disk takes no more")
     return count, rate
+
+
+def _pictures_in(video: Path) -> int:
+    """How many pictures a video file has, as it says itself; 0 for one that is not whole."""
+    reader = cv2.VideoCapture(str(video))
+    try:
+        return round(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+    finally:
+        reader.release()
 
 
 def _colour(message: Any) -> npt.NDArray[Any] | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from common.recording.layout import DAMAGE, records_of
 from common.recording.reading import Recording
 from common.recording.sample import RecordingError
-from common.recording.writing import ABOUT, ENDED, RecordingWriter
+from common.recording.writing import ABOUT, ENDED, NotMade, RecordingWriter, WritingFailed
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,8 @@ def recover(source: Path, target: Path) -> Recovered:
         with Recording(source) as recording:
             saved = _copy(recording, beside)
         beside.replace(target)
+    except WritingFailed as error:
+        raise NotMade(target, error.why) from None
     finally:
         beside.unlink(missing_ok=True)
     return saved

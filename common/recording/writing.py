@@ -41,10 +41,19 @@ class WritingFailed(RecordingError):
     exit_code = 1
 
     def __init__(self, path: Path, error: OSError) -> None:
-        why = "the disk is full" if error.errno in FULL else (error.strerror or str(error))
-        super().__init__(f"{path}: recording stopped, {why}; what was written is kept: zencell recover {path}")
+        self.why = "the disk is full" if error.errno in FULL else (error.strerror or str(error))
+        super().__init__(f"{path}: recording stopped, {self.why}; what was written is kept: zencell recover {path}")
         self.path = path
         self.errno = error.errno
+
+
+class NotMade(RecordingError):
+    """A file that is made of a recording does not fit on the disk; nothing of it is kept."""
+
+    exit_code = 1
+
+    def __init__(self, path: Path, why: str) -> None:
+        super().__init__(f"{path}: cannot be written, {why}; nothing of it is kept")
 
 
 class AppendedFile:
@@ -57,6 +66,7 @@ class AppendedFile:
             RecordingError: it is there already, or cannot be made.
         """
         self.path = path
+        self._closed = False
         try:
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         except FileExistsError:
@@ -90,8 +100,10 @@ class AppendedFile:
         """Nothing is held back."""
 
     def close(self) -> None:
-        """Close the file."""
-        os.close(self._file)
+        """Close the file, once: its number may be another's by then."""
+        if not self._closed:
+            self._closed = True
+            os.close(self._file)
 
 
 class RecordingWriter:

@@ -1,13 +1,17 @@
 """Samples for the tests of recordings."""
 
+import errno
+import os
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 
 import msgpack
+import pytest
 
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.messages import Header, JointState, Message
+from common.recording import writing
 from common.recording.sample import Sample
 from common.recording.writing import RecordingWriter
 
@@ -50,6 +54,20 @@ def write(path: Path, samples: list[Sample], *, every: int = 10) -> Path:
             writer.flush()
     writer.close({"reason": "test"})
     return path
+
+
+def fill_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
+    """Have the disk take so many bytes [B] of recordings, and no more."""
+    real = os.write
+
+    def limited(file: int, data: memoryview) -> int:
+        nonlocal room
+        if len(data) > room:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        room -= len(data)
+        return real(file, data)
+
+    monkeypatch.setattr(writing.os, "write", limited)
 
 
 def places(folder: Path) -> Iterator[Path]:

@@ -3,6 +3,7 @@
 import base64
 import csv
 import json
+import os
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from common.recording.foxglove_schemas import SCHEMAS
 from common.recording.reading import Recording
 from common.recording.recovery import recover
 from common.recording.sample import RecordingError, Sample
-from tests.common.recording.samples import START, STEP, joints, packed, status, write
+from tests.common.recording.samples import START, STEP, fill_disk, joints, packed, status, write
 
 HEADER = Header(stamp=1_700_000_000_123_456_789, frame_id="world")
 TIME = {"sec": 1_700_000_000, "nsec": 123_456_789}
@@ -129,6 +130,16 @@ def test_file_for_foxglove_is_whole_and_says_what_was_left_out(tmp_path: Path) -
         "foxglove.JointStates", "foxglove.JointStates", "PickPlaceStatus", "foxglove.CompressedImage"]
 
 
+def test_file_for_foxglove_that_does_not_fit_on_the_disk_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = write(tmp_path / "a.mcap", [joints(n) for n in range(100)])
+    fill_disk(monkeypatch, 600)
+    with Recording(source) as recording, pytest.raises(RecordingError, match=r"f.mcap: cannot be written, the disk is"):
+        foxglove.export(recording, tmp_path / "f.mcap", lambda topic: True, Decoder())
+    assert list(tmp_path.iterdir()) == [source]
+
+
 def told(number: int) -> Sample:
     """A message whose class is not here, with the schema that was recorded."""
     values = {"header": {"stamp": START + number, "frame_id": "w"}, "gloss": number / 4, "raw": b"\xff\x00"}
@@ -193,6 +204,29 @@ def test_video_has_every_picture_at_the_rate_of_the_recording(tmp_path: Path) ->
     frames = [video.read()[1] for _ in range(10)]
     assert abs(int(frames[9][32, 40, 1]) - 180) < 6
     video.release()
+
+
+def test_video_that_does_not_fit_on_the_disk_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, target = write(tmp_path / "a.mcap", [image(n, PICTURE) for n in range(10)]), tmp_path / "v.mp4"
+    open_writer = cv2.VideoWriter
+
+    class Cut:
+        """Writes to a disk that takes the first 40 bytes, of which OpenCV says nothing."""
+
+        fourcc = open_writer.fourcc
+
+        def __init__(self, *given: object) -> None:
+            self.inner = open_writer(*given)  # type: ignore[call-overload]
+            self.isOpened, self.write = self.inner.isOpened, self.inner.write
+
+        def release(self) -> None:
+            self.inner.release()
+            os.truncate(target, 40)
+
+    monkeypatch.setattr(pictures.cv2, "VideoWriter", Cut)
+    with Recording(source) as recording, pytest.raises(RecordingError, match=r"v.mp4: cannot be written"):
+        pictures.export_video(recording, target, "camera/image_raw", Decoder())
+    assert list(tmp_path.iterdir()) == [source]
 
 
 def test_video_of_depth_alone_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from common.recording.reading import Recording
 from common.recording.recovery import recover
 from common.recording.sample import RecordingError
 from common.recording.summary import summarise
-from tests.common.recording.samples import joints, places, status, write
+from tests.common.recording.samples import fill_disk, joints, places, status, write
 
 SAMPLES = [f(n) for n in range(60) for f in (joints, status)]
 
@@ -105,3 +105,14 @@ def test_recovery_writes_over_nothing(whole: bytes, folder: Path) -> None:
     with pytest.raises(RecordingError, match="is there already"):
         recover(folder / "whole.mcap", folder / "whole.mcap")
     assert (folder / "whole.mcap").read_bytes() == whole
+
+
+def test_disk_that_is_full_leaves_nothing_and_is_told_in_one_line(
+    whole: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, target = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    source.write_bytes(whole)
+    fill_disk(monkeypatch, 600)
+    with pytest.raises(RecordingError, match=r"b.mcap: cannot be written, the disk is full; nothing of it is kept"):
+        recover(source, target)
+    assert list(tmp_path.iterdir()) == [source]

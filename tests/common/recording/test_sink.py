@@ -4,15 +4,17 @@ import errno
 import os
 import threading
 from pathlib import Path
+from random import Random
 
 import pytest
 
 from common.recording import writing
 from common.recording.files import SplitWriter
 from common.recording.reading import Recording
+from common.recording.sample import RecordingError
 from common.recording.sink import Sink
 from common.recording.writing import WritingFailed
-from tests.common.recording.samples import joints, status
+from tests.common.recording.samples import fill_disk, joints, status
 
 
 def test_everything_offered_is_in_the_file_with_how_it_ended(tmp_path: Path) -> None:
@@ -94,6 +96,31 @@ def test_failure_while_closing_is_told_too(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(writing.os, "write", write)
     with pytest.raises(WritingFailed, match="Input/output error"):
+        sink.close({})
+
+
+@pytest.mark.parametrize("missing", [0, 1])  # bytes that the end of the first file lacks, or the start of the next one
+def test_disk_that_is_full_as_the_next_file_is_due_is_told_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: int
+) -> None:
+    def recorded(name: str) -> None:
+        sink = Sink(SplitWriter(tmp_path / name, {"cell": "panda"}, most_bytes=1_000_000))
+        for number in range(4):
+            sink.offer(joints(number, payload=Random(number).randbytes(600_000)))
+        sink.close({})
+
+    recorded("a.mcap")
+    fill_disk(monkeypatch, (tmp_path / "a_0.mcap").stat().st_size - missing)
+    with pytest.raises(WritingFailed, match=r"b_[01].mcap: recording stopped, the disk is full"):
+        recorded("b.mcap")
+
+
+def test_a_file_that_is_there_where_the_next_one_is_due_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "a_1.mcap").touch()
+    sink = Sink(SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}, most_bytes=1_000_000))
+    for number in range(4):
+        sink.offer(joints(number, payload=os.urandom(600_000)))
+    with pytest.raises(RecordingError, match=r"a_1.mcap: is there already"):
         sink.close({})
 
 
