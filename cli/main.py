@@ -72,6 +72,10 @@ class CommandLine(Verbs):
             code = EXIT_INTERRUPTED
         except BrokenPipeError:  # as in `zencell topic echo ... | head`
             code = EXIT_FAILED
+        except OSError as error:  # what the system does not let us do, such as reading a file of somebody else's
+            if error.strerror is None:  # none of the system's
+                raise
+            code = _fail(f"{error.filename}: {error.strerror}" if error.filename else error.strerror, EXIT_FAILED)
         return code if isinstance(code, int) else 0
 
 

@@ -56,7 +56,7 @@ def somebody_listens(endpoint: str) -> bool:
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=PROBE_TIMEOUT):
             return True
-    except OSError:
+    except (OSError, UnicodeError):  # the latter: a name that no host can have
         return False
 
 

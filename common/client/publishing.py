@@ -33,9 +33,15 @@ def checked(topic: AnyTopic | None, key: str, body: str) -> Any:
 
     try:
         given = from_json(json.loads(body))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(key, body, f"is not JSON: {error}") from None
     if topic is None:
+        import msgpack
+
+        try:
+            msgpack.packb(given)
+        except (ValueError, OverflowError) as error:
+            raise ConfigError(key, body, f"cannot be sent: {error}") from None
         return given
     if not isinstance(given, dict):
         what = f", a {topic.message.__name__}" if isinstance(topic, Topic) else ""

@@ -1,5 +1,6 @@
 """Bad input gets one line that names the thing, the value and the choices; exit code 2 and no traceback."""
 
+import contextlib
 import subprocess
 import sys
 from pathlib import Path
@@ -89,6 +90,38 @@ def test_bad_input_is_one_line_and_exit_code_2(
         assert part in line
     assert code == 2
     assert shown.out == ""
+
+
+LONG = "x" * 300  # longer than a file system lets a name be
+RECORDING = str(Path(__file__).parents[1] / "data" / "panda_first_release.mcap")
+
+
+@pytest.mark.parametrize("arguments", [
+    ["record", "-o", f"{LONG}.mcap"], ["check", f"{LONG}.yaml"], ["recover", RECORDING, "-o", f"{LONG}.mcap"],
+    ["export", RECORDING, "--csv", "/proc/nowhere"], ["export", RECORDING, "--images", "/proc/nowhere"],
+    ["robot", "new", f"{LONG}.urdf", "-y"], ["calibrate", "intrinsics", LONG],
+], ids=lambda arguments: " ".join(arguments[:2]))
+def test_what_the_system_does_not_let_us_do_is_one_line(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert app.execute(arguments) in (1, 2)
+    shown = capsys.readouterr()
+    (line,) = shown.err.splitlines()
+    assert line.startswith("zencell: ") and (LONG[:100] in line or "/proc/nowhere" in line)
+    assert shown.out == ""
+
+
+def test_disk_that_takes_no_output_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert app.execute(["cells"]) == 1
+        monkeypatch.undo()
+        with contextlib.suppress(OSError):
+            full.close()
+    assert capsys.readouterr().err.splitlines() == ["zencell: No space left on device"]
 
 
 def test_the_process_ends_with_the_exit_code_and_without_a_traceback(tmp_path: Path) -> None:

@@ -55,6 +55,14 @@ def test_what_is_no_message_names_the_field_and_what_would_do(body: str, wanted:
         checked(topics.GRIPPER_STATE, "gripper/state", body)
 
 
+@pytest.mark.parametrize(("body", "wanted"), [
+    ("[" * 100_000, "is not JSON"), ('{"a": 1' + 30 * "0" + "}", "cannot be sent"),
+])
+def test_json_that_no_message_can_hold_is_told_in_one_line(body: str, wanted: str) -> None:
+    with pytest.raises(ConfigError, match=wanted):
+        checked(None, "my/key", body)
+
+
 @pytest.mark.parametrize(("arguments", "wanted"), [
     (["pub", "motion/stop", "{}"], "'motion/stop' is a request, which is not published: zencell call motion/stop JSON"),
     (["pub", "param/vision_detector", "{}"], "is a request"),

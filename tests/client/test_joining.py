@@ -28,6 +28,11 @@ from services import smart_pick_place, trajectory_executor
 LEFT = {"*": "left/*"}
 
 
+@pytest.mark.parametrize("host", ["a..b", "a" * 80])
+def test_nobody_listens_at_a_name_that_no_host_can_have(host: str) -> None:
+    assert not joining.somebody_listens(f"tcp/{host}:7489")
+
+
 @pytest.fixture
 def net(monkeypatch: pytest.MonkeyPatch) -> LocalNetwork:
     """What programs join in place of a router."""
