@@ -256,7 +256,8 @@ class Arm(Part):
             await self._jog(joints or {}, numbers("linear", linear), numbers("angular", angular), frame, seconds)
         with contextlib.suppress(TimeoutError):  # who moves it next is refused while it comes to rest
             async with asyncio.timeout(RESTS):
-                while np.abs(await self.velocities()).max() > AT_REST:
+                # An arm that was told to move just now may not have begun: the executor knows whether it is over.
+                while np.abs(await self.velocities()).max() > AT_REST or (await self.owner_now()).jogging:
                     pass
 
     async def _jog(

@@ -253,7 +253,9 @@ def test_jogging_moves_as_long_as_it_is_asked_for_and_no_longer() -> None:
         await asyncio.sleep(0.5)
         after = await cell.arm.pose()
         moved = after[:3, 3] - before[:3, 3]
-        await cell.arm.jog(linear=(0.0, -0.1, 0.0), seconds=0.2)
+        for seconds in (0.1, 0.2):
+            await cell.arm.jog(linear=(0.0, -0.1, 0.0), seconds=seconds)
+            assert not (await cell.arm.owner_now()).jogging
         await cell.arm.move("home")  # it rests when jogging returns
         assert 0.03 < moved[1] < 0.11 and abs(moved[0]) < 5e-3 and abs(moved[2]) < 5e-3
         assert np.abs(await cell.arm.velocities()).max() < 1e-3
