@@ -24,8 +24,17 @@ from common.client.scene import Scene
 from common.client.starting import Started
 from common.client.task import TaskControl
 from common.config import check
-from common.errors import ConfigError, UnknownName, ZencellError
-from common.messages import CollisionObject, Header, Message, PlanningScene, SupervisorStatus, WorldEdit, WorldObject
+from common.errors import ConfigError, DecodeError, UnknownName, ZencellError
+from common.messages import (
+    CollisionObject,
+    Header,
+    Message,
+    PlanningScene,
+    StopRequest,
+    SupervisorStatus,
+    WorldEdit,
+    WorldObject,
+)
 from common.topics import Request, Topic
 from common.transport.bus import Bus
 from common.transport.credentials import OPERATOR
@@ -110,10 +119,14 @@ class Cell(Part):
             application: dotted module of the cell's application, if it is one of your own.
             remapped: keys of the cell by the platform's words, where a cell has several arms: as `topics:` of a
                 service in a cell file.
+
+        Raises:
+            ConfigError: nobody may be called like that owner.
         """
         self._where: dict[str, Any] = {"domain": domain, "connect": connect, "secure": secure, "remapped": remapped}
         self._name, self._application = name, application
-        self._has(owner=owner or person())
+        # Said now: who is to stop the arm must not learn only then that nobody may be called so.
+        self._has(owner=check(StopRequest, {"owner": owner or person()}).owner)
         self._joined = contextlib.AsyncExitStack()
         self._started: Started | None = None
         self._bus: Bus | None = None
@@ -327,6 +340,7 @@ class Cell(Part):
         Raises:
             UnknownName: no service of zencell writes it, and it is not asked for as `plain`; with the choices.
             ConfigError: it is a request.
+            DecodeError: what came is not packed as messages are.
             NothingHeard: nothing came in time.
         """
         topic = None if plain else await self._carried(key)
@@ -346,4 +360,8 @@ class Cell(Part):
 
     async def _packed(self, key: str) -> AsyncGenerator[Any]:
         async for sample in self.bus.raw_reader(key):
-            yield msgpack.unpackb(sample.payload)
+            try:
+                value = msgpack.unpackb(sample.payload, strict_map_key=False)
+            except (ValueError, TypeError, RecursionError, msgpack.UnpackException):
+                raise DecodeError(f"{key}: {len(sample.payload)} bytes came that are not msgpack") from None
+            yield value

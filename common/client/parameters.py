@@ -13,7 +13,7 @@ from common import topics
 from common.client.joining import LOOK_TIMEOUT, person
 from common.client.part import Part
 from common.config import check
-from common.errors import NoResponder, RemoteError, RequestFailed, UnknownName, ZencellError
+from common.errors import ConfigError, NoResponder, RemoteError, RequestFailed, UnknownName, ZencellError
 from common.messages import Parameter, ParameterRequest
 from common.transport.bus import Bus
 from common.transport.keys import serves_key
@@ -82,8 +82,7 @@ async def ask(
         ZencellError: what is wrong with the change.
         RequestFailed: the service refuses, or does not answer.
     """
-    values = {"set": to_jsonable_python(changes or {}, inf_nan_mode="constants"), "dry_run": dry_run,
-              "by": f"{person()}/{os.getpid()}"}
+    values = {"set": dict(changes or {}), "dry_run": dry_run, "by": f"{person()}/{os.getpid()}"}
     request = check(ParameterRequest, values)
     try:
         return (await bus.client(topics.parameters_of(service)).call(request, TIMEOUT)).parameters
@@ -124,6 +123,7 @@ async def change(bus: Bus, values: Mapping[str, Any]) -> dict[str, tuple[Any, An
         ZencellError: what is wrong with a value.
         RequestFailed: a service refuses, or does not answer.
     """
+    values = {path: _plain(path, value) for path, value in values.items()}
     found = await look_up(bus, values)
     wanted: dict[str, dict[str, Any]] = {}
     for path, (service, parameter) in found.items():
@@ -136,6 +136,21 @@ async def change(bus: Bus, values: Mapping[str, Any]) -> dict[str, tuple[Any, An
         after = {parameter.path: parameter.value for parameter in await ask(bus, service, changes)}
         told |= {path: (told[path][0], after[path]) for path in changes}
     return told
+
+
+def _plain(path: str, value: object) -> Any:
+    """A value as it travels: what numpy has as numbers and lists.
+
+    Raises:
+        ConfigError: it is nothing of which a parameter is made.
+    """
+    def told(other: Any) -> Any:
+        return other.tolist()
+
+    try:
+        return to_jsonable_python(value, inf_nan_mode="constants", fallback=told)
+    except (ValueError, TypeError, AttributeError):
+        raise ConfigError(path, value, "must be a number, text, list or mapping") from None
 
 
 async def dumped(bus: Bus, services: Iterable[str] | None, *, everything: bool = False) -> str:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 
@@ -17,7 +19,7 @@ from common.client.goals import any_of, pose, region, through
 from common.client.hearing import Camera, NothingHeard
 from common.client.operator_motion import MotionFailed
 from common.config import load_cell
-from common.errors import ConfigError, NoResponder, RemoteError, UnknownName, ZencellError
+from common.errors import ConfigError, DecodeError, NoResponder, RemoteError, UnknownName, ZencellError
 from common.messages import HoldRequest, JointGoal, StopRequest
 from common.transport.bus import Bus
 from common.virtual.simulation import Simulation
@@ -351,6 +353,12 @@ def test_parameters_are_read_and_changed_by_path() -> None:
         before = await cell.param[path]
         await cell.param.set(path, before + 5)
         assert await cell.param[path] == before + 5 == (await cell.param.all())[f"services.{path}"]
+        for value in (np.int64(7), np.float32(8), np.array(9)):  # what is counted in pictures is
+            await cell.param.set(path, value)
+            assert await cell.param[path] == value
+        for value in (object(), np.array([1, 2])):
+            with pytest.raises(ZencellError, match="min_contour_area_px"):
+                await cell.param.set(path, value)
         with pytest.raises(UnknownName, match="did you mean"):
             await cell.param["vision_detector.min_contour_area"]
         with pytest.raises(ZencellError, match="min_contour_area_px"):
@@ -406,6 +414,15 @@ def test_any_key_is_called_and_listened_to() -> None:
         async for packed in cell.listen("joint_states", plain=True):
             assert len(packed["position"]) >= 7
             break
+        for payload, heard in ((msgpack.packb({1: 2}), {1: 2}), (b"hello", DecodeError), (b"", DecodeError)):
+            coming = asyncio.create_task(anext(cell.listen("others", plain=True)))
+            await asyncio.sleep(0.1)  # of virtual time, in which it is listened to
+            cell.bus.raw_writer(f"{cell.name}/others", "", "event").put(payload)
+            if heard is DecodeError:
+                with pytest.raises(DecodeError, match=r"panda/others: .* are not msgpack"):
+                    await coming
+            else:
+                assert await coming == heard
         assert any(service.name == "motion_planner" for service in (await cell.services()).services)
 
     run(program)
@@ -421,6 +438,13 @@ def test_what_nobody_answers_ends_in_the_exception_that_says_so() -> None:
             await cell.arm.order("enable")
 
     run(program, "ur5")
+
+
+@pytest.mark.parametrize("owner", ["x" * 121, "two\nlines", 5])
+def test_a_name_that_nobody_may_have_is_told_before_anything_is_asked_for(owner: Any) -> None:
+    for made in (Cell, partial(Cell.start, "panda")):
+        with pytest.raises(ConfigError, match="owner"):
+            made(owner=owner)
 
 
 async def test_a_cell_that_is_not_joined_says_how_to_join_it() -> None:
