@@ -273,7 +273,7 @@ class Cell(Part):
 
         Raises:
             UnknownName: a frame that nobody tells of; with the choices.
-            NothingHeard: nobody tells of any.
+            NothingHeard: nobody tells of any, or of one that moves any more.
         """
         target, source = [await self._frame(name) for name in (target, source)]
         known = self._frames
@@ -282,7 +282,7 @@ class Cell(Part):
             await known.until_known(target, source)
         else:
             await known.until_known(target, source)
-            await known.until_moved()
+            await known.until_moved(target, source)
         return known.tree.pose(target, source)
 
     async def _frame(self, name: str) -> str:

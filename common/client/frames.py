@@ -24,7 +24,7 @@ class Frames:
     def __init__(self, bus: Bus) -> None:
         """Subscribe to both."""
         self.tree = TransformTree()
-        self.moving: set[str] = set()
+        self._told: dict[str, float] = {}  # of what moves, when it was told of last [s, loop]
         self._cell = bus.cell
         self._changed = asyncio.Event()
         self._moving, self._fixed = bus.reader(topics.TF), bus.reader(topics.TF_STATIC)
@@ -40,10 +40,15 @@ class Frames:
             task.cancel()
         await asyncio.gather(*self._following, return_exceptions=True)
 
+    @property
+    def moving(self) -> frozenset[str]:
+        """What was told of as moving."""
+        return frozenset(self._told)
+
     async def _follow_moving(self) -> None:
         async for message in self._moving:
             self.tree.update(message)
-            self.moving.update(each.child_frame_id for each in message.transforms)
+            self._told |= dict.fromkeys((each.child_frame_id for each in message.transforms), _now())
             self._changed.set()
 
     async def _follow_fixed(self) -> None:
@@ -67,12 +72,39 @@ class Frames:
             self._require_some()
             self.tree.path(target, source)
 
-    async def until_moved(self) -> None:
-        """Return when the next transforms have come; at once where nothing moves."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(PATIENCE if self.moving else 0.0):
-                self._changed.clear()
-                await self._changed.wait()
+    async def until_moved(self, target: str, source: str) -> None:
+        """Return when all that moves between two frames was told anew; at once where nothing does.
+
+        Raises:
+            NothingHeard: some of it was not: where it was last is not where it is.
+        """
+        known = {name: self.tree.stamp_of(name) for name in self._moving_between(target, source)}
+
+        def old() -> list[str]:
+            return [name for name, stamp in known.items() if self.tree.stamp_of(name) <= stamp]
+
+        try:
+            async with asyncio.timeout(PATIENCE):
+                while old():
+                    self._changed.clear()
+                    await self._changed.wait()
+        except TimeoutError:
+            raise self._silence(old()) from None
+
+    def require_told(self, target: str, source: str) -> None:
+        """Return when all that moves between two frames was told of lately.
+
+        Raises:
+            NothingHeard: some of it was not: where it was last is not where it is.
+        """
+        if old := [name for name in self._moving_between(target, source) if self._told[name] < _now() - PATIENCE]:
+            raise self._silence(old)
+
+    def _moving_between(self, target: str, source: str) -> list[str]:
+        return [name for name in self.tree.path(target, source) if name in self._told]
+
+    def _silence(self, frames: list[str]) -> NothingHeard:
+        return NothingHeard(f"{self._cell}/tf of {', '.join(frames)}")
 
     def _known(self, target: str, source: str) -> bool:
         try:
@@ -104,13 +136,19 @@ async def poses(bus: Bus, target: str, source: str, period: float) -> AsyncGener
     """The figures of the pose of source in target, once it is known, each period [s].
 
     Raises:
-        NothingHeard, UnknownName, NotConnected: it does not become known.
+        NothingHeard: it does not become known, or is told of no more.
+        UnknownName, NotConnected: it does not become known.
     """
     async with Frames(bus) as frames:
         await frames.until_known(target, source)
         while True:
+            frames.require_told(target, source)
             yield pose_figures(frames.tree, target, source)
             await asyncio.sleep(period)
+
+
+def _now() -> float:
+    return asyncio.get_running_loop().time()
 
 
 def pose_figures(tree: TransformTree, target: str, source: str) -> dict[str, Any]:

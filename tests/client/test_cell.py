@@ -15,13 +15,24 @@ import pytest
 from common import topics
 from common.client.arm import NotJogged
 from common.client.cell import Cell
+from common.client.frames import poses
 from common.client.goals import any_of, pose, region, through
 from common.client.hearing import Camera, NothingHeard
 from common.client.operator_motion import MotionFailed
 from common.config import load_cell
 from common.errors import ConfigError, DecodeError, NoResponder, RemoteError, UnknownName, ZencellError
-from common.messages import HoldRequest, JointGoal, StopRequest
+from common.messages import (
+    Header,
+    HoldRequest,
+    JointGoal,
+    Pose,
+    StopRequest,
+    TFMessage,
+    TransformStamped,
+    Vector3,
+)
 from common.transport.bus import Bus
+from common.transport.local import LocalNetwork
 from common.virtual.simulation import Simulation
 
 pytestmark = pytest.mark.timeout(600)
@@ -438,6 +449,37 @@ def test_what_nobody_answers_ends_in_the_exception_that_says_so() -> None:
             await cell.arm.order("enable")
 
     run(program, "ur5")
+
+
+async def test_where_a_frame_was_when_it_was_last_told_of_is_not_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("common.client.frames.PATIENCE", 0.2)
+    net = LocalNetwork()
+    said, cell = net.bus("robot_state_publisher").writer(topics.TF), Cell.on(net.bus("program"))
+
+    async def told(stamp: int, *names: str) -> None:
+        for _ in range(50):
+            await asyncio.sleep(0)
+        said.put(TFMessage(transforms=[
+            TransformStamped(header=Header(stamp=stamp, frame_id="world"), child_frame_id=name, transform=Pose(
+                position=Vector3(x=float(stamp)))) for name in names]))
+
+    for stamp in (1, 2):
+        where = asyncio.create_task(cell.tf("world", "link"))
+        await told(stamp, "link", "other")
+        assert (await where)[0, 3] == stamp
+    for _ in range(2):  # also when the other one goes on moving
+        where = asyncio.create_task(cell.tf("world", "link"))
+        await told(3, "other")
+        with pytest.raises(NothingHeard, match="tf of link within"):
+            await where
+    shown = poses(cell.bus, "world", "link", 0.01)
+    where = asyncio.create_task(anext(shown))
+    await told(4, "link", "other")
+    assert (await where)["position"][0] == 4
+    with pytest.raises(NothingHeard, match="tf of link within"):
+        while True:
+            await told(5, "other")
+            assert (await anext(shown))["position"][0] == 4
 
 
 @pytest.mark.parametrize("owner", ["x" * 121, "two\nlines", 5])
