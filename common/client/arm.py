@@ -75,6 +75,7 @@ class Arm(Part):
         self._motion = OperatorMotion(ear.bus, owner=owner)
         self._ear, self._bus, self._tf = ear, ear.bus, tf
         self._moving: set[asyncio.Task[Any]] = set()  # what moves it in this program
+        self._owning = 0  # blocks in which it is ours
 
     # --- where it is ----------------------------------------------------------------------------------------------
 
@@ -314,6 +315,8 @@ class Arm(Part):
     async def owned(self, *, over: bool = False, lease: float = 0.0) -> AsyncIterator[MotionOwner]:
         """Have the motion inside the block: neither a task nor anybody else moves the robot meanwhile.
 
+        A block within another one leaves the motion to that.
+
         Args:
             over: take it from whoever has it; what they move comes to rest, and a task waits for a start.
             lease: give it back after so long without a motion [s, wall], should this program hang; 0: never.
@@ -324,11 +327,18 @@ class Arm(Part):
         try:
             owner = await self.own("take", over=over, lease=lease)
         except (asyncio.CancelledError, RequestLost, RequestTimeout):  # it may have been carried out
-            await self.own("give")
+            await self._give()
             raise
+        self._owning += 1
         try:
             yield owner
         finally:
+            self._owning -= 1
+            await self._give()
+
+    async def _give(self) -> None:
+        """Give the motion back, unless a block of this program still has it."""
+        if not self._owning:
             await self.own("give")
 
     async def owner_now(self) -> MotionOwner:

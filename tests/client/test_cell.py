@@ -241,6 +241,19 @@ def test_motion_that_is_owned_is_nobody_elses_until_the_block_ends() -> None:
     run(program)
 
 
+def test_motion_that_is_owned_is_not_given_back_by_a_block_within() -> None:
+    async def program(cell: Cell) -> None:
+        async with cell.arm.owned():
+            async with cell.arm.owned():
+                await cell.arm.move("home")
+            with pytest.raises(RemoteError):
+                await Cell.on(cell.bus, owner="other").arm.own("take")
+            assert (await cell.arm.owner_now()).owner == "program"
+        await Cell.on(cell.bus, owner="other").arm.own("take")
+
+    run(program)
+
+
 @pytest.mark.parametrize("after", [0.0, 0.001, 0.002, 0.01])
 def test_whoever_is_cancelled_while_taking_the_motion_does_not_keep_it(after: float) -> None:
     async def program(cell: Cell) -> None:
