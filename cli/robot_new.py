@@ -61,10 +61,12 @@ def new(
     pairs = path.with_suffix(".srdf")
     template = like or names_of("cells")[0]
     _writable("--out", path, force)
-    _writable("--out", pairs, force)
+    _writable("--out", pairs, force, (".srdf",))
     layout = None
     if cell:
         _writable("--cell", Path(cell).expanduser(), force)
+        if Path(cell).expanduser().resolve() == path.resolve():
+            raise ConfigError("--cell", cell, "is where the robot is written: name another file")
         layout = layout_of(template)
     wrists = find_wrists(tree)
     if tip is None and len(wrists) > 1 and not yes:
@@ -131,8 +133,8 @@ def _plain_name(text: str) -> str:
     return name if NAME.fullmatch(name) else "robot"
 
 
-def _writable(option: str, path: Path, force: bool) -> None:
-    if path.suffix not in (".yaml", ".yml", ".srdf"):
+def _writable(option: str, path: Path, force: bool, suffixes: Sequence[str] = (".yaml", ".yml")) -> None:
+    if path.suffix not in suffixes:
         raise ConfigError(option, str(path), "must end in .yaml")
     if not path.parent.is_dir():
         raise ConfigError(option, str(path), f"cannot be written: the folder {path.parent} does not exist")

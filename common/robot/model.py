@@ -123,7 +123,8 @@ class RobotModel:
         try:
             return pin.buildGeomFromUrdfString(self.full_model, self.urdf, kind, package_dirs=folders)
         except ValueError as error:
-            raise ConfigError("robot.urdf", self.config.urdf, f"has a mesh that cannot be loaded: {error}") from None
+            said = " ".join(str(error).split())
+            raise ConfigError("robot.urdf", self.config.urdf, f"has a mesh that cannot be loaded: {said}") from None
 
     @property
     def groups(self) -> list[str]:

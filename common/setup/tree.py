@@ -146,6 +146,9 @@ def _joint(element: ET.Element, links: Sequence[str], source: str) -> Joint:
             raise ConfigError("urdf", source, f"has a joint {name!r} whose {key} is {text!r}, no number")
         return number
 
+    axis = element.find("axis")
+    if kind in MOVING and axis is not None and not any(map(_may_turn, axis.get("xyz", "1 0 0").split())):
+        raise ConfigError("urdf", source, f"has a joint {name!r} whose axis is {axis.get('xyz')!r}, which is none")
     missing = next((key for key in ("effort", "velocity") if limit is not None and limit.get(key) is None), None)
     if missing is not None and kind in MOVING:
         raise ConfigError("urdf", source, f"has a joint {name!r} whose limit has no {missing}, which a URDF must give")
@@ -155,6 +158,14 @@ def _joint(element: ET.Element, links: Sequence[str], source: str) -> Joint:
         follows = (mimic.get("joint", ""), 1.0 if factor is None else factor)
     return Joint(name, kind, ends[0], ends[1], value(limit, "lower"), value(limit, "upper"),
                  value(limit, "velocity") or None, follows)
+
+
+def _may_turn(text: str) -> bool:
+    """Whether a number of an axis is not 0; whoever loads the URDF says what is none."""
+    try:
+        return float(text) != 0
+    except ValueError:
+        return True
 
 
 def find_arm(tree: Tree, source: str, tip: str | None = None) -> Arm:

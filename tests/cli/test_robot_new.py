@@ -142,6 +142,13 @@ BAD: dict[str, tuple[str, list[str], list[str]]] = {
     "name with a blank": (URDF.read_text(), ["bad.urdf", "--name", "my arm"], ["--name", "'my arm'"]),
     "folder that is not there": (URDF.read_text(), ["bad.urdf", "--out", "no/a.yaml"], ["--out", "does not exist"]),
     "out that is no YAML": (URDF.read_text(), ["bad.urdf", "--out", "a.txt"], ["--out", "'a.txt'", ".yaml"]),
+    "out that is the file beside it": (
+        URDF.read_text(), ["bad.urdf", "--out", "a.srdf"], ["--out", "'a.srdf'", ".yaml"]),
+    "cell in the place of the robot": (
+        URDF.read_text(), ["bad.urdf", "--out", "a.yaml", "--cell", "./a.yaml"], ["--cell", "'./a.yaml'", "another"]),
+    "mesh that is none": (
+        URDF.read_text().replace('<box size="0.04 0.05 0.11"/>', '<mesh filename="bad.urdf"/>'), ["bad.urdf"],
+        ["a mesh that cannot be loaded"]),
     "gripper on fingers": (
         URDF.read_text(), ["bad.urdf", "--gripper", str(URDF)], ["--gripper", "upper_slide moves there already"]),
     "limits that are none": (
@@ -161,7 +168,8 @@ def test_what_cannot_be_set_up_is_told_in_one_line(case: str, tmp_path: Path) ->
     (tmp_path / "bad.urdf").write_text(text)
     done = ask(tmp_path, "robot", "new", *arguments, "--yes")
     assert done.returncode == 2
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("zencell: ")]
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("zencell: ")
     assert not [word for word in wanted if word not in line], line
 
 

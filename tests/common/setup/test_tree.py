@@ -73,3 +73,12 @@ def test_a_urdf_that_is_no_tree_is_told() -> None:
         chain("base-a", "base-b", "a-c", "b-c")
     with pytest.raises(ConfigError, match="hang on each other, not on base: b, c"):
         chain("base-a", "b-c", "c-b")
+
+
+@pytest.mark.parametrize("axis", ["0 0 0", "0 -0.0 0.0"])
+def test_joint_about_no_axis_is_told(axis: str) -> None:
+    text = ('<robot><link name="a"/><link name="b"/><joint name="j" type="revolute"><parent link="a"/><child link="b"/>'
+            f'<axis xyz="{axis}"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>')
+    with pytest.raises(ConfigError, match=f"'j' whose axis is '{axis}', which is none"):
+        read_tree(ET.fromstring(text), "f")
+    assert read_tree(ET.fromstring(text.replace(axis, "0 0 1")), "f").joints
