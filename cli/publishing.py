@@ -62,11 +62,15 @@ def _publishable(key: str) -> Topic[Any] | None:
 
     Raises:
         ConfigError: it is a request.
+        UnknownName: it is no key, or stands for several.
     """
     from common.application import find_topic
+    from common.client.foreign import require_key
     from common.topics import Topic
 
     topic = find_topic(key)
+    if topic is None:
+        require_key(key, several=False)
     if topic is None or isinstance(topic, Topic):
         return topic
     raise ConfigError("KEY", key, f"is a request, which is not published: zencell call {key} JSON")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from common import topics
 from common.application import all_topics, find_topic
 from common.client.arm import Arm, Hand
+from common.client.foreign import require_key
 from common.client.frames import Frames
 from common.client.hearing import Camera, Carried, Ear, NothingHeard, cameras, messages, the_camera, topic_in
 from common.client.joining import cell_clock, joined, person, supervisor_status
@@ -338,12 +339,15 @@ class Cell(Part):
             timeout: for each message [s, wall]; else they are waited for without end, also once the cell has ended.
 
         Raises:
-            UnknownName: no service of zencell writes it, and it is not asked for as `plain`; with the choices.
+            UnknownName: no service of zencell writes it, and it is not asked for as `plain`; or it is no key; with
+                the choices.
             ConfigError: it is a request.
             DecodeError: what came is not packed as messages are.
             NothingHeard: nothing came in time.
         """
         topic = None if plain else await self._carried(key)
+        if plain:
+            require_key(str(key))
         if topic is None and not plain:
             raise UnknownName("key", str(key), [name for name, t in all_topics().items() if isinstance(t, Topic)])
         if isinstance(topic, Request):

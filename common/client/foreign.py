@@ -20,11 +20,28 @@ class SilentKey(UnknownName):
     """A key that is not known, and nothing says that somebody writes it."""
 
     def __init__(self, key: str, why: str) -> None:
-        from common.application import all_topics
-        from common.topics import Topic
-
-        super().__init__("key", key, [known for known, topic in all_topics().items() if isinstance(topic, Topic)])
+        super().__init__("key", key, _published())
         self.args = (f"{self}; {why}",)
+
+
+def require_key(key: str, *, several: bool = True) -> None:
+    """Return when somebody may have a key of that name; with `several` also when it stands for some, by * and **.
+
+    Raises:
+        UnknownName: nobody can, as with a slash in front; with the keys that are known.
+    """
+    from common.remapping import is_key
+
+    parts = ("x" if several and part in ("*", "**") else part for part in key.split("/"))
+    if not is_key("/".join(parts)):
+        raise UnknownName("key", key, _published())
+
+
+def _published() -> list[str]:
+    from common.application import all_topics
+    from common.topics import Topic
+
+    return [known for known, topic in all_topics().items() if isinstance(topic, Topic)]
 
 
 async def samples(bus: Bus, key: str) -> AsyncGenerator[RawSample, None]:

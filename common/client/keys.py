@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from common.application import all_topics, find_topic
+from common.client.foreign import require_key
 from common.client.hearing import Carried, topic_of_owner
 from common.client.joining import LOOK_TIMEOUT, joined, somebody_listens
 from common.config import load_cell, names_of
@@ -104,6 +105,9 @@ def published_or_foreign(key: str) -> Topic[Any] | None:
     """The topic of a key that is published; None for a key of somebody else's.
 
     Raises:
-        UnknownName: with the keys that are published, for one that is requested.
+        UnknownName: with the keys that are published, for one that is requested, and for what is no key.
     """
-    return published(key) if find_topic(key) else None
+    if find_topic(key):
+        return published(key)
+    require_key(key)
+    return None

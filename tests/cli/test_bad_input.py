@@ -52,6 +52,8 @@ CASES: dict[str, tuple[list[str], list[str]]] = {
     "parameter without a value": (["param", "set", "world.count"], ["param set", "'world.count'", "PATH=VALUE"]),
     "no cell": (["run"], ["CELL"]),
     "unknown topic": (["topic", "info", "joint_state"], ["unknown key", "did you mean 'joint_states'?"]),
+    "key of a part without a name": (["topic", "pub", "my//key", "{}"], ["unknown key 'my//key'", "choices:"]),
+    "key that stands for several": (["topic", "pub", "my/*", "{}"], ["unknown key 'my/*'", "choices:"]),
     "service of no name": (["service", "nobody"], ["unknown service 'nobody'", "motion_planner"]),
     "call without fields": (["call", "motion/plan", "{}"], ["motion/plan.id", "is missing"]),
     "size of two numbers": (["world", "add", "0.5", "0", "--size", "1,2"], ["--size", "'1,2'", "three numbers"]),

@@ -2,9 +2,10 @@ import pytest
 
 from cli.main import app
 from common import topics
+from common.client.keys import published_or_foreign
 from common.client.publishing import checked, stamped
 from common.clock import Clock
-from common.errors import ConfigError
+from common.errors import ConfigError, UnknownName
 
 CLOCK = Clock(2.0, 1_000)
 
@@ -53,6 +54,13 @@ def test_key_of_ones_own_takes_any_json() -> None:
 def test_what_is_no_message_names_the_field_and_what_would_do(body: str, wanted: str) -> None:
     with pytest.raises(ConfigError, match=wanted):
         checked(topics.GRIPPER_STATE, "gripper/state", body)
+
+
+@pytest.mark.parametrize("key", ["/joint_states", "joint_states/", "joint//states", "joint_states?", "joint states"])
+def test_what_can_be_no_key_is_told_before_anything_is_listened_to(key: str) -> None:
+    with pytest.raises(UnknownName, match=r"did you mean 'joint_states'\?"):
+        published_or_foreign(key)
+    assert published_or_foreign("my/**") is published_or_foreign("my/*/key") is None
 
 
 @pytest.mark.parametrize(("body", "wanted"), [

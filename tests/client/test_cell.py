@@ -429,6 +429,7 @@ def test_any_key_is_called_and_listened_to() -> None:
             (cell.call("motion/hold", hold=True, timeout=-1), ConfigError, "timeout"),
             (anext(cell.listen("motion/hold")), ConfigError, "is a request"),
             (anext(cell.listen("joint_state")), UnknownName, "did you mean 'joint_states'"),
+            (anext(cell.listen("/joint_states", plain=True)), UnknownName, "did you mean 'joint_states'"),
         ):
             with pytest.raises(error, match=words):
                 await asked
