@@ -51,6 +51,7 @@ def play_(
     from common.client.playing import play, played_of, renaming
     from common.recording.reading import Recording
     from common.recording.selection import Selection
+    from common.remapping import is_cell
     from common.transport.credentials import refuse_to_publish
 
     refuse_to_publish("play")
@@ -78,6 +79,8 @@ def play_(
         name = cell or recording.cell
         if not name:
             raise ConfigError("--cell", ..., f"{file} does not say of which cell it is: name one")
+        if not is_cell(name):
+            raise ConfigError("--cell", name, "is no name that a cell can have")
         show = rewrite if on_terminal else None
         code = asyncio.run(play(make, recording, played, name, wait or [], domain, connect, echo, show))
     raise typer.Exit(code)

@@ -14,6 +14,7 @@ from typing import Any
 from common.errors import ConfigError
 
 OF_EACH = ("log", "counters", "param")  # first parts of keys that each service has for itself
+LONGEST_CELL = 100  # characters of a cell's name
 SERVICE_NAME = re.compile(r"[A-Za-z_]\w*")
 _KEY = re.compile(r"[^\s/*$?#|]+(/[^\s/*$?#|]+)*")
 _BEGINNING = re.compile(r"([^\s/*$?#|]+/?)*\*")
@@ -22,6 +23,11 @@ _BEGINNING = re.compile(r"([^\s/*$?#|]+/?)*\*")
 def is_key(text: str) -> bool:
     """Whether a text is one key, without the cell, and stands for no others."""
     return _KEY.fullmatch(text) is not None and text.isprintable() and ".." not in text.split("/")
+
+
+def is_cell(text: str) -> bool:
+    """Whether a cell can have the name: it is the first part of each of its keys, and of names of files."""
+    return is_key(text) and "/" not in text and (text[0].isalnum() or text[0] == "_") and len(text) <= LONGEST_CELL
 
 
 class Remapping:

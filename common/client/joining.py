@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from common import topics
 from common.clock import Clock
 from common.config import names_of
-from common.errors import DecodeError, NoRouter, RequestFailed, UnknownName
+from common.errors import ConfigError, DecodeError, NoRouter, RequestFailed, UnknownName
 from common.messages import MotionStatus, SupervisorStatus
+from common.remapping import is_cell
 from common.transport.bus import Bus
 from common.transport.codec import decode
 from common.transport.connect import connect as connect_to
@@ -93,7 +94,10 @@ async def joined(
     Raises:
         NothingUp: there is no router, or no cell.
         UnknownName: several cells are up and none was named.
+        ConfigError: no cell can have that name.
     """
+    if cell is not None and not is_cell(cell):
+        raise ConfigError("cell", cell, "is no name that a cell can have")
     environ = {**os.environ, SECURE_VARIABLE: secure} if secure else os.environ
     endpoint = endpoint_of(domain, connect, environ)
     await until_somebody_listens(endpoint, CONNECT_TIMEOUT)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from common.config.basics import Section, Tunable
+from common.remapping import is_cell
 
 
 class Motion(Section):
@@ -69,10 +70,16 @@ class Pipeline(Section):
     )
 
 
+def _cell(name: str) -> str:
+    if not is_cell(name):
+        raise ValueError(f"{name!r} is no name of a cell, which begins all its keys: take letters, digits, _, - and .")
+    return name
+
+
 class Run(Section):
     """What belongs to one run."""
 
-    cell: str
+    cell: Annotated[str, AfterValidator(_cell)]
     seed: int = Field(0, ge=0, le=2**31 - 1)
     autostart: bool = True
 

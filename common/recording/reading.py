@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,9 +16,9 @@ from mcap.records import Channel, Message, Schema
 from common.recording.layout import DAMAGE, ChunkPlace, Layout, layout_of, records_of
 from common.recording.sample import RecordingError, Sample
 from common.recording.writing import ABOUT, ENDED, RUN, TRACES_SCHEMA
+from common.remapping import is_cell
 
 Wanted = Callable[[str], bool]  # is given a topic: the key without the cell
-CELL_NAME = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
 MOST_SPEED = 1000.0
 LAST = 2**64 - 1  # [ns] no log time is later
 MOST_TEXT = 1000  # [characters] of a value, or values of a list
@@ -111,9 +110,11 @@ class Recording:
         Raises:
             RecordingError: it is none.
         """
-        found = self.metadata(ABOUT).get("cell", "")
-        if not found or (isinstance(found, str) and CELL_NAME.fullmatch(found)):
-            return str(found)
+        # As it was written: a cell may be called 1, or true.
+        told = (record.metadata for record in reversed(self.layout.metadata) if record.name == ABOUT)
+        found = next(told, {}).get("cell", "")
+        if not found or is_cell(found):
+            return found
         raise self._wrong("cell", found, "the name of a cell")
 
     @property

@@ -10,6 +10,7 @@ import pytest
 from cli.main import app
 from tests.harness import ask, command_line, environment
 
+RECORDING = str(Path(__file__).parents[1] / "data" / "panda_first_release.mcap")
 CASES: dict[str, tuple[list[str], list[str]]] = {
     "simulator": (["run", "panda", "--set", "world.simulator=mujocco"], ["'mujocco'", "did you mean 'mujoco'?"]),
     "no simulator": (["run", "panda", "--set", "world.simulator=no.such"], ["world.simulator", "cannot be imported"]),
@@ -52,6 +53,9 @@ CASES: dict[str, tuple[list[str], list[str]]] = {
     "parameter without a value": (["param", "set", "world.count"], ["param set", "'world.count'", "PATH=VALUE"]),
     "no cell": (["run"], ["CELL"]),
     "unknown topic": (["topic", "info", "joint_state"], ["unknown key", "did you mean 'joint_states'?"]),
+    "cell file whose name begins no key": (["check", "a cell.yaml"], ["'a cell' is no name of a cell", "letters"]),
+    "cell that stands for several": (["task", "stop", "--cell", "*"], ["cell: '*'", "is no name that a cell can have"]),
+    "cell of two parts": (["play", RECORDING, "--cell", "a/b"], ["--cell: 'a/b'", "is no name"]),
     "key of a part without a name": (["topic", "pub", "my//key", "{}"], ["unknown key 'my//key'", "choices:"]),
     "key that stands for several": (["topic", "pub", "my/*", "{}"], ["unknown key 'my/*'", "choices:"]),
     "service of no name": (["service", "nobody"], ["unknown service 'nobody'", "motion_planner"]),
@@ -69,6 +73,7 @@ CASES: dict[str, tuple[list[str], list[str]]] = {
 def wrong_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bad")
     base = "robot: panda\nworld: balls\npipeline: cartesian_ompl\n"
+    (folder / "a cell.yaml").write_text(base + "task: first\nservices: {fakes.first: {}}\n")
     (folder / "broken.yaml").write_text("cell: [1,\nrobot: }\n")
     (folder / "list.yaml").write_text("- 1\n")
     (folder / "empty.yaml").write_text("")
@@ -95,7 +100,6 @@ def test_bad_input_is_one_line_and_exit_code_2(
 
 
 LONG = "x" * 300  # longer than a file system lets a name be
-RECORDING = str(Path(__file__).parents[1] / "data" / "panda_first_release.mcap")
 
 
 @pytest.mark.parametrize("arguments", [

@@ -16,6 +16,7 @@ from common.recording.sample import RecordingError, Sample, encoding_of, message
 from common.recording.stamps import Sequences
 from common.recording.summary import summarise
 from common.recording.writing import RecordingWriter
+from common.remapping import is_cell
 from tests.common.recording.samples import START, STEP, joints, status, write
 
 texts = st.text(st.characters(codec="utf-8", exclude_characters="/"), min_size=1, max_size=8)
@@ -165,6 +166,14 @@ def test_summary_counts_by_topic_and_tells_what_was_lost(tmp_path: Path) -> None
     assert summary.topics["camera/image_raw"].missed == 3
     assert (summary.lost, summary.messages, summary.finished) == (5, 11, True)
     assert json.loads(json.dumps(summary.as_dict()))["topics"]["joint_states"]["writers"] == ["executor.1"]
+
+
+@pytest.mark.parametrize("cell", ["panda", "1", "true", "null", "k\u00fcche", "a.b-c_2"])
+def test_a_cell_is_read_by_the_name_that_it_may_have(tmp_path: Path, cell: str) -> None:
+    assert is_cell(cell)
+    RecordingWriter(tmp_path / "a.mcap", {"cell": cell}).close()
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert recording.cell == cell
 
 
 def test_encoding_names_the_class() -> None:
