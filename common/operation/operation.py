@@ -90,6 +90,8 @@ class Operation:
         self.file = Path(summary) if summary else None
         if self.file and not self.file.absolute().parent.is_dir():
             raise ConfigError("--summary", summary, "is in a folder that does not exist")
+        if self.file and self.file.is_dir():
+            raise ConfigError("--summary", summary, "is a folder")
         share = share or Share()
         number, endpoint = place_of(domain, connect)
         self.launch = share.linked(Launch(
@@ -197,11 +199,13 @@ class Operation:
             self.summary.failed = True
             self.write_summary()
             raise
-        self.write_summary()
-        out = LossyWriter(sys.stdout)
-        for line in describe(self.summary.as_dict(), self.fold.figures):
-            out.put(printable(line) + "\n")
-        out.flush(LAST_WORDS)
+        try:
+            self.write_summary()
+        finally:  # what became of the run is said also where the disk takes no file
+            out = LossyWriter(sys.stdout)
+            for line in describe(self.summary.as_dict(), self.fold.figures):
+                out.put(printable(line) + "\n")
+            out.flush(LAST_WORDS)
         return LEFT if code == 0 and self.summary.unexplained else code
 
     def write_summary(self) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from cli.main import app
+from common.operation.operation import Operation
 from tests.harness import ask, command_line, environment
 
 RECORDING = str(Path(__file__).parents[1] / "data" / "panda_first_release.mcap")
@@ -44,6 +45,7 @@ CASES: dict[str, tuple[list[str], list[str]]] = {
     "endpoint that is none": (["node", "list", "--connect", "here"], ["--connect", "'here'", "tcp/"]),
     "seed out of bounds": (["run", "panda", "--seed", "-1"], ["seed", "-1", "0 or more"]),
     "summary in no folder": (["run", "panda", "--summary", "no/where/s.json"], ["--summary", "does not exist"]),
+    "summary that is a folder": (["run", "panda", "--summary", "."], ["--summary", "'.'", "is a folder"]),
     "chaos of no seed": (["run", "panda", "--chaos", "monkey"], ["--chaos", "'monkey'", "0 or more"]),
     "chaos too often": (["up", "panda", "--chaos", "1", "--chaos-rate", "0"], ["--chaos-rate", "'0'", "at most 600"]),
     "rate of no chaos": (["run", "panda", "--chaos-rate", "5"], ["--chaos-rate", "needs --chaos SEED"]),
@@ -116,6 +118,22 @@ def test_what_the_system_does_not_let_us_do_is_one_line(
     (line,) = shown.err.splitlines()
     assert line.startswith("zencell: ") and (LONG[:100] in line or "/proc/nowhere" in line)
     assert shown.out == ""
+
+
+def test_what_became_of_a_run_is_said_although_its_file_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], domain: int
+) -> None:
+    async def operate(operation: Operation, work: object) -> int:
+        folder.rmdir()  # meanwhile
+        return 1
+
+    folder = tmp_path / "figures"
+    folder.mkdir()
+    monkeypatch.setattr(Operation, "_operate", operate)
+    assert app.execute(["run", "panda", "--domain", str(domain), "--summary", str(folder / "s.json")]) == 1
+    shown = capsys.readouterr()
+    assert "panda: IDLE, 0 of 0 placed" in shown.out
+    assert shown.err.splitlines() == [f"zencell: {folder / 's.json.part'}: No such file or directory"]
 
 
 def test_disk_that_takes_no_output_is_one_line(
