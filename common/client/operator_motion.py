@@ -16,7 +16,7 @@ from common import messages as m
 from common import topics
 from common.application import applications
 from common.config import check
-from common.errors import RequestFailed, RequestLost, ZencellError
+from common.errors import ConfigError, RequestFailed, RequestLost, ZencellError
 from common.sources import new_id, wall_ns
 from common.transport.bus import Bus
 from common.transport.reader import Reader
@@ -120,6 +120,8 @@ class OperatorMotion:
         self, trajectory: m.JointTrajectory, timeout: float, heard: int, plan: m.PlanResponse | None = None
     ) -> m.MotionStatus:
         """As `follow`; what was said later than `heard`, when the motion was asked for, keeps the robot."""
+        if not isinstance(timeout, int | float) or not timeout > 0:
+            raise ConfigError("timeout", timeout, "must be more than 0 [s]")
         if (await self.require_free()).held:  # with nothing under way, letting go moves nothing, nor does it later
             await self._hold.call(m.HoldRequest(hold=False, reason="a person moves the robot", owner=self._owner(),
                                                 into_stop=True, heard=heard), REQUEST_TIMEOUT)
@@ -132,8 +134,9 @@ class OperatorMotion:
                 self._require_no_task()
                 raise MotionFailed(answer.error, f"the motion was refused: {answer.message}")
             return await self._ended(answer, timeout)
-        except (asyncio.CancelledError, RequestFailed, _Stalled):
-            await self._bring_to_rest(request.id)
+        except (asyncio.CancelledError, Exception) as error:
+            if not isinstance(error, MotionFailed) or isinstance(error, _Stalled):  # nobody waits for its end any more
+                await self._bring_to_rest(request.id)
             raise
 
     async def require_free(self) -> m.MotionStatus:

@@ -15,6 +15,7 @@ from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.client.arm import Arm
 from common.client.hearing import Ear
 from common.client.operator_motion import MotionFailed, OperatorMotion
+from common.errors import ConfigError
 from common.sources import wall_ns
 from common.transport.local import LocalNetwork
 
@@ -272,6 +273,28 @@ async def test_cancelled_motion_stops_the_robot(cell: Cell, person: OperatorMoti
         await moving
     stop = cell.asked[-1]
     assert isinstance(stop, m.StopRequest) and isinstance(execute, m.ExecuteRequest) and stop.id == execute.id
+
+
+@pytest.mark.parametrize("timeout", ["5", 0, -1.0, float("nan"), None])
+async def test_time_that_nobody_can_wait_for_is_told_before_anything_moves(
+    cell: Cell, person: OperatorMotion, timeout: Any
+) -> None:
+    cell.ends = False
+    with pytest.raises(ConfigError, match="timeout: "):
+        await person.move(HOME, timeout=timeout)
+    assert kinds(cell) == ["PlanRequest"]
+
+
+async def test_whatever_ends_the_wait_for_a_motion_stops_the_robot(
+    cell: Cell, person: OperatorMotion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def breaks(*_: object) -> m.MotionStatus:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(person, "_ended", breaks)
+    with pytest.raises(RuntimeError, match="a bug"):
+        await person.move(HOME)
+    assert kinds(cell)[-1] == "StopRequest"
 
 
 async def test_motion_without_progress_is_stopped_but_not_while_held(cell: Cell, person: OperatorMotion) -> None:
