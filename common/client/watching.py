@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from common.application import all_topics, applications
 from common.client.measuring import Hearing
+from common.remapping import is_key
 
 if TYPE_CHECKING:
     import psutil
@@ -132,7 +133,8 @@ class Watch:
                 self._received[counters.service] = max(0, total - sum(before.received.values())) / (now - then)
         self._counted[counters.service] = (now, counters)
         for key in counters.received:
-            if key not in self._hearing and key not in self._known and not key.startswith("param/"):
+            known = key in self._hearing or key in self._known or key.startswith("param/")
+            if not known and is_key(key):  # whoever counts may say anything
                 self._listen(key)
 
     def view(self) -> View:

@@ -96,6 +96,15 @@ async def test_key_of_ones_own_is_listened_to_once_somebody_reads_it() -> None:
     assert (row.topic, row.messages, row.p50) == ("my/key", 1, None)
 
 
+@pytest.mark.parametrize("key", ["my//key", "/key", "**", "a b", ""])
+async def test_counts_of_what_is_no_key_are_no_end_of_what_others_count(key: str) -> None:
+    network = LocalNetwork()
+    async with Watch(network.bus("top"), CLOCK) as watch:
+        watch.count(counted("mine", {key: 1, "my/key": 1}), 1.0)
+        network.bus("mine").raw_writer("test/my/key", "", "event").put(b"heard")
+        assert [row.topic for row in watch.view().topics] == ["my/key"]
+
+
 def test_processes_that_are_gone_are_stopped_and_those_of_other_hosts_are_ready() -> None:
     status = SupervisorStatus(cell="c", services=[
         ServiceStatus(name="router", state="ready", pid=1), ServiceStatus(name="a", state="ready", pid=2),
