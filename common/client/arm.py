@@ -75,7 +75,7 @@ class Arm(Part):
         self._motion = OperatorMotion(ear.bus, owner=owner)
         self._ear, self._bus, self._tf = ear, ear.bus, tf
         self._moving: set[asyncio.Task[Any]] = set()  # what moves it in this program
-        self._owning = 0  # blocks in which it is ours
+        self._owning, self._lease = 0, 0.0  # blocks in which it is ours, and for how long without a motion [s]
 
     # --- where it is ----------------------------------------------------------------------------------------------
 
@@ -315,7 +315,7 @@ class Arm(Part):
     async def owned(self, *, over: bool = False, lease: float = 0.0) -> AsyncIterator[MotionOwner]:
         """Have the motion inside the block: neither a task nor anybody else moves the robot meanwhile.
 
-        A block within another one leaves the motion to that.
+        A block within another one leaves the motion to that, and has its lease unless it is given one.
 
         Args:
             over: take it from whoever has it; what they move comes to rest, and a task waits for a start.
@@ -324,16 +324,17 @@ class Arm(Part):
         Raises:
             RemoteError: it is somebody else's.
         """
+        before = self._lease
         try:
-            owner = await self.own("take", over=over, lease=lease)
+            owner = await self.own("take", over=over, lease=lease or before)
         except (asyncio.CancelledError, RequestLost, RequestTimeout):  # it may have been carried out
             await self._give()
             raise
-        self._owning += 1
+        self._owning, self._lease = self._owning + 1, lease or before
         try:
             yield owner
         finally:
-            self._owning -= 1
+            self._owning, self._lease = self._owning - 1, before
             await self._give()
 
     async def _give(self) -> None:

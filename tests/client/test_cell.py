@@ -249,7 +249,14 @@ def test_motion_that_is_owned_is_not_given_back_by_a_block_within() -> None:
             with pytest.raises(RemoteError):
                 await Cell.on(cell.bus, owner="other").arm.own("take")
             assert (await cell.arm.owner_now()).owner == "program"
-        await Cell.on(cell.bus, owner="other").arm.own("take")
+        other = Cell.on(cell.bus, owner="other")
+        await other.arm.own("take")
+        await other.arm.own("give")
+        async with cell.arm.owned(lease=1.0):
+            async with cell.arm.owned():
+                pass
+            await asyncio.sleep(2.0)  # as a program that hangs
+            assert (await cell.arm.owner_now()).kind == "none"
 
     run(program)
 
