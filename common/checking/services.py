@@ -24,8 +24,11 @@ def examine(cell: Cell) -> Iterator[Finding]:
 
 
 def wiring(cell: Cell) -> Iterator[Finding]:
-    """What services refuse, and keys that do not fit together."""
+    """What services refuse, a task that is none of them, and keys that do not fit together."""
     found, complete = [], True
+    if cell.task not in cell.services:
+        yield error(f"task: {cell.task!r} is no service of the cell, so that nothing ends a run",
+                    f"name one of {', '.join(cell.services)}")
     for entry in cell.services.values():
         try:
             each = wired(cell, entry)

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from common.errors import ConfigError
 from common.planning.kernel.world import Shape
 from common.robot.finger_joints import finger_positions
 from common.robot.model import RobotModel
@@ -38,7 +39,11 @@ class RobotGeometry:
         _, geometry = pin.buildReducedModel(robot.full_model, full, robot.locked_ids, robot.full_reference)
         geometry.addAllCollisionPairs()
         if robot.srdf is not None:
-            pin.removeCollisionPairs(robot.model, geometry, str(robot.srdf), False)
+            try:
+                pin.removeCollisionPairs(robot.model, geometry, str(robot.srdf), False)
+            except (ValueError, RuntimeError) as error:
+                said = " ".join(str(error).split())
+                raise ConfigError("robot.srdf", str(robot.srdf), f"does not parse: {said}") from None
         self.geometry = geometry
         self._full_data = robot.full_model.createData()
         self.links: list[str] = [robot.model.frames[item.parentFrame].name for item in geometry.geometryObjects]

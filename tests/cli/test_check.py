@@ -64,6 +64,7 @@ THOROUGH = [
     ("panda", ["world.fixtures=[{id: post, dimensions: [0.1,0.1,1.0], position: [0.3,0,0.5]}]"], "error",
      "named_poses.home", True),
     ("panda", ["robot.tcp_link=nonsense"], "error", "robot.tcp_link: 'nonsense' is not a link", True),
+    ("panda", ["robot.srdf=/etc/passwd"], "error", "robot.srdf: '/etc/passwd' does not parse", True),
     ("panda", ["robot.named_poses.home=[9,0,0,-2,0,1.5,0]"], "error", "must be within", True),
 ]
 
@@ -109,6 +110,12 @@ def test_landed_ur5_gives_no_alarm_in_any_of_its_worlds(world):
 @pytest.mark.parametrize("name", ["panda", "ur5"])
 def test_landed_cells_have_an_owner_for_every_key(name):
     assert list(wiring(load_cell(name))) == []
+
+
+def test_task_that_is_no_service_of_the_cell_is_told():
+    (found,) = wiring(load_cell("panda", ["task=nobody"]))
+    assert found.severity == "error" and found.what.startswith("task: 'nobody' is no service of the cell")
+    assert "smart_pick_place" in found.remedy
 
 
 def test_two_writers_and_readers_of_what_nobody_writes_are_told():
