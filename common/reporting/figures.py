@@ -35,7 +35,7 @@ STYLE: Any = {  # matplotlib lists every name in its type
 
 @dataclass(frozen=True, eq=False)
 class JointLimits:
-    """Names of the arm's joints and their limits: positions (dof,) [rad], velocities (dof,) [rad/s]."""
+    """Names of the arm's joints and their limits: positions (dof,) [rad or m], velocities (dof,) [rad or m per s]."""
 
     names: list[str]
     lower: Array
@@ -137,8 +137,8 @@ def joints(times: Array, positions: Array, velocities: Array, names: Sequence[st
                     axes.set_ylim(low - 0.06 * (high - low), high + 0.06 * (high - low))
                 if column == 0:
                     axes.set_ylabel(_short(name), rotation=0, ha="right", va="center")
-        grid[0][0].set_title("position [rad]", fontsize=9)
-        grid[0][1].set_title("speed [rad/s]", fontsize=9)
+        grid[0][0].set_title("position [rad or m]", fontsize=9)
+        grid[0][1].set_title("speed [rad/s or m/s]", fontsize=9)
         for axes in grid[-1]:
             axes.set_xlabel("time [s]")
         return svg(figure, "joints")

@@ -95,6 +95,11 @@ def test_joints_are_taken_by_name_and_states_without_them_left_out():
     assert np.isnan(v[1]).all()
 
 
+def test_what_slides_is_not_told_in_radians():
+    text = figures.joints(np.arange(2.0), np.zeros((2, 1)), np.zeros((2, 1)), ["lift"], None)
+    assert "position [rad or m]" in text and "speed [rad/s or m/s]" in text
+
+
 @pytest.mark.parametrize(("shape", "dimensions"), [("box", [0.4, 0.2, 0.1]), ("cylinder", [0.1, 0.3])])
 def test_a_footprint_is_the_solid_from_above(shape, dimensions):
     turned = m.Pose(position=m.Vector3(x=1, y=2), orientation=m.Quaternion(z=np.sqrt(0.5), w=np.sqrt(0.5)))
