@@ -168,9 +168,19 @@ def iterated(loop: Loop, messages: Any) -> Iterator[Any]:
 @contextlib.contextmanager
 def entered(loop: Loop, block: contextlib.AbstractAsyncContextManager[Any]) -> Iterator[Any]:
     """An asynchronous context as a plain one."""
-    value = loop.wait(block.__aenter__)
+    values: list[Any] = []
+
+    async def enter() -> None:
+        values.append(await block.__aenter__())
+
     try:
-        yield given(loop, value)
+        loop.wait(enter)
+    except KeyboardInterrupt:
+        if values:  # it was entered as Ctrl-C came: what was taken is given back
+            loop.wait(functools.partial(block.__aexit__, None, None, None))
+        raise
+    try:
+        yield given(loop, values[0])
     except BaseException as error:
         if not loop.wait(functools.partial(block.__aexit__, type(error), error, error.__traceback__)):
             raise

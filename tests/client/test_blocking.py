@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import copy
+import functools
 import signal
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 
 import pytest
 
@@ -86,6 +87,32 @@ def test_async_with_is_with_also_when_it_ends_by_an_error(loop: Loop) -> None:
     with pytest.raises(ValueError, match="inside"), Blocking(loop, thing).block():
         raise ValueError("inside")
     assert not thing.entered
+
+
+@pytest.mark.parametrize("when", ["before", "as it is entered"])
+def test_ctrl_c_as_a_block_is_entered_leaves_it(loop: Loop, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+    thing, wait = Thing(), loop.wait
+    thing.entered = False
+
+    def interrupted(begin: Callable[[], Awaitable[object]]) -> None:
+        monkeypatch.undo()
+        if when != "before":
+            wait(begin)
+        else:
+            wait(functools.partial(cancelled, begin))
+        raise KeyboardInterrupt
+
+    async def cancelled(begin: Callable[[], Awaitable[object]]) -> None:
+        entering = asyncio.ensure_future(begin())
+        entering.cancel()
+        await asyncio.wait({entering})
+
+    block = Blocking(loop, thing).block()
+    monkeypatch.setattr(loop, "wait", interrupted)
+    with pytest.raises(KeyboardInterrupt), block:
+        raise AssertionError("nothing is done in it")
+    assert not thing.entered
+    assert called(loop, thing.twice, 4) == 8, "and the loop goes on"
 
 
 def test_ctrl_c_cancels_what_is_waited_for_and_waits_for_its_end(loop: Loop) -> None:
