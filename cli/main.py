@@ -44,6 +44,7 @@ from cli.place import Verbs
 from common.errors import RequestFailed, ZencellError
 from common.terminal import echo, printable
 
+NO_HOME = "Could not determine home directory."  # what pathlib says of ~NAME/...
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 
@@ -76,6 +77,10 @@ class CommandLine(Verbs):
             if error.strerror is None:  # none of the system's
                 raise
             code = _fail(f"{error.filename}: {error.strerror}" if error.filename else error.strerror, EXIT_FAILED)
+        except RuntimeError as error:
+            if str(error) != NO_HOME:
+                raise
+            code = _fail("a path begins with ~ and the name of somebody who has no home here", EXIT_BAD_INPUT)
         return code if isinstance(code, int) else 0
 
 
