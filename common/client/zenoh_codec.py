@@ -37,14 +37,17 @@ def encode(key: str, value: str) -> bytes:
     """
     try:
         given = from_json(json.loads(value))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(key, value, f"is not JSON: {error}") from None
     model = _model_of(key)
     if model is not None:
         if not isinstance(given, dict):
             raise ConfigError(key, value, f"must be a JSON object, a {model.__name__}")
         given = check(model, given, key).model_dump()
-    packed: bytes = msgpack.packb(given, use_bin_type=True)
+    try:
+        packed: bytes = msgpack.packb(given, use_bin_type=True)
+    except (ValueError, OverflowError) as error:
+        raise ConfigError(key, value, f"cannot be sent: {error}") from None
     return packed
 
 

@@ -69,6 +69,10 @@ def test_encoding_checks_what_the_key_carries() -> None:
 
 def test_a_key_that_is_not_ours_takes_any_json() -> None:
     assert msgpack.unpackb(encode("other/key", '{"a": {"base64": "AAE="}}')) == {"a": b"\x00\x01"}
+    with pytest.raises(ConfigError, match="cannot be sent"):
+        encode("other/key", "1" + 30 * "0")
+    with pytest.raises(ConfigError, match="is not JSON"):
+        encode("other/key", 100_000 * "[")
 
 
 @pytest.mark.parametrize("topic", all_topics().values(), ids=str)
