@@ -177,9 +177,8 @@ class Arm(Part):
 
     async def move(self, to: Where | Through, *, timeout: float = PATIENCE, **how: Any) -> MotionStatus:
         """Plan and execute: see there. What somebody says while it is planned keeps the arm, whoever that is."""
-        free = await self.require_free()
-        # What the program itself said before this is known to the executor, and may be under way to us.
-        heard = max(free.newest, (await self.status()).newest)
+        heard = (await self.status()).newest  # what the program itself said just now may still be under way to us
+        await self.require_free()
         return await self._follow(await self.plan(to, **how), timeout, heard)
 
     async def _follow(self, plan: Plan, timeout: float, heard: int | None = None) -> MotionStatus:
