@@ -27,7 +27,7 @@ CLEAR = 0.16  # from the middle of the box to that of a ball [m]
 ENOUGH = 45  # places of the grid, of which seven balls need not fill many
 # Heights of approach, lift and release: an arm that is too short for the first has lower ones.
 GRASPS: tuple[dict[str, float], ...] = (
-    {}, {"approach_clearance": 0.06, "lift_height": 0.08},
+    {}, {"approach_clearance": 0.06, "lift_height": 0.08, "drop_z": 0.2},
     {"approach_clearance": 0.04, "lift_height": 0.06, "drop_z": 0.18},
 )
 NEAREST = 0.12  # to the axis of the base, where the arm itself is not in the way [m]

@@ -84,7 +84,7 @@ def test_one_motion_leads_to_a_ball_that_may_not_be_touched_and_one_across_with_
     cell.until("DONE")
     plans = [r for r in cell.requests if isinstance(r, m.PlanRequest)]
     assert [r.stage for r in plans] == ["pre-grasp", "across"]
-    for plan, low, high, then in ((plans[0], 0.13, 0.05, 0.03), (plans[1], 0.18, 0.075, 0.20)):
+    for plan, low, high, then in ((plans[0], 0.13, 0.05, 0.03), (plans[1], 0.18, 0.075, 0.225)):
         assert isinstance(plan.goal, m.SequenceGoal)
         via, end = plan.goal.items
         assert isinstance(via.goal, m.PoseGoal) and isinstance(end.goal, m.PoseGoal)
