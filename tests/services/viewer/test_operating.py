@@ -17,6 +17,12 @@ from tests.common.viewer.browser_double import PATIENCE, BrowserDouble, opened
 from tests.services.viewer.conftest import TOKEN, Played, SceneDouble, page_of, until
 
 
+async def aim(page: BrowserDouble, goal: str) -> None:
+    """Choose a goal, and wait until that is so: a press comes over another connection."""
+    await page.set("Goal", goal)
+    await page.until(lambda: not page.parts[page.label("Goal marker")]["visible"])
+
+
 async def test_stop_stops_the_arm_and_the_task(panda: Played, page: BrowserDouble) -> None:
     await page.speak(do="stop", n=3)
     await until(lambda: panda.stops and panda.commands)
@@ -304,7 +310,7 @@ async def test_taught_pose_is_a_goal_and_is_kept_for_the_next_page(panda: Played
     await page.until(lambda: not page.button("Go through")[1])
     await page.press("Teach")
     await page.until(lambda: "bin" in page.parts[page.label("Goal")]["options"])
-    await page.set("Goal", "bin")
+    await aim(page, "bin")
     await page.press("Plan")
     await until(lambda: asked)
     assert asked[0].goal == m.JointGoal(positions=q)
@@ -330,7 +336,7 @@ async def test_plan_that_was_found_is_executed_once(panda: Played, page: Browser
     panda.bus.writer(PICK_PLACE_STATUS).put(PickPlaceStatus())
     await ready_to_jog(panda, page)
     assert page.button("Execute")[1] == "plan first"
-    await page.set("Goal", "home")
+    await aim(page, "home")
     await page.press("Plan")
     await page.press("Execute")
     await until(lambda: asked)
