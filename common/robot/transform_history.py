@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 WORLD = "world"
 KEPT = 250  # transforms of each frame: five seconds at 50 Hz
+MOST_FRAMES = 2000  # of which something is kept, those told of last: whoever is on the network can make any number up
 APART = 0.1  # [s] two transforms may be apart for what lies between to be a straight line
 RESTS = 1e-4  # [m, and of a quaternion] a frame that has moved by less rests, and they may be apart for any time
 
@@ -37,14 +38,17 @@ class TransformHistory:
 
     def __init__(self) -> None:
         """Know no frame."""
-        self._kept: dict[str, deque[TransformStamped]] = {}  # by child, oldest first
+        self._kept: dict[str, deque[TransformStamped]] = {}  # by child, in the order in which they were told of
 
     def note(self, message: TFMessage) -> None:
         """Take over transforms; one that is not newer than what is known of its child is left out."""
         for each in message.transforms:
-            kept = self._kept.setdefault(each.child_frame_id, deque(maxlen=KEPT))
+            kept = self._kept.pop(each.child_frame_id, deque(maxlen=KEPT))
+            self._kept[each.child_frame_id] = kept
             if not kept or each.header.stamp > kept[-1].header.stamp:
                 kept.append(each)
+        for name in [*self._kept][: max(0, len(self._kept) - MOST_FRAMES)]:
+            del self._kept[name]
 
     def pose(self, frame: str, fixed: TFMessage, stamp: int) -> Array:
         """(4, 4) T_world_frame at a time [ns], over frames that never move and, where these end, those of tf.

@@ -138,8 +138,9 @@ class Renderer:
 
     def _with_objects(self, objects: Sequence[WorldObject], arm: list[Mesh]) -> View:
         spheres = [thing for thing in objects if self._plain and thing.shape == "sphere"]
-        solid = [self._mesh(thing) for thing in objects if not (self._plain and thing.shape == "sphere")]
-        solid = [*self._solid, *solid, *arm]
+        things = [thing for thing in objects if not (self._plain and thing.shape == "sphere")]
+        known, self._meshes = self._meshes, {}  # of what is seen now: whoever is on the network can tell of any number
+        solid = [*self._solid, *(self._mesh(thing, known) for thing in things), *arm]
         plain = View(self._behind.colour.copy(), self._behind.depth)
         view = cast(solid, self.camera, self._behind) if solid else plain
         distances = [float(np.linalg.norm(_centre(thing) - self.camera.position)) for thing in spheres]
@@ -154,10 +155,10 @@ class Renderer:
                 _blend_sphere(view, shape, _bgr(thing), hidden=hidden)
         return view
 
-    def _mesh(self, thing: WorldObject) -> Mesh:
+    def _mesh(self, thing: WorldObject, known: Mapping[tuple[object, ...], Array]) -> Mesh:
         look = look_of(thing)
         if look not in self._meshes:
-            self._meshes[look] = solid_of_message(thing).triangles
+            self._meshes[look] = known[look] if look in known else solid_of_message(thing).triangles
         color = (thing.color.r, thing.color.g, thing.color.b)
         return Mesh(placed(self._meshes[look], pose_to_matrix(thing.pose)), color)
 

@@ -15,6 +15,7 @@ Report = m.MotionStatus | m.GripperState
 
 OVER = ("succeeded", "aborted", "cancelled")
 MISSES = ("too_wide", "too_narrow", "empty")  # outcomes of a grasp that did not take what was expected
+FARTHEST = 1e4  # [m] of what a task looks at
 FREE = 0.01  # [m] by which fingers are further apart than about what they held, when it falls as if they stood still
 
 
@@ -155,6 +156,10 @@ class Execution:
         return self.over if self.over is not None and reported.id not in (self.command.id, self.before) else reported
 
 
+def _is_near(pose: m.Pose) -> bool:
+    return max(map(abs, place_of(pose))) <= FARTHEST
+
+
 @dataclass
 class View:
     """What a task knows at an instant: only what was perceived or reported. An application adds what it reads.
@@ -169,6 +174,15 @@ class View:
     q: list[float] | None = None
     tcp: m.Pose | None = None
     trouble: str = ""  # why no motion may begin
+
+    def __post_init__(self) -> None:
+        """Leave out what is so far away that no motion can be asked for there: no message has room for its place."""
+        if self.scene is None:
+            return
+        objects = [thing for thing in self.scene.objects if _is_near(thing.pose)]
+        attached = [thing for thing in self.scene.attached if _is_near(thing.object.pose)]
+        if len(objects) + len(attached) < len(self.scene.objects) + len(self.scene.attached):
+            self.scene = self.scene.model_copy(update={"objects": objects, "attached": attached})
 
     @property
     def missing(self) -> list[str]:

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 GREY = m.Color(r=0.6, g=0.6, b=0.6)  # of what is not seen
 LEVEL = 0.005  # [m] what is seen so little above the table lies on it
+MOST_BESIDE = 50  # objects in containers that are in no slot
 AT_REST = 0.5  # [s] for which something is seen in a slot before it is taken to lie there
 
 
@@ -158,6 +159,11 @@ class PerceivedScene:
             self._tracks.new_id(), "attached", pose)
         self._held = m.AttachedObject(link=self.tcp_link, object=thing)
 
+    @property
+    def crowded(self) -> bool:
+        """Whether more was seen than a planning scene has room for: then it does not hold all."""
+        return self._tracks.crowded or any(len(things) > MOST_BESIDE for things in self._beside_slots.values())
+
     def scene(self) -> m.PlanningScene:
         """What is believed now; its stamp is that of the newest frame in it."""
         table = [self._object(t.id, "target", t.sighting, _pose(t)) for t in self._tracks.confirmed()]
@@ -169,7 +175,7 @@ class PerceivedScene:
             beside = things if len(things) > len(beside) else beside
         contained += [  # as the view has it that shows most of them
             self._object(f"contained_{k + 1}", "contained", thing, _pose(Track("", thing.position, 0, 0.0, thing)))
-            for k, thing in enumerate(beside)
+            for k, thing in enumerate(beside[:MOST_BESIDE])
         ]
         held = [self._held] if self._held is not None else []
         return m.PlanningScene(

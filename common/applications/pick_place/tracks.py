@@ -16,6 +16,8 @@ Place = tuple[float, float, float]
 Shape = Literal["sphere", "box", "cylinder"]
 Hides = Callable[[Place], bool]  # whether a place cannot be judged in a picture
 
+AHEAD = 5.0  # [s] what was seen later than that after a frame was told of by a clock that is wrong
+MOST = 200  # objects that are tracked: with what is made of them, a planning scene has room for few more
 WIDTH_SLACK = 0.01  # [m] by which the fingers' width and the seen size of what they hold may differ
 
 
@@ -51,10 +53,10 @@ class Sighting:
 
     @classmethod
     def of(cls, marker: Marker) -> Sighting | None:
-        """What a marker says; None for one that is no object."""
-        if marker.type == "text":
-            return None
+        """What a marker says; None for one that is no object: words, and what has no size."""
         p, s = marker.pose.position, marker.scale
+        if marker.type == "text" or min(s.x, s.y, s.z) <= 0:
+            return None
         return cls((p.x, p.y, p.z), marker.ns, marker.type, (s.x, s.y, s.z), marker.pose.orientation, marker.color)
 
     @property
@@ -90,6 +92,7 @@ class Tracks:
         self.p = parameters
         self._tracks: list[Track] = []
         self._count = 0
+        self.crowded = False  # whether something of the last frame found no room
         self._looked: dict[int, float] = {}  # of views that look at times: when last [s]
         self._hides: dict[int, tuple[float, Hides | None]] = {}  # of the others: when they looked last [s], what hides
 
@@ -131,11 +134,13 @@ class Tracks:
         for track in self._tracks:
             if track.last_seen < now and track.seen >= self.p.confirm_frames and self._is_hidden(track, now):
                 track.last_seen = now
-        self._tracks = [t for t in self._tracks if self._unseen_for(t, now) <= self.p.forget_after]
-        for j, sighting in enumerate(sightings):
-            if j not in matched:
-                self._count += 1
-                self._tracks.append(Track(f"track_{self._count}", sighting.position, 1, now, sighting, view))
+        self._tracks = [t for t in self._tracks if -AHEAD <= self._unseen_for(t, now) <= self.p.forget_after]
+        new = [sighting for j, sighting in enumerate(sightings) if j not in matched]
+        room = MOST - len(self._tracks)
+        self.crowded = len(new) > room
+        for sighting in new[: max(room, 0)]:
+            self._count += 1
+            self._tracks.append(Track(f"track_{self._count}", sighting.position, 1, now, sighting, view))
 
     def _is_hidden(self, track: Track, now: float) -> bool:
         """Whether nobody who looks now can tell whether it is there."""

@@ -15,7 +15,7 @@ from common import topics
 from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Marker, MarkerArray
-from common.perception.intake import LeftOut, Unusable
+from common.perception.intake import LeftOut, Unusable, require_room
 from common.perception.occlusion import Hidden, RobotBefore, Silhouettes
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
@@ -93,6 +93,7 @@ class Views:
                 if (moves or self._only_at_home) and not self._home.covers(stamp):
                     continue
                 try:
+                    require_room(len(frame.markers))
                     camera = await cameras.of(frame.header, own_frame=False)
                 except Unusable as error:
                     self._left_out.note(error)

@@ -8,7 +8,7 @@ import pytest
 from common.config import load_cell
 from common.messages import Header, JointState, TFMessage, TransformStamped
 from common.robot.model import RobotModel
-from common.robot.transform_history import KEPT, NoTransform, TransformHistory
+from common.robot.transform_history import KEPT, MOST_FRAMES, NoTransform, TransformHistory
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
 from services.robot_state_publisher import LinkFrames, stamped
 
@@ -74,3 +74,15 @@ def test_what_is_not_newer_is_left_out_and_unknown_and_circular_frames_are_named
     ring = [TransformStamped(header=Header(frame_id=a), child_frame_id=b, transform=pose) for a, b in ("ab", "ba")]
     with pytest.raises(NoTransform, match="hangs on itself"):
         history.pose("a", TFMessage(transforms=ring), 0)
+
+
+def test_frames_that_are_made_up_push_out_none_that_is_told_of_again() -> None:
+    history = told([0])
+    for stamp in range(1, 8):
+        state = JointState(header=Header(stamp=stamp * MS), name=ROBOT.joint_names, position=list(HOME))
+        message = FRAMES.moving(state)
+        assert message is not None
+        history.note(TFMessage.model_validate({"transforms": message.transforms}))
+        history.note(TFMessage(transforms=[stamped("world", f"new_{stamp}_{k}", np.eye(4), 1) for k in range(1000)]))
+    assert len(history._kept) <= MOST_FRAMES
+    assert np.isfinite(history.pose("lens", FIXED, 7 * MS)).all()

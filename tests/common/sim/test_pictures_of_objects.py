@@ -161,3 +161,10 @@ def test_objects_without_a_place_are_laid_out_apart_by_the_seed() -> None:
 def test_object_that_has_no_shape_is_no_message(wrong):
     with pytest.raises(DecodeError, match=r"WorldObjects\.objects\.0"):
         decode(WorldObjects, msgpack.packb({"objects": [{"id": "a", **wrong}]}))
+
+
+def test_shapes_that_are_not_seen_any_more_are_not_kept() -> None:
+    renderer = Renderer(AROUND)
+    for k in range(20):
+        renderer.see([thing(shape="box", size=[0.05, 0.05, 0.02 + 0.001 * k])])
+    assert len(renderer._meshes) == 1

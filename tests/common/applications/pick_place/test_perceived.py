@@ -242,3 +242,46 @@ def test_something_is_thought_to_carry_what_stands_above_the_table() -> None:
     column, = [o for o in s.scene().objects if o.role == "fixture"]
     assert column.dimensions == pytest.approx([0.04, 0.04, 0.08]) and column.pose.position.z == pytest.approx(0.04)
     assert (column.pose.position.x, column.pose.position.y) == (0.55, 0.1)
+
+
+def thing(k: int, x: float, y: float, side: float = 0.06) -> m.Marker:
+    return m.Marker(ns="thing", id=k, type="box", scale=m.Vector3(x=side, y=side, z=side),
+                    pose=m.Pose(position=m.Vector3(x=x, y=y, z=0.1)))
+
+
+def frame_of(stamp: float, *markers: m.Marker) -> m.MarkerArray:
+    return m.MarkerArray(header=m.Header(stamp=int(stamp * 1e9), frame_id="world"), markers=list(markers))
+
+
+@pytest.mark.parametrize("side", [0.0, -1.0])
+def test_what_has_no_size_is_no_object(side: float) -> None:
+    s = scene()
+    for t in (1.0, 1.1):
+        s.see(frame_of(t, thing(0, 0.4, 0.0, side), thing(1, 0.6, 0.0)), CAMERA, AWAY)
+    assert len(roles(s)["target"]) == 1
+
+
+def test_more_than_a_scene_has_room_for_is_told_and_breaks_nothing() -> None:
+    s = scene()
+    many = [thing(k, 0.2 + 0.1 * (k % 30), -2.0 + 0.1 * (k // 30)) for k in range(1000)]
+    for t in (1.0, 1.1):
+        s.see(frame_of(t, *many), CAMERA, AWAY)
+    assert s.crowded and len(s.scene().objects) <= 500
+    for t in (2.0, 2.1):
+        s.see(frame_of(t, many[0]), CAMERA, AWAY)
+    assert not s.crowded and len(roles(s)["target"]) == 1
+
+
+def test_more_in_a_container_than_a_scene_has_room_for_is_told_and_breaks_nothing() -> None:
+    s = scene()
+    s.see(frame_of(1.0, *(thing(k, 0.55, 0.25, 0.01) for k in range(600))), CAMERA, AWAY)
+    assert s.crowded and len(s.scene().objects) <= 500
+
+
+def test_what_a_wrong_clock_told_of_is_forgotten_with_the_next_frame_of_a_right_one() -> None:
+    s = scene()
+    for t in (1000.0, 1000.1):
+        s.see(frame_of(t, thing(0, 0.4, 0.0)), CAMERA, AWAY)
+    for t in (1.0, 1.1):
+        s.see(frame_of(t, thing(1, 0.6, 0.0)), CAMERA, AWAY)
+    assert [round(o.pose.position.x, 3) for o in s.scene().objects if o.role == "target"] == [0.6]

@@ -584,3 +584,13 @@ def test_an_arm_that_cannot_choose_is_left_any_clear_yaw_and_some_tilt_and_other
         assert pose_to_matrix(descend.pose) == pytest.approx(middle)
         assert over.tilt_tolerance == max(tilt, cell.task.p.orient_tol_rad)
         assert goals["across"].tilt_tolerance == (0.9 if tilt else cell.task.p.orient_tol_rad)  # what is let go falls
+
+
+@pytest.mark.parametrize("place", [(1e7, 0.0, 1e7), (0.4, -0.3, 1e7), (-1e7, 0.0, -1e7)])
+def test_ball_that_is_said_to_lie_farther_away_than_a_motion_can_be_asked_for_is_nobodys_target(
+    place: tuple[float, float, float]
+) -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.balls["far"] = place
+    cell.until("DONE")
+    assert cell.contained == 1
