@@ -15,7 +15,7 @@ Report = m.MotionStatus | m.GripperState
 
 OVER = ("succeeded", "aborted", "cancelled")
 MISSES = ("too_wide", "too_narrow", "empty")  # outcomes of a grasp that did not take what was expected
-FARTHEST = 1e4  # [m] of what a task looks at
+FARTHEST = 1e4  # [m] that what a task looks at is away at most, and large
 FREE = 0.01  # [m] by which fingers are further apart than about what they held, when it falls as if they stood still
 
 
@@ -156,8 +156,8 @@ class Execution:
         return self.over if self.over is not None and reported.id not in (self.command.id, self.before) else reported
 
 
-def _is_near(pose: m.Pose) -> bool:
-    return max(map(abs, place_of(pose))) <= FARTHEST
+def _is_near(thing: m.CollisionObject) -> bool:
+    return max(*map(abs, place_of(thing.pose)), *thing.dimensions) <= FARTHEST
 
 
 @dataclass
@@ -176,11 +176,11 @@ class View:
     trouble: str = ""  # why no motion may begin
 
     def __post_init__(self) -> None:
-        """Leave out what is so far away that no motion can be asked for there: no message has room for its place."""
+        """Leave out what is so far away, or so large, that no message has room for a motion there."""
         if self.scene is None:
             return
-        objects = [thing for thing in self.scene.objects if _is_near(thing.pose)]
-        attached = [thing for thing in self.scene.attached if _is_near(thing.object.pose)]
+        objects = [thing for thing in self.scene.objects if _is_near(thing)]
+        attached = [thing for thing in self.scene.attached if _is_near(thing.object)]
         if len(objects) + len(attached) < len(self.scene.objects) + len(self.scene.attached):
             self.scene = self.scene.model_copy(update={"objects": objects, "attached": attached})
 

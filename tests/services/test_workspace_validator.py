@@ -178,14 +178,21 @@ async def test_it_reads_no_truth():
     assert found.writes == {VALIDATED_TARGETS, REJECTED_TARGETS, WORKSPACE_MARKERS}
 
 
-async def test_frame_with_more_in_it_than_there_is_room_for_is_left_out_and_told(caplog):
+async def test_frame_with_more_in_it_than_there_is_room_for_is_left_out_and_told():
     net = LocalNetwork()
-    rig = Rig(net)
+    rig, told = Rig(net), asyncio.Queue()
+
+    class Listening(logging.Handler):
+        def emit(self, record):
+            told.put_nowait(record.getMessage())
+
     async with running_service(net, run, config, name="workspace_validator"):
         await rig.answer(seen((0.45, -0.2, 0.03)), 1)
         crowd = [(0.35 + 0.006 * (k % 20), -0.3 + 0.006 * (k // 20), 0.03) for k in range(300)]
+        log, listening = logging.getLogger("workspace_validator"), Listening()
+        log.addHandler(listening)
         rig.found.put(seen(*crowd, stamp=2_000))
-        async with asyncio.timeout(10):
-            while "a frame of detections left out: 300 things in it are more than" not in caplog.text:
-                await asyncio.sleep(0)
+        line = await asyncio.wait_for(told.get(), 10)
+        log.removeHandler(listening)
+        assert line.startswith("a frame of detections left out: 300 things in it are more than")
         await rig.answer(seen((0.45, -0.2, 0.03), stamp=3_000), 1)

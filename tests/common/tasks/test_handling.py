@@ -156,3 +156,13 @@ def test_done_is_said_after_a_while_of_later_pictures_and_nothing_begins_after_t
     of.decide(view(now=11.1))
     assert (of.status.state, of.status.figures) == ("DONE", {"seen": 0.0})
     assert row(of, view(box("a", 0.5, 0.0), now=20.0)) == []
+
+
+@pytest.mark.parametrize("far", [
+    box("far", 1e7, 0.0), box("far", 0.5, 0.0, z=1e7), box("far", 0.5, 0.0, size=(1e9, 1e9, 1e9))])
+def test_what_no_motion_can_be_asked_for_is_not_there(far: m.CollisionObject) -> None:
+    stages = row(task(), view(far, box("a", 0.5, -0.1)))
+    assert move(stages, "descend").touches[0][1] == "a"
+    assert row(task(), view(far)) == []
+    held = task()
+    assert row(held, view(holding=True, held=far)) == [], "it waits for a scene that says what is in the hand"
