@@ -27,6 +27,7 @@ MOVED = 0.005  # [m] what reaches no farther than so much beyond what was planne
 FARTHER = 0.005  # [m] than it had to be kept, before what was in the way no longer is
 _REMEMBERED = 32  # plans
 _STEP = 0.02  # [rad] between states that are looked at where nothing can be proved
+_MOST_STATES = 25_000  # that are looked at so: no motion of an arm is longer
 _PERCEIVED = ("target", "contained", "attached")
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 _WAYS = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=3) if any(way)])
@@ -95,6 +96,8 @@ class SceneMonitor:
             trajectory = self._plan.trajectory
         if trajectory is None or sorted(trajectory.joint_names) != sorted(self.robot.joint_names):
             raise NotWatched(f"goal {goal!r} has other joints than those that are planned for")
+        if not trajectory.points:
+            raise NotWatched(f"the trajectory of goal {goal!r} has no points")
         columns = [trajectory.joint_names.index(name) for name in self.robot.joint_names]
         timed = timed_path(trajectory)
         self._times, self._pieces = timed.times, cubics(timed)[:, :, columns]
@@ -176,10 +179,16 @@ class SceneMonitor:
 
 
 def _states(pieces: Array) -> Array:
-    """(N, dof) [rad] along cubics, no joint moving much farther than the step between."""
+    """(N, dof) [rad] along cubics, no joint moving much farther than the step between.
+
+    Raises:
+        NotWatched: they would be too many.
+    """
+    counts = np.maximum(1, np.ceil(np.abs(pieces[:, 1:]).sum(axis=1).max(axis=1) / _STEP))
+    if not counts.sum() <= _MOST_STATES:  # nor where they are no numbers
+        raise NotWatched(f"to look at it takes more than {_MOST_STATES} states")
     found = []
-    for piece in pieces:
-        count = max(1, int(np.ceil(np.abs(piece[1:]).sum(axis=0).max() / _STEP)))
+    for piece, count in zip(pieces, counts.astype(int), strict=True):
         r = np.arange(count)[:, None] / count
         found.append(piece[0] + r * (piece[1] + r * (piece[2] + r * piece[3])))
     return np.concatenate([*found, pieces[-1].sum(axis=0)[None]])

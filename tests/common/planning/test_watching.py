@@ -14,6 +14,7 @@ from common.messages import (
     Header,
     JointGoal,
     JointTrajectory,
+    JointTrajectoryPoint,
     PlanningScene,
     PlanRequest,
     Pose,
@@ -156,6 +157,23 @@ def test_motion_that_was_planned_elsewhere_keeps_off_the_whole_scene_but_for_wha
     with pytest.raises(NotWatched, match="goal 'h' has other joints"):
         other.follow("h", "", trajectory.model_copy(update={"joint_names": list("abcdefg")}))
     assert other.in_the_way(scene(post), 0.0) == "", "and it does not judge by the one before"
+
+
+def test_trajectory_without_points_is_not_watched(monitor):
+    with pytest.raises(NotWatched, match="goal 'g' has no points"):
+        monitor.follow("g", "", JointTrajectory(joint_names=ROBOT.joint_names, points=[]))
+
+
+@pytest.mark.parametrize("seconds, far", [(1.0, 1e12), (1e6, 1.0)])
+def test_trajectory_that_takes_too_many_states_to_look_at_is_not_watched(monitor, seconds, far):
+    none = [0.0] * ROBOT.dof
+    fast = [1e12] * ROBOT.dof
+    points = [JointTrajectoryPoint(time_from_start=0.0, positions=HOME.tolist(), velocities=none, accelerations=none),
+              JointTrajectoryPoint(time_from_start=seconds, positions=[far] * ROBOT.dof, velocities=fast,
+                                   accelerations=none)]
+    monitor.follow("g", "", JointTrajectory(joint_names=ROBOT.joint_names, points=points))
+    with pytest.raises(NotWatched, match="more than 25000 states"):
+        monitor.in_the_way(scene(thing("ball", (0.5, 0.0, 0.5))), 0.0)
 
 
 def test_scene_with_the_same_in_it_is_judged_once(monitor, pipeline):
