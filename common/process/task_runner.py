@@ -16,7 +16,7 @@ from common.robot.transforms import matrix_to_pose
 from common.sources import monotonic, new_id
 from common.tasks.deciding import TaskConfig
 from common.tasks.engine import Task
-from common.tasks.stages import Command, View
+from common.tasks.stages import Command, View, without_far
 from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
 from common.topics import Topic
 from common.transport.bus import Bus
@@ -58,11 +58,15 @@ async def run_task(
     task = make(config, status.message(), new_id(), bus.clock.speed)
     known = view(now=bus.clock.now())
     measured: m.JointState | None = None
+    perceived: m.PlanningScene | None = None
 
     def look() -> V:
-        nonlocal measured
+        nonlocal measured, perceived
         known.now = bus.clock.now()
-        known.scene, known.motion = scene.latest, motion.latest
+        if scene.latest is not None and scene.latest is not perceived:
+            perceived = scene.latest
+            known.scene = without_far(perceived)
+        known.motion = motion.latest
         known.gripper = gripper.latest if config.robot.gripper is not None else m.GripperState()
         for name, reader in own.items():
             setattr(known, name, reader.latest)

@@ -67,7 +67,7 @@ class Task(Deciding[V]):
         self._planning = None
         self._note_plan(response)
         self.planned(move, response)
-        if response.ok and response.trajectory is not None:
+        if response.ok and response.trajectory is not None and response.trajectory.points:
             move.trajectory, move.plan, move.scene_stamp = response.trajectory, response.id, response.scene_stamp
         elif move.otherwise and move in self.row and not response.error.startswith("start_"):
             at = self.row.index(move)

@@ -160,6 +160,15 @@ def _is_near(thing: m.CollisionObject) -> bool:
     return max(*map(abs, place_of(thing.pose)), *thing.dimensions) <= FARTHEST
 
 
+def without_far(scene: m.PlanningScene) -> m.PlanningScene:
+    """The scene without what is so far away, or so large, that no message has room for a motion there."""
+    objects = [thing for thing in scene.objects if _is_near(thing)]
+    attached = [thing for thing in scene.attached if _is_near(thing.object)]
+    if len(objects) + len(attached) == len(scene.objects) + len(scene.attached):
+        return scene
+    return scene.model_copy(update={"objects": objects, "attached": attached})
+
+
 @dataclass
 class View:
     """What a task knows at an instant: only what was perceived or reported. An application adds what it reads.
@@ -176,13 +185,9 @@ class View:
     trouble: str = ""  # why no motion may begin
 
     def __post_init__(self) -> None:
-        """Leave out what is so far away, or so large, that no message has room for a motion there."""
-        if self.scene is None:
-            return
-        objects = [thing for thing in self.scene.objects if _is_near(thing)]
-        attached = [thing for thing in self.scene.attached if _is_near(thing.object)]
-        if len(objects) + len(attached) < len(self.scene.objects) + len(self.scene.attached):
-            self.scene = self.scene.model_copy(update={"objects": objects, "attached": attached})
+        """Leave out what no motion is for."""
+        if self.scene is not None:
+            self.scene = without_far(self.scene)
 
     @property
     def missing(self) -> list[str]:

@@ -91,3 +91,27 @@ async def test_pause_is_answered_with_the_status() -> None:
     async with running_service(net, smart_pick_place.run, CONFIG, name="smart_pick_place"):
         assert (await command.call(m.TaskCommand(command="pause"))).paused
         assert not (await command.call(m.TaskCommand(command="resume"))).paused
+
+
+async def test_plan_without_points_and_a_scene_with_something_far_away_in_the_hand_do_not_end_it() -> None:
+    net = LocalNetwork()
+    bus = net.bus("tester", cell="test", clock=Clock())
+    asked: asyncio.Queue[m.PlanRequest] = asyncio.Queue()
+
+    async def plan(request: m.PlanRequest) -> m.PlanResponse:
+        asked.put_nowait(request)
+        return m.PlanResponse(
+            id=request.id, ok=True, trajectory=m.JointTrajectory(joint_names=CELL.robot.joints, points=[]))
+
+    bus.serve(topics.MOTION_PLAN, plan)
+    await bus.ready()
+    async with running_service(net, smart_pick_place.run, CONFIG, name="smart_pick_place"):
+        show(bus, [(0.40, -0.17)])
+        await asyncio.wait_for(asked.get(), 5)
+        await asyncio.wait_for(asked.get(), 5)  # it is planned anew
+        far = ball("far", 1e7, 1e7)
+        held = [m.AttachedObject(link="panda_hand_tcp", object=far)]
+        header = m.Header(stamp=bus.clock.now_ns(), frame_id="world")
+        bus.writer(topics.PLANNING_SCENE).put(m.PlanningScene(header=header, attached=held))
+        bus.writer(topics.GRIPPER_STATE).put(m.GripperState(header=header, holding=True, outcome="too_wide"))
+        await asyncio.wait_for(asked.get(), 5)
