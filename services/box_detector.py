@@ -16,7 +16,7 @@ from common.perception.boxes import BoxDetector, BoxOptions, SeenBox, outlined
 from common.perception.depth import DepthError, check_depth, depth_of
 from common.perception.exposure import blindness
 from common.perception.image import array_to_image
-from common.perception.intake import LeftOut, Unusable, picture_of, require_room
+from common.perception.intake import LeftOut, Unusable, picture_of, require_near, require_room
 from common.process.camera_reader import CameraReader
 from common.process.service import main
 from common.transport.bus import Bus
@@ -35,9 +35,10 @@ def markers(found: list[SeenBox], config: Config, stamp: int, blind: str = "") -
     """The message of what was found in the picture that was exposed at `stamp`, or of why that tells nothing.
 
     Raises:
-        Unusable: that is more than there is room for.
+        Unusable: that is more, or farther away, than there is room for.
     """
     require_room(len(found))
+    require_near([box.position for box in found])
     return MarkerArray(header=Header(stamp=stamp, frame_id=WORLD), blind=blind, markers=[
         _marker(index, box, config) for index, box in enumerate(found)
     ])

@@ -14,7 +14,7 @@ from common.config import Surroundings
 from common.errors import ZencellError
 from common.messages import Header, Image, Pose, Vector3
 from common.perception.depth import check_depth, depth_of
-from common.perception.intake import Unusable
+from common.perception.intake import Unusable, require_near
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.service import main
@@ -43,6 +43,7 @@ def outline(contours: Contours, image: Image, camera: Pinhole, config: Config) -
     if (count := len(face.outline)) > MOST_POINTS:
         raise Unusable("crowded", f"its {count} points are more than an outline has room for: is the picture full of "
                                   "noise?")
+    require_near(face.outline)
     return face
 
 

@@ -22,7 +22,7 @@ from common.config.basics import Rgb
 from common.messages import Color, Header, Image, Marker, MarkerArray, Pose, Vector3
 from common.perception.depth import Depth, DepthError, check_depth, depth_of
 from common.perception.image import array_to_image
-from common.perception.intake import LeftOut, Unusable, picture_of, require_room
+from common.perception.intake import LeftOut, Unusable, picture_of, require_near, require_room
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.process.service import main
@@ -50,9 +50,10 @@ def markers(
     What is `odd` is among it with the reason as its text: it stands in the way, and is not to be taken.
 
     Raises:
-        Unusable: that is more than there is room for.
+        Unusable: that is more, or farther away, than there is room for.
     """
     require_room(len(detections) + len(odd))
+    require_near([one.position for one in [*detections, *odd]])
     return MarkerArray(
         header=Header(stamp=stamp, frame_id=WORLD),
         remark=remark,

@@ -17,6 +17,7 @@ from common.robot.transform_history import NoTransform, TransformHistory
 Picture = npt.NDArray[np.uint8]
 
 UNKNOWN_CAMERA = "unknown_camera"
+FARTHEST = 1e7  # [m] along each axis that a message has room for
 MOST_THINGS = 250  # found in a picture: neither a list of targets nor a planning scene has room for many more
 
 
@@ -37,6 +38,17 @@ def require_room(things: int) -> None:
     if things > MOST_THINGS:
         raise Unusable("crowded", f"{things} things in it are more than a planning scene has room for: is the picture "
                                   "full of noise?")
+
+
+def require_near(places: npt.ArrayLike) -> None:
+    """Return when places in world [m] that were told by a camera are so near that a message can say where they are.
+
+    Raises:
+        Unusable: one of them is farther, or nowhere: the camera looks along the plane on which it was looked for, or is
+            none that there can be.
+    """
+    if not (np.abs(np.asarray(places, dtype=float)) <= FARTHEST).all():
+        raise Unusable("far", f"something in it would be more than {FARTHEST:g} m away: is the camera's pose right?")
 
 
 class LeftOut:

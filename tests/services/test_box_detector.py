@@ -99,6 +99,12 @@ def test_more_boxes_than_there_is_room_for_are_not_told_of_in_part() -> None:
         box_detector.markers([box] * (MOST_THINGS + 1), CONFIG, 0)
 
 
+@pytest.mark.parametrize("x", [1.1e7, -math.inf, math.nan])
+def test_box_that_is_farther_away_than_can_be_told_is_not_told_of(x: float) -> None:
+    with pytest.raises(Unusable, match=r"more than 1e\+07 m away"):
+        box_detector.markers([SeenBox("red", (x, 0.0, 0.02), 0.0, np.zeros((4, 2)), False)], CONFIG, 0)
+
+
 async def test_picture_with_the_depth_of_another_one_or_of_another_size_is_left_out() -> None:
     net = LocalNetwork()
     camera = Camera(net)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from common.process.in_process import running_service
 from common.robot.transforms import matrix_to_pose
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
-from services import outline_scene
+from services import outline_scene, pixel_to_world
 
 CELL = load_cell("ur5")
 CONFIG = service_config(CELL, "outline_scene", outline_scene.Config)
@@ -115,6 +116,20 @@ def test_depth_of_another_size_than_the_contours_is_left_out() -> None:
     image = array_to_image(cube_depth()[::2, ::2], "32FC1")
     with pytest.raises(Unusable, match=f"512x384, but the picture is {CAMERA.width}x{CAMERA.height}"):
         outline_scene.seen(cube_contours(), image, CAMERA, AROUND)
+
+
+@pytest.mark.parametrize("change", [{"fx": 1e-6}, {"cy": 1e12}])
+def test_what_would_be_farther_away_than_a_scene_can_tell_is_left_out(change: dict[str, float]) -> None:
+    image = array_to_image(cube_depth(), "32FC1")
+    with pytest.raises(Unusable, match=r"more than 1e\+07 m away"):
+        outline_scene.seen(cube_contours(), image, replace(CAMERA, **change), AROUND)
+
+
+@pytest.mark.parametrize("change", [{"fx": 1e-6}, {"cy": 1e12}])
+def test_what_would_be_farther_away_than_an_outline_can_tell_has_none(change: dict[str, float]) -> None:
+    image = array_to_image(cube_depth(), "32FC1")
+    with pytest.raises(Unusable, match=r"more than 1e\+07 m away"):
+        pixel_to_world.outline(cube_contours(), image, replace(CAMERA, **change), pixel_to_world.Config())
 
 
 async def test_picture_with_the_arm_in_it_is_left_out() -> None:

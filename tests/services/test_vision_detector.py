@@ -168,6 +168,24 @@ async def test_a_camera_that_no_pinhole_is_does_not_end_the_service():
         assert (await rig.next()).header.stamp == 2
 
 
+async def test_a_camera_that_sees_things_farther_away_than_can_be_told_does_not_end_the_service(caplog):
+    net = LocalNetwork()
+    rig = Rig(net)
+    with caplog.at_level(logging.WARNING):
+        async with running_service(net, run, config, name="vision_detector"):
+            rig.calibrate()
+            far = camera.T_world_optical.copy()
+            far[:3, 3] = (1e7, 1e7, 1e7)
+            rig.statics.put(tf(far))
+            rig.images.put(picture(stamp=1))
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(rig.found.next(), 0.5)
+            rig.calibrate()
+            rig.images.put(picture(stamp=2))
+            assert len((await asyncio.wait_for(rig.found.next(), 5)).markers) == 3
+    assert "more than 1e+07 m away" in caplog.text
+
+
 async def test_annotated_picture_is_drawn_for_whoever_listens():
     net = LocalNetwork()
     rig = Rig(net)

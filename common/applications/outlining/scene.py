@@ -9,7 +9,7 @@ import numpy as np
 from common import messages as m
 from common.applications.outlining.perceived_solids import PerceivedSolid
 from common.config import Surroundings
-from common.perception.intake import Unusable
+from common.perception.intake import Unusable, require_near
 from common.scene.fixtures import fixture_objects
 
 MOST, MOST_CORNERS, MOST_OF_ONE = 400, 5000, 2000  # solids and corners that a planning scene has room for
@@ -19,12 +19,16 @@ def planning_scene(around: Surroundings, solids: Sequence[PerceivedSolid], stamp
     """Fixtures and perceived solids, in world, as seen in the picture with that stamp.
 
     Raises:
-        Unusable: more is seen than there is room for; what stands somewhere is not left out of a scene.
+        Unusable: more is seen, or farther away, than there is room for; what stands somewhere is not left out of a
+            scene.
     """
     corners = [len(solid.outline) for solid in solids]
     if len(corners) > MOST or sum(corners) > MOST_CORNERS or max(corners, default=0) > MOST_OF_ONE:
         raise Unusable("crowded", f"{len(corners)} objects with {sum(corners)} corners are more than a planning scene "
                                   "has room for: is the picture full of noise?")
+    for solid in solids:
+        require_near(solid.outline)
+        require_near((solid.base, solid.base + solid.height))
     header = m.Header(stamp=stamp, frame_id="world")
     return m.PlanningScene(header=header, objects=[*fixture_objects(around), *map(collision_object, solids)])
 
