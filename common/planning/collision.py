@@ -16,7 +16,7 @@ from common.errors import UnknownName
 from common.messages import CollisionObject, PlanningScene, Pose
 from common.planning.constraints import ToolConstraints
 from common.planning.kernel.world import EXCUSED, KernelWorld
-from common.planning.obstacles import MARGINS, ObstacleBank, ObstacleCache, Rules, Solid
+from common.planning.obstacles import MARGINS, BadShape, ObstacleBank, ObstacleCache, Rules, Solid
 from common.planning.path import SmoothPath
 from common.planning.points import PointObstacle
 from common.planning.robot_geometry import RobotGeometry
@@ -28,6 +28,7 @@ Pair = tuple[str, str]
 
 _PERCEIVED = ("target", "contained", "attached")
 _CONTACT_SLACK = 1  # margin level [1 mm] within which an attached object counts as touching at the start
+_FARTHEST_HELD = 100.0  # [m] from a joint that what is held may reach
 _DEEPER = 2e-4  # [m] than at the start: by rounding, and by how far a followed line may be off
 
 
@@ -136,6 +137,9 @@ class CollisionWorld:
         self._near = self._rules_at_start(disabled, margins)
         self._hand_over_rules()
         self._lever = self._bank.lever
+        if held and not self._lever.max() <= _FARTHEST_HELD:  # in pieces of 1 mm there would be no end to its way
+            raise BadShape(f"{held[0][0].id}: what is held reaches {self._lever.max():.3g} m from a joint, "
+                           f"{_FARTHEST_HELD:g} m are the most")
         # The TCP need not be within the hulls, so it has a lever of its own.
         tcp = robot.model.frames[robot.tcp_frame]
         point = pin.GeometryObject("tcp", tcp.parentJoint, robot.tcp_frame, tcp.placement, coal.Sphere(1e-6))

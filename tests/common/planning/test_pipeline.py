@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from common.config import Motion, Pipeline
-from common.messages import Header, JointGoal, PlanRequest, Vector3
+from common.messages import Header, JointGoal, PlanRequest, Pose, Vector3
 from common.planning.collision import CollisionWorld
 from common.planning.pipeline import PlanningPipeline
 from common.planning.validation import Fault, fine_samples, timed_path
@@ -131,6 +131,14 @@ def test_bad_request_is_answered_with_code_and_choice_and_nothing_is_lost(reques
     assert "\n" not in response.message
     assert response.trajectory is None
     assert PIPELINE.plan(to_joints(HOME, START), scene(SPREAD)).ok
+
+
+def test_what_would_be_held_far_beyond_the_arm_is_refused():
+    with_ball = scene(SPREAD)
+    ball = next(thing.id for thing in with_ball.objects if thing.role == "target")
+    far = {"attach": ball, "attach_pose": Pose(position=Vector3(z=1e7))}
+    response = PIPELINE.plan(to_joints(HOME, START).model_copy(update=far), with_ball)
+    assert response.error == "bad_scene" and "reaches 1e+07 m from a joint, 100 m are the most" in response.message
 
 
 def test_scene_in_another_frame_is_refused():
