@@ -78,14 +78,14 @@ async def run(bus: Bus, config: Config) -> None:
             camera = await cameras.of(image.header)
             picture, metres = picture_of(image, camera), depth_of(depth)
             check_depth(metres, camera.width, camera.height)
+            detector.options = config.model_copy()
+            boxes = await asyncio.to_thread(detector.detect, picture, metres, camera)
         except Unusable as error:
             left_out.note(error)
             return
         except DepthError as error:
             left_out.note(Unusable(error.kind, str(error)))
             return
-        detector.options = config.model_copy()
-        boxes = await asyncio.to_thread(detector.detect, picture, metres, camera)
         try:
             found.put(markers(boxes, config, image.header.stamp, "" if boxes else blindness(picture)))
         except Unusable as error:

@@ -20,6 +20,7 @@ from pydantic import Field
 from common.config import Parameters, Section, Tunable
 from common.config.basics import Length, Rgb
 from common.perception.depth import Depth, Rays, is_valid
+from common.perception.intake import require_near
 from common.perception.pinhole import Pinhole
 
 Array = npt.NDArray[np.float64]
@@ -72,10 +73,15 @@ class BoxDetector:
         self._rays: tuple[Pinhole, Rays] | None = None
 
     def detect(self, picture: Picture, depth: Depth, camera: Pinhole) -> list[SeenBox]:
-        """Boxes in a bgr8 picture (height, width, 3) with depth (height, width) [m], kind by kind."""
+        """Boxes in a bgr8 picture (height, width, 3) with depth (height, width) [m], kind by kind.
+
+        Raises:
+            Unusable: the camera is none that there can be.
+        """
         if self._rays is None or self._rays[0] is not camera:
             pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
             self._rays = camera, Rays.through(camera, pixels)
+        require_near(self._rays[1].directions)
         rays, o, measured = self._rays[1], self.options, is_valid(depth)
         found: list[SeenBox] = []
         for name, coloured in self._coloured(picture):

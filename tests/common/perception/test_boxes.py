@@ -10,6 +10,8 @@ import pytest
 from common.config import CameraConfig, Surroundings
 from common.messages import Color, Pose, Quaternion, Vector3, WorldObject
 from common.perception.boxes import BoxDetector, BoxKind, BoxOptions, SeenBox
+from common.perception.intake import Unusable
+from common.perception.pinhole import Pinhole
 from common.sim.rendering import Renderer
 
 RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.7, 0.2)
@@ -80,3 +82,11 @@ def test_colours_that_nobody_asked_for_and_pictures_without_depth_show_nothing()
     shown = view.see([cube("red", 0.5, 0.0)])
     nothing = np.full(np.shape(shown.depth), np.nan, np.float32)
     assert BoxDetector(BoxOptions(kinds=KINDS)).detect(shown.colour, nothing, view.camera) == []
+
+
+def test_camera_that_none_can_be_shows_no_boxes_and_says_so() -> None:
+    camera = Pinhole(1e-300, 50.0, 1e5, 24.0, 64, 48, np.eye(4))
+    picture, depth = np.full((48, 64, 3), (25, 25, 230), np.uint8), np.full((48, 64), 1.0, np.float32)
+    with pytest.raises(Unusable, match=r"more than 1e\+07 m away"):
+        BoxDetector(BoxOptions(kinds={"red": BoxKind(color=(0.9, 0.1, 0.1), size=(0.04, 0.04, 0.04))})).detect(
+            picture, depth, camera)
