@@ -53,7 +53,7 @@ def markers(
         Unusable: that is more, or farther away, than there is room for.
     """
     require_room(len(detections) + len(odd))
-    require_near([one.position for one in [*detections, *odd]])
+    require_near([*(one.position for one in detections), *(one.position for one in odd)])
     return MarkerArray(
         header=Header(stamp=stamp, frame_id=WORLD),
         remark=remark,
