@@ -5,6 +5,7 @@ A task of one's own says in `decide` what comes next, and of the rest only what 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Generic, Literal, TypeVar
 
@@ -79,6 +80,8 @@ class Deciding(Generic[V]):
         self.row: deque[Stage] = deque()
         self.running: Execution | None = None
         self._opening: Execution | None = None  # what was let go is free of the fingers, which open on
+        self._early: Execution | None = None  # of the fingers, begun while the motion before it comes to rest
+        self.due = math.inf  # it is to be stepped then at the latest [s]
         self.patience = Patience()
         self.look_after = 0.0  # only a picture that is later decides [s]
         self._frames = FrameAge(speed)
@@ -155,6 +158,7 @@ class Deciding(Generic[V]):
 
     def fail(self, message: str, view: V, *, go_home: bool = True) -> None:
         """Count a failure, throw the row away and, where it helps, go home to look again."""
+        go_home = go_home and self._early is None  # what the fingers began ends first
         self.clear()
         self.look_after = view.now
         self.status.message = message
@@ -249,7 +253,7 @@ class Deciding(Generic[V]):
     def clear(self) -> None:
         """Throw the row away; what runs goes on."""
         self.row.clear()
-        self._planning = None
+        self._planning = self._early = None
 
     def stop(self, view: V, reason: str, by: Literal["person", "requester"] = "requester") -> list[Command]:
         """Throw the row away and bring the arm to rest; fingers finish what they began."""

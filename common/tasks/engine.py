@@ -25,6 +25,7 @@ BLOCKED_BY = "scene_monitor"  # holds the arm while something is in the way
 NO_ARM = "the arm cannot be moved: "
 FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] by which fingers may stand elsewhere than a motion was planned with
+LOOSE = 0.5e-3  # [m] by which fingers must have opened before they hold nothing any more
 OPENED_BY = 0.5  # of a motion that began while the fingers opened: then they have
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 
@@ -89,9 +90,14 @@ class Task(Deciding[V]):
 
     def on_goal(self, answer: Report, view: V) -> None:
         """Take in the answer to execute or to a gripper command: accepted, or refused with a reason."""
-        if self.running is None or self.running.command.id != answer.id or self.running.accept(answer):
+        begun = next((one for one in (self.running, self._early) if one and one.command.id == answer.id), None)
+        if begun is None or begun.accept(answer):
             return
-        stage, self.running = self.running.stage, None
+        stage = begun.stage
+        if begun is self._early:
+            self._early = None
+        else:
+            self.running = None
         # What somebody else asked for, or that it came too late, is no failure: it is decided anew.
         if answer.error in ANEW:
             self._decide_anew(f"{stage.name} has to wait: {answer.message}", view)
@@ -100,13 +106,13 @@ class Task(Deciding[V]):
         if isinstance(answer, m.MotionStatus) and answer.error == "start_mismatch":
             self.displaced(stage, view, problem)
         else:
-            self.fail(problem, view)
+            self.fail(problem, view, go_home=self.running is None)
 
     # --- the step --------------------------------------------------------------------------------------------
 
     def step(self, view: V) -> list[Command]:
         """What to ask for now, given what is known."""
-        status = self.status
+        status, self.due = self.status, math.inf
         if view.missing:
             status.message = f"waiting for {', '.join(view.missing)}"
             return []
@@ -174,7 +180,7 @@ class Task(Deciding[V]):
         elif outcome == "forgotten":
             self.running = None
             self.forgotten(stage, view)
-        elif running.moves_arm and stage.carries and not view.holding:
+        elif running.moves_arm and stage.carries and not view.holding and self._early is None:
             stop = self.stop(view, "what it held fell")
             slipped = f": {view.gripper.message}" if view.gripper.outcome == "slipping" else ""
             self.fail(f"what the hand held fell during {stage.name}{slipped}", view, go_home=False)
@@ -260,6 +266,10 @@ class Task(Deciding[V]):
             self.fail("the fingers opened and still hold something", view)
         else:
             self.succeeded(stage, view)
+            if self._early is not None:
+                self.running, self._early = self._early, None
+                self.running.counted = view.now
+                self._tell_stage(self.running.stage)
 
     # --- planning and doing ----------------------------------------------------------------------------------
 
@@ -270,8 +280,9 @@ class Task(Deciding[V]):
         running = self.running.stage if self.running else None
         end = running.end() if isinstance(running, Move) else []
         width = self._width(view)
-        if width is not None and isinstance(running, Grip):
-            width = running.width_after(width)
+        for grip in (running, self._early.stage if self._early else None):
+            if width is not None and isinstance(grip, Grip):
+                width = grip.width_after(width)
         for move in self.row:
             if width is not None and isinstance(move, Grip):
                 width = move.width_after(width)
@@ -289,6 +300,8 @@ class Task(Deciding[V]):
 
     def _advance(self, view: V) -> Iterator[Command]:
         """Begin the next stage when the one before it has ended and its motion is planned and still right."""
+        if self.running is not None:
+            yield from self._begin_early(self.running, view)
         if self.running is not None or not self.row:
             return
         stage = self.row[0]
@@ -307,6 +320,28 @@ class Task(Deciding[V]):
             yield from self._plan_ahead(view)
             return
         yield self._begin(stage, view)
+
+    def _begin_early(self, running: Execution, view: V) -> Iterator[Command]:
+        """Begin with the fingers before the arm stands: until then they touch nothing, or let nothing go."""
+        stage, arm = (self.row[0] if self.row else None), running.stage
+        if not (isinstance(stage, Grip) and stage.early and isinstance(arm, Move)) or self._opening is not None:
+            return
+        assert view.motion is not None and view.gripper is not None
+        motion = view.motion
+        if motion.id != running.command.id or motion.state != "active" or not motion.speed_scaling:
+            return
+        if stage.holds:
+            way = 0.0 if stage.expected_width is None else view.gripper.width - stage.expected_width
+        else:
+            way = LOOSE
+        left = (1.0 - motion.progress) * arm.seconds / motion.speed_scaling
+        begins = motion.header.stamp * 1e-9 + left - self.gripper.least_time(way)
+        if view.now < begins:
+            self.due = begins
+        elif stage.carries == view.holding and self.may_begin(stage, view):
+            self.row.popleft()
+            self._early = self._execution(stage, view)
+            yield self._early.command
 
     def _width(self, view: V) -> float | None:
         """Between the fingers now, or soon where they are opening [m]; None without any."""
@@ -327,6 +362,15 @@ class Task(Deciding[V]):
 
     def _begin(self, stage: Stage, view: V) -> Command:
         self.row.popleft()
+        self.running = self._execution(stage, view)
+        self._tell_stage(stage)
+        return self.running.command
+
+    def _tell_stage(self, stage: Stage) -> None:
+        self.status.state, self.status.stage = stage.state, stage.name
+        self.status.subject = stage.cycle.subject if stage.cycle else ""
+
+    def _execution(self, stage: Stage, view: V) -> Execution:
         command: m.ExecuteRequest | m.GripperCommand
         if isinstance(stage, Move):
             assert stage.trajectory is not None
@@ -339,15 +383,13 @@ class Task(Deciding[V]):
                 command.expected_width, command.width_tolerance = stage.expected_width, stage.width_tolerance
         if stage.cycle is not None:
             stage.cycle.begun = True
-        self.running = Execution(stage, command, view.now)
+        begun = Execution(stage, command, view.now)
         assert view.motion is not None and view.gripper is not None
         if isinstance(stage, Grip):
             self._opening = None  # it replaces that
-            self.running.held = view.gripper.width if view.holding else None
-        self.running.before = self.running.report(view.motion, view.gripper).id
-        self.status.state, self.status.stage = stage.state, stage.name
-        self.status.subject = stage.cycle.subject if stage.cycle else ""
-        return command
+            begun.held = view.gripper.width if view.holding else None
+        begun.before = begun.report(view.motion, view.gripper).id
+        return begun
 
     def _is_planned(self, move: Move) -> bool:
         whole = [s for s in self.row if isinstance(s, Move) and s.cycle is move.cycle] if move.whole else [move]

@@ -79,6 +79,7 @@ class Grip(Stage):
     holds: bool | None = field(default=None, kw_only=True)
     expected_width: float | None = field(default=None, kw_only=True)  # [m]
     width_tolerance: float = field(default=0.01, kw_only=True)  # of expected_width [m]
+    early: bool = field(default=False, kw_only=True)  # begins while the motion before it comes to rest
     effort: float = field(default=0.0, kw_only=True)  # [N]; 0: the gripper's own default
     mass: float = field(default=0.0, kw_only=True)  # of what is held then [kg]; 0: not known
     problem: str = field(default="the fingers closed on nothing", init=False)

@@ -1,0 +1,185 @@
+"""Fingers that begin while the arm comes to rest: they are there when it is, and nothing is lost where it does not."""
+
+from __future__ import annotations
+
+import pytest
+
+from common import messages as m
+from common.tasks.stages import Grip, Move, View
+from tests.common.tasks.test_engine import THERE, Cell, Fetch
+
+SEEN = 0.05  # [m] wide
+
+
+class Take(Fetch):
+    """Takes what is so wide, brings it there, and lets go."""
+
+    def decide(self, view: View) -> None:
+        if self.status.state == "DONE":
+            return
+        if view.holding:
+            self.row += [Move("bring", "BRINGING", goal=THERE, carries=True),
+                         Grip("release", "BRINGING", width=0.08, holds=False, carries=True, early=True)]
+        elif self.status.state == "BRINGING":
+            self.end("DONE")
+        else:
+            self.row += [
+                Move("reach", "REACHING", goal=THERE),
+                Grip("close", "REACHING", width=0.0, holds=True, early=True, expected_width=SEEN),
+                Move("bring", "BRINGING", goal=THERE, carries=True),
+                Grip("release", "BRINGING", width=0.08, holds=False, carries=True, early=True),
+            ]
+
+
+class Hand(Cell):
+    """A cell in which a motion takes a second and a step a hundredth of one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.task = Take(self.task.p, m.TaskStatus(), "t")
+
+    def step(self) -> list[object]:
+        self.now -= 0.09
+        return list(super().step())
+
+    def grips(self) -> list[m.GripperCommand]:
+        return [command for command in self.asked if isinstance(command, m.GripperCommand)]
+
+    def until_grip(self) -> float:
+        """Step until the fingers are asked for something more; how long after the begin of the arm's motion [s]."""
+        before = len(self.grips())
+        for _ in range(300):
+            self.step()
+            if len(self.grips()) > before:
+                return self.now - self.motion.header.stamp * 1e-9
+        raise AssertionError("never")
+
+    def fingers(self, width: float, *, holding: bool, state: str = "succeeded") -> None:
+        self.gripper = self.gripper.model_copy(update={
+            "state": state, "width": width, "holding": holding, "moving": state == "active"})
+
+    def arm(self, state: str = "succeeded") -> None:
+        self.motion = self.motion.model_copy(update={"state": state})
+
+
+@pytest.fixture
+def closing() -> Hand:
+    """The arm is about to arrive and the fingers have begun to close."""
+    hand = Hand()
+    hand.gripper = m.GripperState(width=0.08)
+    hand.until_grip()
+    return hand
+
+
+def stage(hand: Hand) -> str:
+    return hand.task.running.stage.name if hand.task.running else ""
+
+
+def test_fingers_close_so_late_that_they_touch_nothing_before_the_arm_stands() -> None:
+    hand = Hand()
+    began = hand.until_grip()
+    least = hand.task.gripper.least_time(0.08 - SEEN)
+    assert 1.0 - least <= began < 1.0 - least + 0.011 and 0.1 < least < 0.3
+    assert stage(hand) == "reach" and hand.task.status.stage == "reach" and hand.motion.state == "active"
+
+
+def test_who_waits_for_the_right_time_says_when_that_is() -> None:
+    hand = Hand()
+    while not hand.motion.id:
+        hand.step()
+    hand.step()
+    due = hand.motion.header.stamp * 1e-9 + 1.0 - hand.task.gripper.least_time(0.08 - SEEN)
+    assert hand.task.due == pytest.approx(due)
+    hand.motion = hand.motion.model_copy(update={"speed_scaling": 0.5})
+    hand.step()
+    assert hand.task.due == pytest.approx(due + 1.0), "at half the speed it takes two"
+    hand.motion = hand.motion.model_copy(update={"held": True})
+    hand.step()
+    assert hand.task.due == float("inf"), "as long as it is held nobody knows"
+
+
+def test_arm_that_arrives_has_the_fingers_followed_and_asks_them_for_nothing_twice(closing: Hand) -> None:
+    closing.arm()
+    closing.step()
+    assert stage(closing) == "close" and closing.task.status.stage == "close"
+    closing.fingers(SEEN, holding=True)
+    closing.step()
+    assert stage(closing) == "bring" and len(closing.grips()) == 1 and closing.task.status.failures == 0
+
+
+def test_time_in_motion_is_counted_once(closing: Hand) -> None:
+    closing.arm()
+    closing.step()
+    closing.fingers(SEEN, holding=True)
+    closing.step()
+    reached = closing.task.status.moving_seconds
+    assert reached <= closing.now - 100.0 + 1e-6
+
+
+def test_what_is_let_go_a_moment_before_the_arm_stands_did_not_fall(closing: Hand) -> None:
+    closing.arm()
+    closing.step()
+    closing.fingers(SEEN, holding=True)
+    began = closing.until_grip()
+    assert 0.9 < began < 1.0 and closing.grips()[-1].width == 0.08
+    closing.fingers(0.0506, holding=False, state="active")
+    assert closing.step() == [] and closing.task.status.failures == 0
+    closing.arm()
+    closing.step()
+    closing.fingers(0.08, holding=False)
+    closing.step()
+    closing.step()
+    assert closing.task.status.state == "DONE" and closing.task.status.failures == 0
+
+
+def test_held_arm_has_no_fingers_begin() -> None:
+    hand = Hand()
+    for _ in range(70):
+        hand.step()
+    hand.motion = hand.motion.model_copy(update={"held": True})
+    for _ in range(100):
+        assert hand.step() == []
+    assert not hand.grips()
+
+
+@pytest.mark.parametrize("end", ["aborted", "cancelled"])
+def test_arm_that_does_not_arrive_has_the_fingers_end_before_anything_else_is_decided(closing: Hand, end: str) -> None:
+    closing.arm(end)
+    for _ in range(20):
+        assert not [command for command in closing.step() if not isinstance(command, m.PlanRequest)]
+        closing.task.status.paused = False  # resumed
+    closing.fingers(SEEN, holding=True)
+    closing.step()
+    closing.step()
+    assert stage(closing) == "bring", "with what they took meanwhile"
+
+
+def test_stop_on_the_way_begins_nothing_more(closing: Hand) -> None:
+    for command in closing.task.command("stop", closing.view):
+        assert isinstance(command, m.StopRequest)
+    closing.arm("cancelled")
+    closing.fingers(SEEN, holding=True)
+    for _ in range(20):
+        assert closing.step() == []
+
+
+@pytest.mark.parametrize("error", ["stale_request", "hardware_fault"])
+def test_fingers_that_refuse_let_the_arm_arrive_and_are_asked_anew(closing: Hand, error: str) -> None:
+    refused = m.GripperState(id=closing.grips()[0].id, state="rejected", error=error, message="no")
+    closing.task.on_goal(refused, closing.view)
+    closing.gripper = m.GripperState(width=0.08)
+    assert closing.step() == [] and stage(closing) == "reach"
+    closing.arm()
+    closing.until_grip()
+    assert len(closing.grips()) == 2 and closing.task.status.failures == (error == "hardware_fault")
+
+
+def test_fingers_that_stand_open_or_hold_already_are_not_begun_early() -> None:
+    hand = Hand()
+    hand.gripper = m.GripperState(width=0.08)
+    for _ in range(50):
+        hand.step()
+    hand.fingers(SEEN, holding=True)  # something came between them by itself
+    for _ in range(100):
+        hand.step()
+    assert not hand.grips() and stage(hand) == "reach"
