@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import ctypes
 import os
 import resource
 import threading
 from typing import NoReturn
 
 from common.errors import ConfigError, ZencellError
+from common.process.environment import share_memory
 from common.process.lifeline import Lifeline, fail, leave
 from common.process.log import log_to_stderr
 from common.process.service import add_process_options
@@ -31,22 +31,12 @@ OPEN = (
     "(docs/security.md)"
 )
 _CLOSE_SECONDS = 0.4
-_ARENA_MAX = -8  # in malloc.h
 _READERS = 16  # threads that take what comes: each may wait for somebody who falls behind in pictures
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         fail(ConfigError(self.prog, message, "cannot be used; --help lists the options"))
-
-
-def _share_memory() -> None:
-    """Have all threads share one store of memory, where the C library can be told so.
-
-    With stores of their own each keeps what once waited in it for a reader that read nothing: some MB that stay.
-    """
-    if (tell := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
-        tell(_ARENA_MAX, 1)
 
 
 def _read_beside() -> None:
@@ -73,7 +63,7 @@ def main() -> NoReturn:
                              "are known; repeatable")
     add_process_options(parser)
     options = parser.parse_args()
-    _share_memory()
+    share_memory()
     _read_beside()
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # a connection takes three files in a secured router

@@ -16,6 +16,7 @@ from typing import Any, Generic, NoReturn, Protocol, TypeVar
 from common.clock import BOOTED_VARIABLE, EPOCH_VARIABLE, KEPT_VARIABLE, SPEED_VARIABLE, Clock
 from common.config import Cell, Parameters, Watchdogs, load_cell, service_config
 from common.errors import ConfigError, UnknownName, ZencellError
+from common.process.environment import share_memory
 from common.process.lifeline import Lifeline, fail, leave
 from common.process.log import BusLog, log_to_stderr
 from common.process.loop_watch import LoopWatch
@@ -156,6 +157,7 @@ def main(run: Run[P], config: type[P]) -> NoReturn:
     stderr; 1 for a crash, with its traceback.
     """
     sys.setswitchinterval(_SWITCH_SECONDS)
+    share_memory()
     kind = own_name()
     parser = _Parser(prog=kind)
     add_options(parser)
