@@ -4,8 +4,8 @@
 made under every key of both cells, on the virtual clock. With `--live SECONDS` it does so to a cell of real processes
 as well, and compares the gaps in its joint states with those of a cell beside it that is left alone. Of each gap it
 tells whether the executor computed, waited for a processor, which is the machine's load, or was held up by something.
-Exit code 1 if anything but DecodeError was raised, a process ended, or there were more gaps without those in which the
-executor waited for a processor.
+Exit code 1 if anything but DecodeError was raised, a process ended, memory grew, or there were more gaps without those in
+which the executor waited for a processor.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from benchmarks.soak import Seen, keep_busy
+import psutil
+
+from benchmarks.soak import Seen, keep_busy, look_at
 from common import topics
 from common.application import all_topics
 from common.config import load_cell
@@ -37,6 +39,8 @@ from tests.mutations import Mutations, models
 CELL = "panda"  # of real processes
 ROUND = 60.0  # [s] for which gaps are gathered before they are counted
 AFTER = 1.0  # [s]
+LEAST = 20  # rounds after which memory must have come to rest
+MOST_GROWTH, MOST_MEGABYTES = 0.05, 3.0  # of it in the last three quarters
 TOLD = 10  # findings that are printed in full
 PAUSE = 0.002  # [s] of virtual time between two payloads
 SECONDS = 60.0  # of virtual time
@@ -155,6 +159,15 @@ async def working(folder: Path, name: str) -> AsyncIterator[tuple[RunningCell, B
         await cell.ended(30.0)
 
 
+def private(processes: dict[str, psutil.Process]) -> dict[str, float]:
+    """Memory that each has for itself [MB]; what has just ended is left out."""
+    sizes = {}
+    for name, process in processes.items():
+        with suppress(psutil.Error, FileNotFoundError):
+            sizes[name] = look_at(process).private * 1e-6
+    return sizes
+
+
 async def live(options: argparse.Namespace, folder: Path) -> list[str]:
     """Compare a cell that is attacked with one that is left alone beside it; a line for each thing that is worse."""
     rounds = max(1, round(options.live / ROUND))
@@ -162,7 +175,7 @@ async def live(options: argparse.Namespace, folder: Path) -> list[str]:
     async with working(folder, "alone") as (alone, quiet), working(folder, "attacked") as (cell, bus):
         async with cell.listen() as attacker:
             before = cell.processes()
-            memory = {name: process.memory_info().rss for name, process in before.items()}
+            memory = [private(before)]
             executors = [one.processes()["trajectory_executor"].pid for one in (alone, cell)]
             async with beside(attack(attacker, Mutations(options.seed), CELL, options.pause, acts=options.acts)):
                 for _ in range(rounds):
@@ -170,14 +183,18 @@ async def live(options: argparse.Namespace, folder: Path) -> list[str]:
                     await asyncio.sleep(options.live / rounds)
                     for gaps, side in zip(both, (calm, attacked), strict=True):
                         gaps.add_to(side)
+                    memory.append(private(cell.processes()))
             await asyncio.sleep(AFTER)  # until what was asked last is answered
             after = cell.processes()
         print(calm, attacked, *calm.own, *attacked.own, sep="\n")
-        print("memory of what was attacked [MB]: " + ", ".join(
-            f"{name} {memory[name] * 1e-6:.0f} -> {process.memory_info().rss * 1e-6:.0f}"
-            for name, process in after.items() if name in memory), flush=True)
     wrong = [f"{name} ended: {folder}" for name, process in before.items()
              if name not in after or after[name].pid != process.pid]
+    at = [0, rounds // 4, rounds // 2, rounds]
+    told = {name: [memory[number].get(name, 0.0) for number in at] for name in before}
+    print("memory of what was attacked, at the begin, after a quarter, a half, and at the end [MB]: " + ", ".join(
+        f"{name} {' '.join(f'{size:.1f}' for size in sizes)}" for name, sizes in told.items()), flush=True)
+    wrong += [f"{name} grew from {sizes[1]:.1f} MB after a quarter to {sizes[3]:.1f}" for name, sizes in told.items()
+              if rounds >= LEAST and sizes[3] - sizes[1] > max(MOST_GROWTH * sizes[1], MOST_MEGABYTES)]
     own, own_before = len(attacked.own) + attacked.lost, len(calm.own) + calm.lost
     if own > own_before:
         wrong.append(f"{own} gaps in joint states without waiting for a processor, {own_before} when left alone")
