@@ -4,8 +4,8 @@
 made under every key of both cells, on the virtual clock. With `--live SECONDS` it does so to a cell of real processes
 as well, and compares the gaps in its joint states with those of a cell beside it that is left alone. Of each gap it
 tells whether the executor computed, waited for a processor, which is the machine's load, or was held up by something.
-Exit code 1 if anything but DecodeError was raised, a process ended, memory grew, or there were more gaps without those in
-which the executor waited for a processor.
+Exit code 1 if anything but DecodeError was raised, a process ended, memory grew, or there were more gaps, without those
+in which the executor waited for a processor.
 """
 
 from __future__ import annotations
