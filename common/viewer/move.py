@@ -103,6 +103,7 @@ class MovePanel:
         self._kind = MARKER
         self._found: PlanResponse | None = None
         self._other: PlanResponse | None = None  # that it is compared with
+        self._planned: PoseGoal | JointGoal | None = None  # the goal that both are for
         self._forgot = 0  # how often what was planned was forgotten
         self.compared = NOTHING
         self._reached: tuple[Pose, float, bool] | None = None  # goal, since when, whether it was looked for why not
@@ -167,6 +168,7 @@ class MovePanel:
         if self._hand is not None:
             self._hand.show(self._kept)
         self._taught.show(self._kept)
+        self._look_at_marker()
         found = "" if self._found is not None else "plan first"
         content = block(buttons(
             press("Plan", "move:plan"), press("Execute", "move:execute", self._kept or found, arm=True),
@@ -249,6 +251,8 @@ class MovePanel:
             await self._do(self._move(goal, self._asked, "There"), "Planning and going there …")
 
     async def _execute(self) -> None:
+        if self._look_at_marker():
+            return
         found = self._found
         if found is None or found.trajectory is None:
             self._tell("Plan first.", "bad")
@@ -256,6 +260,8 @@ class MovePanel:
         await self._do(self._follow(found, found.trajectory), "Executing the plan …")
 
     async def _execute_other(self) -> None:
+        if self._look_at_marker():
+            return
         self._found = self._other
         await self._execute()
 
@@ -276,6 +282,7 @@ class MovePanel:
             return
         kept = [response if response.ok and response.trajectory is not None else None for response in responses]
         self._found, self._other = kept[0], kept[1] if len(kept) > 1 else None
+        self._planned = goal
         if self._other is not None:
             self._goal.compare(self._other.trajectory)
         if self._found is not None and self._found.trajectory is not None:
@@ -288,6 +295,15 @@ class MovePanel:
         self._forgot += 1
         self._found = self._other = None
         self._goal.compare(None)
+
+    def _look_at_marker(self) -> bool:
+        """Forget a plan to where the marker was, if it has been moved since, and say so; whether it has."""
+        planned = self._planned if self._found is not None or self._other is not None else None
+        if self._kind != MARKER or not isinstance(planned, PoseGoal) or planned.pose == self._goal.goal_pose:
+            return False
+        self._forget()
+        self._tell("The goal marker was moved: plan again.", "busy")
+        return True
 
     async def _follow(self, found: PlanResponse, trajectory: JointTrajectory) -> None:
         self._forget()
@@ -340,6 +356,7 @@ class MovePanel:
         if q is None:
             self._tell("Where the arm is is not known.", "bad")
             return
+        self._forget()
         self._xyz, self._rpy, self._q = self.numbers.of(q)
         assign(self._at, self._xyz)
         assign(self._turned, self._rpy)

@@ -171,6 +171,28 @@ async def test_plan_to_the_marker_tells_what_is_in_the_way(
     assert (asked[0].planner, asked[0].goal) == ("chomp", m.PoseGoal(pose=scenes[0].goal_pose))
 
 
+async def test_plan_is_forgotten_when_the_marker_that_it_leads_to_is_moved(
+    panda: Played, page: BrowserDouble, scenes: list[SceneDouble]
+) -> None:
+    point = m.JointTrajectoryPoint(time_from_start=1.0, positions=[0.0] * 7, velocities=[0.0] * 7,
+                                   accelerations=[0.0] * 7)
+    way = m.JointTrajectory(joint_names=[f"panda_joint{k}" for k in range(1, 8)], points=[point])
+
+    async def plan(request: m.PlanRequest) -> m.PlanResponse:
+        return m.PlanResponse(id=request.id, ok=True, trajectory=way)
+
+    panda.bus.serve(topics.MOTION_PLAN, plan)
+    panda.bus.writer(topics.MOTION_STATUS).put(m.MotionStatus())
+    await until(lambda: scenes)
+    await page.set("Goal marker", True)
+    await until(lambda: scenes[0].told("goal_marker"))
+    await page.press("Plan")
+    await page.until(lambda: page.button("Execute")[1] == "")
+    scenes[0].goal_pose = m.Pose(position=m.Vector3(x=0.5, z=0.5))
+    await page.until(lambda: "plan first" in page.button("Execute")[1])
+    assert "The goal marker was moved: plan again." in page.text
+
+
 async def jogs_of(reader: Reader[m.JogCommand], count: int) -> list[m.JogCommand]:
     async with asyncio.timeout(PATIENCE):
         return [await reader.next() for _ in range(count)]
