@@ -295,6 +295,11 @@ class Arm(Part):
                 ours = ours or goes
         finally:
             writer.put(JogCommand(header=self._bus.header(), owner=self.owner, heard=heard))
+        while not ours and clock() - began < UNHEARD:  # that it moves is told a moment after it was asked for
+            await asyncio.sleep(JOG_PERIOD)
+            now = owners.latest
+            assert now is not None
+            ours = now.jogging and now.owner == self.owner
         if not ours:
             now, state = owners.latest, motion.latest
             assert now is not None and state is not None

@@ -286,7 +286,7 @@ def test_jogging_moves_as_long_as_it_is_asked_for_and_no_longer() -> None:
         await asyncio.sleep(0.5)
         after = await cell.arm.pose()
         moved = after[:3, 3] - before[:3, 3]
-        for seconds in (0.1, 0.2):
+        for seconds in (0.01, 0.1, 0.2):
             await cell.arm.jog(linear=(0.0, -0.1, 0.0), seconds=seconds)
             assert not (await cell.arm.owner_now()).jogging
         await cell.arm.move("home")  # it rests when jogging returns
