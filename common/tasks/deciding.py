@@ -220,6 +220,11 @@ class Deciding(Generic[V]):
     # --- what helps to decide --------------------------------------------------------------------------------
 
     @property
+    def under_way(self) -> list[Stage]:
+        """What arm and fingers do: of fingers that begin before the arm stands the status tells once it does."""
+        return [one.stage for one in (self.running, self._early) if one is not None]
+
+    @property
     def gripper(self) -> GripperConfig:
         """The robot's gripper.
 
@@ -253,7 +258,7 @@ class Deciding(Generic[V]):
     def clear(self) -> None:
         """Throw the row away; what runs goes on."""
         self.row.clear()
-        self._planning = self._early = None
+        self._planning = None
 
     def stop(self, view: V, reason: str, by: Literal["person", "requester"] = "requester") -> list[Command]:
         """Throw the row away and bring the arm to rest; fingers finish what they began."""

@@ -141,7 +141,7 @@ class Task(Deciding[V]):
             self.look_after = view.now
         if self.running is not None:
             self.decide_ahead(self.running.stage, view)
-        elif not self.row and not (view.motion.state == "active" or view.gripper.moving):
+        elif not (self.row or self._early or view.motion.state == "active" or view.gripper.moving):
             self.decide(view)  # not before what a task before this one began has ended
         if status.state not in ("DONE", "ERROR"):
             status.task_seconds = view.now - (self._began or view.now)
@@ -163,6 +163,7 @@ class Task(Deciding[V]):
     def _watch(self, view: V) -> list[Command]:
         """Follow the stage that runs: its end, its failure, and what falls out of the hand."""
         if self.running is None:
+            self._watch_early(view)
             return self._watch_opening(view)
         assert view.motion is not None and view.gripper is not None
         running, stage = self.running, self.running.stage
@@ -200,6 +201,20 @@ class Task(Deciding[V]):
         elif stage.carries and view.gripper.outcome == "slipping":  # it may still arrive
             self.status.message = f"{stage.name}: {view.gripper.message}"
         return self._watch_opening(view)
+
+    def _watch_early(self, view: V) -> None:
+        """Follow fingers whose arm did not arrive: what they let go is, and what they hold is decided about anew."""
+        if (early := self._early) is None:
+            return
+        assert view.motion is not None and view.gripper is not None
+        early.count(view.now, view.motion)
+        outcome = early.outcome(view.motion, view.gripper)
+        if outcome == "running" and early.spent <= self.time_limit(early.stage):
+            return
+        self._early, self.look_after = None, view.now
+        done = early.report(view.motion, view.gripper).state == "succeeded" and not view.holding
+        if outcome == "ended" and done and isinstance(early.stage, Grip) and early.stage.holds is False:
+            self.succeeded(early.stage, view)
 
     def _watch_opening(self, view: V) -> list[Command]:
         """Follow fingers that open while the arm leaves already; one that they would not let through is stopped."""
@@ -302,7 +317,7 @@ class Task(Deciding[V]):
         """Begin the next stage when the one before it has ended and its motion is planned and still right."""
         if self.running is not None:
             yield from self._begin_early(self.running, view)
-        if self.running is not None or not self.row:
+        if self.running is not None or self._early is not None or not self.row:
             return
         stage = self.row[0]
         if stage.carries and not view.holding:

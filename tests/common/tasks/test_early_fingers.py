@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from common import messages as m
-from common.tasks.stages import Grip, Move, View
+from common.tasks.stages import Grip, Move, Stage, View
 from tests.common.tasks.test_engine import THERE, Cell, Fetch
 
 SEEN = 0.05  # [m] wide
@@ -13,6 +15,13 @@ SEEN = 0.05  # [m] wide
 
 class Take(Fetch):
     """Takes what is so wide, brings it there, and lets go."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.did: list[str] = []
+
+    def succeeded(self, stage: Stage, view: View) -> None:
+        self.did.append(stage.name)
 
     def decide(self, view: View) -> None:
         if self.status.state == "DONE":
@@ -69,6 +78,17 @@ def closing() -> Hand:
     hand.gripper = m.GripperState(width=0.08)
     hand.until_grip()
     return hand
+
+
+@pytest.fixture
+def releasing(closing: Hand) -> Hand:
+    """The arm is about to arrive with what it took, and the fingers have begun to open."""
+    closing.arm()
+    closing.step()
+    closing.fingers(SEEN, holding=True)
+    closing.until_grip()
+    assert closing.task.did == ["reach", "close"]
+    return closing
 
 
 def stage(hand: Hand) -> str:
@@ -183,3 +203,63 @@ def test_fingers_that_stand_open_or_hold_already_are_not_begun_early() -> None:
     for _ in range(100):
         hand.step()
     assert not hand.grips() and stage(hand) == "reach"
+
+
+def test_row_that_is_thrown_away_has_what_was_let_go_early_be_let_go_and_not_fallen(releasing: Hand) -> None:
+    releasing.task.clear()
+    releasing.fingers(0.0506, holding=False, state="active")
+    assert releasing.step() == [] and releasing.task.status.failures == 0
+    releasing.arm()
+    releasing.step()
+    releasing.fingers(0.08, holding=False)
+    releasing.step()
+    assert releasing.task.did[2:] == ["bring", "release"] and releasing.task.status.failures == 0
+
+
+@pytest.mark.parametrize("end", ["stop", "aborted", "cancelled"])
+def test_what_is_let_go_by_an_arm_that_does_not_arrive_is_let_go_once(releasing: Hand, end: str) -> None:
+    if end == "stop":
+        releasing.task.command("stop", releasing.view)
+        end = "cancelled"
+    releasing.arm(end)
+    releasing.fingers(0.0506, holding=False, state="active")
+    releasing.step()
+    assert releasing.task.did[2:] == []
+    releasing.fingers(0.08, holding=False)
+    for _ in range(3):
+        releasing.step()
+    assert releasing.task.did[2:] == ["release"] and not releasing.task.under_way
+
+
+def test_fingers_whose_command_is_on_its_way_end_before_anything_is_decided_when_the_arm_does_not_arrive() -> None:
+    hand = Hand()
+    hand.gripper = m.GripperState(width=0.08)
+    answer, waiting = hand.answer, list[Any]()
+    hand.answer = lambda command: waiting.append(command) if isinstance(command, m.GripperCommand) else answer(command)
+    hand.until_grip()
+    hand.arm("aborted")
+    for _ in range(20):
+        assert hand.step() == []
+    answer(waiting[0])
+    assert hand.step() == [] and not hand.task.running
+    hand.fingers(SEEN, holding=True)
+    hand.step()
+    hand.step()
+    assert stage(hand) == "bring"
+
+
+@pytest.mark.parametrize("end", ["forgotten", "refused", "forever"])
+def test_fingers_that_are_never_heard_of_again_keep_nothing_from_being_decided(closing: Hand, end: str) -> None:
+    closing.arm("aborted")
+    closing.step()
+    if end == "forgotten":
+        closing.gripper = m.GripperState(header=m.Header(stamp=int((closing.now + 1.0) * 1e9)), width=0.08)
+    elif end == "refused":
+        closing.task.on_goal(m.GripperState(id=closing.grips()[0].id, state="rejected", error="stopped"), closing.view)
+        closing.gripper = m.GripperState(width=0.08)
+    else:
+        closing.now += 60.0
+        closing.gripper = closing.gripper.model_copy(update={"moving": False})
+    for _ in range(3):
+        closing.step()
+    assert stage(closing) == "reach"
