@@ -81,6 +81,7 @@ class Deciding(Generic[V]):
         self.running: Execution | None = None
         self._opening: Execution | None = None  # what was let go is free of the fingers, which open on
         self._early: Execution | None = None  # of the fingers, begun while the motion before it comes to rest
+        self._heard: tuple[m.MotionStatus, float] | None = None  # what was told of the motion before it, and when [s]
         self.due = math.inf  # it is to be stepped then at the latest [s]
         self.patience = Patience()
         self.look_after = 0.0  # only a picture that is later decides [s]
