@@ -347,6 +347,8 @@ class Task(Deciding[V]):
             self._heard = motion, view.now  # clocks of two hosts differ: its stamp would tell of another time
         if motion.id != running.command.id or motion.state != "active" or not motion.speed_scaling:
             return
+        if motion.message:
+            return  # it is being stopped: nobody knows when it arrives
         if stage.holds:
             way = 0.0 if stage.expected_width is None else view.gripper.width - stage.expected_width
         else:

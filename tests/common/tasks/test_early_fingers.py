@@ -275,3 +275,14 @@ def test_fingers_touch_nothing_before_the_arm_stands_whatever_its_clock_says(ahe
     hand.until_grip()
     least = hand.task.gripper.least_time(0.08 - SEEN)
     assert 1.0 - least <= hand.now - began < 1.0 - least + 0.021
+
+
+def test_arm_that_is_being_stopped_has_no_fingers_begin() -> None:
+    hand = Hand()
+    for _ in range(60):
+        hand.step()
+    hand.motion = hand.motion.model_copy(update={"message": "stopping: j1 is 0.2000 rad off its path"})
+    for _ in range(60):
+        assert hand.step() == []
+    hand.arm("aborted")
+    assert not hand.grips()
