@@ -26,6 +26,7 @@ NO_ARM = "the arm cannot be moved: "
 FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] by which fingers may stand elsewhere than a motion was planned with
 LOOSE = 0.5e-3  # [m] by which fingers must have opened before they hold nothing any more
+HASTENED = 0.1  # share of its speed by which an arm may go faster meanwhile, and arrive no later than is reckoned
 OPENED_BY = 0.5  # of a motion that began while the fingers opened: then they have
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 
@@ -347,8 +348,8 @@ class Task(Deciding[V]):
             self._heard = motion, view.now  # clocks of two hosts differ: its stamp would tell of another time
         if motion.id != running.command.id or motion.state != "active" or not motion.speed_scaling:
             return
-        if motion.message:
-            return  # it is being stopped: nobody knows when it arrives
+        if motion.message or motion.speed_scaling > running.slowest + HASTENED:
+            return  # it is being stopped, or comes to its speed again by a ramp: nobody knows when it arrives
         if stage.holds:
             way = 0.0 if stage.expected_width is None else view.gripper.width - stage.expected_width
         else:

@@ -286,3 +286,20 @@ def test_arm_that_is_being_stopped_has_no_fingers_begin() -> None:
         assert hand.step() == []
     hand.arm("aborted")
     assert not hand.grips()
+
+
+@pytest.mark.parametrize("before", [{"held": True}, {"speed_scaling": 0.1}])
+def test_arm_that_goes_on_by_a_ramp_has_the_fingers_begin_when_it_stands(before: dict[str, Any]) -> None:
+    hand = Hand()
+    for _ in range(50):
+        hand.step()
+    going = hand.motion.model_copy(update={"progress": 0.9})
+    hand.motion = going.model_copy(update=before)
+    hand.step()
+    hand.motion = going
+    for _ in range(50):
+        hand.step()
+    assert not hand.grips()
+    hand.arm()
+    hand.step()
+    assert stage(hand) == "close"
