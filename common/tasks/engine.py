@@ -26,7 +26,7 @@ NO_ARM = "the arm cannot be moved: "
 FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] by which fingers may stand elsewhere than a motion was planned with
 LOOSE = 0.5e-3  # [m] by which fingers must have opened before they hold nothing any more
-HASTENED = 0.1  # share of its speed by which an arm may go faster meanwhile, and arrive no later than is reckoned
+HASTENED = 0.1  # share of its speed by which an arm may go faster or slower meanwhile, and arrive as is reckoned
 OPENED_BY = 0.5  # of a motion that began while the fingers opened: then they have
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 
@@ -191,7 +191,7 @@ class Task(Deciding[V]):
             stop = self.stop(view, "it takes too long")
             self.fail(f"{stage.name} took longer than {round(limit, 2):g} s", view)
             return stop
-        elif running.moves_arm and (why := self.outdated(stage, view)):
+        elif running.moves_arm and (why := self.outdated(stage, view) or self._closed_before(running)):
             stop = self.stop(view, why)
             self.status.message = f"{stage.name}: {why}"
             return stop
@@ -242,6 +242,14 @@ class Task(Deciding[V]):
         else:
             self.fail(why, view)
         return stop
+
+    def _closed_before(self, running: Execution) -> str:
+        """That fingers close about what the arm would go on down to, as it was held or slowed since they began."""
+        early = self._early
+        if early is None or not isinstance(early.stage, Grip) or not early.stage.holds:
+            return ""
+        late = running.slowest < early.slowest - HASTENED
+        return f"held or slowed as the fingers began to {early.stage.name}" if late else ""
 
     def _blocked(self, view: V) -> str:
         """What stays in the way of the motion that runs; empty while nothing does, or it may still go away."""
@@ -361,6 +369,7 @@ class Task(Deciding[V]):
         elif stage.carries == view.holding and self.may_begin(stage, view):
             self.row.popleft()
             self._early = self._execution(stage, view)
+            self._early.slowest = running.slowest
             yield self._early.command
 
     def _width(self, view: V) -> float | None:

@@ -156,7 +156,7 @@ class PickPlace(Task[PickPlaceView]):
         elif self._contained.lasts(contained, view.scene_stamp) >= min(CONTAINED_FOR, self.p.empty):
             status.done = max(status.done, contained)
         looked = not self._around.on_hand or min(view.stamps) > self.look_after
-        if not stages & {"close", "lift", "across", "release"} and looked:
+        if looked and not view.holding and not stages & {"close", "lift", "across", "release"}:
             status.total = status.done + len(view.targets)
 
     def _counted(self, view: PickPlaceView) -> int:

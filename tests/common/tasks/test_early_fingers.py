@@ -303,3 +303,26 @@ def test_arm_that_goes_on_by_a_ramp_has_the_fingers_begin_when_it_stands(before:
     hand.arm()
     hand.step()
     assert stage(hand) == "close"
+
+
+@pytest.mark.parametrize("late", [{"held": True, "message": "held"}, {"speed_scaling": 0.1}])
+def test_arm_does_not_go_on_down_with_fingers_that_closed_while_it_was_held_or_slowed(
+    closing: Hand, late: dict[str, Any],
+) -> None:
+    going = closing.motion
+    closing.motion = going.model_copy(update=late)
+    asked = closing.step()
+    assert [(c.id, c.by) for c in asked if isinstance(c, m.StopRequest)] == [(going.id, "requester")]
+    closing.arm("cancelled")
+    closing.fingers(SEEN, holding=True)
+    for _ in range(5):
+        closing.step()
+    closing.motion = going.model_copy(update={"state": "cancelled"})
+    closing.step()
+    closing.step()
+    assert stage(closing) == "bring" and closing.task.status.failures == 0
+
+
+def test_arm_that_is_held_as_the_fingers_let_go_goes_on_to_where_it_was_going(releasing: Hand) -> None:
+    releasing.motion = releasing.motion.model_copy(update={"held": True})
+    assert releasing.step() == [] and stage(releasing) == "bring"

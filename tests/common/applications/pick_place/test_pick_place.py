@@ -634,9 +634,9 @@ def test_ball_that_is_said_to_lie_farther_away_than_a_motion_can_be_asked_for_is
 def test_ball_that_was_taken_a_moment_before_a_pause_is_one_of_those_to_be_placed() -> None:
     cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
     cell.until("pre-grasp")
-    while cell._fingers is None:
-        cell.step()
-    cell.tcp = cell.balls["track_0"]
+    cell.motion, cell.tcp = cell.motion.model_copy(update={"progress": 0.8}), cell.balls["track_0"]
+    cell.step()
+    assert cell.task.status.stage == "pre-grasp" and cell._fingers is not None
     cell.tell("pause")
     for _ in range(20):
         cell.step()
