@@ -81,6 +81,7 @@ class Deciding(Generic[V]):
         self.running: Execution | None = None
         self._opening: Execution | None = None  # what was let go is free of the fingers, which open on
         self._early: Execution | None = None  # of the fingers, begun while the motion before it comes to rest
+        self._heard: tuple[m.MotionStatus, float] | None = None  # what was told of the motion before it, and when [s]
         self.due = math.inf  # it is to be stepped then at the latest [s]
         self.patience = Patience()
         self.look_after = 0.0  # only a picture that is later decides [s]
@@ -220,6 +221,11 @@ class Deciding(Generic[V]):
     # --- what helps to decide --------------------------------------------------------------------------------
 
     @property
+    def under_way(self) -> list[Stage]:
+        """What arm and fingers do: of fingers that begin before the arm stands the status tells once it does."""
+        return [one.stage for one in (self.running, self._early) if one is not None]
+
+    @property
     def gripper(self) -> GripperConfig:
         """The robot's gripper.
 
@@ -253,7 +259,7 @@ class Deciding(Generic[V]):
     def clear(self) -> None:
         """Throw the row away; what runs goes on."""
         self.row.clear()
-        self._planning = self._early = None
+        self._planning = None
 
     def stop(self, view: V, reason: str, by: Literal["person", "requester"] = "requester") -> list[Command]:
         """Throw the row away and bring the arm to rest; fingers finish what they began."""

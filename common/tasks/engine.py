@@ -26,6 +26,7 @@ NO_ARM = "the arm cannot be moved: "
 FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] by which fingers may stand elsewhere than a motion was planned with
 LOOSE = 0.5e-3  # [m] by which fingers must have opened before they hold nothing any more
+HASTENED = 0.1  # share of its speed by which an arm may go faster or slower meanwhile, and arrive as is reckoned
 OPENED_BY = 0.5  # of a motion that began while the fingers opened: then they have
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 
@@ -141,7 +142,7 @@ class Task(Deciding[V]):
             self.look_after = view.now
         if self.running is not None:
             self.decide_ahead(self.running.stage, view)
-        elif not self.row and not (view.motion.state == "active" or view.gripper.moving):
+        elif not (self.row or self._early or view.motion.state == "active" or view.gripper.moving):
             self.decide(view)  # not before what a task before this one began has ended
         if status.state not in ("DONE", "ERROR"):
             status.task_seconds = view.now - (self._began or view.now)
@@ -163,6 +164,7 @@ class Task(Deciding[V]):
     def _watch(self, view: V) -> list[Command]:
         """Follow the stage that runs: its end, its failure, and what falls out of the hand."""
         if self.running is None:
+            self._watch_early(view)
             return self._watch_opening(view)
         assert view.motion is not None and view.gripper is not None
         running, stage = self.running, self.running.stage
@@ -189,7 +191,7 @@ class Task(Deciding[V]):
             stop = self.stop(view, "it takes too long")
             self.fail(f"{stage.name} took longer than {round(limit, 2):g} s", view)
             return stop
-        elif running.moves_arm and (why := self.outdated(stage, view)):
+        elif running.moves_arm and (why := self.outdated(stage, view) or self._closed_before(running)):
             stop = self.stop(view, why)
             self.status.message = f"{stage.name}: {why}"
             return stop
@@ -200,6 +202,20 @@ class Task(Deciding[V]):
         elif stage.carries and view.gripper.outcome == "slipping":  # it may still arrive
             self.status.message = f"{stage.name}: {view.gripper.message}"
         return self._watch_opening(view)
+
+    def _watch_early(self, view: V) -> None:
+        """Follow fingers whose arm did not arrive: what they let go is, and what they hold is decided about anew."""
+        if (early := self._early) is None:
+            return
+        assert view.motion is not None and view.gripper is not None
+        early.count(view.now, view.motion)
+        outcome = early.outcome(view.motion, view.gripper)
+        if outcome == "running" and early.spent <= self.time_limit(early.stage):
+            return
+        self._early, self.look_after = None, view.now
+        done = early.report(view.motion, view.gripper).state == "succeeded" and not view.holding
+        if outcome == "ended" and done and isinstance(early.stage, Grip) and early.stage.holds is False:
+            self.succeeded(early.stage, view)
 
     def _watch_opening(self, view: V) -> list[Command]:
         """Follow fingers that open while the arm leaves already; one that they would not let through is stopped."""
@@ -226,6 +242,14 @@ class Task(Deciding[V]):
         else:
             self.fail(why, view)
         return stop
+
+    def _closed_before(self, running: Execution) -> str:
+        """That fingers close about what the arm would go on down to, as it was held or slowed since they began."""
+        early = self._early
+        if early is None or not isinstance(early.stage, Grip) or not early.stage.holds:
+            return ""
+        late = running.slowest < early.slowest - HASTENED
+        return f"held or slowed as the fingers began to {early.stage.name}" if late else ""
 
     def _blocked(self, view: V) -> str:
         """What stays in the way of the motion that runs; empty while nothing does, or it may still go away."""
@@ -302,7 +326,7 @@ class Task(Deciding[V]):
         """Begin the next stage when the one before it has ended and its motion is planned and still right."""
         if self.running is not None:
             yield from self._begin_early(self.running, view)
-        if self.running is not None or not self.row:
+        if self.running is not None or self._early is not None or not self.row:
             return
         stage = self.row[0]
         if stage.carries and not view.holding:
@@ -328,19 +352,24 @@ class Task(Deciding[V]):
             return
         assert view.motion is not None and view.gripper is not None
         motion = view.motion
+        if self._heard is None or self._heard[0] is not motion:
+            self._heard = motion, view.now  # clocks of two hosts differ: its stamp would tell of another time
         if motion.id != running.command.id or motion.state != "active" or not motion.speed_scaling:
             return
+        if motion.message or motion.speed_scaling > running.slowest + HASTENED:
+            return  # it is being stopped, or comes to its speed again by a ramp: nobody knows when it arrives
         if stage.holds:
             way = 0.0 if stage.expected_width is None else view.gripper.width - stage.expected_width
         else:
             way = LOOSE
         left = (1.0 - motion.progress) * arm.seconds / motion.speed_scaling
-        begins = motion.header.stamp * 1e-9 + left - self.gripper.least_time(way)
+        begins = self._heard[1] + left - self.gripper.least_time(way)
         if view.now < begins:
             self.due = begins
         elif stage.carries == view.holding and self.may_begin(stage, view):
             self.row.popleft()
             self._early = self._execution(stage, view)
+            self._early.slowest = running.slowest
             yield self._early.command
 
     def _width(self, view: V) -> float | None:
