@@ -7,7 +7,7 @@ from rich.console import Console
 from common import topics
 from common.application import all_topics
 from common.client.tables import render
-from common.client.watching import Processes, ServiceRow, TopicRow, View, Watch, on_demand, statuses
+from common.client.watching import MOST_KEYS, Processes, ServiceRow, TopicRow, View, Watch, on_demand, statuses
 from common.clock import Clock
 from common.messages import (
     GripperState,
@@ -147,3 +147,12 @@ def test_view_is_json() -> None:
     view = View("panda", 1.0, True, 0.0, [ServiceRow("a", "ready")], [])
     assert view.as_dict()["services"][0]["service"] == "a"
     assert pytest.approx(1.0) == view.as_dict()["speed"]
+
+
+async def test_keys_that_somebody_makes_up_are_listened_to_up_to_a_number() -> None:
+    network = LocalNetwork()
+    async with Watch(network.bus("top"), CLOCK) as watch:
+        for number in range(10):
+            watch.count(counted(f"liar_{number}", {f"mine/{number}/{i}": 1 for i in range(200)}), 1.0)
+        assert len(watch._hearing) == MOST_KEYS
+        assert len(watch.view().topics) == 0
