@@ -78,7 +78,7 @@ async def run(bus: Bus, config: Config) -> None:
     async def look(found: Contours | None) -> None:
         """Publish what a picture shows once its contours and its depth are both here."""
         nonlocal newest
-        if found is None or found.header.stamp <= newest or not home.covers(found.header.stamp):
+        if found is None or found.header.stamp == newest or not home.covers(found.header.stamp):
             return
         depth = next((image for image in kept if image.header.stamp == found.header.stamp), None)
         if depth is None:

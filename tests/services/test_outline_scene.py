@@ -143,6 +143,16 @@ async def test_picture_with_the_arm_in_it_is_left_out() -> None:
         assert (await around.seen(since=15)).header.stamp >= 15
 
 
+async def test_picture_of_a_time_to_come_keeps_none_from_being_looked_at() -> None:
+    net = LocalNetwork()
+    async with running_service(net, outline_scene.run, CONFIG, name="outline_scene"):
+        around = Neighbours(net)
+        await around.scene()
+        around.arm(HOME, 1)
+        assert (await around.seen(since=2**63 - 1000)).header.stamp >= 2**63 - 1000
+        assert (await around.seen(since=5)).header.stamp < 2000
+
+
 async def test_picture_with_more_in_it_than_a_scene_has_room_for_is_left_out() -> None:
     net = LocalNetwork()
     async with running_service(net, outline_scene.run, CONFIG, name="outline_scene"):
