@@ -21,6 +21,7 @@ from common.recording.stamps import stamp_of
 # writer is found room for where its key is known.
 MOST_CHANNELS = 2000
 CHUNK_BYTES = 512 * 1024  # before compression; a picture has a chunk of its own
+_BESIDE = 40  # [bytes] about, that a message takes beside its payload: readers take no chunk of very many tiny ones
 PROFILE = "zencell"
 ABOUT, RUN, ENDED = "zencell", "run", "ended"  # names of metadata records
 TRACES_TOPIC, TRACES_SCHEMA = "recording/traces", "zencell.Traces"
@@ -163,7 +164,7 @@ class RecordingWriter:
             self._traces.append((channel, sequence, sample.trace))
         self.messages += 1
         self._newest = max(self._newest, sample.log_time)
-        self._waiting += len(sample.payload)
+        self._waiting += _BESIDE + len(sample.payload)
         if self._waiting >= CHUNK_BYTES:
             self.flush()
         return True

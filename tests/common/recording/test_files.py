@@ -188,3 +188,9 @@ def test_repetitions_are_known_and_gaps_counted() -> None:
     assert [sequences.is_new("k", "w", n) for n in (5, 5, 6, 4, 9)] == [True, False, True, False, True]
     assert sequences.missed == {"k": 2}
     assert sequences.is_new("k", "restarted", 1)
+
+
+def test_many_tiny_messages_at_once_can_be_read_again(tmp_path: Path) -> None:
+    samples = [joints(number, payload=b"\x80") for number in range(60_000)]
+    with Recording(write(tmp_path / "a.mcap", samples, every=len(samples))) as recording:
+        assert sum(1 for _ in recording.samples()) == 60_000
