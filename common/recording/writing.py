@@ -13,6 +13,7 @@ import msgpack
 from mcap.writer import CompressionType, Writer
 
 from common.messages import SupervisorStatus
+from common.messages.basics import MOST_NAME
 from common.recording.decoding import schema_of
 from common.recording.sample import RecordingError, Sample
 from common.recording.stamps import stamp_of
@@ -20,6 +21,7 @@ from common.recording.stamps import stamp_of
 # Of a file; whoever is on the network can make any number up, and readers take no file of many more. One of another
 # writer is found room for where its key is known.
 MOST_CHANNELS = 2000
+LONGEST_KEY = 500  # characters
 CHUNK_BYTES = 512 * 1024  # before compression; a picture has a chunk of its own
 _BESIDE = 40  # [bytes] about, that a message takes beside its payload: readers take no chunk of very many tiny ones
 PROFILE = "zencell"
@@ -170,12 +172,14 @@ class RecordingWriter:
         return True
 
     def _channel_of(self, sample: Sample) -> int | None:
-        """The channel of a message; of too many writers one for all the others, and none for one key too many."""
+        """The channel of a message; of too many writers one for all others, of a key too many or too long none."""
         writer, about = sample.writer, (sample.key, sample.message, sample.kind)
         if (about, writer) not in self._channels and len(self._channels) >= MOST_CHANNELS:
             if about not in self._about:
                 return None
             writer = ""
+        if len(sample.key) > LONGEST_KEY or len(sample.message) > MOST_NAME:
+            return None
         if (about, writer) not in self._channels:
             self._about.add(about)
             self._channels[about, writer] = self._writer.register_channel(
