@@ -71,7 +71,7 @@ async def run(bus: Bus, config: Config) -> None:
     async def look(image: Image | None) -> None:
         nonlocal newest
         depth = next((one for one in kept if image is not None and one.header.stamp == image.header.stamp), None)
-        if image is None or depth is None or image.header.stamp <= newest:
+        if image is None or depth is None or image.header.stamp == newest:
             return
         newest = image.header.stamp
         try:

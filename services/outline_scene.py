@@ -8,7 +8,7 @@ from collections import deque
 from common import topics
 from common.applications.outlining.messages import Contours
 from common.applications.outlining.perceived_solids import perceived_solids
-from common.applications.outlining.scene import planning_scene
+from common.applications.outlining.scene import planning_scene, require_apart
 from common.applications.outlining.topics import CONTOURS
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Image, PlanningScene
@@ -35,8 +35,10 @@ def seen(found: Contours, image: Image, camera: Pinhole, around: Surroundings) -
     """What the contours of a picture and its depth show.
 
     Raises:
-        Unusable: they show nothing: where no pixel has a depth it is not known that nothing stands there.
+        Unusable: they show nothing: where no pixel has a depth it is not known that nothing stands there; or more than
+            there is time for.
     """
+    require_apart(found)
     depth = depth_of(image)
     try:
         check_depth(depth, found.width, found.height)
@@ -78,7 +80,7 @@ async def run(bus: Bus, config: Config) -> None:
     async def look(found: Contours | None) -> None:
         """Publish what a picture shows once its contours and its depth are both here."""
         nonlocal newest
-        if found is None or found.header.stamp <= newest or not home.covers(found.header.stamp):
+        if found is None or found.header.stamp == newest or not home.covers(found.header.stamp):
             return
         depth = next((image for image in kept if image.header.stamp == found.header.stamp), None)
         if depth is None:

@@ -11,6 +11,7 @@ from common import topics
 from common.errors import DecodeError
 from common.messages import SupervisorStatus
 from common.recording.own import Own
+from common.recording.reading import MOST_SPEED, MOST_TEXT
 from common.recording.sample import Sample, message_of
 from common.recording.stamps import Sequences
 from common.recording.writing import RUN, run_of
@@ -107,6 +108,8 @@ class Capture:
             status = decode(SupervisorStatus, raw.payload)
         except DecodeError:
             return  # somebody else's
+        if status.speed > MOST_SPEED or any(len(text) > MOST_TEXT for text in (status.world, *status.overrides)):
+            return  # no supervisor says that, and nobody would read a recording of it
         self._run_known = True
         self._sink.describe(RUN, run_of(status))
 

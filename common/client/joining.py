@@ -15,6 +15,7 @@ from common.clock import Clock
 from common.config import names_of
 from common.errors import ConfigError, DecodeError, NoRouter, RequestFailed, UnknownName
 from common.messages import MotionStatus, SupervisorStatus
+from common.messages.basics import MOST_STAMP
 from common.remapping import is_cell
 from common.transport.bus import Bus
 from common.transport.codec import decode
@@ -174,12 +175,20 @@ async def supervisor_status(bus: Bus, cell: str = "") -> SupervisorStatus | None
 
 
 async def cell_clock(bus: Bus) -> Clock:
-    """The clock that the cell runs by; the environment's where no supervisor tells."""
+    """The clock that the cell runs by; the environment's where no supervisor tells, or of none that there can be."""
     status = await supervisor_status(bus)
     if status is None or not status.epoch:
         return bus.clock
     here = status.host == socket.gethostname()  # another host has a clock of its own
-    return Clock(status.speed, status.epoch, status.booted if here and status.booted else None)
+    try:
+        clock = Clock(status.speed, status.epoch, status.booted if here and status.booted else None)
+        if 0 <= clock.now_ns() <= MOST_STAMP:
+            return clock
+        told = "its time is none that a stamp can say"
+    except ValueError as error:
+        told = str(error)
+    bus.log.warning("%s: the clock that it tells of is left out: %s", topics.SUPERVISOR_STATUS.key, told)
+    return bus.clock
 
 
 async def newest_heard(bus: Bus) -> int:

@@ -134,6 +134,8 @@ async def change(bus: Bus, values: Mapping[str, Any]) -> dict[str, tuple[Any, An
         await ask(bus, service, changes, dry_run=True)
     for service, changes in wanted.items():
         after = {parameter.path: parameter.value for parameter in await ask(bus, service, changes)}
+        if missing := next((path for path in changes if path not in after), None):
+            raise RequestFailed(f"{service} does not say what became of {missing}")
         told |= {path: (told[path][0], after[path]) for path in changes}
     return told
 
@@ -175,10 +177,18 @@ def differs(parameter: Parameter) -> bool:
 
 
 def tree_of(parameters: Iterable[Parameter]) -> dict[str, Any]:
-    """The values in the shape of a cell file."""
+    """The values in the shape of a cell file.
+
+    Raises:
+        RequestFailed: one would be a part of another's value.
+    """
     tree: dict[str, Any] = {}
+    told: set[str] = set()
     for parameter in parameters:
         *above, name = parameter.path.split(".")
+        if any(".".join(above[:depth]) in told for depth in range(1, len(above) + 1)):
+            raise RequestFailed(f"{parameter.path} is told of as a part of another parameter")
+        told.add(parameter.path)
         node = tree
         for part in above:
             node = node.setdefault(part, {})

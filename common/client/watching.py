@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 SUPERVISOR, ROUTER = "supervisor", "router"
 ASK_TIMEOUT = 1.0  # [s]
+MOST_KEYS = 300  # that are listened to
 
 
 @dataclass
@@ -88,8 +89,6 @@ class Watch:
         self._on_demand = on_demand()
         self._hearing: dict[str, Hearing] = {}
         self._rates = Rates()
-        self._counted: dict[str, tuple[float, ServiceCounters]] = {}  # by service: when [s], what
-        self._received: dict[str, float] = {}  # by service [1/s]
         self._processes = Processes()
         self._alive = bus.alive
         self._status = bus.reader(topics.SUPERVISOR_STATUS)
@@ -126,15 +125,9 @@ class Watch:
     def count(self, counters: ServiceCounters, now: float) -> None:
         """Take note of what a service has counted until a time [s]; keys of a person's own are listened to from now."""
         self._rates.update(counters, now)
-        total = sum(counters.received.values())
-        if counters.service in self._counted:
-            then, before = self._counted[counters.service]
-            if now > then:  # a service that was started again counts from zero
-                self._received[counters.service] = max(0, total - sum(before.received.values())) / (now - then)
-        self._counted[counters.service] = (now, counters)
         for key in counters.received:
             known = key in self._hearing or key in self._known or key.startswith("param/")
-            if not known and is_key(key):  # whoever counts may say anything
+            if not known and is_key(key) and len(self._hearing) < MOST_KEYS:  # whoever counts may say anything
                 self._listen(key)
 
     def view(self) -> View:
@@ -154,9 +147,8 @@ class Watch:
             row.pid = self._processes.parent_of(self._status.latest.services)
         if row.pid is not None:
             row.cpu, row.memory = self._processes.load_of(row.pid, status.name)
-        row.received = self._received.get(status.name)
-        if status.name in self._counted:
-            counted = self._counted[status.name][1]
+        row.received = self._rates.received_by(status.name)
+        if (counted := self._rates.counted(status.name)) is not None:
             row.dropped, row.invalid, row.overflow = (
                 sum(numbers.values()) for numbers in (counted.dropped, counted.invalid, counted.overflow)
             )

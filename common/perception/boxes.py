@@ -83,10 +83,12 @@ class BoxDetector:
             self._rays = camera, Rays.through(camera, pixels)
         require_near(self._rays[1].directions)
         rays, o, measured = self._rays[1], self.options, is_valid(depth)
+        below = np.abs(depth * rays.directions[..., 2])  # the camera [m]
         found: list[SeenBox] = []
         for name, coloured in self._coloured(picture):
             kind = o.kinds[name]
-            for left, top, inside in _patches(coloured & measured):
+            least = 0.999 * FILLED**2 * kind.size[0] * kind.size[1] * camera.fx**2  # [px^2 m^2], of `_boxes`; rounded
+            for left, top, inside in _patches(coloured & measured, below, least):
                 height, width = inside.shape
                 cut = (slice(top, top + height), slice(left, left + width))
                 points = rays.origin + depth[cut][..., None].astype(float) * rays.directions[cut]
@@ -164,10 +166,19 @@ def _hue(color: Rgb) -> int:
     return int(cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV)[0, 0, 0])
 
 
-def _patches(mask: Bools) -> Iterator[tuple[int, int, Bools]]:
-    """Connected parts of a mask: the left and top of each [px], and the part itself."""
+def _patches(mask: Bools, below: Array | None = None, least: float = 0.0) -> Iterator[tuple[int, int, Bools]]:
+    """Connected parts of a mask: the left and top of each [px], and the part itself.
+
+    Left out are those too small to be anything: in a picture full of noise there are very many. Their area [px] by the
+    square of how far below the camera they are at most, as (height, width) [m] says, is less than the `least`.
+    """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    for number in range(1, count):
+    numbers = np.arange(1, count)
+    if below is not None:
+        farthest = np.zeros(count)
+        np.maximum.at(farthest, labels[mask], below[mask])
+        numbers = numbers[stats[1:, cv2.CC_STAT_AREA] * farthest[1:] ** 2 >= least]
+    for number in numbers.tolist():
         left, top, width, height, _area = (int(value) for value in stats[number])
         yield left, top, labels[top : top + height, left : left + width] == number
 

@@ -10,6 +10,8 @@ from typing import Any
 from common.recording.sample import Sample
 from common.recording.writing import ABOUT, RecordingWriter
 
+MOST_STATES = 500  # with which a file begins: those that were said last
+
 
 class SplitWriter:
     """Writes FILE.mcap, or FILE_0.mcap, FILE_1.mcap, ... of about `most_bytes` each.
@@ -55,19 +57,23 @@ class SplitWriter:
         self._descriptions[name] = values
         self._file.describe(name, values)
 
-    def add(self, sample: Sample) -> None:
-        """Write a message.
+    def add(self, sample: Sample) -> bool:
+        """Write a message; whether there was room for its key.
 
         Raises:
             RecordingError: the disk takes no more.
         """
-        self._file.add(sample)
-        if self._most is None:
-            return
+        written = self._file.add(sample)
+        if self._most is None or not written:
+            return written
         if sample.kind == "state":
+            self._states.pop((sample.key, sample.writer), None)
             self._states[sample.key, sample.writer] = sample
+            while len(self._states) > MOST_STATES:
+                del self._states[next(iter(self._states))]
         if self._file.size >= self._most:
             self._next(sample.log_time)
+        return written
 
     def _next(self, now: int) -> None:
         full = self._file

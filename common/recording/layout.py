@@ -33,7 +33,7 @@ MOST_RECORDS = 50_000  # of a chunk; the recorder writes 512 kB
 MOST_CHANNELS = 5000  # and schemas that are told of in a chunk
 MOST_DESCRIBED = 32 * 1024 * 1024  # [bytes] of schemas, channels and metadata beside the chunks
 MOST_DESCRIPTIONS = 20_000  # of these
-MOST_SHORT, SHORT = 20_000, 64  # records, when they have fewer bytes on average
+MOST_SHORT, SHORT = 20_000, 24  # records, when they have fewer bytes on average: the index of one message has 31
 MOST_GROWTH, GROWTH_FREE = 5000, 2**30  # times the size of the file; and [bytes] that need no file of a size
 
 

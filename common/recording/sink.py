@@ -14,6 +14,7 @@ from common.recording.sample import RecordingError, Sample
 
 MOST_BYTES = 256 * 1024 * 1024  # that wait while the disk stalls: ten seconds of the most that cameras send
 MOST_SAMPLES = 200_000
+MOST_KEYS, OTHERS = 1000, "others"  # of which it is counted what was dropped, and what all others are called
 BATCH_SECONDS = 0.1  # between looks into the queue
 FLUSH_SECONDS = 0.8  # between chunks: with the batch, a kill costs less than a second
 
@@ -25,13 +26,13 @@ class Figures:
     messages: int
     size: int  # [bytes] on disk
     seconds: float
-    dropped: dict[str, int] = field(default_factory=dict)  # by key: the disk was too slow
+    dropped: dict[str, int] = field(default_factory=dict)  # by key: the disk was too slow, or the file is full of keys
 
 
 class Sink:
     """Takes samples from any thread without ever blocking, and writes them in one of its own.
 
-    What does not fit while the disk stalls is dropped and counted by key.
+    What does not fit while the disk stalls is dropped and counted by key, and so is what is under one key too many.
     """
 
     def __init__(
@@ -65,10 +66,13 @@ class Sink:
             if self._closing or self.error is not None:
                 return
             if self._bytes + len(sample.payload) > self._most or len(self._waiting) >= MOST_SAMPLES:
-                self._dropped[sample.key] += 1
+                self._drop(sample.key)
                 return
             self._waiting.append(sample)
             self._bytes += len(sample.payload)
+
+    def _drop(self, key: str) -> None:
+        self._dropped[key if key in self._dropped or len(self._dropped) < MOST_KEYS else OTHERS] += 1
 
     def describe(self, name: str, values: Mapping[str, Any]) -> None:
         """Have a metadata record written; from any thread."""
@@ -127,9 +131,11 @@ class Sink:
                 self._writer.describe(name, values)
             while samples:
                 sample = samples.popleft()
-                self._writer.add(sample)
+                written = self._writer.add(sample)
                 with self._changed:
                     self._bytes -= len(sample.payload)
+                    if not written:
+                        self._drop(sample.key)
                 if time.monotonic() >= flush_at:
                     self._writer.flush()
                     flush_at = time.monotonic() + FLUSH_SECONDS

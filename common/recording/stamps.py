@@ -10,6 +10,8 @@ import msgpack
 
 from common.messages.basics import MOST_STAMP
 
+# Whoever is on the network can make up any number of them: known are those heard of last, and counted the first.
+MOST_WRITERS, MOST_KEYS = 10_000, 1000
 SEEN_BYTES = 512  # from the front of a payload, where the header is
 
 
@@ -71,17 +73,20 @@ class Sequences:
     def __init__(self) -> None:
         """Nothing came yet."""
         self.missed: Counter[str] = Counter()  # by key: numbers that never came
-        self._newest: dict[tuple[str, str], int] = {}
+        self._newest: dict[tuple[str, str], int] = {}  # that which was heard of last at the end
 
     def is_new(self, key: str, writer: str, sequence: int) -> bool:
         """Whether a message is newer than what its writer said before; a gap before it is counted.
 
         A state comes again each second under the same number, and by a question beside the subscription.
         """
-        before = self._newest.get((key, writer))
-        if before is not None and sequence <= before:
+        before = self._newest.pop((key, writer), None)
+        self._newest[key, writer] = sequence if before is None else max(sequence, before)
+        if before is None:
+            while len(self._newest) > MOST_WRITERS:
+                del self._newest[next(iter(self._newest))]
+        elif sequence <= before:
             return False
-        self._newest[key, writer] = sequence
-        if before is not None and sequence > before + 1:
+        elif sequence > before + 1 and (key in self.missed or len(self.missed) < MOST_KEYS):
             self.missed[key] += sequence - before - 1
         return True

@@ -30,7 +30,8 @@ def outcome(files: list[str], figures: Figures, missed: dict[str, int]) -> list[
     """How a recording went, for the person who made it."""
     names = files[0] if len(files) == 1 else f"{files[0]} to {files[-1]}"
     line = f"recorded {figures.messages:,} messages, {in_bytes(figures.size)}, {figures.seconds:.1f} s: {names}"
-    lost = [f"  {key}: {count} dropped, the disk was too slow" for key, count in sorted(figures.dropped.items())]
+    why = "the disk was too slow, or there were too many keys"
+    lost = [f"  {key}: {count} dropped, {why}" for key, count in sorted(figures.dropped.items())]
     lost += [f"  {key}: {count} lost on the way here" for key, count in sorted(missed.items())]
     return [line, *(lost or ["nothing was lost"])]
 

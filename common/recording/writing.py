@@ -13,11 +13,17 @@ import msgpack
 from mcap.writer import CompressionType, Writer
 
 from common.messages import SupervisorStatus
+from common.messages.basics import MOST_NAME
 from common.recording.decoding import schema_of
 from common.recording.sample import RecordingError, Sample
 from common.recording.stamps import stamp_of
 
+# Of a file; whoever is on the network can make any number up, and readers take no file of many more. One of another
+# writer is found room for where its key is known.
+MOST_CHANNELS = 2000
+LONGEST_KEY = 500  # characters
 CHUNK_BYTES = 512 * 1024  # before compression; a picture has a chunk of its own
+_BESIDE = 40  # [bytes] about, that a message takes beside its payload: readers take no chunk of very many tiny ones
 PROFILE = "zencell"
 ABOUT, RUN, ENDED = "zencell", "run", "ended"  # names of metadata records
 TRACES_TOPIC, TRACES_SCHEMA = "recording/traces", "zencell.Traces"
@@ -122,7 +128,8 @@ class RecordingWriter:
         self.messages = 0
         self._file = AppendedFile(path)
         self._writer = Writer(self._file, chunk_size=_OURS_ALONE, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
-        self._channels: dict[tuple[str, str, str, str], int] = {}
+        self._channels: dict[tuple[tuple[str, str, str], str], int] = {}  # by key, message and kind, and writer
+        self._about: set[tuple[str, str, str]] = set()
         self._schemas: dict[str, int] = {"": 0}
         self._traces: list[tuple[int, int, str]] = []
         self._traces_channel = 0
@@ -141,13 +148,17 @@ class RecordingWriter:
         texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in values.items()}
         self._writer.add_metadata(name, texts)
 
-    def add(self, sample: Sample) -> None:
-        """Write a message. It is on disk after the next `flush`, or when the chunk is full.
+    def add(self, sample: Sample) -> bool:
+        """Write a message, unless too many keys are in the file for one more; whether it was.
+
+        It is on disk after the next `flush`, or when the chunk is full.
 
         Raises:
             WritingFailed: the disk takes no more.
         """
         channel = self._channel_of(sample)
+        if channel is None:
+            return False
         stamp = sample.publish_time or stamp_of(sample.payload) or sample.log_time
         sequence = sample.sequence & 0xFFFFFFFF
         self._writer.add_message(channel, sample.log_time, sample.payload, stamp, sequence)
@@ -155,17 +166,26 @@ class RecordingWriter:
             self._traces.append((channel, sequence, sample.trace))
         self.messages += 1
         self._newest = max(self._newest, sample.log_time)
-        self._waiting += len(sample.payload)
+        self._waiting += _BESIDE + len(sample.payload)
         if self._waiting >= CHUNK_BYTES:
             self.flush()
+        return True
 
-    def _channel_of(self, sample: Sample) -> int:
-        name = (sample.key, sample.writer, sample.message, sample.kind)
-        if name not in self._channels:
-            self._channels[name] = self._writer.register_channel(
-                sample.key, "msgpack", self._schema_of(sample), {"kind": sample.kind, "writer": sample.writer}
+    def _channel_of(self, sample: Sample) -> int | None:
+        """The channel of a message; of too many writers one for all others, of a key too many or too long none."""
+        writer, about = sample.writer, (sample.key, sample.message, sample.kind)
+        if (about, writer) not in self._channels and len(self._channels) >= MOST_CHANNELS:
+            if about not in self._about:
+                return None
+            writer = ""
+        if len(sample.key) > LONGEST_KEY or len(sample.message) > MOST_NAME:
+            return None
+        if (about, writer) not in self._channels:
+            self._about.add(about)
+            self._channels[about, writer] = self._writer.register_channel(
+                sample.key, "msgpack", self._schema_of(sample), {"kind": sample.kind, "writer": writer}
             )
-        return self._channels[name]
+        return self._channels[about, writer]
 
     def _schema_of(self, sample: Sample) -> int:
         message = sample.message

@@ -16,6 +16,8 @@ from common.reporting.truth import Truth
 
 SAME_PLACE = 0.03  # [m] rejections closer than this are of the same thing
 NOT_LEFT_BEHIND = "inside the container"  # such a detection is of what was placed
+MOST_PLACES = 1000  # that are listed as rejected: the newest
+MOST_PLANS = 10_000  # of all lives of the task, the newest
 MAX_LATENCIES = 20_000  # of frames; the older half is forgotten then: the last quarter of an hour stays at 10 Hz
 
 
@@ -27,15 +29,19 @@ class Rejected:
 
     def add(self, rejections: Iterable[Rejection]) -> None:
         """Take note of rejections; of the same place only the newest reason is kept."""
+        at = [_place(known.position) for known in self.places]
         for rejection in rejections:
             if NOT_LEFT_BEHIND in rejection.reason:
                 continue
-            for index, known in enumerate(self.places):
-                if _distance(known.position, rejection.position) < SAME_PLACE:
-                    self.places[index] = rejection
+            place = _place(rejection.position)
+            for index, known in enumerate(at):
+                if abs(known[0] - place[0]) < SAME_PLACE and math.dist(known, place) < SAME_PLACE:
+                    self.places[index], at[index] = rejection, place
                     break
             else:
                 self.places.append(rejection)
+                at.append(place)
+                del self.places[:-MOST_PLACES], at[:-MOST_PLACES]
 
 
 @dataclass
@@ -60,7 +66,7 @@ class Counted:
             self.retries + other.retries,
             self.moving + other.moving,
             self.planning + other.planning,
-            self.plans + other.plans,
+            [*self.plans, *other.plans][-MOST_PLANS:],
         )
 
     def restarted_since(self, earlier: Counted) -> bool:
@@ -256,5 +262,5 @@ def _xyz(position: Vector3) -> list[float]:
     return [round(position.x, 4), round(position.y, 4), round(position.z, 4)]
 
 
-def _distance(a: Vector3, b: Vector3) -> float:
-    return math.dist((a.x, a.y, a.z), (b.x, b.y, b.z))
+def _place(position: Vector3) -> tuple[float, float, float]:
+    return position.x, position.y, position.z

@@ -18,6 +18,7 @@ WORLD = "world"
 KEPT = 250  # transforms of each frame: five seconds at 50 Hz
 MOST_FRAMES = 2000  # of which something is kept, those told of last: whoever is on the network can make any number up
 APART = 0.1  # [s] two transforms may be apart for what lies between to be a straight line
+AHEAD = 10.0  # [s] that a transform may be older than one before it: else that one said a time that is yet to come
 RESTS = 1e-4  # [m, and of a quaternion] a frame that has moved by less rests, and they may be apart for any time
 
 
@@ -41,10 +42,15 @@ class TransformHistory:
         self._kept: dict[str, deque[TransformStamped]] = {}  # by child, in the order in which they were told of
 
     def note(self, message: TFMessage) -> None:
-        """Take over transforms; one that is not newer than what is known of its child is left out."""
+        """Take over transforms; one that is not newer than what is known of its child is left out.
+
+        Where it is much older, what is known is left out: a stamp of a time to come must not hide all until then.
+        """
         for each in message.transforms:
             kept = self._kept.pop(each.child_frame_id, deque(maxlen=KEPT))
             self._kept[each.child_frame_id] = kept
+            if kept and kept[-1].header.stamp - each.header.stamp > AHEAD * 1e9:
+                kept.clear()
             if not kept or each.header.stamp > kept[-1].header.stamp:
                 kept.append(each)
         for name in [*self._kept][: max(0, len(self._kept) - MOST_FRAMES)]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from common.errors import UnknownName, ZencellError
 from common.messages import TFMessage
+from common.robot.transform_history import AHEAD, MOST_FRAMES
 from common.robot.transforms import invert, pose_to_matrix
 
 Array = NDArray[np.float64]
@@ -36,9 +37,14 @@ class TransformTree:
         self._edges: dict[str, tuple[str, Array, int]] = {}  # by child: parent, T_parent_child, stamp [ns]
 
     def update(self, message: TFMessage) -> None:
-        """Take over transforms; one that is older than what is known of its child is left out."""
+        """Take over transforms; one that is a little older than what is known of its child is left out.
+
+        Of too many frames those are forgotten that were told of longest ago.
+        """
         for each in message.transforms:
             self.set(each.header.frame_id, each.child_frame_id, pose_to_matrix(each.transform), each.header.stamp)
+        for name in [*self._edges][: max(0, len(self._edges) - MOST_FRAMES)]:
+            del self._edges[name]
 
     def set(self, parent: str, child: str, T_parent_child: Array, stamp: int = 0) -> None:
         """Say where a frame is in another one.
@@ -47,11 +53,12 @@ class TransformTree:
             parent: the frame that the child hangs on; a child that hung elsewhere moves over.
             child: has one parent.
             T_parent_child: (4, 4), lengths in [m].
-            stamp: when [ns]; what is older than the transform that is known is left out.
+            stamp: when [ns]; what is older than the transform that is known is left out, unless by so much that this
+                one was of a time to come.
         """
-        known = self._edges.get(child)
-        if known is None or known[0] != parent or stamp >= known[2]:
-            self._edges[child] = (parent, T_parent_child, stamp)
+        known = self._edges.pop(child, None)
+        late = known is not None and known[0] == parent and 0 < known[2] - stamp <= AHEAD * 1e9
+        self._edges[child] = known if known is not None and late else (parent, T_parent_child, stamp)
 
     @property
     def frames(self) -> list[str]:

@@ -34,7 +34,7 @@ class HomeWatch:
             self._until = stamp if self._until is None else self._until
         elif not self._known:
             self._since = 0  # it has not moved before, as far as anybody here knows
-        elif self._until is not None:
+        elif self._until is not None or (self._since or 0) > stamp:  # that was of a time to come
             self._since, self._until = stamp, None
         self._known = True
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from common.config import GripperConfig, ObjectConfig, Scenery, Surroundings, World
 from common.errors import ConfigError, Refused, UnknownName
 from common.messages import Header, WorldEdit, WorldObject, WorldObjects
+from common.planning.prism import convex_hull
 from common.robot.finger_joints import closing_frame
 from common.robot.transforms import invert, transform
 from common.sim.bodies import Body, Rest, restored
@@ -37,6 +38,7 @@ Array = NDArray[np.float64]
 GRAVITY = 9.81  # [m/s^2]
 MOST_OBJECTS = 500  # in the world: each is told of while something moves, and looked at in every cycle
 MOST_CORNERS = 50_000  # of all of them
+FARTHEST = 1000.0  # [m] along each axis from the origin of world, and from a thing's own: all has to be told of
 MOST_BENT = 200  # corners of a cross-section that is not convex: how it meets another takes time by their product
 FEW = 32  # spheres among which a place is found at once
 
@@ -260,6 +262,9 @@ class KinematicWorld(News):
         if request.op != "remove":
             if request.position is None:
                 raise Refused("no_position", f"position: {request.op} needs one, for example {{x: 0.5, y: 0.0}}")
+            at = request.position
+            if max(abs(at.x), abs(at.y), abs(at.z)) > FARTHEST:
+                raise Refused("too_far", f"position: is more than {FARTHEST:g} m away from the origin of world")
             rest = self._ground.put(body, request.position.x, request.position.y, request.yaw, self._bodies)
         lay, slot = old is not None and old.state in ("table", "contained"), body.slot_taken
         block = body.block() if lay else None
@@ -366,7 +371,7 @@ def _requested(request: WorldEdit) -> Solid:
     size = request.size
     if request.shape is None or size is None or size.x <= 0 or (request.shape != "sphere" and size.z <= 0):
         raise Refused("no_size", f"size: a {request.shape} needs one, for example {{x: 0.04, y: 0.04, z: 0.04}}")
-    inner = request.inner_radius or 0.0
+    inner = (request.inner_radius or 0.0) if request.shape == "ring" else 0.0
     if request.shape == "ring" and not 0 < inner < size.x / 2:
         raise Refused("no_size", f"inner_radius: a ring needs one below {size.x / 2:g} m")
     if request.shape == "box" and size.y <= 0:
@@ -376,7 +381,12 @@ def _requested(request: WorldEdit) -> Solid:
     if len(request.polygon) > MOST_BENT and not is_convex(np.array(request.polygon)):
         raise Refused("too_many_corners", f"polygon: has {len(request.polygon)} corners and is not convex; at most "
                                           f"{MOST_BENT} can be")
-    return shaped(request.shape, size, inner, request.polygon)
+    if request.shape == "prism" and len(convex_hull(np.array(request.polygon))) < 3:
+        raise Refused("no_size", "polygon: encloses nothing")
+    solid = shaped(request.shape, size, inner, request.polygon)
+    if solid.reach > FARTHEST:
+        raise Refused("no_size", f"size: it would reach {solid.reach:g} m from its middle; {FARTHEST:g} m can be")
+    return solid
 
 
 def _corners(solid: Solid) -> int:

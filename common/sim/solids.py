@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +58,7 @@ def triangulate(outline: Array) -> Array:
     """Triangles (n, 3, 2) of a simple polygon (k, 2), either way round: ears are cut off until three corners are left.
 
     Meisters, "Polygons have ears" (1975): there is always an ear. A convex polygon gets a fan about its middle, whose
-    triangles are less thin.
+    triangles are less thin. What is left without an ear, since the polygon crosses itself, gets a fan about a corner.
     """
     following = np.roll(outline, -1, axis=0)
     twice_area = float(np.sum(_cross(outline, following)))
@@ -69,10 +70,12 @@ def triangulate(outline: Array) -> Array:
     left = list(range(len(corners)))
     ears = []
     while len(left) > 3:
-        ear = next((i for i in range(len(left)) if _is_ear(corners, left, i)), 0)  # 0: the polygon crosses itself
+        ear = next((i for i in range(len(left)) if _is_ear(corners, left, i)), None)
+        if ear is None:
+            break
         ears.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
         del left[ear]
-    return np.asarray(corners[np.array([*ears, left])])
+    return np.asarray(corners[np.array([*ears, *([left[0], b, c] for b, c in pairwise(left[1:]))])])
 
 
 def _is_ear(corners: Array, left: Sequence[int], i: int) -> bool:

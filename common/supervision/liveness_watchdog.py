@@ -7,11 +7,17 @@ from dataclasses import dataclass
 
 from common.config import Watchdogs
 from common.messages import Notice, ServiceStatus, SupervisorStatus
+from common.messages.basics import clean
 from common.transport.keys import ROUTER
 from common.waking import Waking
 
 PERIOD = 0.25  # [s] between two looks
 LEASE = 2.0  # [s] after which a connection counts as lost on which nothing comes
+# Of what other hosts say, that of last: whoever is on the network can make any number up, and all of it has to find
+# room in a status of ours.
+MOST_ELSEWHERE = 80  # services
+MOST_HOSTS, MOST_NOTICES = 10, 20  # with notices
+LONGEST = 150  # characters of a line
 
 
 @dataclass(frozen=True)
@@ -114,6 +120,7 @@ class Elsewhere:
         """
         self.host, self._own = host, frozenset(own)
         self._heard: dict[str, ServiceStatus] = {}
+        self._lately: dict[str, None] = {}  # names of these, that which was heard of last at the end
         self._notices: dict[str, list[Notice]] = {}  # by host
         self._first = host  # of the hosts that were heard of
 
@@ -121,10 +128,20 @@ class Elsewhere:
         """Take note of what a supervisor says of its own part; what it passes on is not news."""
         self._first = min(self._first, status.host)
         if status.host != self.host:
-            self._notices[status.host] = [each for each in status.notices if each.host == status.host]
+            self._notices.pop(status.host, None)
+            self._notices[status.host] = [
+                each.model_copy(update={"message": clean(each.message, LONGEST)})
+                for each in status.notices if each.host == status.host
+            ][:MOST_NOTICES]
         for service in status.services:
             if service.name not in self._own and service.host == status.host:
-                self._heard[service.name] = service
+                self._heard[service.name] = service.model_copy(update={"message": clean(service.message, LONGEST)})
+                self._lately.pop(service.name, None)
+                self._lately[service.name] = None
+        for name in [*self._lately][: max(0, len(self._lately) - MOST_ELSEWHERE)]:
+            del self._lately[name], self._heard[name]
+        for host in [*self._notices][: max(0, len(self._notices) - MOST_HOSTS)]:
+            del self._notices[host]
 
     def statuses(self, alive: Collection[str]) -> list[ServiceStatus]:
         """All of them as they are now: a host that cannot be reached does not tell any more.
@@ -142,7 +159,7 @@ class Elsewhere:
     @property
     def notices(self) -> list[Notice]:
         """What there is to know of other hosts."""
-        return [each for host in sorted(self._notices) for each in self._notices[host]]
+        return [each for host in sorted(self._notices) for each in self._notices[host]][:MOST_NOTICES]
 
     def is_told_here(self, service: str) -> bool:
         """Whether it is for this host, and for one only, to repeat what a service says: what nobody keeps is shared."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from common.config import CameraConfig
 from common.messages import TFMessage, TransformStamped
 from common.robot.model import RobotModel
+from common.robot.transform_history import MOST_FRAMES
 from common.robot.transforms import pose_to_matrix, rpy_to_matrix, transform
 from common.robot.visual_meshes import Piece, Rgb
 from common.viewer.nodes import brightened
@@ -100,8 +101,12 @@ class Transforms:
         self.newest: dict[str, TransformStamped] = {}  # by frame
 
     def update(self, m: TFMessage) -> None:
-        """Take over transforms."""
-        self.newest.update((each.child_frame_id, each) for each in m.transforms)
+        """Take over transforms; of too many frames those are forgotten that were told of longest ago."""
+        for each in m.transforms:
+            self.newest.pop(each.child_frame_id, None)
+            self.newest[each.child_frame_id] = each
+        for name in [*self.newest][: max(0, len(self.newest) - MOST_FRAMES)]:
+            del self.newest[name]
 
     def pose(self, frame: str) -> Array:
         """(4, 4) T_world_frame, or what the surroundings say when transforms do not lead to world."""

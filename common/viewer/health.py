@@ -40,13 +40,11 @@ class HealthPanel:
         """
         self._services = list(services)
         self._rates = Rates()
-        self._counters: dict[str, ServiceCounters] = {}
         self._html = gui.add_html("")
 
     def count(self, counters: ServiceCounters, now: float) -> None:
         """Take note of what a service counted until a wall time [s]."""
         self._rates.update(counters, now)
-        self._counters[counters.service] = counters
 
     def show(self, supervisor: SupervisorStatus | None, alive: frozenset[str]) -> None:
         """Show all services as the supervisor sees them; without one, whether they are there."""
@@ -64,7 +62,7 @@ class HealthPanel:
     def _row(self, name: str, state: str, pid: int | None, restarts: int, message: str) -> str:
         word, kind = words.service_state(state, restarts)
         busiest = self._rates.busiest_of(name) if kind == "good" else None
-        counted = self._counters.get(name)
+        counted = self._rates.counted(name)
         lost = sum(counted.overflow.values()) + sum(counted.invalid.values()) if counted else 0
         return row(
             span(name, "tight"),

@@ -79,27 +79,33 @@ def grouped(labels: list[tuple[str, Array]], scale: float, view: View | None) ->
     places = np.array([at for _, at in labels], dtype=float)
     corners = view(places) if view is not None else np.full((len(labels), 2), np.nan)
     groups = [_Group(at, corner, [text]) for (text, _), at, corner in zip(labels, places, corners, strict=True)]
-    merged = True
-    while merged:  # a label with more lines may reach what it did not before
-        merged = False
-        for i, one in enumerate(groups):
-            for other in groups[i + 1:]:
-                if _meet(one, other, scale):
-                    one.words += other.words
-                    groups.remove(other)
-                    merged = True
-                    break
-            if merged:
-                break
-    return groups
+    sizes, there = np.array([group.size(scale) for group in groups]), np.full(len(groups), True)
+    seen = np.isfinite(corners).all(axis=1)
 
+    def meeting(one: int, others: slice) -> list[int]:
+        """Those of the others that one label would lie over."""
+        (left, low), (width, height) = corners[one], sizes[one]
+        lefts, lows = corners[others].T
+        widths, heights = sizes[others].T
+        over = (left < lefts + widths) & (lefts < left + width) & (low - height < lows) & (lows - heights < low)  # down
+        near = np.linalg.norm(places[others] - places[one], axis=1) < _NEAR
+        chosen = np.flatnonzero(there[others] & np.where(seen[others] & seen[one], over, near))
+        return [int(each) + others.start for each in chosen]
 
-def _meet(one: _Group, other: _Group, scale: float) -> bool:
-    if not (np.isfinite(one.corner).all() and np.isfinite(other.corner).all()):
-        return bool(np.linalg.norm(one.at - other.at) < _NEAR)
-    (left, low), (width, height) = one.corner, one.size(scale)
-    (left2, low2), (width2, height2) = other.corner, other.size(scale)  # pixels count downwards
-    return bool(left < left2 + width2 and left2 < left + width and low - height < low2 and low2 - height2 < low)
+    one = 0
+    while one < len(groups):
+        found = meeting(one, slice(one + 1, len(groups))) if there[one] else []
+        while found:
+            other = found[0]
+            groups[one].words += groups[other].words
+            sizes[one], there[other] = groups[one].size(scale), False
+            # With more lines it may reach what it did not before.
+            if before := meeting(one, slice(0, one)):
+                one, found = before[0], [one]
+            else:
+                found = meeting(one, slice(one + 1, len(groups)))
+        one += 1
+    return [group for group, kept in zip(groups, there, strict=True) if kept]
 
 
 def view_of(camera: viser.CameraHandle) -> View:

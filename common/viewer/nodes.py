@@ -86,8 +86,11 @@ def _seen(value: float) -> int:
 # --- solids and lines ---
 
 
-def add_solid(scene: viser.SceneApi, name: str, solid: CollisionObject) -> Solid:
-    """The node of a solid of the planning scene, in its colour, at its pose in the node above it."""
+def add_solid(scene: viser.SceneApi, name: str, solid: CollisionObject) -> Solid | None:
+    """The node of a solid of the planning scene, in its colour, at its pose in the node above it.
+
+    None for a prism whose outline encloses nothing.
+    """
     from common.planning.prism import convex_hull  # brings the collision library, which only a scene needs
     from common.sim.solids import upright
 
@@ -101,6 +104,8 @@ def add_solid(scene: viser.SceneApi, name: str, solid: CollisionObject) -> Solid
     if solid.shape == "cylinder":
         return scene.add_cylinder(name, sizes[0], sizes[1], color, **place, **shade)
     hull = convex_hull(np.array(solid.outline))
+    if len(hull) < 3:
+        return None
     triangles = upright(hull, np.empty((0, 2)), -sizes[0] / 2, sizes[0] / 2)
     return add_triangles(scene, name, triangles, color, **place, **shade)
 

@@ -14,11 +14,16 @@ from common.client.capturing import Capture
 from common.clock import Clock
 from common.config import load_cell
 from common.recording.decoding import schema_of
+from common.recording.files import SplitWriter
 from common.recording.own import Own
+from common.recording.reading import Recording
 from common.recording.sample import Sample
 from common.recording.selection import Selection
+from common.recording.sink import Sink
 from common.transport.bus import Bus
+from common.transport.codec import encode
 from common.transport.local import LocalNetwork
+from common.transport.session import RawSample
 
 TWO_CAMERAS = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")
 RENAMED = {"camera/*": "left/camera/*"}
@@ -86,3 +91,15 @@ def test_modules_of_a_persons_own_bring_their_messages_and_kinds(
     kinds = own.kinds(own.topics())
     assert (kinds["shine"], kinds["left/gloss"], kinds["joint_states"]) == ("state", "event", "stream")
     assert json.loads(schema_of("Shine"))["properties"]["gloss"]["type"] == "number"
+
+
+@pytest.mark.parametrize("told", [{"speed": 1e12}, {"world": "w" * 4000}, {"overrides": ["o=" + "o" * 2000]}])
+async def test_run_is_that_of_a_supervisor_that_there_can_be(told: dict[str, object], tmp_path: Path) -> None:
+    sink = Sink(SplitWriter(tmp_path / "a.mcap", {"cell": "cell"}))
+    capture = Capture(bus_of(LocalNetwork(), "recorder"), Selection.of(), sink)
+    for said in (told, {"speed": 2.0}):
+        status = m.SupervisorStatus.model_validate({"cell": "cell", "services": [], **said})
+        capture.on_sample(RawSample("cell/supervisor/status", encode(status)))
+    sink.close({"reason": "test"})
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert recording.run.speed == 2.0

@@ -14,7 +14,7 @@ import yaml
 from cli.main import app
 from common.client import parameters
 from common.config import load_cell, service_config
-from common.errors import RequestTimeout
+from common.errors import RequestFailed, RequestTimeout
 from common.messages import Parameter, ParameterReply, ParameterRequest
 from common.topics import parameters_of
 from common.transport.local import LocalNetwork
@@ -264,6 +264,27 @@ async def test_a_service_that_does_not_answer_hides_nothing_of_the_others(monkey
     assert (await parameters.look_up(bus, ["tuned.x"]))["tuned.x"][1].value == 1
     with pytest.raises(RequestTimeout, match="param/frozen"):
         await parameters.look_up(bus, ["motion.velocity_scaling"])  # may be one of that service
+    await bus.close()
+
+
+async def test_answers_that_make_no_sense_are_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus, asked = LocalNetwork().bus("tuned"), 0
+
+    async def answer(request: ParameterRequest) -> ParameterReply:
+        nonlocal asked
+        asked += 1
+        paths = () if request.set and not request.dry_run else ("services.tuned.x", "services.tuned.x.y")
+        return ParameterReply(service="tuned", parameters=[
+            Parameter(path=path, value=1, type="integer", changed=True) for path in paths])
+
+    bus.serve(parameters_of("tuned"), answer)
+    await bus.ready()
+    monkeypatch.setattr(parameters, "serving", lambda _: asyncio.sleep(0, ["tuned"]))
+    with pytest.raises(RequestFailed, match=r"tuned does not say what became of services\.tuned\.x"):
+        await parameters.change(bus, {"tuned.x": 2})
+    assert asked == 3
+    with pytest.raises(RequestFailed, match=r"services\.tuned\.x\.y is told of as a part of another parameter"):
+        await parameters.dumped(bus, None)
     await bus.close()
 
 

@@ -362,6 +362,7 @@ def test_lines_for_people() -> None:
     assert progress(now, before, 2) == "   2.0 s  1,234 messages  2.0 MB  2.0 MB/s  5 lost"
     assert outcome(["a_0.mcap", "a_1.mcap"], now, {"panda/log": 1}) == [
         "recorded 1,234 messages, 2.0 MB, 2.0 s: a_0.mcap to a_1.mcap",
-        "  panda/tf: 3 dropped, the disk was too slow", "  panda/log: 1 lost on the way here"]
+        "  panda/tf: 3 dropped, the disk was too slow, or there were too many keys",
+        "  panda/log: 1 lost on the way here"]
     assert outcome(["a.mcap"], before, {})[1] == "nothing was lost"
     assert [in_bytes(n) for n in (5, 5e3, 5e6, 5e9)] == ["5 B", "5.0 kB", "5.0 MB", "5.0 GB"]

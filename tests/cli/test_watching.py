@@ -1,13 +1,15 @@
 import io
 import os
+import socket
 
 import pytest
 from rich.console import Console
 
 from common import topics
 from common.application import all_topics
+from common.client.joining import cell_clock
 from common.client.tables import render
-from common.client.watching import Processes, ServiceRow, TopicRow, View, Watch, on_demand, statuses
+from common.client.watching import MOST_KEYS, Processes, ServiceRow, TopicRow, View, Watch, on_demand, statuses
 from common.clock import Clock
 from common.messages import (
     GripperState,
@@ -147,3 +149,27 @@ def test_view_is_json() -> None:
     view = View("panda", 1.0, True, 0.0, [ServiceRow("a", "ready")], [])
     assert view.as_dict()["services"][0]["service"] == "a"
     assert pytest.approx(1.0) == view.as_dict()["speed"]
+
+
+async def test_keys_that_somebody_makes_up_are_listened_to_up_to_a_number() -> None:
+    network = LocalNetwork()
+    async with Watch(network.bus("top"), CLOCK) as watch:
+        for number in range(10):
+            watch.count(counted(f"liar_{number}", {f"mine/{number}/{i}": 1 for i in range(200)}), 1.0)
+        assert len(watch._hearing) == MOST_KEYS
+        assert len(watch.view().topics) == 0
+
+
+@pytest.mark.parametrize("told", [
+    {"speed": 5e-324}, {"speed": 1e12}, {"speed": 10.0, "epoch": 1}, {"speed": 10.0, "epoch": 2**63 - 1},
+    {"booted": -(2**63) + 1}, {"booted": 2**63 - 1},
+])
+async def test_clock_that_there_cannot_be_is_not_that_of_a_tool(told: dict[str, float]) -> None:
+    network = LocalNetwork()
+    said = SupervisorStatus.model_validate(
+        {"cell": "cell", "host": socket.gethostname(), "services": [], "epoch": CLOCK.epoch_ns, **told})
+    network.bus("liar").writer(topics.SUPERVISOR_STATUS).put(said)
+    tool = network.bus("top", clock=CLOCK)
+    assert await cell_clock(tool) is CLOCK
+    tool.clock = await cell_clock(tool)
+    assert tool.header().stamp > 0

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 import math
 
 import numpy as np
@@ -69,6 +70,16 @@ async def test_cube_is_told_with_kind_size_place_and_the_stamp_of_its_picture_wh
         assert (shown.width, shown.height) == (320, 240)
         mask = image_to_array(await camera.masks.next())
         assert (mask[110:130, 150:170] == 255).all() and (mask == 255).sum() == 400
+
+
+async def test_picture_of_a_time_to_come_keeps_none_from_being_looked_at() -> None:
+    net = LocalNetwork()
+    camera = Camera(net)
+    async with running_service(net, box_detector.run, CONFIG):
+        for stamp in (2**63 - 1, 5, 6):
+            camera.depth(stamp)
+            camera.picture(stamp)
+            assert (await asyncio.wait_for(camera.found.next(), 20)).header.stamp == stamp
 
 
 async def test_depth_in_millimetres_is_told_by_its_encoding() -> None:

@@ -118,6 +118,15 @@ def test_depth_of_another_size_than_the_contours_is_left_out() -> None:
         outline_scene.seen(cube_contours(), image, CAMERA, AROUND)
 
 
+def test_contours_that_lie_over_one_another_again_and_again_are_not_looked_into() -> None:
+    found = cube_contours()
+    around = [(-1e12, -1e12), (1e12, -1e12), (1e12, 1e12), (-1e12, 1e12)]
+    many = [Contour.model_construct(index=i, label=f"Object_{i}", pixels=around) for i in range(1000)]
+    image = array_to_image(cube_depth(), "32FC1")
+    with pytest.raises(Unusable, match="its 1000 contours cover it more than 20 times"):
+        outline_scene.seen(found.model_copy(update={"contours": many}), image, CAMERA, AROUND)
+
+
 @pytest.mark.parametrize("change", [{"fx": 1e-6}, {"cy": 1e12}])
 def test_what_would_be_farther_away_than_a_scene_can_tell_is_left_out(change: dict[str, float]) -> None:
     image = array_to_image(cube_depth(), "32FC1")
@@ -141,6 +150,16 @@ async def test_picture_with_the_arm_in_it_is_left_out() -> None:
         around.see(5)
         around.arm(HOME, 10)
         assert (await around.seen(since=15)).header.stamp >= 15
+
+
+async def test_picture_of_a_time_to_come_keeps_none_from_being_looked_at() -> None:
+    net = LocalNetwork()
+    async with running_service(net, outline_scene.run, CONFIG, name="outline_scene"):
+        around = Neighbours(net)
+        await around.scene()
+        around.arm(HOME, 1)
+        assert (await around.seen(since=2**63 - 1000)).header.stamp >= 2**63 - 1000
+        assert (await around.seen(since=5)).header.stamp < 2000
 
 
 async def test_picture_with_more_in_it_than_a_scene_has_room_for_is_left_out() -> None:

@@ -7,12 +7,28 @@ from collections.abc import Sequence
 import numpy as np
 
 from common import messages as m
+from common.applications.outlining.messages import Contours
 from common.applications.outlining.perceived_solids import PerceivedSolid
 from common.config import Surroundings
 from common.perception.intake import Unusable, require_near
 from common.scene.fixtures import fixture_objects
 
+MOST_PICTURES = 20  # that the boxes about all contours of a picture cover together: to look into more takes minutes
 MOST, MOST_CORNERS, MOST_OF_ONE = 400, 5000, 2000  # solids and corners that a planning scene has room for
+
+
+def require_apart(contours: Contours) -> None:
+    """Return when contours lie so much beside one another in their picture as those of things do.
+
+    Raises:
+        Unusable: they do not.
+    """
+    covered = 0.0
+    for contour in contours.contours:
+        pixels = np.clip(np.array(contour.pixels), 0, (contours.width, contours.height))
+        covered += float(np.prod(pixels.max(axis=0) - pixels.min(axis=0)))
+    if covered > MOST_PICTURES * contours.width * contours.height:
+        raise Unusable("crowded", f"its {len(contours.contours)} contours cover it more than {MOST_PICTURES} times")
 
 
 def planning_scene(around: Surroundings, solids: Sequence[PerceivedSolid], stamp: int) -> m.PlanningScene:

@@ -236,16 +236,21 @@ class PhysicsWorld(News):
             return self._slip(request.id)
         before = set(self._paper.ids)
         name = self._paper.edit(request, now)
-        for update in self._paper.take_events():
-            if request.op == "reset" or update.data.partition(":")[2] == name:
-                self._events.append(update)
+        updates = self._paper.take_events()
         changed = self._paper.ids if request.op == "reset" else [name] if name in self._paper.bodies else []
         if request.op == "reset":
             self._masses = dict(self._first_masses)
         elif request.op == "add":
             self._masses[name] = request.mass or self._first_masses.get(request.like or self._usual, USUAL_MASS)
         if request.op == "reset" or before != set(self._paper.ids):
-            self._build()
+            try:
+                self._build()
+            except ConfigError as error:  # of what was added: all else was built before
+                self._paper.edit(WorldEdit(op="remove", id=name), now)
+                self._paper.take_events()
+                self._masses.pop(name, None)
+                raise Refused("no_size", f"{name}: {error}") from None
+        self._events += [each for each in updates if request.op == "reset" or each.data.partition(":")[2] == name]
         cell, data = self._built
         for each in changed:
             place, body = cell.things[each], self._paper.bodies[each]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Any
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from common import topics
 from common.messages import CameraInfo, TransformStamped
+from common.robot.transforms import pose_to_matrix
 from common.topics import Topic
 from common.viewer.labels import Labels
 from common.viewer.layers import Layer
@@ -22,6 +25,8 @@ _PIXELS = 320  # at most so many across: it is small on the page
 _PICTURES = 0.5  # [s] between pictures
 _MOVES = 0.1  # [s] between places of a camera that moves
 _COLOR = (120, 170, 255)
+_MOST, _DEEPEST = 500, 50  # frames that are shown, and how many one may hang on: tf may tell of any number
+_ROOTS = ("", "world")
 
 
 class Camera(Layer):
@@ -85,53 +90,55 @@ class Frames(Layer):
 
     def build(self) -> None:
         """Start without any."""
-        self._waiting: dict[str, TransformStamped] = {}  # frames whose parent is not known yet
         self._parents: dict[str, str] = {}
         self._nodes: dict[str, viser.FrameHandle] = {}
         self.labels = Labels(self.scene, self.root, scale=0.6)
 
     def show(self, topic: Topic[Any], message: Any) -> None:
-        """Move all frames to where they are now, also those that hang on what moved."""
+        """Move all frames to where they are now, also those that hang on what moved; what hangs on nothing is left out.
+
+        Of each frame first the one that it hangs on is looked at.
+        """
+        below: dict[str, list[TransformStamped]] = {}
         for each in self.stage.transforms.newest.values():
-            self._place(each)
-        self.labels.show({name: (name, self.stage.transforms.pose(name)[:3, 3]) for name in self._nodes},
-                         self.stage.view())
+            below.setdefault(each.header.frame_id, []).append(each)
+        places: dict[str, NDArray[np.float64]] = {}
+        waiting = deque((root, self.root, np.eye(4), 0) for root in _ROOTS)
+        while waiting:
+            parent, above, T_world_parent, depth = waiting.popleft()
+            for each in below.get(parent, ()):
+                name = each.child_frame_id
+                if name not in _ROOTS and depth < _DEEPEST and len(places) < _MOST:
+                    places[name] = T_world_parent @ pose_to_matrix(each.transform)
+                    waiting.append((name, self._placed(each, above).name, places[name], depth + 1))
+        for name in [name for name in self._nodes if name not in places]:
+            self._forget(name)
+        self.labels.show({name: (name, places[name][:3, 3]) for name in self._nodes}, self.stage.view())
 
     def node(self, frame: str) -> viser.FrameHandle | None:
         """The node of a frame."""
         return self._nodes.get(frame)
 
-    def _place(self, each: TransformStamped) -> None:
+    def _placed(self, each: TransformStamped, above: str) -> viser.FrameHandle:
+        """The node of a frame, where it is now in the one that it hangs on."""
         name, parent = each.child_frame_id, each.header.frame_id
         if self._parents.get(name) != parent:
-            above = self._name_of(parent)
-            if above is None:
-                self._waiting[name] = each
-                return
-            self._add(name, parent, above)
+            self._forget(name)  # hangs elsewhere now, and so do those that hang on it
+            path = f"{above}/{name.replace('/', '_').replace(' ', '_')}"
+            while self.scene.get_handle_by_name(path) is not None:  # that of another frame
+                path += "_"
+            self._nodes[name] = self.scene.add_frame(path, axes_length=_AXIS, axes_radius=0.04 * _AXIS)
+            self._parents[name] = parent
         node = self._nodes[name]
         node.position, node.wxyz = position_of(each.transform), wxyz_of(each.transform)
-
-    def _name_of(self, frame: str) -> str | None:
-        if frame in ("", "world"):
-            return self.root
-        node = self._nodes.get(frame)
-        return node.name if node else None
-
-    def _add(self, name: str, parent: str, above: str) -> None:
-        if name in self._nodes:  # hangs elsewhere now, and so do those that hang on it
-            self._forget(name)
-        node = f"{above}/{name.replace('/', '_')}"
-        self._nodes[name] = self.scene.add_frame(node, axes_length=_AXIS, axes_radius=0.04 * _AXIS)
-        self._parents[name] = parent
-        for waiting in [w for w in self._waiting.values() if w.header.frame_id == name]:
-            if self._waiting.pop(waiting.child_frame_id, None) is not None:
-                self._place(waiting)
+        return node
 
     def _forget(self, name: str) -> None:
-        self._nodes[name].remove()
-        below = f"{self._nodes[name].name}/"
-        for frame in [frame for frame, node in self._nodes.items() if node.name.startswith(below)] + [name]:
+        """Leave out a frame, and those that hang on it; nothing where it is not shown."""
+        if (node := self._nodes.get(name)) is None:
+            return
+        node.remove()
+        for frame in [frame for frame, each in self._nodes.items() if each.name.startswith(f"{node.name}/")] + [name]:
             del self._nodes[frame], self._parents[frame]
 
 

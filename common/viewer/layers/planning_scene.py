@@ -60,9 +60,10 @@ class Fixtures(Layer):
             known[1].position, known[1].wxyz = position_of(thing.pose), wxyz_of(thing.pose)
             return
         if known is not None:
-            known[1].remove()
+            self._nodes.pop((link, name))[1].remove()
         node = add_solid(self.scene, f"{self._above(link)}/{next(self._numbers)}", thing)
-        self._nodes[link, name] = (look, node)
+        if node is not None:
+            self._nodes[link, name] = (look, node)
 
     def _above(self, link: str) -> str:
         if not link:

@@ -21,6 +21,7 @@ TRUTH = (0, 229, 255)
 EDITED = (255, 255, 0)
 _COLOR = -3  # of what tells a look: the last three are the colour, which is not shown
 _FREE = ("table", "contained", "elsewhere")  # what may be pulled: not what the hand holds, nor what falls
+_MOST_WORK = 2_000_000  # squares of the corners of all: to cut up more would keep the page from whoever presses STOP
 _LARGER = 1.03  # a sphere is drawn a little outside of what was perceived
 _LEAST_SLOPE = 1e-3  # of a line of sight that meets the plane anywhere near
 
@@ -43,10 +44,14 @@ class Truth(Layer):
         self._drags: dict[str, Drag] = {}
 
     def show(self, topic: Topic[Any], message: Any) -> None:
-        """Show these objects and no others."""
+        """Show these objects and no others; of more than there is room for, the first."""
         from common.sim.objects import look_of  # brings shapes, which only a scene needs
 
-        self._things = {thing.id: thing for thing in message.objects}
+        self._things, work = {}, 0
+        for thing in message.objects:
+            work += len(thing.polygon) ** 2
+            if work <= _MOST_WORK:
+                self._things[thing.id] = thing
         looks = {name: look_of(thing)[:_COLOR] for name, thing in self._things.items()}
         for name in [name for name, (look, _) in self._nodes.items() if looks.get(name) != look]:
             if name in self._drags:

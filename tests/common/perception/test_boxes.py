@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 
 from common.config import CameraConfig, Surroundings
 from common.messages import Color, Pose, Quaternion, Vector3, WorldObject
+from common.perception import boxes
 from common.perception.boxes import BoxDetector, BoxKind, BoxOptions, SeenBox
 from common.perception.intake import Unusable
 from common.perception.pinhole import Pinhole
@@ -82,6 +85,26 @@ def test_colours_that_nobody_asked_for_and_pictures_without_depth_show_nothing()
     shown = view.see([cube("red", 0.5, 0.0)])
     nothing = np.full(np.shape(shown.depth), np.nan, np.float32)
     assert BoxDetector(BoxOptions(kinds=KINDS)).detect(shown.colour, nothing, view.camera) == []
+
+
+def test_in_a_picture_full_of_noise_a_cube_is_found_and_specks_are_not_looked_into(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looked_into = 0
+
+    def counted(*given: Any) -> Iterator[Any]:
+        nonlocal looked_into
+        looked_into += 1
+        return faces(*given)
+
+    faces = boxes._faces
+    monkeypatch.setattr(boxes, "_faces", counted)
+    view = Renderer(AROUND)
+    shown = view.see([cube("red", 0.45, -0.15)])
+    picture = shown.colour.copy()
+    picture[::3, ::3][(shown.colour[::3, ::3, 2] < 150)] = (25, 25, 230)
+    found = BoxDetector(BoxOptions(kinds=KINDS)).detect(picture, np.asarray(shown.depth, np.float32), view.camera)
+    assert len(found) == 1 and looked_into < 10
 
 
 def test_camera_that_none_can_be_shows_no_boxes_and_says_so() -> None:

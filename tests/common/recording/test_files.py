@@ -188,3 +188,21 @@ def test_repetitions_are_known_and_gaps_counted() -> None:
     assert [sequences.is_new("k", "w", n) for n in (5, 5, 6, 4, 9)] == [True, False, True, False, True]
     assert sequences.missed == {"k": 2}
     assert sequences.is_new("k", "restarted", 1)
+
+
+def test_many_tiny_messages_at_once_can_be_read_again(tmp_path: Path) -> None:
+    samples = [joints(number, payload=b"\x80") for number in range(60_000)]
+    with Recording(write(tmp_path / "a.mcap", samples, every=len(samples))) as recording:
+        assert sum(1 for _ in recording.samples()) == 60_000
+
+
+def test_tiny_messages_under_many_keys_and_long_ones_can_be_read_again(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
+    for turn in range(12):
+        for number in range(2000):
+            assert writer.add(joints(2000 * turn + number, key=f"panda/made/up/{number}", payload=b"\x80"))
+        writer.flush()
+    assert not writer.add(joints(0, key="panda/made/up/0" + 500 * "p"))
+    writer.close()
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert sum(1 for _ in recording.samples()) == 24_000

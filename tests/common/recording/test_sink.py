@@ -12,7 +12,8 @@ from common.recording import writing
 from common.recording.files import SplitWriter
 from common.recording.reading import Recording
 from common.recording.sample import RecordingError
-from common.recording.sink import Sink
+from common.recording.sink import MOST_KEYS, Sink
+from common.recording.stamps import MOST_WRITERS, Sequences
 from common.recording.writing import WritingFailed
 from tests.common.recording.samples import fill_disk, joints, status
 
@@ -40,7 +41,7 @@ def test_what_does_not_fit_while_the_disk_stalls_is_dropped_and_counted(
         def add(self, sample):
             writing.set()
             disk.wait()
-            super().add(sample)
+            return super().add(sample)
 
     size = len(joints(0).payload)
     sink = Sink(Stalled(tmp_path / "a.mcap", {}), most_bytes=3 * size + 1)
@@ -53,6 +54,32 @@ def test_what_does_not_fit_while_the_disk_stalls_is_dropped_and_counted(
     assert sink.close({}).messages == 3
     with Recording(tmp_path / "a.mcap") as recording:
         assert recording.metadata("ended")["dropped"] == {"panda/joint_states": 3}
+
+
+def test_whatever_keys_and_writers_somebody_makes_up_the_recording_goes_on_and_can_be_read(tmp_path: Path) -> None:
+    sink = Sink(SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}))
+    sink.offer(joints(0))
+    for number in range(33_000):
+        sink.offer(joints(1 + 2 * number, writer=f"liar.{number}"))
+        sink.offer(joints(2 + 2 * number, key=f"panda/made/up/{number}"))
+    sink.offer(joints(200_000))
+    sink.offer(joints(200_001, writer="executor.2"))  # was started again
+    figures = sink.close({"reason": "test"})
+    assert figures.messages + sum(figures.dropped.values()) == 66_003 and len(figures.dropped) == MOST_KEYS + 1
+    with Recording(tmp_path / "a.mcap") as recording:
+        states = [sample for sample in recording.samples() if sample.key == "panda/joint_states"]
+    assert len(states) == 33_003
+    assert [sample.writer for sample in states[-3:]] == ["", "executor.1", ""]
+
+
+def test_of_writers_that_somebody_makes_up_those_are_known_that_were_heard_of_last() -> None:
+    sequences = Sequences()
+    for number in range(MOST_WRITERS + 10):
+        for sequence in (1, 5):
+            assert sequences.is_new(f"key {number}", f"liar.{number}", sequence)
+        assert sequences.is_new("panda/joint_states", "executor.1", number + 1)
+    assert not sequences.is_new("panda/joint_states", "executor.1", MOST_WRITERS)
+    assert len(sequences._newest) == MOST_WRITERS and len(sequences.missed) == 1000
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])

@@ -5,7 +5,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.applications.pick_place.messages import PickPlaceStatus
-from common.messages import Header, MotionStatus, PlanFigure, Pose, PoseArray, Rejection, Vector3, WorldObjects
+from common.messages import (
+    Header,
+    MotionStatus,
+    PlanFigure,
+    Pose,
+    PoseArray,
+    Rejection,
+    Rejections,
+    Vector3,
+    WorldObjects,
+)
 from common.reporting.application import Figures
 from common.reporting.summary import Rejected, Summary, describe, percentile
 from common.reporting.truth import Truth
@@ -45,6 +55,17 @@ def test_a_place_is_listed_once_and_what_lies_in_the_box_never() -> None:
     assert [(place.position.y, place.reason) for place in rejected.places] == [
         (0.0, "partly out of view"), (0.1, "too far")
     ]
+
+
+def test_of_what_is_made_up_the_newest_is_kept() -> None:
+    summary = Summary("panda", 1, 1.0)
+    for number in range(12):
+        summary.on_rejections(0.0, Rejections(header=Header(), rejected=[at(i, number) for i in range(1000)]))
+        for plans in ([PLAN] * 1000, []):
+            summary.on_status(status("IDLE", number, plans=plans))
+    told = summary.as_dict()
+    assert len(told["rejected"]) == 1000 and {each["position"][1] for each in told["rejected"]} == {11.0}
+    assert len(told["plans"]) == 10_000
 
 
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), max_size=20))

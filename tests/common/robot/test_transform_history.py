@@ -7,6 +7,7 @@ import pytest
 
 from common.config import load_cell
 from common.messages import Header, JointState, TFMessage, TransformStamped
+from common.messages.basics import MOST_STAMP
 from common.robot.model import RobotModel
 from common.robot.transform_history import KEPT, MOST_FRAMES, NoTransform, TransformHistory
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
@@ -27,14 +28,17 @@ def joints_at(stamp: int) -> np.ndarray:
     return HOME + SPEED * stamp * 1e-9
 
 
+def told_at(stamp: int, moves: bool = True) -> TFMessage:
+    q = joints_at(stamp) if moves else HOME
+    message = FRAMES.moving(JointState(header=Header(stamp=stamp), name=ROBOT.joint_names, position=q.tolist()))
+    assert message is not None
+    return TFMessage.model_validate({"transforms": message.transforms})
+
+
 def told(stamps: list[int], moves: bool = True) -> TransformHistory:
     history = TransformHistory()
     for stamp in stamps:
-        q = joints_at(stamp) if moves else HOME
-        state = JointState(header=Header(stamp=stamp), name=ROBOT.joint_names, position=q.tolist())
-        message = FRAMES.moving(state)
-        assert message is not None
-        history.note(TFMessage.model_validate({"transforms": message.transforms}))
+        history.note(told_at(stamp, moves))
     return history
 
 
@@ -86,3 +90,14 @@ def test_frames_that_are_made_up_push_out_none_that_is_told_of_again() -> None:
         history.note(TFMessage(transforms=[stamped("world", f"new_{stamp}_{k}", np.eye(4), 1) for k in range(1000)]))
     assert len(history._kept) <= MOST_FRAMES
     assert np.isfinite(history.pose("lens", FIXED, 7 * MS)).all()
+
+
+def test_stamp_of_a_time_to_come_hides_nothing_that_is_told_after_it() -> None:
+    history = told([0, 20 * MS])
+    made_up = [each.model_copy(update={"header": Header(stamp=MOST_STAMP, frame_id=each.header.frame_id)})
+               for each in told_at(40 * MS).transforms]
+    history.note(TFMessage(transforms=made_up))
+    for stamp in (60 * MS, 80 * MS):
+        history.note(told_at(stamp))
+    expected = ROBOT.fk(joints_at(70 * MS)) @ T_TCP_CAMERA
+    np.testing.assert_allclose(history.pose("lens", FIXED, 70 * MS), expected, atol=1e-5)

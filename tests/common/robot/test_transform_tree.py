@@ -5,6 +5,8 @@ from hypothesis import strategies as st
 
 from common.errors import UnknownName
 from common.messages import Header, Pose, TFMessage, TransformStamped, Vector3
+from common.messages.basics import MOST_STAMP
+from common.robot.transform_history import MOST_FRAMES
 from common.robot.transform_tree import NotConnected, TransformTree
 from common.robot.transforms import invert, matrix_to_rpy, rpy_to_matrix, transform
 
@@ -70,6 +72,23 @@ def test_older_transform_does_not_replace_a_newer_one_and_a_child_may_move_to_an
     tree.update(message("hand", 5, 3.0))
     assert tree.pose("hand", "part")[0, 3] == 3.0
     assert tree.parent_of("part") == "hand"
+
+
+def test_stamp_of_a_time_to_come_hides_nothing_that_is_told_after_it() -> None:
+    tree = TransformTree()
+    for stamp, x in ((MOST_STAMP, 1), (20, 2), (10, 3)):
+        tree.set("belt", "part", moved(x), stamp)
+    assert tree.pose("belt", "part")[0, 3] == 2.0 and tree.stamp_of("part") == 20
+
+
+def test_of_frames_that_are_made_up_those_are_known_that_were_told_of_last() -> None:
+    tree = TransformTree()
+    for number in range(5):
+        tree.update(TFMessage(transforms=[
+            TransformStamped(header=Header(frame_id="world"), child_frame_id=name, transform=Pose())
+            for name in ("tool", *(f"{number} {i}" for i in range(900)))]))
+    assert len(tree.frames) == MOST_FRAMES + 1
+    assert tree.parent_of("tool") == "world" and tree.parent_of("0 0") is None
 
 
 def test_walk_gives_every_frame_below_its_parent() -> None:

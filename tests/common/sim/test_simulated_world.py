@@ -467,3 +467,26 @@ def test_cross_section_with_many_corners_that_point_inwards_is_refused() -> None
     with pytest.raises(Refused, match="polygon: has 1000 corners"):
         world.edit(WorldEdit(**asked, polygon=star.tolist(), position=Vector3(x=0.3)), 0.0)
     world.edit(WorldEdit(**asked, polygon=(0.02 * around).tolist(), position=Vector3(x=0.3)), 0.0)
+
+
+@pytest.mark.parametrize(("asked", "code"), [
+    ({"shape": "prism", "polygon": [(0.1, 0.1)] * 3}, "no_size"),
+    ({"shape": "prism", "polygon": [(0.0, 0.0), (0.1, 0.0), (0.2, 0.0)]}, "no_size"),
+    ({"shape": "prism", "polygon": [(-1e7, 0.0), (1e7, 0.0), (0.0, 1e7)]}, "no_size"),
+    ({"shape": "box", "size": Vector3(x=0.04, y=0.04, z=1e7)}, "no_size"),
+    ({"shape": "sphere", "size": Vector3(x=1e7)}, "no_size"),
+    ({"shape": "box", "position": Vector3(x=1e7, y=-1e7)}, "too_far"),
+])
+def test_what_no_message_could_tell_of_is_refused(asked: dict[str, object], code: str) -> None:
+    given = {"op": "add", "size": Vector3(x=0.04, y=0.04, z=0.02), "position": Vector3(x=0.3), **asked}
+    world = Rig().world
+    with pytest.raises(Refused) as refused:
+        world.edit(WorldEdit.model_validate(given), 0.0)
+    assert refused.value.code == code
+
+
+def test_inner_radius_of_what_is_no_ring_says_nothing() -> None:
+    world = Rig().world
+    name = world.edit(WorldEdit(op="add", shape="cylinder", size=Vector3(x=0.04, y=0.04, z=0.02), inner_radius=1e9,
+                                position=Vector3(x=0.3)), 0.0)
+    assert {thing.id: thing.inner_radius for thing in world.objects(Header()).objects}[name] == 0.0

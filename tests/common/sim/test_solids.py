@@ -6,8 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.config import Fixture, ObjectConfig
+from common.sim import solids
 from common.sim.objects import object_mesh, world_object
 from common.sim.solids import between, circle, fixture_mesh, primitive, triangulate, upright
+
+is_ear = solids._is_ear
 
 
 def area(triangles):
@@ -42,6 +45,20 @@ def test_ears_touch_no_other_corner(turn):
     letter = [(-4, -3), (4, -3), (4, -1), (1, -1), (1, 4), (-1, 4), (-1, -1), (-4, -1)]
     outline = np.array(letter, float) @ np.array([[c, s], [-s, c]])
     assert area(triangulate(outline)) == pytest.approx(shoelace(outline), rel=1e-9)
+
+
+def test_polygon_that_crosses_itself_takes_no_longer_than_others():
+    looked_at = 0
+
+    def counted(*given):
+        nonlocal looked_at
+        looked_at += 1
+        return is_ear(*given)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(solids, "_is_ear", counted)
+        triangles = triangulate(np.random.default_rng(1).uniform(-0.1, 0.1, (200, 2)))
+    assert triangles.shape == (198, 3, 2) and looked_at < 2000
 
 
 def test_band_between_two_circles_has_their_difference():

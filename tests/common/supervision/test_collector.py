@@ -19,7 +19,7 @@ from common.messages import (
 )
 from common.reporting.fold import Fold
 from common.supervision.collector import Collector
-from common.supervision.rates import Rates
+from common.supervision.rates import MOST_SERVICES, Rates
 from common.transport.local import LocalNetwork
 
 
@@ -35,6 +35,22 @@ def test_rates_come_from_what_readers_count() -> None:
     assert rates.busiest_of("smart_pick_place") is None
     rates.update(ServiceCounters(service="vision_detector", received={"left/image_raw": 0}), 3.0)
     assert rates.of_topic("left/image_raw") == 0.0  # it was started again
+
+
+def test_of_services_that_somebody_makes_up_those_are_known_that_were_heard_of_last() -> None:
+    rates = Rates()
+    for second in range(3):
+        for number in range(1000):
+            made_up = {f"key {second} {number} {i}": second for i in range(10)}
+            rates.update(ServiceCounters(service=f"{number}", received=made_up), float(second))
+        rates.update(ServiceCounters(service="viewer", writes=["a"], received={"a": 5 * second}), float(second))
+    assert len(rates._counted) == MOST_SERVICES >= len(rates._rates)
+    assert sum(map(len, rates._rates.values())) <= 10 * MOST_SERVICES
+    assert rates.counted("0") is None and rates.received_by("0") is None
+    assert rates.busiest_of("viewer") is None  # it was pushed out each time
+    for second in (3, 4):
+        rates.update(ServiceCounters(service="viewer", writes=["a"], received={"a": 5 * second}), float(second))
+    assert rates.busiest_of("viewer") == ("a", 5.0) and rates.received_by("viewer") == 5.0
 
 
 def balls(*labels: str) -> PoseArray:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from common.messages import ServiceStatus, SupervisorStatus
-from common.supervision.liveness_watchdog import Elsewhere
+from common.messages import Notice, ServiceStatus, SupervisorStatus
+from common.supervision.liveness_watchdog import MOST_ELSEWHERE, Elsewhere
+from common.transport.codec import decode, encode
 
 
 def said(host: str, *services: tuple[str, str, str]) -> SupervisorStatus:
@@ -38,3 +39,20 @@ def test_a_service_behind_a_cut_link_is_not_told_of_as_ready() -> None:
 def test_own_services_are_told_of_with_the_name_of_this_host() -> None:
     (own,) = Elsewhere("arm", ["motion_planner"]).ours([ServiceStatus(name="motion_planner", state="ready")])
     assert own.host == "arm"
+
+
+def test_whatever_others_make_up_there_is_room_for_it_beside_our_own() -> None:
+    elsewhere, long = Elsewhere("arm", ["motion_planner"]), "\N{MATHEMATICAL BOLD CAPITAL A}"
+    for number in range(30):
+        host = f"{number:03}" + long * 117
+        elsewhere.hear(SupervisorStatus(
+            cell="toy", host=host, notices=[Notice(message=long * 4000, host=host)] * 1000, services=[
+                ServiceStatus(name=f"{number:03}{i:04}" + long * 113, host=host, state="waiting", message=long * 4000)
+                for i in range(1000)]))
+    elsewhere.hear(said("camera", ("vision_detector", "camera", "ready")))
+    own = [ServiceStatus(name=f"service_{i}", state="ready") for i in range(20)]
+    told = SupervisorStatus(
+        cell="toy", services=[*own, *elsewhere.statuses({"vision_detector"})], notices=elsewhere.notices)
+    heard = decode(SupervisorStatus, encode(told)).services
+    assert len(heard) == 20 + MOST_ELSEWHERE and heard[-1].name == "vision_detector"
+    assert len(elsewhere._notices) <= 10 and len(elsewhere._lately) == MOST_ELSEWHERE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from common import messages as m
 from common import topics
 from common.config import CameraConfig
 from common.perception.pinhole import Pinhole
+from common.robot.transform_history import MOST_FRAMES
 from common.robot.transforms import matrix_to_pose, pose_to_matrix, rpy_to_matrix, transform
 from common.viewer.figure import Transforms
 from tests.common.viewer.scene_cell import Stage, around_of, at, in_world
@@ -63,6 +65,35 @@ def test_frames_that_hang_on_each_other_in_a_circle_are_left_out(stage: Stage) -
         stage.say(topics.TF, tf(parent, child, TURNED))
     assert stage.layer("frames").node("a") is None and stage.layer("frames").node("c") is not None
     assert np.isfinite(stage.view.stage.transforms.pose("a")).all()
+
+
+def test_frames_whose_names_differ_by_a_slash_stand_beside_each_other(stage: Stage) -> None:
+    for x in (1.0, 2.0):
+        for parent, child in (("world", "a/b"), ("world", "a_b"), ("world", "words 0"), ("a_b", "tip")):
+            stage.say(topics.TF, tf(parent, child, at(x, 0, 0)))
+    frames = stage.layer("frames")
+    assert {name: in_world(stage.server, frames.node(name))[0, 3] for name in ("a/b", "a_b", "words 0", "tip")} == {
+        "a/b": 2.0, "a_b": 2.0, "words 0": 2.0, "tip": 4.0}
+
+
+def test_frame_that_hangs_on_what_hung_on_it_changes_places(stage: Stage) -> None:
+    for parent, child in (("world", "a"), ("a", "b"), ("b", "a"), ("world", "b"), ("world", "world")):
+        stage.say(topics.TF, tf(parent, child, at(1, 0, 0)))
+    assert in_world(stage.server, stage.layer("frames").node("a"))[0, 3] == 2.0
+
+
+def test_any_number_of_frames_is_told_of_and_the_newest_are_shown(stage: Stage) -> None:
+    def hang(names: list[str]) -> m.TFMessage:
+        """Each on the one before it, told of from the last one on."""
+        each = [tf(parent, child, at(0, 0, 1)).transforms[0] for parent, child in pairwise(["world", *names])]
+        return m.TFMessage(transforms=each[::-1])
+
+    for number in range(4):
+        stage.say(topics.TF, hang([f"{number}/{i}" for i in range(1000)]))
+    stage.say(topics.TF, tf("world", "base", TURNED))
+    frames = stage.layer("frames")
+    assert len(stage.view.stage.transforms.newest) == MOST_FRAMES and len(frames._nodes) <= 500
+    assert frames.node("base") is not None and frames.node("0/1") is None and frames.node("3/1") is not None
 
 
 def test_frames_are_moved_ten_times_a_second_at_most(stage: Stage) -> None:

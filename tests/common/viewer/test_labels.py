@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 import viser
@@ -46,6 +48,13 @@ def test_labels_apart_stay_apart_and_those_at_one_place_are_lines_of_one(server:
     assert labels.texts == ["flange", "hand", "tool"]
     labels.show({}, as_pixels)
     assert labels.texts == []
+
+
+def test_many_labels_at_one_place_among_many_apart_are_put_together_at_once() -> None:
+    labels = [("a", np.array([float(x), 0, 0])) for x in range(1000)] + [("b", np.array([0.0, -9.0, 0.0]))] * 2000
+    since = time.process_time()
+    assert [len(group.words) for group in grouped(labels, 1.0, as_pixels)] == [1] * 1000 + [2000]
+    assert time.process_time() - since < 10  # looked at pair by pair anew after each it would be hours
 
 
 def test_where_nobody_tells_how_they_look_what_is_near_is_put_together() -> None:

@@ -187,6 +187,20 @@ def test_prism_is_as_large_as_its_cross_section(ur5: Stage) -> None:
     np.testing.assert_allclose(node.vertices.max(axis=0), [0.04, 0.03, 0.03], atol=1e-6)
 
 
+def test_prism_that_encloses_nothing_is_left_out(ur5: Stage) -> None:
+    def prism(*outline: tuple[float, float]) -> m.CollisionObject:
+        return m.CollisionObject(id="a", role="target", shape="prism", dimensions=[0.1], outline=list(outline),
+                                 pose=at(0.4, 0, 0))
+
+    objects = ur5.layer("objects")
+    for outline in ([(0.1, 0.1)] * 3, [(0.0, 0.0), (0.1, 0.0), (0.2, 0.0)]):
+        ur5.say(topics.PLANNING_SCENE, scene_of(prism((0.0, 0.0), (0.1, 0.0), (0.0, 0.1))))
+        assert objects.node("a") is not None
+        ur5.say(topics.PLANNING_SCENE, scene_of(prism(*outline)))
+        assert objects.node("a") is None
+    ur5.say(topics.PLANNING_SCENE, scene_of())
+
+
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
 def test_messages_without_content_do_no_harm(server: viser.ViserServer, cell: str) -> None:
     stage = Stage(server, cell)

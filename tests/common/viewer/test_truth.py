@@ -63,6 +63,16 @@ def test_truth_is_hidden_until_it_is_asked_for(panda: Stage) -> None:
     assert not is_shown(panda.server, node)
 
 
+def test_more_corners_than_can_be_drawn_at_a_look_are_left_out(panda: Stage) -> None:
+    panda.show("truth", True)
+    corners = [(0.1 * np.cos(a), 0.1 * np.sin(a)) for a in np.linspace(0, 6, 1000)]
+    size = m.Vector3(x=0.2, y=0.2, z=0.1)
+    things = [m.WorldObject(id=f"{i}", shape="prism", polygon=corners, size=size) for i in range(100)]
+    panda.say(topics.SCENE_OBJECTS, m.WorldObjects(header=WORLD, objects=[*things, *balls(last=(0.4, 0.1)).objects]))
+    assert [panda.layer("truth").node(name) is not None for name in ("0", "1", "2", "99", "last")] == [
+        True, True, False, False, False]
+
+
 def test_balls_come_move_and_go(panda: Stage) -> None:
     panda.show("truth", True)
     panda.say(topics.SCENE_OBJECTS, balls(ball_1=(0.4, 0.1), ball_2=(0.5, 0.1)))

@@ -72,6 +72,13 @@ def test_pictures_count_from_the_return_home_until_the_arm_leaves_again() -> Non
     assert watch.covers(40) and watch.covers(100)
 
 
+def test_return_home_at_a_time_to_come_counts_until_the_next_word_of_the_arm() -> None:
+    watch = HomeWatch(HOME)
+    for q, stamp in ((AWAY, 10), (HOME, 2**63 - 1), (HOME, 40)):
+        watch.note(q, stamp)
+    assert not watch.covers(39) and watch.covers(40) and watch.covers(100)
+
+
 def test_arm_that_was_elsewhere_at_first_has_to_come_home() -> None:
     watch = HomeWatch(HOME)
     watch.note(AWAY, 10)

@@ -254,6 +254,20 @@ def test_edits_add_move_remove_and_reset() -> None:
     assert rig.world.ids == ["thing_1", "thing_2"] and rig.place() == pytest.approx((0.45, 0.0, 0.03), abs=1e-3)
 
 
+def test_what_the_simulator_does_not_take_is_refused_and_changes_nothing() -> None:
+    rig = Rig(BALL)
+    rig.wait(0.1)
+    thin = WorldEdit(op="add", shape="prism", size=Vector3(x=0.1, y=0.1, z=1e-30), position=Vector3(x=0.6, y=-0.2),
+                     polygon=[(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)])
+    rig.world.take_events()
+    with pytest.raises(Refused, match="cannot simulate"):
+        rig.world.edit(thin, rig.now)
+    assert rig.world.ids == ["thing_1"] and rig.world.take_events() == []
+    added = rig.world.edit(WorldEdit(op="add", id="b", position=Vector3(x=0.6, y=-0.2)), rig.now)
+    rig.wait(0.1)
+    assert rig.world.ids == ["thing_1", added] and rig.place()[0] == pytest.approx(0.45)
+
+
 @pytest.mark.parametrize("meanwhile", [None, WorldEdit(op="add", position=Vector3(x=0.3, y=-0.3, z=0.0))])
 def test_what_a_person_lets_slip_falls_out_of_the_fingers(meanwhile: WorldEdit | None) -> None:
     rig = Rig(BALL)
