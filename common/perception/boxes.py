@@ -176,7 +176,7 @@ def _patches(mask: Bools, below: Array | None = None, least: float = 0.0) -> Ite
     numbers = np.arange(1, count)
     if below is not None:
         farthest = np.zeros(count)
-        np.maximum.at(farthest, labels[mask], below[mask])
+        np.maximum.at(farthest, labels[mask].astype(np.intp), below[mask])
         numbers = numbers[stats[1:, cv2.CC_STAT_AREA] * farthest[1:] ** 2 >= least]
     for number in numbers.tolist():
         left, top, width, height, _area = (int(value) for value in stats[number])

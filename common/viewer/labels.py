@@ -80,7 +80,7 @@ def grouped(labels: list[tuple[str, Array]], scale: float, view: View | None) ->
     corners = view(places) if view is not None else np.full((len(labels), 2), np.nan)
     groups = [_Group(at, corner, [text]) for (text, _), at, corner in zip(labels, places, corners, strict=True)]
     sizes, there = np.array([group.size(scale) for group in groups]), np.full(len(groups), True)
-    seen = np.isfinite(corners).all(axis=1)
+    seen = np.asarray(np.isfinite(corners).all(axis=1))
 
     def meeting(one: int, others: slice) -> list[int]:
         """Those of the others that one label would lie over."""
@@ -89,8 +89,8 @@ def grouped(labels: list[tuple[str, Array]], scale: float, view: View | None) ->
         widths, heights = sizes[others].T
         over = (left < lefts + widths) & (lefts < left + width) & (low - height < lows) & (lows - heights < low)  # down
         near = np.linalg.norm(places[others] - places[one], axis=1) < _NEAR
-        chosen = np.flatnonzero(there[others] & np.where(seen[others] & seen[one], over, near))
-        return [int(each) + others.start for each in chosen]
+        lies = np.where(seen[others] & seen[one], over, near)
+        return [int(each) + others.start for each in np.flatnonzero(np.logical_and(there[others], lies))]
 
     one = 0
     while one < len(groups):
