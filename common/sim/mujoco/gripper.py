@@ -69,6 +69,8 @@ class PhysicsFingers:
 
     def drive(self, now: float) -> None:
         """Give the servo its set-point before a step."""
+        if self._target >= self._width - SHORT:  # where they were placed they stand, and press on nothing
+            self._at_once = False
         wanted = self._profile.read(now)
         width, rate = (self._target, 0.0) if self._at_once else (wanted.width, wanted.velocity)
         slope = self._slope

@@ -23,6 +23,8 @@ from common.sim.mujoco.world import PhysicsWorld
 BALL = {"shape": "sphere", "radius": 0.03, "mass": 0.1}
 CUBE = {"shape": "box", "size": [0.05, 0.05, 0.05], "mass": 0.1}
 PERIOD = 0.01  # [s] of a cycle of control
+GRIPPER = load_cell("panda").robot.gripper
+assert GRIPPER is not None
 
 
 class Rig:
@@ -164,6 +166,19 @@ def test_heavy_thing_slips_out_of_weak_fingers() -> None:
     rig.grip(0.0, effort=2.0)
     rig.move(rig.above(0.45, 0.0, 0.2))
     assert rig.place()[2] < 0.05
+
+
+def test_fingers_close_as_fast_as_they_are_told_to_from_the_first_time_on() -> None:
+    rig = Rig()
+    for _ in range(2):
+        rig.wait(0.1)
+        rig.fingers.command(0.0, rig.now, 5.0)
+        widths = []
+        while rig.fingers.read(rig.now).moving:
+            rig.wait(PERIOD)
+            widths.append(rig.fingers.read(rig.now).width)
+        assert np.abs(np.diff(widths)).max() <= 1.05 * GRIPPER.speed * PERIOD
+        rig.grip(0.08)
 
 
 def test_fingers_close_on_nothing_and_say_so() -> None:
