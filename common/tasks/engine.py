@@ -182,6 +182,8 @@ class Task(Deciding[V]):
             self._ended(stage, running.report(view.motion, view.gripper), view)
         elif outcome == "forgotten":
             self.running = None
+            if self._early is not None and isinstance(self._early.stage, Grip):  # where it is let go nobody knows
+                self._early = replace(self._early, stage=replace(self._early.stage, holds=None))
             self.forgotten(stage, view)
         elif running.moves_arm and stage.carries and not view.holding and self._early is None:
             stop = self.stop(view, "what it held fell")

@@ -346,3 +346,12 @@ def test_arm_of_which_nothing_is_heard_any_more_has_no_fingers_begin() -> None:
     for _ in range(200):
         hand.step()
     assert not hand.grips() and stage(hand) == "reach" and hand.task.due == float("inf")
+
+
+def test_what_was_let_go_is_not_done_when_the_controller_has_forgotten_where_the_arm_was_going(releasing: Hand) -> None:
+    releasing.motion = m.MotionStatus(header=m.Header(stamp=int((releasing.now + 1.0) * 1e9)))
+    releasing.step()
+    releasing.fingers(0.08, holding=False)
+    for _ in range(3):
+        releasing.step()
+    assert releasing.task.did[2:] == [] and releasing.task.status.failures == 1 and stage(releasing) != "bring"
