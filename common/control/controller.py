@@ -317,7 +317,7 @@ class TrajectoryController:
         if not goal.stopping:
             message = self._holding(goal)
             if message == self._status.message:
-                self._status.progress = goal.progress  # all else of it is as it was
+                self._status.progress = goal.progress(self.delay)  # all else of it is as it was
                 self._memory.put(goal.id, self._status)
             else:
                 self._report("active", message=message)
@@ -457,7 +457,7 @@ class TrajectoryController:
 
     def _report(self, state: GoalState, error: str = "", message: str = "", source: str = "") -> MotionStatus:
         assert self._goal is not None
-        progress = 1.0 if state == "succeeded" else self._goal.progress
+        progress = 1.0 if state == "succeeded" else self._goal.progress(self.delay)
         self._status = MotionStatus(
             id=self._goal.id, state=state, progress=progress, error=error, message=message, source=source or self._name,
             plan=self._goal.plan, scene_stamp=self._goal.scene_stamp,

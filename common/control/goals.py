@@ -50,6 +50,7 @@ class Goal:
     plan: str = ""  # id of the plan request that it answers
     scene_stamp: int = 0  # of the planning scene that it was planned on
     ended: float | None = None  # cell time at which the set-points came to rest
+    _told: float = 0.0  # progress so far
     _newest: tuple[float, tuple[Vector, Vector]] | None = None  # time and answer: most are asked for three times
 
     @property
@@ -76,10 +77,11 @@ class Goal:
         u = np.clip(times / self.blend, 0.0, 1.0) if self.blend > 0 else np.ones_like(times)
         return self.trajectory.positions_at(times) + _left(u)[:, None] * self.offset
 
-    @property
-    def progress(self) -> float:
-        """The share of the trajectory that is behind it."""
-        return min(self.time / self.duration, 1.0)
+    def progress(self, delay: float) -> float:
+        """The share of the trajectory that is behind an arm which is a delay [s] behind its set-points."""
+        behind = self.time - delay * self.pace.rate
+        self._told = max(self._told, min(behind / self.duration, 1.0))  # a delay that is measured grows at times
+        return self._told
 
 
 def _left(u: V) -> V:

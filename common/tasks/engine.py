@@ -27,6 +27,7 @@ FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] by which fingers may stand elsewhere than a motion was planned with
 LOOSE = 0.5e-3  # [m] by which fingers must have opened before they hold nothing any more
 HASTENED = 0.1  # share of its speed by which an arm may go faster or slower meanwhile, and arrive as is reckoned
+TOLD = 0.25  # [s] after which an arm that moves would have told how far it is: what is older is no arm that arrives
 OPENED_BY = 0.5  # of a motion that began while the fingers opened: then they have
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 
@@ -181,6 +182,8 @@ class Task(Deciding[V]):
             self._ended(stage, running.report(view.motion, view.gripper), view)
         elif outcome == "forgotten":
             self.running = None
+            if self._early is not None and isinstance(self._early.stage, Grip):  # where it is let go nobody knows
+                self._early = replace(self._early, stage=replace(self._early.stage, holds=None))
             self.forgotten(stage, view)
         elif running.moves_arm and stage.carries and not view.holding and self._early is None:
             stop = self.stop(view, "what it held fell")
@@ -355,6 +358,8 @@ class Task(Deciding[V]):
         if self._heard is None or self._heard[0] is not motion:
             self._heard = motion, view.now  # clocks of two hosts differ: its stamp would tell of another time
         if motion.id != running.command.id or motion.state != "active" or not motion.speed_scaling:
+            return
+        if view.now - self._heard[1] > TOLD:
             return
         if motion.message or motion.speed_scaling > running.slowest + HASTENED:
             return  # it is being stopped, or comes to its speed again by a ramp: nobody knows when it arrives

@@ -95,7 +95,8 @@ class Rows:
         anywhere = Move("across", "PLACING", cycle, goal=self._above((box.x, box.y), yaw, wide), carries=True)
         if cycle.over is None:
             return anywhere
-        room = box.half_side - box.wall_thickness - self.p.world.ball_radius - OFF_WALLS - wide / 4
+        radius = max(self.p.world.ball_radius, cycle.target.radius)
+        room = box.half_side - box.wall_thickness - radius - OFF_WALLS - wide / 4
         x, y = (middle + min(max(at - middle, -room), room) if room > 0 else middle
                 for at, middle in zip(cycle.over, (box.x, box.y), strict=True))
         goal = self._above((x, y), yaw, wide / 2)

@@ -268,6 +268,18 @@ def test_arm_that_is_behind_its_set_points_is_judged_by_those_of_then_and_by_non
     assert rig.until_over().state == "succeeded"
 
 
+def test_progress_is_that_of_the_arm_where_it_is_behind_its_set_points_and_never_falls(limits, rest_to_rest):
+    rig, seen = Rig(limits, Behind(10)), []
+    rig.controller.delay = 0.1
+    rig.accept("a", rest_to_rest([0, 0], [1, 1]))
+    for k in range(105):
+        rig.controller.delay = 0.1 + 0.02 * (k % 2)
+        seen.append(rig.step().progress)
+    assert seen == sorted(seen) and seen[49] == pytest.approx(0.4, abs=0.011)
+    assert seen[99] == pytest.approx(0.9, abs=0.011), "the set-points are there, the arm is not"
+    assert rig.until_over().progress == 1.0
+
+
 def test_arm_whose_readings_are_held_up_is_judged_by_where_it_was_to_be_when_they_were_made(limits, rest_to_rest):
     rig = Rig(limits, Behind(10), path=0.02)
     rig.controller.delay = 0.1

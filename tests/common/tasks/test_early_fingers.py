@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from common import messages as m
-from common.tasks.stages import Grip, Move, Stage, View
+from common.tasks.stages import Command, Grip, Move, Stage, View
 from tests.common.tasks.test_engine import THERE, Cell, Fetch
 
 SEEN = 0.05  # [m] wide
@@ -46,10 +46,20 @@ class Hand(Cell):
     def __init__(self) -> None:
         super().__init__()
         self.task = Take(self.task.p, m.TaskStatus(), "t")
+        self.began = self.told = 0.0
+        self.silent = False
 
     def step(self) -> list[object]:
         self.now -= 0.09
+        if self.motion.state == "active" and not (self.motion.held or self.silent) and self.now - self.told > 0.09:
+            self.told = self.now
+            self.motion = self.motion.model_copy(update={"progress": min(self.now + 0.1 - self.began, 1.0)})
         return list(super().step())
+
+    def answer(self, command: Command) -> None:
+        if isinstance(command, m.ExecuteRequest):
+            self.began = self.told = self.now
+        super().answer(command)
 
     def grips(self) -> list[m.GripperCommand]:
         return [command for command in self.asked if isinstance(command, m.GripperCommand)]
@@ -326,3 +336,22 @@ def test_arm_does_not_go_on_down_with_fingers_that_closed_while_it_was_held_or_s
 def test_arm_that_is_held_as_the_fingers_let_go_goes_on_to_where_it_was_going(releasing: Hand) -> None:
     releasing.motion = releasing.motion.model_copy(update={"held": True})
     assert releasing.step() == [] and stage(releasing) == "bring"
+
+
+def test_arm_of_which_nothing_is_heard_any_more_has_no_fingers_begin() -> None:
+    hand = Hand()
+    for _ in range(20):
+        hand.step()
+    hand.silent = True
+    for _ in range(200):
+        hand.step()
+    assert not hand.grips() and stage(hand) == "reach" and hand.task.due == float("inf")
+
+
+def test_what_was_let_go_is_not_done_when_the_controller_has_forgotten_where_the_arm_was_going(releasing: Hand) -> None:
+    releasing.motion = m.MotionStatus(header=m.Header(stamp=int((releasing.now + 1.0) * 1e9)))
+    releasing.step()
+    releasing.fingers(0.08, holding=False)
+    for _ in range(3):
+        releasing.step()
+    assert releasing.task.did[2:] == [] and releasing.task.status.failures == 1 and stage(releasing) != "bring"

@@ -62,6 +62,21 @@ def test_balls_are_let_go_above_the_columns_in_which_least_lies() -> None:
         assert off + cell.task.p.world.ball_radius < box.half_side - box.wall_thickness, "it falls clear of the walls"
 
 
+@given(st.floats(0.005, 0.08), st.floats(0.01, 0.2), st.booleans())
+def test_what_is_let_go_above_a_column_falls_clear_of_the_walls_however_large_it_is(
+    radius: float, wide: float, flat: bool,
+) -> None:
+    task = CellDouble([], place_pos_tol=wide).task
+    box, size = task.p.world.container, (math.sqrt(2) * radius, math.sqrt(2) * radius) if flat else None
+    over = box.x + box.slot_offset, box.y - box.slot_offset
+    goal = task._rows._across(Pick(target=Target("t", (0.4, -0.3, 0.03), radius, size), over=over), 0.0).goal
+    assert isinstance(goal, m.PoseGoal)
+    at, side = goal.pose.position, goal.position_tolerance
+    inside = box.half_side - box.wall_thickness
+    for off, about in ((abs(at.x - box.x), side.x), (abs(at.y - box.y), side.y)):
+        assert off + about / 2 + radius < inside or off == 0.0, "unless there is no such place"
+
+
 def test_where_there_is_no_way_to_the_emptiest_column_a_ball_is_let_go_anywhere_above_the_container() -> None:
     cell = CellDouble([(0.40, -0.30)])
     cell.unplannable = lambda request: (  # noqa: E731 - as the double has it
