@@ -9,8 +9,8 @@ Memory is what a process has for itself (anonymous and shared pages, also those 
 libraries, come and go with whatever else runs on the machine. Growth is the lower quartile of the last fifth of the
 looks against that of the first fifth, of those after the first minutes: what a process holds between two pictures, and
 not the two or three of 0.9 MB that happen to be under way. Those who handle pictures may keep two more in pieces: the C
-library leaves up to twice the largest piece that was given back at the top of its store. The router has a descriptor
-more or two while a subscriber that it has dropped connects again: of its own count those that are left when both are gone.
+library leaves up to twice the largest piece that was given back at the top of its store. The router has a descriptor or
+two more while a subscriber that it has dropped connects again: of its own count those that are left when both are gone.
 """
 
 from __future__ import annotations
