@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 BLINK = 1.0  # [s] for which somebody may be gone before that is told
+MOST = 100  # services that are remembered when they are gone: anybody may make up names
+NAMED = 8  # of them in a line
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,9 @@ class Losses:
                 self._gone.pop(name, None)
             elif name in self._seen:
                 self._gone.setdefault(name, now)
+        for name in sorted(self._gone, key=self._gone.__getitem__)[: max(0, len(self._gone) - MOST)]:
+            del self._gone[name]
+            self._seen.remove(name)
         gone = {name: since for name, since in self._gone.items() if now - since >= BLINK or name == ""}
         if not connected:
             since = gone.get("", now)
@@ -54,5 +59,6 @@ class Losses:
         lost = [Loss(answers[part][0], since, frozenset({part})) for part, since in parts.items()]
         if names:
             does = "does" if len(names) == 1 else "do"
-            lost.append(Loss(f"{', '.join(names)} {does} not answer", min(gone[name] for name in names)))
+            more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+            lost.append(Loss(f"{', '.join(names[:NAMED])}{more} {does} not answer", min(gone[name] for name in names)))
         return lost

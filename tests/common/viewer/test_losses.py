@@ -48,3 +48,15 @@ def test_word_that_waited_on_its_way_is_late_whatever_the_clocks_say() -> None:
     assert delays.late(1, 1000.5, 5.5 + 0.4) > LATE, "it was held up"
     assert delays.late(1, 1001.0, 6.0625) < LATE
     assert delays.late(2, 1002.0, 9000.0) == 0.0, "the browser's machine slept meanwhile"
+
+
+def test_names_that_somebody_makes_up_again_and_again_are_neither_kept_for_ever_nor_all_told() -> None:
+    losses = Losses()
+    for number in range(1000):
+        losses.update(True, ["camera", f"made up {number:04}"], {}, float(number))
+    losses.update(True, ["camera"], {}, 1000.0)
+    (lost,) = losses.update(True, ["camera"], {}, 2000.0)
+    assert lost.what.endswith(" and 92 more do not answer") and "made up 0900" in lost.what
+    losses.update(True, [], {}, 2010.0)
+    (lost,) = losses.update(True, [], {}, 2020.0)
+    assert "camera" in lost.what, "what was there last is told"
