@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 MOST_CAUGHT_UP = 2.0  # [s] of a hold-up; what is longer, the world has stood still
 TOLD = 0.05  # [s] between changes that are told of while something moves
-SLIPPERY = 0.5  # [s] fingers do not touch what a person lets slip
+SLIPPERY = 0.5  # [s] fingers do not touch what a person lets slip, and not before they are clear of it
 QUIET = 1e-6  # [m] or of a quaternion: nothing has moved since the last look
 ASLEEP = 1e-3  # [m/s] or [rad/s]: velocities below are not kept over a restart
 
@@ -135,7 +135,7 @@ class PhysicsWorld(News):
     def _look(self, now: float) -> None:
         """Take note of what has moved."""
         cell, data = self._built
-        for name in [name for name, until in self._slippery.items() if now >= until]:
+        for name in [name for name, until in self._slippery.items() if now >= until and not self._within_robot(name)]:
             del self._slippery[name]
             self._touchable(name, True)
         contacts = self._contacts.look(data)
@@ -282,6 +282,17 @@ class PhysicsWorld(News):
             geoms = cell.model.geom_bodyid == cell.things[name].body
             affinity = cell.model.geom_conaffinity[geoms]
             cell.model.geom_conaffinity[geoms] = affinity | ROBOT if by_robot else affinity & ~ROBOT
+
+
+    def _within_robot(self, name: str) -> bool:
+        """Whether part of the robot is where a thing is: they would be flung apart if they touched from now on."""
+        cell, data = self._built
+        if name not in cell.things:
+            return False
+        of_thing = np.flatnonzero(cell.model.geom_bodyid == cell.things[name].body)
+        of_robot = np.flatnonzero(cell.model.geom_contype & ROBOT)
+        return any(mujoco.mj_geomDistance(cell.model, data, int(one), int(other), 0.0, None) < 0.0
+                   for one in of_thing for other in of_robot)
 
 
 def _copy(old: CellModel, source: mujoco.MjData, new: CellModel, data: mujoco.MjData) -> None:

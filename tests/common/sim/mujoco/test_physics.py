@@ -298,6 +298,21 @@ def test_what_a_person_lets_slip_falls_out_of_the_fingers(meanwhile: WorldEdit |
     assert rig.place()[2] == pytest.approx(0.03, abs=2e-3) and not rig.fingers.read(rig.now).holding
 
 
+def test_what_a_person_lets_slip_on_the_table_is_not_flung_away_by_the_fingers_that_close_through_it() -> None:
+    rig = Rig(BALL)
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    rig.grip(0.0)
+    rig.world.edit(WorldEdit(op="drop"), rig.now)
+    rig.wait(3.0)
+    assert math.dist(rig.place(), (0.45, 0.0, 0.03)) < 5e-3
+    assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3, "nor pushes it the arm"
+    rig.move(rig.above(0.45, 0.0, 0.2))
+    rig.grip(0.08)
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    rig.grip(0.0)
+    assert rig.fingers.read(rig.now).holding, "and it can be taken again"
+
+
 def test_hold_up_of_the_process_is_no_leap_in_the_world() -> None:
     rig = Rig(BALL)
     rig.push("thing_1", 0.2)
