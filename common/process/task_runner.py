@@ -91,10 +91,6 @@ class Stepped(Answered[V_contra], Protocol[V_contra]):
     def status(self) -> m.TaskStatus:
         """How far it is."""
 
-    @property
-    def due(self) -> float:
-        """It is to be stepped then at the latest, cell time [s]."""
-
     def step(self, view: V_contra) -> list[Command]:
         """What to ask for now."""
 
@@ -136,7 +132,7 @@ class TaskRunner(Generic[V]):
                 group.create_task(self._wake_on(reader))
             while True:
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(self._patience):  # wait_for of Python 3.11 can lose a cancellation
+                    async with asyncio.timeout(LONGEST_STEP):  # wait_for of Python 3.11 can lose a cancellation
                         await self._woken.wait()
                 self._woken.clear()
                 told, self._told = self._told, []
@@ -146,12 +142,6 @@ class TaskRunner(Generic[V]):
                     self._orders.begin(group, command)
                 self._tell()
                 self._have_motion(group, view.motion if view else None)
-
-    @property
-    def _patience(self) -> float:
-        """Until the next step, if nothing is heard [s, wall]."""
-        clock = self._bus.clock
-        return min(LONGEST_STEP, max(0.0, self._task.due - clock.now()) / clock.speed)
 
     def _have_motion(self, group: asyncio.TaskGroup, motion: m.MotionStatus | None) -> None:
         """Have the motion of the robot from a start to the end or a stop, if it is nobody else's."""

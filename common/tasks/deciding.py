@@ -5,7 +5,6 @@ A task of one's own says in `decide` what comes next, and of the rest only what 
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import Generic, Literal, TypeVar
 
@@ -80,9 +79,6 @@ class Deciding(Generic[V]):
         self.row: deque[Stage] = deque()
         self.running: Execution | None = None
         self._opening: Execution | None = None  # what was let go is free of the fingers, which open on
-        self._early: Execution | None = None  # of the fingers, begun while the motion before it comes to rest
-        self._heard: tuple[m.MotionStatus, float] | None = None  # what was told of the motion before it, and when [s]
-        self.due = math.inf  # it is to be stepped then at the latest [s]
         self.patience = Patience()
         self.look_after = 0.0  # only a picture that is later decides [s]
         self._frames = FrameAge(speed)
@@ -159,7 +155,6 @@ class Deciding(Generic[V]):
 
     def fail(self, message: str, view: V, *, go_home: bool = True) -> None:
         """Count a failure, throw the row away and, where it helps, go home to look again."""
-        go_home = go_home and self._early is None  # what the fingers began ends first
         self.clear()
         self.look_after = view.now
         self.status.message = message
@@ -219,11 +214,6 @@ class Deciding(Generic[V]):
         return MOVED
 
     # --- what helps to decide --------------------------------------------------------------------------------
-
-    @property
-    def under_way(self) -> list[Stage]:
-        """What arm and fingers do: of fingers that begin before the arm stands the status tells once it does."""
-        return [one.stage for one in (self.running, self._early) if one is not None]
 
     @property
     def gripper(self) -> GripperConfig:

@@ -25,9 +25,6 @@ BLOCKED_BY = "scene_monitor"  # holds the arm while something is in the way
 NO_ARM = "the arm cannot be moved: "
 FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] by which fingers may stand elsewhere than a motion was planned with
-LOOSE = 0.5e-3  # [m] by which fingers must have opened before they hold nothing any more
-HASTENED = 0.1  # share of its speed by which an arm may go faster or slower meanwhile, and arrive as is reckoned
-TOLD = 0.25  # [s] after which an arm that moves would have told how far it is: what is older is no arm that arrives
 OPENED_BY = 0.5  # of a motion that began while the fingers opened: then they have
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 
@@ -92,14 +89,9 @@ class Task(Deciding[V]):
 
     def on_goal(self, answer: Report, view: V) -> None:
         """Take in the answer to execute or to a gripper command: accepted, or refused with a reason."""
-        begun = next((one for one in (self.running, self._early) if one and one.command.id == answer.id), None)
-        if begun is None or begun.accept(answer):
+        if self.running is None or self.running.command.id != answer.id or self.running.accept(answer):
             return
-        stage = begun.stage
-        if begun is self._early:
-            self._early = None
-        else:
-            self.running = None
+        stage, self.running = self.running.stage, None
         # What somebody else asked for, or that it came too late, is no failure: it is decided anew.
         if answer.error in ANEW:
             self._decide_anew(f"{stage.name} has to wait: {answer.message}", view)
@@ -108,13 +100,13 @@ class Task(Deciding[V]):
         if isinstance(answer, m.MotionStatus) and answer.error == "start_mismatch":
             self.displaced(stage, view, problem)
         else:
-            self.fail(problem, view, go_home=self.running is None)
+            self.fail(problem, view)
 
     # --- the step --------------------------------------------------------------------------------------------
 
     def step(self, view: V) -> list[Command]:
         """What to ask for now, given what is known."""
-        status, self.due = self.status, math.inf
+        status = self.status
         if view.missing:
             status.message = f"waiting for {', '.join(view.missing)}"
             return []
@@ -143,7 +135,7 @@ class Task(Deciding[V]):
             self.look_after = view.now
         if self.running is not None:
             self.decide_ahead(self.running.stage, view)
-        elif not (self.row or self._early or view.motion.state == "active" or view.gripper.moving):
+        elif not self.row and not (view.motion.state == "active" or view.gripper.moving):
             self.decide(view)  # not before what a task before this one began has ended
         if status.state not in ("DONE", "ERROR"):
             status.task_seconds = view.now - (self._began or view.now)
@@ -165,7 +157,6 @@ class Task(Deciding[V]):
     def _watch(self, view: V) -> list[Command]:
         """Follow the stage that runs: its end, its failure, and what falls out of the hand."""
         if self.running is None:
-            self._watch_early(view)
             return self._watch_opening(view)
         assert view.motion is not None and view.gripper is not None
         running, stage = self.running, self.running.stage
@@ -182,10 +173,8 @@ class Task(Deciding[V]):
             self._ended(stage, running.report(view.motion, view.gripper), view)
         elif outcome == "forgotten":
             self.running = None
-            if self._early is not None and isinstance(self._early.stage, Grip):  # where it is let go nobody knows
-                self._early = replace(self._early, stage=replace(self._early.stage, holds=None))
             self.forgotten(stage, view)
-        elif running.moves_arm and stage.carries and not view.holding and self._early is None:
+        elif running.moves_arm and stage.carries and not view.holding:
             stop = self.stop(view, "what it held fell")
             slipped = f": {view.gripper.message}" if view.gripper.outcome == "slipping" else ""
             self.fail(f"what the hand held fell during {stage.name}{slipped}", view, go_home=False)
@@ -194,7 +183,7 @@ class Task(Deciding[V]):
             stop = self.stop(view, "it takes too long")
             self.fail(f"{stage.name} took longer than {round(limit, 2):g} s", view)
             return stop
-        elif running.moves_arm and (why := self.outdated(stage, view) or self._closed_before(running)):
+        elif running.moves_arm and (why := self.outdated(stage, view)):
             stop = self.stop(view, why)
             self.status.message = f"{stage.name}: {why}"
             return stop
@@ -205,20 +194,6 @@ class Task(Deciding[V]):
         elif stage.carries and view.gripper.outcome == "slipping":  # it may still arrive
             self.status.message = f"{stage.name}: {view.gripper.message}"
         return self._watch_opening(view)
-
-    def _watch_early(self, view: V) -> None:
-        """Follow fingers whose arm did not arrive: what they let go is, and what they hold is decided about anew."""
-        if (early := self._early) is None:
-            return
-        assert view.motion is not None and view.gripper is not None
-        early.count(view.now, view.motion)
-        outcome = early.outcome(view.motion, view.gripper)
-        if outcome == "running" and early.spent <= self.time_limit(early.stage):
-            return
-        self._early, self.look_after = None, view.now
-        done = early.report(view.motion, view.gripper).state == "succeeded" and not view.holding
-        if outcome == "ended" and done and isinstance(early.stage, Grip) and early.stage.holds is False:
-            self.succeeded(early.stage, view)
 
     def _watch_opening(self, view: V) -> list[Command]:
         """Follow fingers that open while the arm leaves already; one that they would not let through is stopped."""
@@ -245,14 +220,6 @@ class Task(Deciding[V]):
         else:
             self.fail(why, view)
         return stop
-
-    def _closed_before(self, running: Execution) -> str:
-        """That fingers close about what the arm would go on down to, as it was held or slowed since they began."""
-        early = self._early
-        if early is None or not isinstance(early.stage, Grip) or not early.stage.holds:
-            return ""
-        late = running.slowest < early.slowest - HASTENED
-        return f"held or slowed as the fingers began to {early.stage.name}" if late else ""
 
     def _blocked(self, view: V) -> str:
         """What stays in the way of the motion that runs; empty while nothing does, or it may still go away."""
@@ -293,10 +260,6 @@ class Task(Deciding[V]):
             self.fail("the fingers opened and still hold something", view)
         else:
             self.succeeded(stage, view)
-            if self._early is not None:
-                self.running, self._early = self._early, None
-                self.running.counted = view.now
-                self._tell_stage(self.running.stage)
 
     # --- planning and doing ----------------------------------------------------------------------------------
 
@@ -307,9 +270,8 @@ class Task(Deciding[V]):
         running = self.running.stage if self.running else None
         end = running.end() if isinstance(running, Move) else []
         width = self._width(view)
-        for grip in (running, self._early.stage if self._early else None):
-            if width is not None and isinstance(grip, Grip):
-                width = grip.width_after(width)
+        if width is not None and isinstance(running, Grip):
+            width = running.width_after(width)
         for move in self.row:
             if width is not None and isinstance(move, Grip):
                 width = move.width_after(width)
@@ -327,9 +289,7 @@ class Task(Deciding[V]):
 
     def _advance(self, view: V) -> Iterator[Command]:
         """Begin the next stage when the one before it has ended and its motion is planned and still right."""
-        if self.running is not None:
-            yield from self._begin_early(self.running, view)
-        if self.running is not None or self._early is not None or not self.row:
+        if self.running is not None or not self.row:
             return
         stage = self.row[0]
         if stage.carries and not view.holding:
@@ -347,35 +307,6 @@ class Task(Deciding[V]):
             yield from self._plan_ahead(view)
             return
         yield self._begin(stage, view)
-
-    def _begin_early(self, running: Execution, view: V) -> Iterator[Command]:
-        """Begin with the fingers before the arm stands: until then they touch nothing, or let nothing go."""
-        stage, arm = (self.row[0] if self.row else None), running.stage
-        if not (isinstance(stage, Grip) and stage.early and isinstance(arm, Move)) or self._opening is not None:
-            return
-        assert view.motion is not None and view.gripper is not None
-        motion = view.motion
-        if self._heard is None or self._heard[0] is not motion:
-            self._heard = motion, view.now  # clocks of two hosts differ: its stamp would tell of another time
-        if motion.id != running.command.id or motion.state != "active" or not motion.speed_scaling:
-            return
-        if view.now - self._heard[1] > TOLD:
-            return
-        if motion.message or motion.speed_scaling > running.slowest + HASTENED:
-            return  # it is being stopped, or comes to its speed again by a ramp: nobody knows when it arrives
-        if stage.holds:
-            way = 0.0 if stage.expected_width is None else view.gripper.width - stage.expected_width
-        else:
-            way = LOOSE
-        left = (1.0 - motion.progress) * arm.seconds / motion.speed_scaling
-        begins = self._heard[1] + left - self.gripper.least_time(way)
-        if view.now < begins:
-            self.due = begins
-        elif stage.carries == view.holding and self.may_begin(stage, view):
-            self.row.popleft()
-            self._early = self._execution(stage, view)
-            self._early.slowest = running.slowest
-            yield self._early.command
 
     def _width(self, view: V) -> float | None:
         """Between the fingers now, or soon where they are opening [m]; None without any."""
@@ -396,15 +327,6 @@ class Task(Deciding[V]):
 
     def _begin(self, stage: Stage, view: V) -> Command:
         self.row.popleft()
-        self.running = self._execution(stage, view)
-        self._tell_stage(stage)
-        return self.running.command
-
-    def _tell_stage(self, stage: Stage) -> None:
-        self.status.state, self.status.stage = stage.state, stage.name
-        self.status.subject = stage.cycle.subject if stage.cycle else ""
-
-    def _execution(self, stage: Stage, view: V) -> Execution:
         command: m.ExecuteRequest | m.GripperCommand
         if isinstance(stage, Move):
             assert stage.trajectory is not None
@@ -417,13 +339,15 @@ class Task(Deciding[V]):
                 command.expected_width, command.width_tolerance = stage.expected_width, stage.width_tolerance
         if stage.cycle is not None:
             stage.cycle.begun = True
-        begun = Execution(stage, command, view.now)
+        self.running = Execution(stage, command, view.now)
         assert view.motion is not None and view.gripper is not None
         if isinstance(stage, Grip):
             self._opening = None  # it replaces that
-            begun.held = view.gripper.width if view.holding else None
-        begun.before = begun.report(view.motion, view.gripper).id
-        return begun
+            self.running.held = view.gripper.width if view.holding else None
+        self.running.before = self.running.report(view.motion, view.gripper).id
+        self.status.state, self.status.stage = stage.state, stage.name
+        self.status.subject = stage.cycle.subject if stage.cycle else ""
+        return command
 
     def _is_planned(self, move: Move) -> bool:
         whole = [s for s in self.row if isinstance(s, Move) and s.cycle is move.cycle] if move.whole else [move]

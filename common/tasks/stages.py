@@ -79,7 +79,6 @@ class Grip(Stage):
     holds: bool | None = field(default=None, kw_only=True)
     expected_width: float | None = field(default=None, kw_only=True)  # [m]
     width_tolerance: float = field(default=0.01, kw_only=True)  # of expected_width [m]
-    early: bool = field(default=False, kw_only=True)  # begins while the motion before it comes to rest
     effort: float = field(default=0.0, kw_only=True)  # [N]; 0: the gripper's own default
     mass: float = field(default=0.0, kw_only=True)  # of what is held then [kg]; 0: not known
     problem: str = field(default="the fingers closed on nothing", init=False)
@@ -112,7 +111,6 @@ class Execution:
     before: str = ""  # id of the goal that its controller told of then
     moving: float = 0.0  # in motion so far
     spent: float = 0.0  # as if the motion were at full speed: what time-outs go by
-    slowest: float = 1.0  # share of its speed at which the arm was to go so far; 0 once it was held
     accepted: int | None = None  # stamp of the answer that accepted it
     held: float | None = None  # between the fingers as it began, where they held something [m]
     over: Report | None = None  # the answer, when it told of the end already: it was asked for more than once
@@ -125,7 +123,6 @@ class Execution:
     def count(self, now: float, motion: m.MotionStatus) -> None:
         """Count the time up to now."""
         passed, self.counted = max(0.0, now - self.counted), max(now, self.counted)
-        self.slowest = min(self.slowest, 0.0 if motion.held else motion.speed_scaling)
         if self.moves_arm and motion.held:
             return
         self.moving += passed

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from itertools import pairwise
 from typing import Any
-
-import pytest
 
 from common import messages as m
 from common import topics
@@ -17,7 +14,6 @@ from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.clock import Clock
 from common.errors import Refused
-from common.process import task_runner
 from common.process.in_process import running_service
 from common.process.task_runner import TaskRunner
 from common.sources import wall_ns
@@ -36,7 +32,6 @@ class Script:
 
     def __init__(self) -> None:
         self.status = PickPlaceStatus()
-        self.due = math.inf
         self.first: list[Command] = [GO]
         self.also: list[Command] = []  # together with every command
 
@@ -311,30 +306,3 @@ async def test_motion_that_is_refused_again_and_again_is_asked_for_more_and_more
     assert told == {"clock_ahead"}
     waits = [after - before for before, after in pairwise(asked)]
     assert waits[1] >= 0.1 and waits[2] >= 0.2 and waits[3] >= 0.4 and waits[4] >= 0.8
-
-
-async def test_task_is_stepped_at_the_time_that_it_is_due(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(task_runner, "LONGEST_STEP", 3600.0)
-    clock, times, stepped = Clock(speed=10.0), list[float](), asyncio.Event()
-
-    class Due(Silent):
-        def __init__(self) -> None:
-            super().__init__()
-            self.due = 0.0
-
-        def step(self, view: Any) -> list[Command]:
-            times.append(clock.now())
-            if len(times) == 1:
-                self.due = times[0] + 0.5
-            elif times[-1] >= self.due:
-                stepped.set()
-            return []
-
-    async def run(bus: Bus, config: None) -> None:
-        runner = TaskRunner(bus, Due(), lambda: None, bus.writer(PICK_PLACE_STATUS), lambda: 1.0)
-        await bus.ready()
-        await runner.run(())
-
-    async with running_service(LocalNetwork(), run, None, name="smart_pick_place", clock=clock):
-        async with asyncio.timeout(30):
-            await stepped.wait()
