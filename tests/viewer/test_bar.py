@@ -22,8 +22,8 @@ LAYOUT = Path(__file__).with_name("nothing_to_draw.yaml")
 PANDA = ("up", "panda", "--set", "autostart=false", "--set", f"services.viewer.layout={LAYOUT}")
 SIZES = {"large": (1600, 1000), "usual": (1280, 800), "small": (800, 600), "phone": (390, 844)}
 
-# What lies at the middle and the corners of STOP, how large that is, and whether the bar covers anything of the page, as
-# it is seen: room for a bar that has grown is made when the next picture is drawn.
+# What lies at the middle and the corners of STOP, how large that is, and whether the bar covers anything of the page,
+# as it is seen: room for a bar that has grown is made when the next picture is drawn.
 LOOK = """async () => {
   await new Promise(drawn => requestAnimationFrame(() => requestAnimationFrame(drawn)));
   const stop = document.querySelector("#zc-stop"), at = stop.getBoundingClientRect();
