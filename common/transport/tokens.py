@@ -163,18 +163,13 @@ class TokenWatch:
 
 
 async def tokens_now(session: Session, key: str, loop: asyncio.AbstractEventLoop, timeout: float) -> list[str]:
-    """The tokens under a full key expression that are there now, as far as they are known after `timeout` seconds.
-
-    Zenoh leaves out of its answer what a watch of this session is being told just then, one time in a thousand on a
-    busy machine, and has it in the next: it is asked twice.
-    """
+    """The tokens under a full key expression that are there now, as far as they are known after `timeout` seconds."""
     tokens: set[str] = set()
+    done = asyncio.Event()
+    session.get_tokens(key, tokens.add, partial(call_on_loop, loop, done.set), timeout=timeout)
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(timeout):
-            for _ in range(2):
-                done = asyncio.Event()
-                session.get_tokens(key, tokens.add, partial(call_on_loop, loop, done.set), timeout=timeout)
-                await done.wait()
+            await done.wait()
     return sorted(tokens)
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import uuid
 
 import pytest
 
@@ -11,6 +12,8 @@ from common.topics import Request
 from common.transport import requests
 from common.transport.bus import Bus
 from common.transport.codec import decode_error, encode
+from common.transport.connect import connect
+from common.transport.keys import serves_key
 from common.transport.local import LocalNetwork
 from common.transport.session import RawReply
 
@@ -57,6 +60,20 @@ async def test_call_right_after_the_client_was_made_finds_the_server(new_bus) ->
     await served(server)
     await client.alive.wait("server", PATIENCE)
     assert (await client.client(topics.TASK_COMMAND).call(START)).message == "start"
+
+
+async def test_all_who_serve_are_found_while_this_session_watches_one_of_them(shared_router) -> None:
+    cell, names = f"test_{uuid.uuid4().hex[:8]}", [f"server_{number}" for number in range(8)]
+    async with connect(cell=cell, service="host", endpoint=shared_router) as host:
+        for name in names:
+            host._declare_token(serves_key(cell, f"param/{name}", name))
+        for _ in range(60):  # what is left to Zenoh lacks one of them in every tenth
+            async with connect(cell=cell, service="client", endpoint=shared_router) as client:
+                await client.raw_tokens(serves_key(cell, "param/*"), PATIENCE)
+                await client._watch(serves_key(cell, f"param/{names[3]}")).known(PATIENCE)
+                for _ in range(4):
+                    tokens = await client.raw_tokens(serves_key(cell, "param/*"), PATIENCE)
+                    assert [token.rpartition("/")[2] for token in tokens] == names
 
 
 async def test_nobody_serves_the_key_is_known_before_sending(new_bus) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from typing import cast
 
 import pytest
 
@@ -16,8 +15,7 @@ from common.transport.bus import Bus
 from common.transport.keys import alive_key, owns_key
 from common.transport.local import LocalNetwork, LocalSession
 from common.transport.ownership import MOST_OTHERS, MOST_TOLD, Owner, Ownership
-from common.transport.session import Session
-from common.transport.tokens import MOST_AT_ONCE, MOST_NAMES, TokenWatch, tokens_now
+from common.transport.tokens import MOST_AT_ONCE, MOST_NAMES, TokenWatch
 
 NewBus = Callable[..., Awaitable[Bus]]
 FLOOD = 3000  # counts, not seconds: as many more would be the same
@@ -192,18 +190,3 @@ async def test_lines_about_who_claims_a_key_go_on_after_a_while_and_say_how_many
     assert len(lines) == MOST_TOLD
     owners._judge(others[-1], now=ownership.TELL_SECONDS)
     assert lines[-1].endswith(f"; so did {MOST_TOLD} before") and len({*lines}) == MOST_TOLD + 1
-
-
-async def test_token_that_is_left_out_of_one_answer_is_in_what_is_there_now() -> None:
-    answers = iter([["cell/serves/a"], ["cell/serves/a", "cell/serves/b"]])
-
-    class Forgetful:
-        def get_tokens(
-            self, key: str, on_token: Callable[[str], None], on_done: Callable[[], None], *, timeout: float
-        ) -> None:
-            for token in next(answers):
-                on_token(token)
-            on_done()
-
-    found = await tokens_now(cast(Session, Forgetful()), "cell/serves/*", asyncio.get_running_loop(), 5.0)
-    assert found == ["cell/serves/a", "cell/serves/b"]
