@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Picture = npt.NDArray[np.uint8]
 
 BEFORE, AFTER = 4.0, 2.0  # [s] that a film shows about the moment
-MOST = 3  # moments in a page, the first ones
+MOST = 3  # moments in a page: those in which something was lost, then others, the first ones of each
 MOST_CAMERAS = 4  # that have a film of a moment, by their names
 PERIOD = 0.2  # [s] between two pictures, at the least
 WIDTH, HEIGHT = 360, 480  # [px] at most
@@ -60,17 +60,21 @@ class Film:
 
 
 def moments(run: Gathering) -> list[tuple[float, str]]:
-    """When [s] something went wrong for the first times, and what; what one film shows is told once."""
+    """When [s] something went wrong for the first times, and what; what one film shows is told once.
+
+    What is lost goes before what was only tried again: a run may well end DONE after either.
+    """
+    lost = [(event.time, f"{event.what} {event.note}") for event in run.losses]
     wrong = [(event.time, " ".join(filter(None, (event.what, event.note)))) for event in run.failures]
     wrong += [(motion.until or motion.since, f"motion {motion.note}: {motion.message or motion.error}")
               for motion in run.motions if motion.note in ("aborted", "rejected")]
     wrong += [(span.since, f"ERROR {span.note}".strip()) for span in run.tasks[1:]  # the first was before
               if span.label == "ERROR"]
     kept: list[tuple[float, str]] = []
-    for at, what in sorted(wrong):
-        if not kept or at - kept[-1][0] > AFTER:
+    for at, what in [*sorted(lost), *sorted(wrong)]:
+        if all(abs(at - other) > AFTER for other, _ in kept):
             kept.append((at, what))
-    return kept[:MOST]
+    return sorted(kept[:MOST])
 
 
 def films(recording: Recording, run: Gathering) -> list[Film]:

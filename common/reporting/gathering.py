@@ -99,6 +99,7 @@ class Gathering:
     services: dict[str, Service] = field(default_factory=dict)
     restarts: list[Event] = field(default_factory=list)
     failures: list[Event] = field(default_factory=list)  # of the task, and what it tries again
+    losses: list[Event] = field(default_factory=list)  # by truth: what came to lie out of reach of everything
     log: list[Event] = field(default_factory=list)
     lines_left_out: int = 0
     counters: dict[str, m.ServiceCounters] = field(default_factory=dict)
@@ -108,13 +109,14 @@ class Gathering:
     _failed: int | None = None  # so far; what there was before the recording began is no event of it
     _before: str | None = None  # the goal that had ended by then
     _scene: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    _in_place: set[str] = field(default_factory=set)  # ids of objects that lay or moved where they may
 
     def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
         """What of the platform's topics is listened to."""
         return {
             t.MOTION_STATUS: self.on_motion, t.GRIPPER_STATE: self.on_gripper, t.DISPLAY_TRAJECTORY: self.on_trajectory,
             t.JOINT_STATES: self.on_joints, t.PLANNING_SCENE: self.on_scene, t.SUPERVISOR_STATUS: self.on_services,
-            t.LOG: self.on_log, t.COUNTERS: self.on_counters,
+            t.LOG: self.on_log, t.COUNTERS: self.on_counters, t.SCENE_OBJECTS: self.on_objects,
         }
 
     def on_task(self, time: float, status: m.TaskStatus) -> None:
@@ -172,6 +174,16 @@ class Gathering:
                 self._scene[thing.id] = (p.x, p.y, p.z)
             elif thing.id not in self.footprints:
                 self.footprints[thing.id] = footprint(thing)
+
+    def on_objects(self, time: float, world: m.WorldObjects) -> None:
+        """Take note of what is lost; what lay there before the recording began was lost before."""
+        for thing in world.objects:
+            if thing.state != "elsewhere":
+                self._in_place.add(thing.id)
+            elif thing.id in self._in_place:
+                self._in_place.discard(thing.id)
+                p = thing.pose.position
+                self.losses.append(Event(time, thing.id, f"lies elsewhere, at ({p.x:.3f}, {p.y:.3f}, {p.z:.3f})"))
 
     def on_services(self, time: float, status: m.SupervisorStatus) -> None:
         """Take note of the processes."""

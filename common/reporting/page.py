@@ -112,6 +112,7 @@ def _problems(run: Gathering) -> list[Row]:
             rows.append((motion.until or motion.since, f"motion {motion.note}", motion.label, " ".join(why)))
     rows += [(span.since, "task failed", span.note, "see the log below") for span in run.tasks if span.label == "ERROR"]
     rows += [(event.time, "started again", event.what, event.note) for event in run.restarts]
+    rows += [(event.time, "lost, by truth", event.what, event.note) for event in run.losses]
     rows.sort(key=lambda row: row[0])
     return [*rows]
 

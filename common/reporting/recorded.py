@@ -34,7 +34,7 @@ def page_of(recording: Recording, cell: str | None = None) -> str:
     from common.recording.writing import ABOUT
     from common.reporting.film import films
     from common.reporting.fold import Fold
-    from common.reporting.gathering import Gathering
+    from common.reporting.gathering import Event, Gathering
     from common.reporting.page import Report, page
     from common.topics import general_key
 
@@ -60,6 +60,10 @@ def page_of(recording: Recording, cell: str | None = None) -> str:
         raise RecordingError(f"{recording.path}: says nothing about a run; "
                              "it needs a task's status, joint_states or supervisor/status")
     gathered.finish(recording.seconds)
+    if left := fold.summary.unexplained:
+        places = ", ".join(f"({x:.3f}, {y:.3f}, {z:.3f})" for x, y, z in left)
+        ended = gathered.tasks[-1].since
+        gathered.losses.append(Event(ended, "DONE", f"but left at {places}: not among what was rejected"))
     if not recording.finished:
         notes.append(cut(recording))
     if decoder.skipped:

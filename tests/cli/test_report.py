@@ -417,6 +417,46 @@ def test_what_had_gone_wrong_before_the_recording_began_has_no_film(tmp_path):
     assert re.findall(r"<figcaption[^>]*>([^(]*) \(", text) == ["8.00 s: motion rejected: of now"]
 
 
+def rolls_off_the_table(tape, lost_at):
+    """Two balls, of which one comes to lie on the floor while the task fails nowhere; another lay there before."""
+    for t in range(30):
+        states = {"ball_0": "contained", "ball_1": "table" if t < lost_at else "elsewhere", "ball_2": "elsewhere"}
+        tape.put(t, "scene_objects", m.WorldObjects(objects=[
+            m.WorldObject(id=name, shape="sphere", pose=m.Pose(position=point(0.9, 0.2 * k, -0.5)), state=state)
+            for k, (name, state) in enumerate(states.items())]))
+
+
+def test_what_comes_to_lie_on_the_floor_is_listed_and_has_a_film_before_what_was_only_tried_again(tmp_path):
+    tape = Tape(tmp_path / "run.mcap")
+    failures(tape, 1, 5, 10, 15)
+    rolls_off_the_table(tape, 20)
+    for k in range(30):
+        tape.put(k, "camera/image_raw", picture(tape, k, 10 * k))
+    tape.writer.close({})
+    assert app.execute(["report", str(tmp_path / "run.mcap")]) == 0
+    text = (tmp_path / "run.html").read_text()
+    told = re.findall(r"<figcaption[^>]*>([0-9.]+ s: .*) \(camera", text)
+    assert told == ["1.00 s: GRASPING", "5.00 s: GRASPING", "20.00 s: ball_1 lies elsewhere, at (0.900, 0.200, -0.500)"]
+    page = Page(text)
+    assert page.table("problems") == [
+        ["20.00", "lost, by truth", "ball_1", "lies elsewhere, at (0.900, 0.200, -0.500)"]]
+
+
+def test_run_that_ends_done_with_something_left_that_it_does_not_name_has_a_film_of_its_end(tmp_path):
+    tape = Tape(tmp_path / "run.mcap")
+    tape.put(0, "pick_place_status", PickPlaceStatus(header=tape.header(0), state="GRASPING", started=True))
+    tape.put(0, "scene_objects", m.WorldObjects(objects=[m.WorldObject(
+        id="ball_0", shape="sphere", pose=m.Pose(position=point(0.5, 0.2)), state="table")]))
+    tape.put(8, "pick_place_status", PickPlaceStatus(header=tape.header(8), state="DONE", started=True))
+    for k in range(10):
+        tape.put(k, "camera/image_raw", picture(tape, k, 10 * k))
+    tape.writer.close({})
+    assert app.execute(["report", str(tmp_path / "run.mcap")]) == 0
+    text = (tmp_path / "run.html").read_text()
+    assert len(films_of(text)) == 1
+    assert "8.00 s: DONE but left at (0.500, 0.200, 0.030): not among what was rejected" in text
+
+
 def test_report_of_a_run_without_failures_or_pictures_has_no_film(recorded, tmp_path):
     tape = Tape(tmp_path / "well.mcap")
     tape.put(0, "pick_place_status", PickPlaceStatus(header=tape.header(0), state="IDLE"))
