@@ -12,9 +12,10 @@ from pydantic import Field, model_validator
 
 from common.applications.pick_place.blobs import Blob, Mask, Outline, Traced, find_blobs, middles, small_blobs
 from common.applications.pick_place.depth_balls import find_in_depth
-from common.applications.pick_place.fit import fit_each, fit_spheres
+from common.applications.pick_place.fit import Fit, fit_each, fit_spheres
 from common.applications.pick_place.masks import Colours, Masks
 from common.applications.pick_place.odd import (
+    BELOW,
     EXPLAINED,
     FALLING,
     FLAT,
@@ -195,6 +196,11 @@ class Detector:
                     self.odd += [self._odd(camera.project(center + camera.position), camera, NOT_ROUND)
                                  for center in fit.centers]
                     continue
+                reasons = self._higher(blob, fit, camera, offset if offsets else None, pixel_size)
+                if reasons:
+                    self.odd += [self._odd(camera.project(center + camera.position), camera, reason)
+                                 for center, reason in zip(fit.centers, reasons, strict=True)]
+                    continue
                 seen += [_Seen(center, blob.area / len(centers), blob.border) for center in fit.centers]
             elif not len(blob.border):
                 self.odd.append(self._odd(blob.centroid, camera, NOT_ROUND))
@@ -267,6 +273,24 @@ class Detector:
         if len(blob.border) or self.resting.shows_container(camera, blob.centroid):
             return True
         return float(np.mean(owner >= 0)) >= EXPLAINED
+
+    def _higher(self, blob: Blob, fit: Fit, camera: Pinhole, usual: float | None, pixel_size: float) -> list[str]:
+        """Why the balls of a blob are none on the table: one looks too large, it lies on others. Empty if none does.
+
+        `usual` is the offset of balls that stand alone [m]; without any, that of the ball that looks smallest is.
+        """
+        if len(blob.border) or self.resting.shows_container(camera, blob.centroid):
+            return []
+        distance, _ = ray_distances(blob.outline.rays, fit.centers)
+        own = [distance[fit.owner == k, k] for k in range(len(fit.centers))]
+        offsets = np.array([np.mean(one) - self.resting.radius if len(one) else np.nan for one in own])
+        if np.isnan(offsets).all():
+            return []
+        usual = float(np.nanmin(offsets)) if usual is None else usual
+        upper = int(np.nanargmax(offsets))
+        if offsets[upper] - usual <= MOST_UNLIKE * pixel_size:
+            return []
+        return [sized(float(offsets[k]), usual) if k == upper else BELOW for k in range(len(offsets))]
 
     def _on_table(self, camera: Pinhole, odd: list[Odd]) -> list[Odd]:
         """Those that are not in the container, nor above the horizon, where no ray meets the table."""

@@ -20,6 +20,7 @@ Array = npt.NDArray[np.float64]
 
 NOT_ROUND = "it has not the outline of a ball"
 FLAT = "it is not as round as a ball there: flat, such as a picture of one"
+BELOW = "it is seen together with one that lies higher, as on it"
 EXPLAINED = 0.8  # part of the outline of a blob that lies on those of its balls, at least
 MOST_OVAL = 0.55  # [px] by which the outline of a ball may be longer one way than the other
 MOST_UNLIKE = 0.5  # [px] by which balls of one picture may differ in how large they look

@@ -90,6 +90,37 @@ def test_of_a_stack_neither_ball_is_offered(place: tuple[float, float]) -> None:
     assert all(marker.text for marker in frame.markers)
 
 
+SIDE = CameraConfig(position=(1.15, 0.0, 0.85), rpy=(-2.4, 0.0, math.pi / 2))
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("others", [True, False])
+def test_of_a_stack_neither_ball_is_offered_where_the_camera_sees_it_from_the_side(
+    place: tuple[float, float], others: bool,
+) -> None:
+    camera, around = Pinhole.from_config(SIDE), AROUND.model_copy(update={"camera": SIDE})
+    beside = [ball(x, y) for x, y in OTHERS] if others else []
+    picture = Renderer(around, camera=camera).see([ball(*place), ball(*place, 0.09), *beside]).colour
+    detector = Detector(around)
+    assert len(detector.detect(picture, camera)) == len(beside)
+    assert sorted("it lies higher" in one.reason for one in detector.odd) == [False, True]
+    assert any(math.dist(one.position[:2], place) < 0.01 for one in detector.odd), "the lower one is where it is"
+
+
+@pytest.mark.parametrize("eye", [AROUND.camera, SIDE])
+@pytest.mark.parametrize("others", [True, False])
+def test_balls_that_touch_do_not_lie_on_each_other(eye: CameraConfig, others: bool) -> None:
+    camera, around = Pinhole.from_config(eye), AROUND.model_copy(update={"camera": eye})
+    draw, detector = Renderer(around, camera=camera), Detector(around)
+    touching = [(0.45, -0.30), (0.51, -0.30), (0.48, -0.248), (0.45, -0.19)]
+    for turn in np.linspace(0, 2 * math.pi, 12, endpoint=False):
+        about = complex(0.48, -0.26)
+        turned = [about + (complex(*place) - about) * np.exp(1j * turn) for place in touching]
+        beside = [ball(x, y) for x, y in OTHERS[1:]] if others else []
+        picture = draw.see([*(ball(z.real, z.imag) for z in turned), *beside]).colour
+        assert len(detector.detect(picture, camera)) == len(touching) + len(beside) and detector.odd == []
+
+
 @pytest.mark.parametrize("places", [
     [(0.544, 0.265), (0.514, 0.21), (0.579, 0.216)], [(0.552, 0.273), (0.539, 0.214)],
 ])
