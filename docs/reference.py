@@ -17,6 +17,7 @@ from common.client.arm import Arm, Hand
 from common.client.cell import Cell, World
 from common.client.hearing import Camera
 from common.client.parameters import Parameters
+from common.client.scene import Scene
 from common.client.task import TaskControl
 from common.config.tunables import bounds_of
 from common.messages import schema
@@ -26,7 +27,7 @@ MADE = "Made by `python -m docs.generate`; a test keeps it current."
 WIDTH = 90  # of a line of code that can be read without scrolling
 PARTS = {  # of the client, as a program gets at each
     "Cell": Cell, "cell.arm": Arm, "cell.gripper": Hand, "cell.camera()": Camera, "cell.task": TaskControl,
-    "cell.param": Parameters, "cell.world": World,
+    "cell.param": Parameters, "cell.scene": Scene, "cell.world": World,
 }
 
 
@@ -173,7 +174,7 @@ def entry(name: str, function: Any, kind: str) -> list[str]:
     """Heading, signature and docstring of a function."""
     lines = ["", f"### {name}", ""]
     if kind != "property":
-        begin = f"{'await ' if kind == 'await' else ''}{name.replace('()', '')}("
+        begin = f"{'await ' if kind == 'await' else ''}{name}("
         arguments = [*arguments_of(function)]
         short = f"{begin}{', '.join(arguments)})"
         call = [short] if len(short) <= WIDTH else [begin, *(f"    {each}," for each in arguments), ")"]

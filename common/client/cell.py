@@ -17,7 +17,7 @@ from common.application import all_topics, find_topic
 from common.client.arm import Arm, Hand
 from common.client.foreign import require_key
 from common.client.frames import Frames
-from common.client.hearing import Camera, Carried, Ear, NothingHeard, cameras, messages, the_camera, topic_in
+from common.client.hearing import Camera, Carried, Ear, NothingHeard, cameras, messages, topic_in
 from common.client.joining import cell_clock, joined, person, supervisor_status
 from common.client.parameters import Parameters
 from common.client.part import Part
@@ -238,13 +238,14 @@ class Cell(Part):
         """Names of its cameras."""
         return await cameras(self.bus)
 
-    async def camera(self, name: str = "") -> Camera:
-        """A camera; its name may be left out where there is one.
+    def camera(self, name: str = "") -> Camera:
+        """A camera; its name may be left out where there is one. `await cell.camera().image()` looks it up, too.
 
         Raises:
-            UnknownName: with the choices.
+            UnknownName: with the choices, when it is awaited or asked for anything.
         """
-        return Camera(await the_camera(self.bus, name), self._ear, self.tf)
+        _ = self.bus  # says so where the cell is not joined
+        return Camera(name, self._ear, self.tf)
 
     async def planning_scene(self) -> PlanningScene:
         """What planners avoid: fixtures, what was perceived, and what persons added."""

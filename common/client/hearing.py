@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncGenerator, Callable, Coroutine
+from collections.abc import AsyncGenerator, Callable, Coroutine, Generator
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -116,14 +116,30 @@ class Ear:
 
 
 class Camera(Part):
-    """One camera of a cell. Lengths are in metres, pictures are arrays of (height, width) and channels."""
+    """One camera of a cell. Lengths are in metres, pictures are arrays of (height, width) and channels.
 
-    name: str  # first part of its keys
+    It is looked up when it is first asked for anything, or when it is awaited itself.
+    """
+
+    name: str  # first part of its keys; before it was looked up what was given
 
     def __init__(self, name: str, ear: Ear, tf: Callable[[str, str], Coroutine[Any, Any, Array]]) -> None:
-        """A camera by the first part of its keys."""
+        """A camera by the first part of its keys, or the only one."""
         self._has(name=name)
         self._ear, self._tf = ear, tf
+        self._found = False
+
+    def __await__(self) -> Generator[Any, None, Camera]:
+        return self._looked_up().__await__()
+
+    async def _looked_up(self) -> Camera:
+        if not self._found:
+            self._has(name=await the_camera(self._ear.bus, self.name))
+            self._found = True
+        return self
+
+    async def _key(self, last: str) -> str:
+        return f"{(await self._looked_up()).name}/{last}"
 
     async def image(self) -> NDArray[np.uint8]:
         """The next picture, (height, width, 3) blue green red, or as its encoding says."""
@@ -131,7 +147,7 @@ class Camera(Part):
 
     async def message(self) -> Image:
         """The next picture as it travels, with its stamp and frame."""
-        return await self._ear.fresh(replace(topics.CAMERA_IMAGE, key=f"{self.name}/{PICTURE}"))
+        return await self._ear.fresh(replace(topics.CAMERA_IMAGE, key=await self._key(PICTURE)))
 
     async def depth(self) -> NDArray[np.float32]:
         """The next depth picture (height, width): metres along the optical axis, NaN where there is none.
@@ -139,11 +155,11 @@ class Camera(Part):
         Raises:
             NothingHeard: the camera has no depth.
         """
-        return image_to_array(await self._ear.fresh(replace(topics.DEPTH_CAMERA_DEPTH, key=f"{self.name}/{DEPTH}")))
+        return image_to_array(await self._ear.fresh(replace(topics.DEPTH_CAMERA_DEPTH, key=await self._key(DEPTH))))
 
     async def info(self) -> CameraInfo:
         """Size, frame, intrinsics and distortion."""
-        return await self._ear.newest(replace(topics.CAMERA_INFO, key=f"{self.name}/{INFO}"))
+        return await self._ear.newest(replace(topics.CAMERA_INFO, key=await self._key(INFO)))
 
     async def intrinsics(self) -> Array:
         """The matrix (3, 3) [px]."""

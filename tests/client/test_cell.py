@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,7 +18,7 @@ from common.client.arm import NotJogged
 from common.client.cell import Cell
 from common.client.frames import poses
 from common.client.goals import any_of, pose, region, through
-from common.client.hearing import Camera, NothingHeard
+from common.client.hearing import NothingHeard
 from common.client.operator_motion import MotionFailed
 from common.config import load_cell
 from common.errors import ConfigError, DecodeError, NoResponder, RemoteError, UnknownName, ZencellError
@@ -348,6 +349,18 @@ def test_pictures_come_as_arrays_with_the_camera_that_took_them() -> None:
     run(program)
 
 
+def test_camera_is_asked_in_one_line_and_looked_up_then() -> None:
+    async def program(cell: Cell) -> None:
+        (name,) = await cell.cameras()
+        assert (await cell.camera().image()).shape == (await cell.camera(name).image()).shape
+        camera = cell.camera()
+        assert (await camera.intrinsics()).shape == (3, 3) and camera.name == name
+        with pytest.raises(UnknownName, match=name):
+            await cell.camera("left").pose()
+
+    run(program)
+
+
 def test_depth_is_in_metres() -> None:
     async def program(cell: Cell) -> None:
         depth = await (await cell.camera()).depth()
@@ -465,7 +478,7 @@ def test_what_nobody_answers_ends_in_the_exception_that_says_so() -> None:
         with pytest.raises(NoResponder, match="param/nobody"):
             await cell.call("param/nobody")
         with pytest.raises(NothingHeard, match="nobody/camera_info"):
-            await Camera("nobody", cell._ear, cell.tf).info()
+            await cell._ear.newest(replace(topics.CAMERA_INFO, key="nobody/camera_info"))
         with pytest.raises(RemoteError, match="controller"):
             await cell.arm.order("enable")
 
@@ -515,6 +528,8 @@ async def test_a_cell_that_is_not_joined_says_how_to_join_it() -> None:
     for name in ("arm", "gripper", "task", "param", "world", "bus"):
         with pytest.raises(ZencellError, match="async with"):
             getattr(cell, name)
+    with pytest.raises(ZencellError, match="async with"):
+        cell.camera()
     with pytest.raises(AttributeError, match="amr"):
         _: Any = cell.amr
 
