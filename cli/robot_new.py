@@ -85,9 +85,11 @@ def new(
     _tell(made, robot, path, pairs)
     if layout is not None:
         write_cell(Path(cell).expanduser(), template, path, layout)
+    where = cell or f"{template} --set robot={path}"
     echo(f"next: zencell robot check {path}")
+    echo(f"      zencell up {where} --set autostart=false    # looked at on its page: View, Frames")
     if robot.config.gripper is not None:
-        echo(f"      zencell run {cell or f'{template} --set robot={path}'}")
+        echo(f"      zencell run {where}")
 
 
 def check(

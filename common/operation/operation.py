@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 START_REQUEST_TIMEOUT = 5.0  # [s]
+DOUBTS_TIMEOUT = 10.0  # [s] for the quick look at the cell, which is nicer than its services
 LAST_WORDS = 5.0  # [s] for whoever is slow to read what became of a run
 LEFT = 3  # exit code
 
@@ -325,6 +326,8 @@ class Operation:
             await collector.settle()
 
         await beside(self._disturbing(), beside(collector.run(), end()))
+        if self._doubts is not None:  # of a short run: they may say why it was short
+            await asyncio.wait({self._doubts}, timeout=DOUBTS_TIMEOUT)
         return 0 if self.summary.state == "DONE" else 1
 
     async def _until_interrupted(self, bus: Bus) -> int:

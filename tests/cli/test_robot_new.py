@@ -76,6 +76,7 @@ def test_limits_that_the_urdf_does_not_give_are_marked_as_guessed(made: Path) ->
     told = (made / "told.txt").read_text()
     assert "guessed: velocity_limits of spin" in told
     assert "next: zencell robot check side.yaml" in told and "zencell run side_cell.yaml" in told
+    assert "zencell up side_cell.yaml --set autostart=false" in told
 
 
 def test_the_file_passes_its_own_check_and_one_with_another_axis_does_not(made: Path) -> None:
