@@ -79,7 +79,9 @@ def tell(line: str, folder: Path, domain: int) -> subprocess.CompletedProcess[st
         return ask(folder, *words, environment={"ZENCELL_DOMAIN": str(free_domain() if words[0] == "run" else domain)})
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != REAL and CELL in TEXTS[name]])
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=[pytest.mark.alone] if "robot jog" in TEXTS[name] else [])  # a matter of 0.1 s
+    for name in NAMES if name != REAL and CELL in TEXTS[name]])
 def test_tutorial_beside_a_cell_does_what_it_says(name: str, up: Place, tmp_path: Path) -> None:
     assert follow(name, tmp_path, up.domain)
 

@@ -291,7 +291,8 @@ class Arm(Part):
                     await asyncio.sleep(LET_GO)
                     began = clock()
                 elif not goes and not waits:
-                    raise NotJogged(now.told, _kept(state))
+                    late = "words of this program came too late" if ours and now.kind == "none" else ""
+                    raise NotJogged(now.told, _kept(state) or late)
                 ours = ours or goes
         finally:
             writer.put(JogCommand(header=self._bus.header(), owner=self.owner, heard=heard))

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from common import topics
+from common.client import arm
 from common.client.arm import NotJogged
 from common.client.cell import Cell
 from common.client.frames import poses
@@ -185,6 +186,22 @@ def test_stop_of_ones_own_is_ended_by_the_next_motion_and_that_of_others_is_not(
         assert refused.value.code == "stopped"
         with pytest.raises(MotionFailed, match="another"):
             await cell.gripper.open()
+
+    run(program)
+
+
+def test_jog_of_a_program_that_was_held_up_says_that_its_words_came_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def program(cell: Cell) -> None:
+        async def hold_up() -> None:
+            while not (await cell.arm.owner_now()).jogging:  # noqa: ASYNC110 - nothing else tells of it
+                await asyncio.sleep(0.01)
+            monkeypatch.setattr(arm, "JOG_PERIOD", 1.0)  # longer than the arm goes on without a word
+
+        holding = asyncio.create_task(hold_up())
+        with pytest.raises(NotJogged, match="nobody's; words of this program came too late"):
+            await cell.arm.jog(linear=(0.0, 0.0, 0.05), seconds=10.0)
+        await holding
+        assert np.abs(await cell.arm.velocities()).max() < 1e-3
 
     run(program)
 
