@@ -54,7 +54,7 @@ USER zencell
 # graphics card, is 250 MB: the others do without.
 FROM run AS physics
 USER root
-RUN apt-get update -q && apt-get install -q -y --no-install-recommends libegl1 libgl1-mesa-dri \
+RUN apt-get update -q && apt-get install -q -y --no-install-recommends libegl1 libgl1-mesa-dri libopengl0 \
  && rm -rf /var/lib/apt/lists/* /var/cache/apt/*.bin
 COPY pyproject.toml constraints.txt /tmp/
 RUN --mount=type=cache,target=/root/.cache/pip --mount=type=secret,id=pip,target=/etc/pip.conf \

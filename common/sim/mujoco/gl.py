@@ -1,7 +1,7 @@
 """Which OpenGL draws pictures without a screen, and the one thread that may do so.
 
 MuJoCo's own choice, which it makes when it is imported, is for a screen: here the two that need none are looked for.
-Both are libraries of the system; with Debian's libegl1 and libgl1-mesa-dri EGL draws without a graphics card, too.
+Both are libraries of the system; with Debian's libegl1, libgl1-mesa-dri and libopengl0 EGL draws without a graphics card, too.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def chosen_gl() -> str:
         log.info("pictures are drawn by OpenGL (%s, %s)", found, why)
     else:
         log.warning("pictures are drawn by rays, without shadows: there is no EGL here (apt-get install libegl1 "
-                    "libgl1-mesa-dri) and no OSMesa")
+                    "libgl1-mesa-dri libopengl0) and no OSMesa")
     return found
 
 

@@ -7,6 +7,7 @@ sensor (`common/sim/sensor.py`) exposes it. Values are proportional to light.
 from __future__ import annotations
 
 import atexit
+import ctypes
 import logging
 from collections.abc import Sequence
 from typing import Any
@@ -113,7 +114,7 @@ class PhysicsRenderer:
             return None
         try:
             return Canvas(model, self.camera, self._gl)
-        except (ImportError, RuntimeError, AttributeError) as error:  # PyOpenGL has all three for what is not there
+        except (ImportError, RuntimeError, AttributeError, ctypes.ArgumentError) as error:  # PyOpenGL has all of them
             log.warning("pictures are drawn by rays, without shadows: OpenGL (%s) does not work: %s", self._gl, error)
             self._gl = ""
             return None

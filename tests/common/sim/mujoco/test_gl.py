@@ -25,7 +25,7 @@ def test_egl_is_taken_before_osmesa_and_rays_where_there_is_neither(monkeypatch,
     assert chosen(monkeypatch, osmesa=True) == "osmesa"
     gl.chosen_gl.cache_clear()
     assert chosen(monkeypatch) == ""
-    assert "apt-get install libegl1 libgl1-mesa-dri" in caplog.text
+    assert "apt-get install libegl1 libgl1-mesa-dri libopengl0" in caplog.text
 
 
 @pytest.mark.parametrize(("named", "found"), [("osmesa", "osmesa"), (" EGL ", "egl"), ("off", ""), ("glfw", "egl")])

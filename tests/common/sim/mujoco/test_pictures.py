@@ -1,3 +1,5 @@
+import ctypes
+
 import cv2
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from common.messages import Color, Header, JointState, Pose, Vector3, WorldObjec
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
 from common.sim.interface import load_renderer
+from common.sim.mujoco import rendering
 from common.sim.mujoco.gl import chosen_gl
 from common.sim.mujoco.rendering import PhysicsRenderer
 
@@ -18,7 +21,7 @@ PLACES = [(0.40, 0.0, 0.03), (0.55, -0.20, 0.03), (0.30, 0.12, 0.03), (0.58, 0.1
 ABOVE = Light(position=(0.4, 0.0, 2.0), aim=(0.4, 0.0, 0.0))
 ASIDE = Light(position=(0.4, 1.0, 1.0), aim=(0.4, 0.0, 0.0))
 
-needs_gl = pytest.mark.skipif(not GL, reason="no OpenGL here: apt-get install libegl1 libgl1-mesa-dri")
+needs_gl = pytest.mark.skipif(not GL, reason="no OpenGL here: apt-get install libegl1 libgl1-mesa-dri libopengl0")
 
 
 def balls(places=PLACES):
@@ -185,6 +188,17 @@ def test_what_is_out_of_sight_is_not_drawn_and_what_stands_still_is_not_drawn_ag
     assert renderer.see(list(things), AWAY) is first
     gone = [thing.model_copy(update={"state": "elsewhere"}) for thing in things]
     assert not red(renderer.see(gone, AWAY).colour).any() and red(first.colour).any()
+
+
+@pytest.mark.parametrize("error", [ImportError, RuntimeError, AttributeError, ctypes.ArgumentError])
+def test_pictures_are_drawn_by_rays_where_opengl_is_there_and_does_not_work(monkeypatch, caplog, error):
+    def broken(kind, width, height):
+        raise error("no glGetError")
+
+    monkeypatch.setattr(rendering, "gl_context", broken)
+    renderer = PhysicsRenderer(CELL.world, Scenery(), ROBOT, SMALL, depth=False, gl="egl")
+    assert red(renderer.see(balls(), AWAY).colour).any()
+    assert "drawn by rays, without shadows: OpenGL (egl) does not work: no glGetError" in caplog.text
 
 
 def test_simulator_of_the_cell_says_who_draws(monkeypatch):

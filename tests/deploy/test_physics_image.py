@@ -1,0 +1,18 @@
+"""The image's target `physics`, for cells with `simulator: mujoco`: pictures are drawn by OpenGL in it, without a screen."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.deploy.engine import require_engine, run
+
+pytestmark = [pytest.mark.container, pytest.mark.timeout(900)]
+
+DRAWS = "from common.sim.mujoco.gl import chosen_gl, gl_context; print(chosen_gl()); gl_context('egl', 64, 48).free()"
+
+
+def test_pictures_are_drawn_by_opengl_in_the_image_with_physics() -> None:
+    require_engine()
+    image = "zencell-test-physics"
+    run("docker", "build", "-q", "--target", "physics", "-t", image, ".", timeout=800)
+    assert run("docker", "run", "--rm", image, "python", "-c", DRAWS, timeout=120).split() == ["egl"]
