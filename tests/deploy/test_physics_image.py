@@ -1,4 +1,4 @@
-"""The image's target `physics`, for cells with `simulator: mujoco`: pictures are drawn by OpenGL in it, without a screen."""
+"""The target `physics` of the image, for cells with `simulator: mujoco`: OpenGL draws pictures without a screen."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Which OpenGL draws pictures without a screen, and the one thread that may do so.
 
 MuJoCo's own choice, which it makes when it is imported, is for a screen: here the two that need none are looked for.
-Both are libraries of the system; with Debian's libegl1, libgl1-mesa-dri and libopengl0 EGL draws without a graphics card, too.
+Both are libraries of the system; with Debian's libegl1, libgl1-mesa-dri and libopengl0 EGL needs no graphics card.
 """
 
 from __future__ import annotations
