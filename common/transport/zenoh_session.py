@@ -15,6 +15,7 @@ from common.transport.credentials import Credentials
 from common.transport.endpoint import LARGE_BYTES, client_config, near_of
 from common.transport.outbox import Outbox
 from common.transport.session import Declared, OnQuery, OnReply, OnSample, OnToken, RawReply, RawSample
+from common.transport.tokens import MOST_NAMES
 
 log = logging.getLogger(__name__)
 
@@ -231,7 +232,10 @@ class ZenohSession:
         def tell(sample: zenoh.Sample) -> None:
             token, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
             with self._lock:
-                (watcher.told.add if there else watcher.told.discard)(token)
+                if not there:
+                    watcher.told.discard(token)
+                elif len(watcher.told) < MOST_NAMES:  # however many somebody declares, a question looks at few
+                    watcher.told.add(token)
             on_token(token, there)
 
         with self._lock:
