@@ -122,6 +122,13 @@ class GripperConfig(Section):
                 raise ValueError(f"named width {name} is {width:g} m, more than max_width {self.max_width:g} m")
         return self
 
+    def least_time(self, distance: float) -> float:
+        """Fingers at rest need at least so long [s] to come closer or further apart by a distance [m] of the width."""
+        way, ramp = max(distance, 0.0), self.speed**2 / (2 * self.acceleration)
+        ramped = math.sqrt(2 * way / self.acceleration)
+        by_speed = self.speed / self.acceleration + (way - ramp) / self.speed if way > ramp else ramped
+        return max(by_speed, math.cbrt(6 * way / self.jerk))
+
     @property
     def finger_inner(self) -> float:
         """From the tool centre point to the inner face of an open finger [m]."""

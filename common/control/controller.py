@@ -255,6 +255,37 @@ class TrajectoryController:
         """Whether a goal was heard of."""
         return self._memory.get(goal) is not None
 
+    @property
+    def end(self) -> Vector | None:
+        """Where the goal that is followed ends (dof,) [rad]; None without one."""
+        goal = self._goal
+        return None if goal is None else goal.positions_at(np.array([goal.duration]))[0]
+
+    def arrives_in(self, goal: str) -> float:
+        """Until the arm is at the end of a goal, as far as is known now [s]; infinite when it may never be.
+
+        One that comes to its speed yet is there sooner.
+        """
+        running = self._goal
+        if running is None or running.id != goal:
+            return 0.0 if self.succeeded(goal) else math.inf
+        if running.stopping or self._holds:
+            return math.inf
+        if running.time >= running.duration:
+            return 0.0
+        rate = min(running.pace.rate, self.speed_scaling * running.share)
+        return (running.duration - running.time) / rate + self.delay if rate > 0.0 else math.inf
+
+    def fails(self, goal: str) -> bool:
+        """Whether the arm is not brought to the end of a goal any more."""
+        if self._goal is not None and self._goal.id == goal:
+            return self._goal.stopping
+        return not self.succeeded(goal)
+
+    def succeeded(self, goal: str) -> bool:
+        """Whether the newest goal is that one, and the arm was brought to its end."""
+        return self._status.id == goal and self._status.state == "succeeded"
+
     def _holding(self, goal: Goal) -> str:
         """What there is to say of a goal about being held."""
         if not self._holds:

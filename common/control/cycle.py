@@ -20,6 +20,7 @@ from common.control.inhibits import Inhibits
 from common.control.jogging import Jogging, ToolKinematics
 from common.control.payload import Payload
 from common.control.readings import read_fingers, read_joints
+from common.control.waiting_fingers import WaitingFingers
 from common.errors import ConfigError, Refused
 from common.hardware.interface import (
     ControlledArm,
@@ -31,6 +32,7 @@ from common.hardware.interface import (
     Vector,
 )
 from common.messages import (
+    CLOSED_BEFORE,
     ExecuteRequest,
     GripperCommand,
     GripperState,
@@ -98,6 +100,7 @@ class ControlCycle:
         self._felt = world if isinstance(world, FeltWorld) else None
         self._arm = TrajectoryController(limits, start, tolerances, name=controller, period=period)
         self._gripper: GripperController | None = None
+        self._waiting = WaitingFingers(self._arm, kinematics)
         self._fingers = gripper
         self._obstructible: SimulatedGripper | None = None
         if gripper is not None:
@@ -147,6 +150,8 @@ class ControlCycle:
                 self._arm_fault.failed(str(fault), now)
                 self._arm.fault(str(fault))
                 self.authority.interrupt_jogging()
+        if self._gripper is not None:
+            self._meet(self._gripper, now)
         if self._own is not None:
             self._inhibits.arm_stopped = self._own.stopped
         report.robot = self._news_of_robot(header)
@@ -194,6 +199,21 @@ class ControlCycle:
             asked("sending set-points", self._hardware.write, *set_points, now)
             self._arm_fault.works(now)
         return self._joint_state(header, dq)
+
+    def _meet(self, gripper: GripperController, now: float) -> None:
+        """Have fingers that wait for the arm begin; one that they closed ahead of is not brought on."""
+        waiting = self._waiting.command
+        if waiting is not None and self._waiting.begins(now, self._q):
+            try:
+                gripper.begin(waiting, now)
+            except HardwareFault as fault:
+                self._hand_fault.failed(str(fault), now)
+                self._arm.abort("hardware_fault", str(fault), "hardware")
+                gripper.call_off(waiting, str(fault))
+        if self._waiting.closed_before(now):
+            self._arm.abort(CLOSED_BEFORE, "held up or slowed as the fingers began to close")
+        if off := self._waiting.called_off():
+            gripper.call_off(*off)
 
     def standing(self) -> Standing | None:
         """What simulated hardware would be found like after a restart, if it has changed since the last call."""
@@ -312,11 +332,20 @@ class ControlCycle:
             raise Refused("no_gripper", "this robot has no gripper")
         objection = (self.authority.inhibited(request, request.id) or late
                      or self.authority.others(request.owner) or self._hand_fault.objection)
+        waits = bool(request.after) and request.after == self._arm.goal
+        if request.after and not waits and self._arm.fails(request.after):
+            objection = objection or Refused("unknown_goal", f"goal {request.after!r} is not followed now")
         try:
             known = self._gripper.knows(request.id)
-            state = self._gripper.command(request, now, objection)
+            state = self._gripper.command(request, now, objection, waits)
             if not known:
                 self.authority.refused(request, state)
+            if not known and state.state == "active":
+                if self._waiting.command is not None:
+                    self._gripper.call_off(self._waiting.command, f"replaced by {request.id!r}")
+                    self._waiting.command = None
+                if waits:
+                    self._waiting.wait(request)
             if objection is None:
                 self.authority.use(request.owner)
             return state

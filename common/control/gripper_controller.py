@@ -6,6 +6,7 @@ A grasp is judged by the width that is held, and what is held is watched until t
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from common.config import GripperConfig
 from common.control.faults import asked
@@ -36,13 +37,16 @@ class GripperController:
         self._effort = config.effort
         self.state = GripperState(source=config.controller)
 
-    def command(self, request: GripperCommand, now: float, objection: Refused | None = None) -> GripperState:
+    def command(
+        self, request: GripperCommand, now: float, objection: Refused | None = None, waits: bool = False,
+    ) -> GripperState:
         """The state of the goal: active, or rejected with the reason; for a known id what became of it.
 
         Args:
             request: for the fingers.
             now: cell time [s].
             objection: what speaks against a new goal from the start.
+            waits: whether the fingers go on with what they do until `begin` or `call_off`.
 
         Raises:
             HardwareFault: the fingers do not work.
@@ -50,7 +54,7 @@ class GripperController:
         known = self._memory.get(request.id)
         if known is not None:
             return known
-        reading = self.state.model_dump(include={"width", "position", "effort", "holding", "moving", "source"})
+        reading = self._reading
         message, code = "", ""
         if objection is not None:
             message, code = str(objection), objection.code
@@ -65,13 +69,38 @@ class GripperController:
             rejected = GripperState.model_validate(
                 {**reading, "id": request.id, "state": "rejected", "error": code, "message": message})
             return self._memory.put(request.id, rejected, refused=True)
+        if waits:
+            waiting = {**reading, "id": request.id, "state": "active", "message": f"waits for goal {request.after!r}"}
+            return self._memory.put(request.id, GripperState.model_validate(waiting))
+        return self.begin(request, now)
+
+    def begin(self, request: GripperCommand, now: float) -> GripperState:
+        """The state of a goal that nothing speaks against, at a time [s].
+
+        Raises:
+            HardwareFault: the fingers do not work.
+        """
         self._tell(request.width, now, request.effort)
         if self.state.state == "active":
             replaced = {"state": "cancelled", "message": f"replaced by {request.id!r}"}
             self._memory.put(self.state.id, self.state.model_copy(update=replaced))
         self._asked = request
-        self.state = GripperState.model_validate({**reading, "moving": True, "id": request.id, "state": "active"})
+        begun = {**self._reading, "moving": True, "id": request.id, "state": "active"}
+        self.state = GripperState.model_validate(begun)
         return self._memory.put(request.id, self.state)
+
+    def call_off(self, request: GripperCommand, why: str) -> None:
+        """Have a goal that waits be cancelled; the fingers go on with what they do."""
+        off = {"id": request.id, "state": "cancelled", "error": "", "message": why}
+        if self.state.state == "active":
+            self._memory.put(request.id, self.state.model_copy(update=off))
+        else:
+            self.state = self._memory.put(request.id, self.state.model_copy(update=off))
+
+    @property
+    def _reading(self) -> dict[str, Any]:
+        """What was read of the fingers."""
+        return self.state.model_dump(include={"width", "position", "effort", "holding", "moving", "source"})
 
     def knows(self, goal: str) -> bool:
         """Whether a goal was heard of."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from common.messages.basics import SCHEMA_VERSION, Finite, Fraction, Header, Message, Name, Positive
 from common.messages.camera import CameraInfo, Image, Marker, MarkerArray, PointCloud2, Rejection, Rejections
 from common.messages.execution import (
+    CLOSED_BEFORE,
     ExecuteRequest,
     FollowedRequest,
     GoalState,

@@ -34,6 +34,7 @@ JogFrame = Literal["base", "tool", "world"]
 Who = Label
 Since = Annotated[int, Field(ge=0, le=MOST_STAMP)]
 MOST_INHIBITS = 32  # that are told of
+CLOSED_BEFORE = "closed_before"  # error of a motion for whose end the fingers began to close, and that was held up
 NOT_KEPT = "not kept on disk"  # begins the reason of an inhibit that would not outlive its process
 
 
@@ -168,10 +169,15 @@ class GripperCommand(Message):
 
     With `expected_width` it is a grasp, which fails where what is held is wider or narrower, or nothing is. The header
     says when it was decided: a command that comes too late is refused; one without a stamp never is.
+
+    With `after` the fingers wait for the arm, by the arm's own time: they begin `lead` before it is there, though no
+    farther away than `within`, and not at all where it does not arrive. An arm that is held, slowed or held up once
+    they have begun to close does not go on with what they may have closed about.
     """
 
     most_bytes: ClassVar[int] = SMALL
-    later: ClassVar[tuple[str, ...]] = ("expected_width", "width_tolerance", "owner", "mass", "heard")
+    later: ClassVar[tuple[str, ...]] = (
+        "expected_width", "width_tolerance", "owner", "mass", "heard", "after", "lead", "within")
 
     header: Header = Header()
     id: Name
@@ -184,6 +190,9 @@ class GripperCommand(Message):
     )
     width_tolerance: Annotated[float, Field(gt=0, le=0.2, description="of expected_width [m]")] = 0.005
     mass: Annotated[float, Field(ge=0, le=1000)] = Field(0.0, description="of what is to be held [kg]; 0: not known")
+    after: Label = Field("", description="id of the arm's goal that the fingers wait for; empty: for none")
+    lead: Annotated[float, Field(ge=0, le=10)] = Field(0.0, description="before the end of that [s]")
+    within: Annotated[float, Field(ge=0, le=1)] = Field(0.005, description="of where the tool is then [m]")
 
 
 class GripperState(Message):

@@ -79,6 +79,7 @@ class Deciding(Generic[V]):
         self.row: deque[Stage] = deque()
         self.running: Execution | None = None
         self._opening: Execution | None = None  # what was let go is free of the fingers, which open on
+        self._early: Execution | None = None  # of the fingers, which wait for the motion that runs to be nearly over
         self.patience = Patience()
         self.look_after = 0.0  # only a picture that is later decides [s]
         self._frames = FrameAge(speed)
@@ -155,6 +156,7 @@ class Deciding(Generic[V]):
 
     def fail(self, message: str, view: V, *, go_home: bool = True) -> None:
         """Count a failure, throw the row away and, where it helps, go home to look again."""
+        go_home = go_home and self._early is None  # what the fingers began ends first
         self.clear()
         self.look_after = view.now
         self.status.message = message
@@ -214,6 +216,11 @@ class Deciding(Generic[V]):
         return MOVED
 
     # --- what helps to decide --------------------------------------------------------------------------------
+
+    @property
+    def under_way(self) -> list[Stage]:
+        """What arm and fingers do: of fingers that begin before the arm stands the status tells once it does."""
+        return [one.stage for one in (self.running, self._early) if one is not None and one.begun]
 
     @property
     def gripper(self) -> GripperConfig:

@@ -25,6 +25,9 @@ BLOCKED_BY = "scene_monitor"  # holds the arm while something is in the way
 NO_ARM = "the arm cannot be moved: "
 FOUND_HELD = "the robot was found held; resume or start to go on"
 FINGERS_OFF = 0.003  # [m] by which fingers may stand elsewhere than a motion was planned with
+LOOSE = 0.5e-3  # [m] by which fingers must have opened before they hold nothing any more
+AHEAD = 1.0  # [s] before the end of a motion fingers are asked to wait for it: until then the row may change
+CLOSE_WITHIN = 0.05  # [m] of it they may begin to close: they touch nothing before it
 OPENED_BY = 0.5  # of a motion that began while the fingers opened: then they have
 MOST_FIGURES = 200  # plans that a status tells of: a cell may run for days
 
@@ -89,9 +92,17 @@ class Task(Deciding[V]):
 
     def on_goal(self, answer: Report, view: V) -> None:
         """Take in the answer to execute or to a gripper command: accepted, or refused with a reason."""
-        if self.running is None or self.running.command.id != answer.id or self.running.accept(answer):
+        begun = next((one for one in (self.running, self._early) if one and one.command.id == answer.id), None)
+        if begun is None or begun.accept(answer):
             return
-        stage, self.running = self.running.stage, None
+        stage = begun.stage
+        if begun is self._early:  # then not before the arm is there
+            assert isinstance(stage, Grip)
+            self._early, stage.early = None, False
+            if self.running is not None:
+                self.row.appendleft(stage)
+            return
+        self.running = None
         # What somebody else asked for, or that it came too late, is no failure: it is decided anew.
         if answer.error in ANEW:
             self._decide_anew(f"{stage.name} has to wait: {answer.message}", view)
@@ -120,6 +131,8 @@ class Task(Deciding[V]):
         self._tell_stopped(view.motion.stopped)
         if self._began is None and status.started:
             self._began = view.now
+        if self._early is not None and view.gripper.id == self._early.command.id:
+            self._early.begun = self._early.begun or view.gripper.state != "cancelled"
         commands = self._watch(view)
         self._stopping = self._stopping and view.motion.state == "active"
         if view.motion.fault and not commands and self.running is None:
@@ -135,7 +148,7 @@ class Task(Deciding[V]):
             self.look_after = view.now
         if self.running is not None:
             self.decide_ahead(self.running.stage, view)
-        elif not self.row and not (view.motion.state == "active" or view.gripper.moving):
+        elif not (self.row or self._early or view.motion.state == "active" or view.gripper.moving):
             self.decide(view)  # not before what a task before this one began has ended
         if status.state not in ("DONE", "ERROR"):
             status.task_seconds = view.now - (self._began or view.now)
@@ -157,6 +170,7 @@ class Task(Deciding[V]):
     def _watch(self, view: V) -> list[Command]:
         """Follow the stage that runs: its end, its failure, and what falls out of the hand."""
         if self.running is None:
+            self._watch_early(view)
             return self._watch_opening(view)
         assert view.motion is not None and view.gripper is not None
         running, stage = self.running, self.running.stage
@@ -173,8 +187,10 @@ class Task(Deciding[V]):
             self._ended(stage, running.report(view.motion, view.gripper), view)
         elif outcome == "forgotten":
             self.running = None
+            if self._early is not None and isinstance(self._early.stage, Grip):  # where it is let go nobody knows
+                self._early = replace(self._early, stage=replace(self._early.stage, holds=None))
             self.forgotten(stage, view)
-        elif running.moves_arm and stage.carries and not view.holding:
+        elif running.moves_arm and stage.carries and not view.holding and not (self._early and self._early.begun):
             stop = self.stop(view, "what it held fell")
             slipped = f": {view.gripper.message}" if view.gripper.outcome == "slipping" else ""
             self.fail(f"what the hand held fell during {stage.name}{slipped}", view, go_home=False)
@@ -194,6 +210,23 @@ class Task(Deciding[V]):
         elif stage.carries and view.gripper.outcome == "slipping":  # it may still arrive
             self.status.message = f"{stage.name}: {view.gripper.message}"
         return self._watch_opening(view)
+
+    def _watch_early(self, view: V) -> None:
+        """Follow fingers whose arm did not arrive: what they let go is, and what they hold is decided about anew."""
+        if (early := self._early) is None:
+            return
+        assert view.motion is not None and view.gripper is not None
+        early.count(view.now, view.motion)
+        if view.motion.state == "active":  # it comes to rest
+            return
+        early.wait_no_more(view.motion, view.gripper)
+        outcome = early.outcome(view.motion, view.gripper)
+        if outcome == "running" and early.spent <= self.time_limit(early.stage):
+            return
+        self._early, self.look_after = None, view.now
+        done = early.report(view.motion, view.gripper).state == "succeeded" and not view.holding
+        if outcome == "ended" and done and isinstance(early.stage, Grip) and early.stage.holds is False:
+            self.succeeded(early.stage, view)
 
     def _watch_opening(self, view: V) -> list[Command]:
         """Follow fingers that open while the arm leaves already; one that they would not let through is stopped."""
@@ -250,7 +283,7 @@ class Task(Deciding[V]):
         elif isinstance(stage, Grip) and holds and isinstance(reported, m.GripperState) and reported.outcome in MISSES:
             stage.problem = reported.message
             self.missed(stage, view)
-        elif reported.error == "hardware_fault" and isinstance(stage, Move):  # the motion is not to blame
+        elif reported.error in ("hardware_fault", m.CLOSED_BEFORE) and isinstance(stage, Move):  # it is not to blame
             self._decide_anew(f"{stage.name} {reported.state}: {reported.message}", view)
         elif reported.state != "succeeded":
             self.fail(f"{stage.name} {reported.state}: {reported.message}", view)
@@ -260,6 +293,11 @@ class Task(Deciding[V]):
             self.fail("the fingers opened and still hold something", view)
         else:
             self.succeeded(stage, view)
+            if self._early is not None and view.motion is not None and view.gripper is not None:
+                self.running, self._early = self._early, None
+                self.running.wait_no_more(view.motion, view.gripper)
+                self.running.counted, self.running.begun = view.now, True
+                self._tell_stage(self.running.stage)
 
     # --- planning and doing ----------------------------------------------------------------------------------
 
@@ -270,8 +308,9 @@ class Task(Deciding[V]):
         running = self.running.stage if self.running else None
         end = running.end() if isinstance(running, Move) else []
         width = self._width(view)
-        if width is not None and isinstance(running, Grip):
-            width = running.width_after(width)
+        for grip in (running, self._early.stage if self._early else None):
+            if width is not None and isinstance(grip, Grip):
+                width = grip.width_after(width)
         for move in self.row:
             if width is not None and isinstance(move, Grip):
                 width = move.width_after(width)
@@ -289,7 +328,9 @@ class Task(Deciding[V]):
 
     def _advance(self, view: V) -> Iterator[Command]:
         """Begin the next stage when the one before it has ended and its motion is planned and still right."""
-        if self.running is not None or not self.row:
+        if self.running is not None:
+            yield from self._begin_early(self.running, view)
+        if self.running is not None or self._early is not None or not self.row:
             return
         stage = self.row[0]
         if stage.carries and not view.holding:
@@ -307,6 +348,30 @@ class Task(Deciding[V]):
             yield from self._plan_ahead(view)
             return
         yield self._begin(stage, view)
+
+    def _begin_early(self, running: Execution, view: V) -> Iterator[Command]:
+        """Have the fingers begin before the arm stands: until then they touch nothing, or let nothing go."""
+        stage, arm = (self.row[0] if self.row else None), running.stage
+        if not (isinstance(stage, Grip) and stage.early and isinstance(arm, Move)) or self._opening or self._early:
+            return
+        assert view.motion is not None and view.gripper is not None
+        motion = view.motion
+        if motion.id != running.command.id or motion.state != "active":
+            return
+        left = (1.0 - motion.progress) * arm.seconds
+        if left <= AHEAD * motion.speed_scaling and stage.carries == view.holding and self.may_begin(stage, view):
+            self.row.popleft()
+            self._early = self._execution(stage, view)
+            self._early.begun = False
+            command = self._early.command
+            assert isinstance(command, m.GripperCommand)
+            command.after = running.command.id
+            if stage.holds:
+                way = 0.0 if stage.expected_width is None else view.gripper.width - stage.expected_width
+                command.lead, command.within = self.gripper.least_time(way), CLOSE_WITHIN
+            else:
+                command.lead = self.gripper.least_time(LOOSE)
+            yield command
 
     def _width(self, view: V) -> float | None:
         """Between the fingers now, or soon where they are opening [m]; None without any."""
@@ -327,6 +392,15 @@ class Task(Deciding[V]):
 
     def _begin(self, stage: Stage, view: V) -> Command:
         self.row.popleft()
+        self.running = self._execution(stage, view)
+        self._tell_stage(stage)
+        return self.running.command
+
+    def _tell_stage(self, stage: Stage) -> None:
+        self.status.state, self.status.stage = stage.state, stage.name
+        self.status.subject = stage.cycle.subject if stage.cycle else ""
+
+    def _execution(self, stage: Stage, view: V) -> Execution:
         command: m.ExecuteRequest | m.GripperCommand
         if isinstance(stage, Move):
             assert stage.trajectory is not None
@@ -339,15 +413,13 @@ class Task(Deciding[V]):
                 command.expected_width, command.width_tolerance = stage.expected_width, stage.width_tolerance
         if stage.cycle is not None:
             stage.cycle.begun = True
-        self.running = Execution(stage, command, view.now)
+        begun = Execution(stage, command, view.now)
         assert view.motion is not None and view.gripper is not None
         if isinstance(stage, Grip):
             self._opening = None  # it replaces that
-            self.running.held = view.gripper.width if view.holding else None
-        self.running.before = self.running.report(view.motion, view.gripper).id
-        self.status.state, self.status.stage = stage.state, stage.name
-        self.status.subject = stage.cycle.subject if stage.cycle else ""
-        return command
+            begun.held = view.gripper.width if view.holding else None
+        begun.before = begun.report(view.motion, view.gripper).id
+        return begun
 
     def _is_planned(self, move: Move) -> bool:
         whole = [s for s in self.row if isinstance(s, Move) and s.cycle is move.cycle] if move.whole else [move]

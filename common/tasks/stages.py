@@ -79,6 +79,7 @@ class Grip(Stage):
     holds: bool | None = field(default=None, kw_only=True)
     expected_width: float | None = field(default=None, kw_only=True)  # [m]
     width_tolerance: float = field(default=0.01, kw_only=True)  # of expected_width [m]
+    early: bool = field(default=False, kw_only=True)  # begins by the time that the motion before it comes to rest
     effort: float = field(default=0.0, kw_only=True)  # [N]; 0: the gripper's own default
     mass: float = field(default=0.0, kw_only=True)  # of what is held then [kg]; 0: not known
     problem: str = field(default="the fingers closed on nothing", init=False)
@@ -111,7 +112,8 @@ class Execution:
     before: str = ""  # id of the goal that its controller told of then
     moving: float = 0.0  # in motion so far
     spent: float = 0.0  # as if the motion were at full speed: what time-outs go by
-    accepted: int | None = None  # stamp of the answer that accepted it
+    accepted: int | None = None  # stamp of the answer that accepted it; an older report knows nothing of it
+    begun: bool = True  # else it waits for the arm
     held: float | None = None  # between the fingers as it began, where they held something [m]
     over: Report | None = None  # the answer, when it told of the end already: it was asked for more than once
 
@@ -131,10 +133,16 @@ class Execution:
     def accept(self, answer: Report) -> bool:
         """Take in the answer to the command: whether it was accepted."""
         if answer.state != "rejected":
-            self.accepted = answer.header.stamp
+            self.accepted = max(self.accepted or 0, answer.header.stamp)
         if answer.state in OVER:
             self.over = answer
         return answer.state != "rejected"
+
+    def wait_no_more(self, motion: m.MotionStatus, gripper: m.GripperState) -> None:
+        """Fingers that waited for the arm began, or never will, by the time that its end was told of."""
+        if self.accepted is not None:
+            self.accepted = max(self.accepted, motion.header.stamp)
+        self.begun = self.begun or (gripper.id == self.command.id and gripper.state != "cancelled")
 
     def outcome(self, motion: m.MotionStatus, gripper: m.GripperState) -> Literal["running", "ended", "forgotten"]:
         """What the controllers say of it; forgotten once they accepted it and tell of another goal."""

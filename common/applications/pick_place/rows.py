@@ -78,7 +78,7 @@ class Rows:
 
     def _close(self, cycle: Pick, yaw: float) -> Grip:
         cup = self.gripper.cup is not None
-        return Grip("close", "GRASPING", cycle, width=0.0, holds=True, effort=cycle.target.grip_effort,
+        return Grip("close", "GRASPING", cycle, width=0.0, holds=True, early=not cup, effort=cycle.target.grip_effort,
                     expected_width=self.gripper.held_width if cup else cycle.target.width(yaw),
                     width_tolerance=self.p.width_tolerance, mass=cycle.target.mass)
 
@@ -110,7 +110,8 @@ class Rows:
         return above
 
     def _release(self, cycle: Pick) -> Grip:
-        return Grip("release", "PLACING", cycle, width=self.gripper.max_width, carries=True, holds=False)
+        return Grip("release", "PLACING", cycle, width=self.gripper.max_width, carries=True, holds=False,
+                    early=self.gripper.cup is None)
 
     def open(self) -> Grip:
         """Fingers apart."""

@@ -150,12 +150,13 @@ class PickPlace(Task[PickPlaceView]):
         # tell of it only later, when it was started again as well. A ball that is let go counts when it is: until then
         # it may hang over others, and a picture of it shows one more.
         contained = self._counted(view)
-        if status.stage == "release":
+        stages = {status.stage, *(stage.name for stage in self.under_way)}
+        if "release" in stages:
             self._contained.reset()
         elif self._contained.lasts(contained, view.scene_stamp) >= min(CONTAINED_FOR, self.p.empty):
             status.done = max(status.done, contained)
         looked = not self._around.on_hand or min(view.stamps) > self.look_after
-        if status.stage not in ("close", "lift", "across", "release") and looked:
+        if looked and not view.holding and not stages & {"close", "lift", "across", "release"}:
             status.total = status.done + len(view.targets)
 
     def _counted(self, view: PickPlaceView) -> int:

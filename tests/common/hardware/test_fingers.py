@@ -81,3 +81,14 @@ def test_fingers_told_to_be_where_they_are_do_not_move() -> None:
     fingers = Fingers(CONFIG, 0.08)
     fingers.command(0.08, 0.0)
     assert not fingers.read(0.0).moving
+
+
+@given(WIDTHS, WIDTHS)
+def test_fingers_are_never_faster_than_their_least_time(start: float, end: float) -> None:
+    fingers, least = Fingers(CONFIG, start), CONFIG.least_time(abs(end - start))
+    fingers.command(end, 0.0)
+    for share in (0.25, 0.5, 0.75):
+        moved = abs(fingers.read(CONFIG.least_time(share * abs(end - start))).width - start)
+        assert moved <= share * abs(end - start) + 1e-9
+    assert abs(fingers.read(least).width - start) <= abs(end - start) + 1e-9
+    assert abs(fingers.read(least + 0.2).width - end) < 1e-9, "and not much slower"

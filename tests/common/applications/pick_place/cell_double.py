@@ -12,6 +12,7 @@ from common.applications.pick_place.task import PickPlace
 from common.config import Surroundings, load_cell
 
 CELL = load_cell("panda")
+MOTION, FINGERS, LEAD = 0.45, 0.25, 0.1  # [s] that each takes, and by which those begin before the arm stands
 
 
 class CellDouble:
@@ -41,6 +42,8 @@ class CellDouble:
         self._stamp = self.now
         self._arrival = 0.0
         self._ends: list[m.ExecuteRequest] = []
+        self._waiting: m.GripperCommand | None = None  # for the arm
+        self._fingers: tuple[m.GripperCommand, float] | None = None  # what they were told, and when they have done it
         self._goals: dict[str, m.Pose] = {}
 
     def view(self) -> PickPlaceView:
@@ -78,10 +81,19 @@ class CellDouble:
     def step(self) -> list[m.Message]:
         """One step of the task; every request is answered before the next."""
         self.now += 0.1
+        if self._waiting is not None and self.motion.state != "active":
+            self.gripper = self.gripper.model_copy(update={
+                "header": m.Header(stamp=int(self.now * 1e9)), "id": self._waiting.id, "state": "cancelled"})
+            self._waiting = None
         if self.motion.held:
             self._arrival += 0.1
+        elif self._waiting is not None and self.now >= self._arrival - LEAD:
+            self._let_begin(self._waiting)
         elif self._ends and self.now >= self._arrival:
             self._arrive(self._ends.pop())
+        if self._fingers is not None and self.now >= self._fingers[1]:
+            done, self._fingers = self._fingers[0], None
+            self._grip(done)
         asked: list[m.Message] = list(self.task.step(self.view()))
         for request in asked:
             self.answer(request)
@@ -99,7 +111,8 @@ class CellDouble:
                 goal = goal.goals[0]
             if isinstance(goal, m.PoseGoal):
                 self._goals[request.id] = goal.pose
-            point = m.JointTrajectoryPoint(time_from_start=0, positions=[0.0], velocities=[0.0], accelerations=[0.0])
+            point = m.JointTrajectoryPoint(
+                time_from_start=MOTION, positions=[0.0], velocities=[0.0], accelerations=[0.0])
             trajectory = m.JointTrajectory(header=m.Header(frame_id=request.id), joint_names=["j"], points=[point])
             self.task.on_plan(m.PlanResponse(id=request.id, ok=not error, trajectory=None if error else trajectory,
                                              error=error, message=error and f"{request.stage}: {error}",
@@ -112,9 +125,15 @@ class CellDouble:
             self.motion = m.MotionStatus(header=header, id=request.id, state="active", held=self.motion.held)
             self.task.on_goal(self.motion, self.view())
             self._ends.append(request)
-            self._arrival = self.now + 0.45
+            self._arrival = self.now + MOTION
         elif isinstance(request, m.GripperCommand):
-            self._grip(request, header)
+            if self._ends:
+                assert request.after == self._ends[-1].id
+                self._waiting = request
+                self.task.on_goal(m.GripperState(header=header, id=request.id, state="active"), self.view())
+            else:
+                self._grip(request)
+                self.task.on_goal(self.gripper, self.view())
         elif isinstance(request, m.StopRequest):
             if self.motion.state == "active":
                 self._ends.clear()
@@ -122,13 +141,22 @@ class CellDouble:
         elif isinstance(request, m.HoldRequest):
             self.motion = self.motion.model_copy(update={"header": header, "held": request.hold})
 
-    def _arrive(self, request: m.ExecuteRequest) -> None:
+    def _let_begin(self, request: m.GripperCommand) -> None:
+        self._waiting, self._fingers = None, (request, self.now + FINGERS)
+        self._go_to_end(self._ends[-1])
+        self.gripper = self.gripper.model_copy(update={
+            "header": m.Header(stamp=int(self.now * 1e9)), "id": request.id, "state": "active", "moving": True})
+
+    def _go_to_end(self, request: m.ExecuteRequest) -> None:
         pose = self._goals.get(request.trajectory.header.frame_id)
         if pose is not None:
             self.tcp = (pose.position.x, pose.position.y, pose.position.z)
+
+    def _arrive(self, request: m.ExecuteRequest) -> None:
+        self._go_to_end(request)
         self.motion = m.MotionStatus(header=m.Header(stamp=int(self.now * 1e9)), id=request.id, state="succeeded")
 
-    def _grip(self, request: m.GripperCommand, header: m.Header) -> None:
+    def _grip(self, request: m.GripperCommand) -> None:
         if request.width > 0.06 and self.held:
             self._fall()
         elif request.width < 0.06 and not self.slips:
@@ -138,13 +166,13 @@ class CellDouble:
             self.balls.pop(self.held, None)
         elif request.width < 0.06:
             self.slips -= 1
-        self.gripper = m.GripperState(header=header, id=request.id, state="succeeded", holding=bool(self.held),
-                                      width=0.06 if self.held else request.width)
+        self.gripper = m.GripperState(
+            header=m.Header(stamp=int(self.now * 1e9)), id=request.id, state="succeeded", holding=bool(self.held),
+            width=0.06 if self.held else request.width)
         if self.held and self.odd and request.width < 0.06:
             self.odd -= 1
             self.gripper = self.gripper.model_copy(update={
                 "state": "aborted", "outcome": "too_wide", "width": 0.075, "message": "the fingers closed on a brick"})
-        self.task.on_goal(self.gripper, self.view())
 
     def _fall(self) -> None:
         if max(abs(self.tcp[0] - 0.55), abs(self.tcp[1] - 0.25)) < 0.07:  # between its walls

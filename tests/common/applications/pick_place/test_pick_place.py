@@ -461,18 +461,61 @@ def test_ball_that_hangs_over_the_container_while_it_is_let_go_counts_once() -> 
     cell = CellDouble([(0.40, -0.30)])
     cell.until("across")
     asked: list[m.GripperCommand] = []
-    cell._grip = lambda request, header: asked.append(request)
+    cell._grip = asked.append
     cell.until("release")
     cell.contained = 2  # one above the other, as a picture shows it while the fingers open
     for _ in range(20):
         cell.step()
     del cell._grip
-    cell._grip(asked[-1], m.Header(stamp=int(cell.now * 1e9)))
+    cell._grip(asked[-1])
     cell.contained = 2  # as the picture before still says
     cell.step()
     cell.contained = 1
     cell.until("DONE")
     assert (cell.task.status.placed, cell.task.status.targets) == (1, 1)
+
+
+def until_fingers_open(cell: CellDouble) -> None:
+    """Until they have been told to above the container, and the arm has not arrived."""
+    cell.until("across")
+    until_fingers_move(cell)
+    assert cell.task.status.stage == "across"
+
+
+def until_fingers_move(cell: CellDouble) -> None:
+    """Before the arm stands."""
+    for _ in range(10):
+        cell.step()
+        if cell._fingers is not None:
+            return
+    raise AssertionError("they did not begin")
+
+
+def test_ball_that_was_let_go_a_moment_before_a_pause_counts_once() -> None:
+    cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
+    until_fingers_open(cell)
+    cell.tell("pause")
+    for _ in range(20):
+        cell.step()
+        assert cell.task.status.targets == 2
+    assert cell.contained == 1 and cell.task.status.stage == "across"
+    cell.tell("resume")
+    cell.until("DONE")
+    assert (cell.contained, cell.task.status.placed, cell.task.status.targets) == (2, 2, 2)
+
+
+def test_ball_that_was_let_go_a_moment_before_a_stop_counts_though_it_hides_another() -> None:
+    cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
+    cell.until("release")
+    cell.until("pre-grasp")
+    until_fingers_open(cell)
+    cell.tell("stop")
+    for _ in range(20):
+        cell.step()
+        cell.contained = min(cell.contained, 1)  # the other one is not seen any more
+    cell.tell("start")
+    cell.until("DONE")
+    assert (cell.task.status.placed, cell.task.status.targets) == (2, 2)
 
 
 def test_restart_waits_for_what_the_task_before_it_had_begun() -> None:
@@ -609,3 +652,15 @@ def test_ball_that_is_said_to_lie_farther_away_than_a_motion_can_be_asked_for_is
     cell.balls["far"] = place
     cell.until("DONE")
     assert cell.contained == 1
+
+
+def test_ball_that_was_taken_a_moment_before_a_pause_is_one_of_those_to_be_placed() -> None:
+    cell = CellDouble([(0.40, -0.30), (0.52, -0.30)])
+    cell.until("pre-grasp")
+    until_fingers_move(cell)
+    assert cell.task.status.stage == "pre-grasp"
+    cell.tell("pause")
+    for _ in range(20):
+        cell.step()
+        assert cell.task.status.targets == 2
+    assert cell.held and cell.task.status.stage == "pre-grasp"

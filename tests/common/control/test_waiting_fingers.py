@@ -1,0 +1,247 @@
+"""Fingers that wait for the arm begin by the arm's own time, and nowhere else than near the end of its motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common import messages as m
+from common.hardware.interface import HardwareFault, Limits
+from common.messages import GripperCommand, HoldRequest, StopRequest
+from tests.common.control.test_control_cycle import GRIPPER, Rig
+from tests.common.hardware.conftest import Make
+
+DOWN, AWAY = 0.4, 0.3  # [m] that the arm goes
+CLOSE = GRIPPER.least_time(0.08 - 0.06)  # [s] from open fingers to the ball
+OPEN = GRIPPER.least_time(0.5e-3)
+WITHIN = 0.005  # [m]
+
+
+class Hand(Rig):
+    """The hand above a ball, or with the ball in it and on its way somewhere else."""
+
+    def __init__(self, limits: Limits, trajectory: Make, holding: bool) -> None:
+        super().__init__(limits)
+        self.step()
+        if holding:
+            self.grip("close", 0.0)
+            self.run(1.0)
+            assert self.grippers[-1].holding
+            self.execute("go", trajectory([0, 0], [-AWAY, 0.0]))
+            self.begin = self.command("open", width=0.08, lead=OPEN, within=WITHIN)
+        else:
+            self.execute("up", trajectory([0, 0], [0, DOWN]))
+            self.run(3.0)
+            self.execute("go", trajectory([0, DOWN], [0, 0.0]))
+            self.begin = self.command("close", width=0.0, expected_width=0.06, lead=CLOSE, within=0.05)
+
+    def command(self, goal: str, after: str = "go", **more: float) -> m.GripperState:
+        return self.cycle.command(GripperCommand(id=goal, after=after, **more), self.now)
+
+    @property
+    def width(self) -> float:
+        return self.cycle._gripper.state.width
+
+    @property
+    def gripper(self) -> m.GripperState:
+        return self.cycle._gripper.state
+
+    @property
+    def motion(self) -> m.MotionStatus:
+        return self.cycle._arm.status
+
+    def until(self, told, most: float = 10.0) -> float:
+        """Step until that is so; how long it took [s]."""
+        began = self.now
+        while not told():
+            self.step()
+            assert self.now - began < most, (self.motion, self.gripper)
+        return self.now - began
+
+    @property
+    def height(self) -> float:
+        return float(self.cycle._q[1])
+
+
+@pytest.fixture(scope="session")
+def taking(limits: Limits, rest_to_rest: Make) -> Callable[[], Hand]:
+    return lambda: Hand(limits, rest_to_rest, holding=False)
+
+
+@pytest.fixture(scope="session")
+def carrying(limits: Limits, rest_to_rest: Make) -> Callable[[], Hand]:
+    return lambda: Hand(limits, rest_to_rest, holding=True)
+
+
+def test_fingers_touch_what_they_take_just_after_the_arm_stands(taking: Callable[[], Hand]) -> None:
+    hand = taking()
+    assert (hand.begin.state, hand.begin.id) == ("active", "close") and "go" in hand.begin.message
+    hand.until(lambda: hand.width < 0.079)
+    assert hand.motion.state == "active" and hand.gripper.id == "close"
+    hand.until(lambda: hand.motion.state == "succeeded")
+    assert not hand.gripper.holding, "before it stands they touch nothing"
+    waited = hand.until(lambda: hand.gripper.state == "succeeded")
+    assert waited <= 0.05 and hand.gripper.outcome == "grasped"
+
+
+def test_fingers_that_let_go_do_so_where_the_arm_comes_to_rest(carrying: Callable[[], Hand]) -> None:
+    hand = carrying()
+    hand.until(lambda: not hand.gripper.holding)
+    assert hand.motion.state == "active" and abs(hand.cycle._q[0] + AWAY) <= WITHIN
+    hand.run(1.0)
+    assert hand.motion.state == "succeeded" and hand.balls[-1].poses[0].position.x == pytest.approx(0.2, abs=WITHIN)
+
+
+def test_fingers_begin_no_farther_from_the_end_than_they_may(carrying: Callable[[], Hand]) -> None:
+    hand = carrying()
+    hand.command("wide", width=0.08, lead=10.0, within=0.002)
+    hand.until(lambda: hand.gripper.id == "wide")
+    assert 0 < abs(hand.cycle._q[0] + AWAY) <= 0.002
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_arm_that_is_slower_has_the_fingers_begin_later(taking: Callable[[], Hand], share: float) -> None:
+    hand = taking()
+    hand.cycle.speed_scaling = share
+    hand.until(lambda: hand.gripper.id == "close")
+    left = hand.until(lambda: hand.motion.state == "succeeded")
+    assert left == pytest.approx(CLOSE, abs=0.03)
+
+
+def test_held_arm_has_no_fingers_begin_and_goes_on_to_where_they_do(taking: Callable[[], Hand]) -> None:
+    hand = taking()
+    hand.until(lambda: hand.motion.progress > 0.5)
+    hand.cycle.authority.hold(HoldRequest(hold=True, by="person"), hand.now)
+    hand.run(5.0)
+    assert hand.width == 0.08 and hand.gripper.id != "close"
+    hand.cycle.authority.hold(HoldRequest(hold=False, by="person"), hand.now)
+    hand.until(lambda: hand.gripper.state == "succeeded" and hand.gripper.id == "close")
+    assert hand.gripper.outcome == "grasped" and hand.motion.state == "succeeded"
+
+
+@pytest.mark.parametrize("by", ["person", "requester"])
+def test_stop_calls_off_fingers_that_wait(taking: Callable[[], Hand], by: str) -> None:
+    hand = taking()
+    hand.until(lambda: hand.motion.progress > 0.3)
+    hand.cycle.authority.stop(StopRequest(id="" if by == "person" else "go", by=by), hand.now)
+    hand.run(5.0)
+    assert hand.width == 0.08 and hand.motion.state == "cancelled"
+    assert (hand.grippers[-1].id, hand.grippers[-1].state) == ("close", "cancelled")
+    assert hand.command("close", width=0.0).state == "cancelled", "asked for again it moves nothing"
+    hand.run(1.0)
+    assert hand.width == 0.08
+
+
+def test_fingers_that_wait_for_a_goal_that_is_not_followed_are_refused(taking: Callable[[], Hand]) -> None:
+    hand = taking()
+    refused = hand.command("other", after="nobody's", width=0.0)
+    assert (refused.state, refused.error) == ("rejected", "unknown_goal") and "nobody's" in refused.message
+    hand.until(lambda: hand.gripper.state == "succeeded" and hand.gripper.id == "close")
+
+
+def test_fingers_that_wait_for_an_arm_that_is_there_begin_at_once(taking: Callable[[], Hand]) -> None:
+    hand = taking()
+    hand.until(lambda: hand.motion.state == "succeeded" and hand.gripper.state == "succeeded")
+    assert hand.command("open", width=0.08).state == "active"
+    hand.run(0.5)
+    assert hand.gripper.id == "open" and hand.gripper.state == "succeeded"
+
+
+def test_newer_command_takes_the_place_of_one_that_waits(taking: Callable[[], Hand]) -> None:
+    hand = taking()
+    hand.command("half", after="", width=0.07)
+    hand.run(5.0)
+    assert hand.width == pytest.approx(0.07) and hand.gripper.id == "half"
+    assert hand.command("close", width=0.0).state == "cancelled"
+
+
+def test_what_the_fingers_do_is_judged_while_others_wait(carrying: Callable[[], Hand]) -> None:
+    hand = carrying()
+    assert hand.gripper.outcome == "grasped" and hand.gripper.id == "close"
+    hand.world.edit(m.WorldEdit(op="remove", id="ball_1"), hand.now)
+    hand.step()
+    hand.step()
+    assert hand.gripper.outcome == "slipping" and hand.gripper.id == "close"
+
+
+def test_fingers_that_do_not_work_when_they_are_to_begin_stop_the_arm(
+    taking: Callable[[], Hand], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    hand = taking()
+
+    def broken(*given: object) -> None:
+        raise HardwareFault("no answer from the hand")
+
+    monkeypatch.setattr(hand.hardware.gripper, "command", broken)
+    hand.until(lambda: hand.motion.state == "aborted")
+    assert hand.motion.error == "hardware_fault" and "no answer" in hand.motion.message
+    assert hand.command("close", width=0.0).state == "cancelled"
+
+
+@pytest.mark.parametrize("how", ["held", "slowed", "no processor"])
+def test_arm_does_not_go_on_down_with_fingers_that_closed_ahead_of_it(taking: Callable[[], Hand], how: str) -> None:
+    hand = taking()
+    hand.until(lambda: hand.gripper.id == "close")
+    if how == "held":
+        hand.cycle.authority.hold(HoldRequest(hold=True, by="person"), hand.now)
+    elif how == "slowed":
+        hand.cycle.speed_scaling = 0.1
+    else:
+        hand.step(0.3)
+    hand.until(lambda: hand.motion.state != "active")
+    before = hand.height
+    assert (hand.motion.state, hand.motion.error) == ("aborted", m.CLOSED_BEFORE)
+    hand.cycle.speed_scaling = 1.0
+    hand.cycle.authority.hold(HoldRequest(hold=False, by="person"), hand.now)
+    hand.run(3.0)
+    assert hand.height == pytest.approx(before, abs=1e-3) and hand.gripper.state != "active"
+
+
+def test_arm_that_is_held_as_it_lets_go_still_arrives(carrying: Callable[[], Hand]) -> None:
+    hand = carrying()
+    hand.until(lambda: hand.gripper.id == "open")
+    hand.cycle.authority.hold(HoldRequest(hold=True, by="person"), hand.now)
+    hand.run(1.0)
+    hand.cycle.authority.hold(HoldRequest(hold=False, by="person"), hand.now)
+    hand.until(lambda: hand.motion.state == "succeeded")
+
+
+@settings(deadline=None, max_examples=25)
+@given(stalls=st.lists(st.tuples(st.floats(0.0, 1.5), st.floats(0.03, 0.6)), max_size=5), speed=st.floats(0.2, 1.0),
+       lead=st.floats(0.0, 1.0))
+def test_wherever_there_is_no_processor_what_is_let_go_falls_where_it_was_to(
+    carrying: Callable[[], Hand], stalls: list[tuple[float, float]], speed: float, lead: float,
+) -> None:
+    hand = carrying()
+    hand.command("sooner", width=0.08, lead=lead, within=WITHIN)
+    hand.cycle.speed_scaling = speed
+    began, left = hand.now, sorted(stalls)
+    while hand.gripper.holding:
+        due = bool(left) and (hand.now - began) * speed >= left[0][0]
+        hand.step(left.pop(0)[1] if due else 0.01)
+        assert hand.now - began < 120.0
+    hand.run(1.0)
+    assert math.dist((hand.balls[-1].poses[0].position.x, hand.balls[-1].poses[0].position.y), (0.2, 0.0)) <= WITHIN
+
+
+@settings(deadline=None, max_examples=25)
+@given(at=st.floats(0.0, 0.15), stall=st.floats(0.03, 0.6), speed=st.floats(0.2, 1.0))
+def test_whenever_there_is_no_processor_the_arm_does_not_go_on_with_fingers_that_are_closed(
+    taking: Callable[[], Hand], at: float, stall: float, speed: float,
+) -> None:
+    hand = taking()
+    hand.cycle.speed_scaling = speed
+    hand.until(lambda: hand.gripper.id == "close")
+    hand.run(at)
+    hand.step(stall)
+    closed = list[float]()
+    while hand.motion.state == "active":
+        closed += [hand.height] if hand.width <= 0.061 else []
+        hand.step()
+    hand.run(1.0)
+    assert not closed or np.ptp([*closed, hand.height]) <= 0.002
