@@ -171,7 +171,7 @@ class GripperCommand(Message):
     says when it was decided: a command that comes too late is refused; one without a stamp never is.
 
     With `after` the fingers wait for the arm, by the arm's own time: they begin `lead` before it is there, though no
-    farther away than `within`, and not at all where it does not arrive. An arm that is held, slowed or held up once
+    farther away than `within`, and not at all where it does not arrive. An arm that is held, slowed or stalls once
     they have begun to close does not go on with what they may have closed about.
     """
 
