@@ -55,9 +55,12 @@ class WaitingFingers:
         """Whether fingers began to close for an arm that is not going to arrive in time; said once."""
         if not self._closing:
             return False
+        if self._arm.fails(self._closing):  # it comes to rest already, for a reason of its own
+            self._closing = ""
+            return False
         left = self._arm.arrives_in(self._closing)
         late = now + left > self._due + LATER
-        if left == 0.0 or late or self._arm.fails(self._closing):
+        if left == 0.0 or late:
             self._closing = ""
         return late and left > 0.0
 

@@ -137,6 +137,15 @@ def test_stop_calls_off_fingers_that_wait(taking: Callable[[], Hand], by: str) -
     assert hand.width == 0.08
 
 
+@pytest.mark.parametrize("by", ["person", "requester"])
+def test_stop_as_the_fingers_close_is_told_of_as_a_stop(taking: Callable[[], Hand], by: str) -> None:
+    hand = taking()
+    hand.until(lambda: hand.gripper.id == "close")
+    hand.cycle.authority.stop(StopRequest(id="" if by == "person" else "go", by=by, reason="enough"), hand.now)
+    hand.until(lambda: hand.motion.state != "active")
+    assert (hand.motion.state, hand.motion.error, hand.motion.message) == ("cancelled", "cancelled", "enough")
+
+
 def test_fingers_that_wait_for_a_goal_that_is_not_followed_are_refused(taking: Callable[[], Hand]) -> None:
     hand = taking()
     refused = hand.command("other", after="nobody's", width=0.0)
