@@ -30,8 +30,11 @@ class WaitingFingers:
         self.command = command
         self._end = self._place(self._arm.end) if self._arm.end is not None else None
 
-    def begins(self, now: float, measured: Vector) -> bool:
-        """Whether those that wait are to begin at a time [s], the arm measured there (dof,) [rad]: they do."""
+    def begins(self, now: float, measured: Vector, width: float) -> bool:
+        """Whether those that wait are to begin at a time [s]: they do.
+
+        The arm is measured there (dof,) [rad], the fingers are so far apart [m].
+        """
         command = self.command
         if command is None:
             return False
@@ -39,7 +42,7 @@ class WaitingFingers:
         if not there and (left > command.lead or not self._is_near(measured, command.within)):
             return False
         self.command = None
-        if command.expected_width is not None and not there:
+        if command.width < width and not there:
             self._closing, self._due = command.after, now + left
         return True
 

@@ -211,6 +211,20 @@ def test_arm_does_not_go_on_down_with_fingers_that_closed_ahead_of_it(taking: Ca
     assert hand.height == pytest.approx(before, abs=1e-3) and hand.gripper.state != "active"
 
 
+def test_arm_does_not_go_on_down_with_fingers_that_were_to_close_on_whatever_is_there(
+    taking: Callable[[], Hand],
+) -> None:
+    hand = taking()
+    hand.command("whatever", width=0.0, lead=CLOSE, within=0.05)
+    hand.until(lambda: hand.gripper.id == "whatever")
+    hand.cycle.authority.hold(HoldRequest(hold=True, by="person"), hand.now)
+    hand.run(1.0)
+    before = hand.height
+    hand.cycle.authority.hold(HoldRequest(hold=False, by="person"), hand.now)
+    hand.run(1.0)
+    assert hand.motion.error == m.CLOSED_BEFORE and hand.height == pytest.approx(before, abs=1e-3)
+
+
 def test_arm_that_is_held_as_it_lets_go_still_arrives(carrying: Callable[[], Hand]) -> None:
     hand = carrying()
     hand.until(lambda: hand.gripper.id == "open")
