@@ -271,8 +271,9 @@ class TrajectoryController:
             return 0.0 if self.succeeded(goal) else math.inf
         if running.stopping or self._holds:
             return math.inf
-        if running.time >= running.duration:
-            return 0.0
+        if running.time >= running.duration:  # the set-points are there, the arm is as much later as it is behind them
+            since = 0.0 if running.ended is None or self._last is None else self._last - running.ended
+            return max(self.delay - since, 0.0)
         rate = min(running.pace.rate, self.speed_scaling * running.share)
         return (running.duration - running.time) / rate + self.delay if rate > 0.0 else math.inf
 

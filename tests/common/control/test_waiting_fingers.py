@@ -11,9 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common import messages as m
-from common.hardware.interface import HardwareFault, Limits
+from common.hardware.fingers import Fingers
+from common.hardware.interface import HardwareFault, Limits, Vector
+from common.hardware.mock import MockHardware
 from common.messages import GripperCommand, HoldRequest, StopRequest
-from tests.common.control.test_control_cycle import GRIPPER, Rig
+from tests.common.control.test_control_cycle import GRIPPER, START, Rig
 from tests.common.hardware.conftest import Make
 
 DOWN, AWAY = 0.4, 0.3  # [m] that the arm goes
@@ -22,11 +24,29 @@ OPEN = GRIPPER.least_time(0.5e-3)
 WITHIN = 0.005  # [m]
 
 
+class LateArm(MockHardware):
+    """At each set-point so much later [s]."""
+
+    def __init__(self, start: Vector, delay: float, gripper: Fingers) -> None:
+        super().__init__(start, gripper)
+        self._delay = delay
+        self._sent = [(-math.inf, start, 0.0 * start)]
+
+    def read(self, now: float) -> tuple[Vector, Vector]:
+        while len(self._sent) > 1 and self._sent[1][0] <= now - self._delay + 1e-6:
+            self._sent.pop(0)
+        return self._sent[0][1].copy(), self._sent[0][2].copy()
+
+    def write(self, positions: Vector, velocities: Vector, now: float) -> None:
+        self._sent.append((now, positions.copy(), velocities.copy()))
+
+
 class Hand(Rig):
     """The hand above a ball, or with the ball in it and on its way somewhere else."""
 
-    def __init__(self, limits: Limits, trajectory: Make, holding: bool) -> None:
-        super().__init__(limits)
+    def __init__(self, limits: Limits, trajectory: Make, holding: bool, delay: float = 0.0) -> None:
+        super().__init__(limits, LateArm(START, delay, Fingers(GRIPPER, 0.08)))
+        self.cycle._arm.delay = delay
         self.step()
         if holding:
             self.grip("close", 0.0)
@@ -87,6 +107,17 @@ def test_fingers_touch_what_they_take_just_after_the_arm_stands(taking: Callable
     assert not hand.gripper.holding, "before it stands they touch nothing"
     waited = hand.until(lambda: hand.gripper.state == "succeeded")
     assert waited <= 0.05 and hand.gripper.outcome == "grasped"
+
+
+@pytest.mark.parametrize("delay", [0.05, 0.15, 0.3, 0.5])
+def test_fingers_touch_nothing_before_an_arm_behind_its_set_points_stands(
+    limits: Limits, rest_to_rest: Make, delay: float,
+) -> None:
+    hand = Hand(limits, rest_to_rest, holding=False, delay=delay)
+    hand.until(lambda: hand.width <= 0.061)
+    assert hand.height <= 1e-3
+    hand.until(lambda: hand.motion.state == "succeeded")
+    assert hand.until(lambda: hand.gripper.state == "succeeded") <= 0.05
 
 
 def test_fingers_that_let_go_do_so_where_the_arm_comes_to_rest(carrying: Callable[[], Hand]) -> None:
