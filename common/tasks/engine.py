@@ -175,6 +175,8 @@ class Task(Deciding[V]):
         assert view.motion is not None and view.gripper is not None
         running, stage = self.running, self.running.stage
         running.count(view.now, view.motion)
+        if self._early is not None:  # what they wait is no time of theirs
+            self._early.counted = view.now
         outcome = running.outcome(view.motion, view.gripper)
         limit = self.time_limit(stage)
         if running.let_go(view.gripper):  # the arm may leave while they open on
@@ -296,7 +298,7 @@ class Task(Deciding[V]):
             if self._early is not None and view.motion is not None and view.gripper is not None:
                 self.running, self._early = self._early, None
                 self.running.wait_no_more(view.motion, view.gripper)
-                self.running.counted, self.running.begun = view.now, True
+                self.running.begun = True
                 self._tell_stage(self.running.stage)
 
     # --- planning and doing ----------------------------------------------------------------------------------

@@ -265,6 +265,27 @@ def test_what_is_let_go_by_an_arm_that_does_not_arrive_is_let_go_once(releasing:
     assert releasing.task.did[2:] == ["release"] and not releasing.task.under_way
 
 
+def test_what_is_let_go_after_a_long_pause_by_an_arm_that_does_not_arrive_is_let_go(closing: Hand) -> None:
+    closing.arm()
+    closing.step()
+    closing.fingers(SEEN, holding=True)
+    closing.until_waiting()
+    closing.arm("active", held=True)
+    closing.step()
+    closing.now += 60.0
+    closing.step()
+    closing.arm("active", held=False)
+    closing.step()
+    closing.begin()
+    closing.fingers(0.0506, holding=False, state="active")
+    closing.arm("aborted")
+    closing.step()
+    closing.step()
+    closing.fingers(0.08, holding=False)
+    closing.step()
+    assert closing.task.did == ["reach", "close", "release"]
+
+
 @pytest.mark.parametrize("end", ["forgotten", "refused", "forever"])
 def test_fingers_that_are_never_heard_of_again_keep_nothing_from_being_decided(closing: Hand, end: str) -> None:
     closing.arm("aborted")
