@@ -226,9 +226,13 @@ class Task(Deciding[V]):
         if outcome == "running" and early.spent <= self.time_limit(early.stage):
             return
         self._early, self.look_after = None, view.now
-        done = early.report(view.motion, view.gripper).state == "succeeded" and not view.holding
-        if outcome == "ended" and done and isinstance(early.stage, Grip) and early.stage.holds is False:
-            self.succeeded(early.stage, view)
+        stage, reported = early.stage, early.report(view.motion, view.gripper)
+        if outcome != "ended" or not isinstance(stage, Grip):
+            return
+        if stage.holds is False and reported.state == "succeeded" and not view.holding:
+            self.succeeded(stage, view)
+        elif stage.holds and isinstance(reported, m.GripperState) and reported.outcome in MISSES:
+            self.row.appendleft(Grip("open", stage.state, width=self.gripper.max_width))  # they take nothing as they are
 
     def _watch_opening(self, view: V) -> list[Command]:
         """Follow fingers that open while the arm leaves already; one that they would not let through is stopped."""

@@ -307,6 +307,9 @@ def test_arm_that_its_fingers_closed_ahead_of_is_no_failure(closing: Hand) -> No
     closing.arm("aborted", error=m.CLOSED_BEFORE, message="held up")
     closing.step()
     closing.fingers(0.0, holding=False, state="aborted", outcome="empty")
+    closing.step()
+    assert closing.task.status.failures == 0 and stage(closing) == "open", "it does not go down with closed fingers"
+    closing.fingers(0.08, holding=False)
     for _ in range(3):
         closing.step()
     assert closing.task.status.failures == 0 and stage(closing) == "reach"
