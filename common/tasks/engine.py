@@ -232,7 +232,7 @@ class Task(Deciding[V]):
         if stage.holds is False and reported.state == "succeeded" and not view.holding:
             self.succeeded(stage, view)
         elif stage.holds and isinstance(reported, m.GripperState) and reported.outcome in MISSES:
-            self.row.appendleft(Grip("open", stage.state, width=self.gripper.max_width))  # they take nothing as they are
+            self.row.appendleft(Grip("open", stage.state, width=self.gripper.max_width))  # for the next try
 
     def _watch_opening(self, view: V) -> list[Command]:
         """Follow fingers that open while the arm leaves already; one that they would not let through is stopped."""
@@ -374,9 +374,9 @@ class Task(Deciding[V]):
             command.after = running.command.id
             if stage.holds:
                 way = 0.0 if stage.expected_width is None else view.gripper.width - stage.expected_width
-                command.lead, command.within = self.gripper.least_time(way), CLOSE_WITHIN
+                command.lead, command.within = min(self.gripper.least_time(way), AHEAD), CLOSE_WITHIN
             else:
-                command.lead = self.gripper.least_time(LOOSE)
+                command.lead = min(self.gripper.least_time(LOOSE), AHEAD)
             yield command
 
     def _width(self, view: V) -> float | None:

@@ -8,7 +8,8 @@ import pytest
 
 from common import messages as m
 from common.tasks.stages import Command, Grip, Move, Stage, View
-from tests.common.tasks.test_engine import THERE, Cell, Fetch
+from common.transport.codec import decode, encode
+from tests.common.tasks.test_engine import CELL, THERE, Cell, Fetch
 
 SEEN = 0.05  # [m] wide
 
@@ -43,8 +44,8 @@ class Take(Fetch):
 class Hand(Cell):
     """A cell in which a motion takes a second; a test says when fingers that wait for its end begin."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, **robot: Any) -> None:
+        super().__init__(**robot)
         self.task = Take(self.task.p, m.TaskStatus(), "t")
         self.gripper = m.GripperState(width=0.08)
         self.waits: m.GripperCommand | None = None
@@ -129,6 +130,12 @@ def test_fingers_are_asked_to_be_there_when_the_arm_is_and_to_touch_nothing_befo
     hand.fingers(SEEN, holding=True)
     release = hand.until_waiting()
     assert 0.0 < release.lead < 0.06 and release.within <= 0.005, "what is let go falls where it was to"
+
+
+def test_fingers_that_take_very_long_are_asked_for_with_a_lead_that_a_command_may_have() -> None:
+    hand = Hand(gripper=CELL.robot.gripper.model_copy(update={"speed": 0.001}))
+    command = hand.until_waiting()
+    assert decode(m.GripperCommand, encode(command)) == command
 
 
 def test_fingers_are_asked_for_late_in_a_long_motion() -> None:
