@@ -80,6 +80,7 @@ class Deciding(Generic[V]):
         self.running: Execution | None = None
         self._opening: Execution | None = None  # what was let go is free of the fingers, which open on
         self._early: Execution | None = None  # of the fingers, which wait for the motion that runs to be nearly over
+        self._held_up = False  # the arm was as fingers closed early: the next ones close once it stands
         self.patience = Patience()
         self.look_after = 0.0  # only a picture that is later decides [s]
         self._frames = FrameAge(speed)

@@ -290,6 +290,7 @@ class Task(Deciding[V]):
             stage.problem = reported.message
             self.missed(stage, view)
         elif reported.error in ("hardware_fault", m.CLOSED_BEFORE) and isinstance(stage, Move):  # it is not to blame
+            self._held_up = reported.error == m.CLOSED_BEFORE
             self._decide_anew(f"{stage.name} {reported.state}: {reported.message}", view)
         elif reported.state != "succeeded":
             self.fail(f"{stage.name} {reported.state}: {reported.message}", view)
@@ -298,6 +299,7 @@ class Task(Deciding[V]):
         elif holds is False and view.holding:
             self.fail("the fingers opened and still hold something", view)
         else:
+            self._held_up = self._held_up and not holds
             self.succeeded(stage, view)
             if self._early is not None and view.motion is not None and view.gripper is not None:
                 self.running, self._early = self._early, None
@@ -359,6 +361,8 @@ class Task(Deciding[V]):
         """Have the fingers begin before the arm stands: until then they touch nothing, or let nothing go."""
         stage, arm = (self.row[0] if self.row else None), running.stage
         if not (isinstance(stage, Grip) and stage.early and isinstance(arm, Move)) or self._opening or self._early:
+            return
+        if stage.holds and self._held_up:
             return
         assert view.motion is not None and view.gripper is not None
         motion = view.motion

@@ -322,6 +322,23 @@ def test_arm_that_its_fingers_closed_ahead_of_is_no_failure(closing: Hand) -> No
     assert closing.task.status.failures == 0 and stage(closing) == "reach"
 
 
+def test_arm_that_is_held_up_each_time_its_fingers_close_is_waited_for_the_next_time(closing: Hand) -> None:
+    closing.arm("aborted", error=m.CLOSED_BEFORE, message="held up")
+    closing.step()
+    closing.fingers(0.08, holding=False, state="cancelled")
+    while stage(closing) != "reach":
+        closing.step()
+    for _ in range(5):
+        closing.step()
+    assert len(closing.grips()) == 1
+    closing.arm()
+    closing.step()
+    assert stage(closing) == "close" and not closing.grips()[-1].after
+    closing.fingers(SEEN, holding=True)
+    assert closing.until_waiting().after, "what was taken is let go early again"
+    assert closing.task.status.failures == 0
+
+
 def test_report_of_before_the_arm_stood_is_not_taken_for_fingers_that_forgot() -> None:
     hand = Hand()
     hand.until_waiting()
