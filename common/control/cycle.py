@@ -203,6 +203,9 @@ class ControlCycle:
     def _meet(self, gripper: GripperController, now: float) -> None:
         """Have fingers that wait for the arm begin; one that they closed ahead of is not brought on."""
         waiting = self._waiting.command
+        if waiting is not None and (stopped := self.authority.inhibited(waiting, waiting.id)):
+            gripper.call_off(waiting, str(stopped))
+            self._waiting.command = waiting = None
         if waiting is not None and self._waiting.begins(now, self._q, gripper.state.width):
             try:
                 gripper.begin(waiting, now)

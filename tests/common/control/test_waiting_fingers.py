@@ -168,6 +168,14 @@ def test_stop_calls_off_fingers_that_wait(taking: Callable[[], Hand], by: str) -
     assert hand.width == 0.08
 
 
+def test_stop_of_what_waits_lets_the_arm_arrive_without_it(taking: Callable[[], Hand]) -> None:
+    hand = taking()
+    hand.cycle.authority.stop(StopRequest(id="close", by="requester"), hand.now)
+    hand.until(lambda: hand.motion.state == "succeeded")
+    hand.run(1.0)
+    assert hand.width == 0.08 and (hand.gripper.id, hand.gripper.state) == ("close", "cancelled")
+
+
 @pytest.mark.parametrize("by", ["person", "requester"])
 def test_stop_as_the_fingers_close_is_told_of_as_a_stop(taking: Callable[[], Hand], by: str) -> None:
     hand = taking()
