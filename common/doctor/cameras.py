@@ -22,14 +22,17 @@ def cameras(sys: Path = SYS) -> Iterator[Finding]:
     Args:
         sys: where sysfs is.
     """
-    depth = list(_depth_cameras(sys))
-    yield from depth
+    depth = dict(_depth_cameras(sys))
+    yield from depth.values()
     for path in sorted((sys / "class/video4linux").glob("video*"), key=lambda path: (len(path.name), path.name)):
+        if any((path / "device").resolve().is_relative_to(camera) for camera in depth):
+            continue  # told already, with the driver that reads all of it
         if _read(path / "index") in ("", "0"):  # others of the same camera give no pictures
             yield ok(f"camera /dev/{path.name}: {_read(path / 'name') or 'without a name'} (camera_opencv)")
 
 
-def _depth_cameras(sys: Path) -> Iterator[Finding]:
+def _depth_cameras(sys: Path) -> Iterator[tuple[Path, Finding]]:
+    """Where each is in sysfs, and what there is to say of it."""
     for path in sorted((sys / "bus/usb/devices").glob("*")):
         maker, product = _read(path / "idVendor"), _read(path / "product")
         for vendor, word, what, driver, package in DEPTH_CAMERAS:
@@ -37,10 +40,11 @@ def _depth_cameras(sys: Path) -> Iterator[Finding]:
                 continue
             told = " ".join(part for part in (what, product, _read(path / "serial")) if part)
             if find_spec(package) is None:
-                yield warn(f"depth camera {told}: {package} is not installed",
-                           f"pip install 'zencell[cameras]' for driver: {driver} of real_depth_camera")
+                found = warn(f"depth camera {told}: {package} is not installed",
+                             f"pip install 'zencell[cameras]' for driver: {driver} of real_depth_camera")
             else:
-                yield ok(f"depth camera {told} (driver: {driver} of real_depth_camera)")
+                found = ok(f"depth camera {told} (driver: {driver} of real_depth_camera)")
+            yield path.resolve(), found
 
 
 def _read(path: Path) -> str:

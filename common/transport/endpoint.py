@@ -24,8 +24,8 @@ NEAR_VARIABLE = "ZENCELL_NEAR"  # ENDPOINT=OTHER,OTHER, set by a supervisor for 
 NEAR_MS = 2000  # in which a try to connect ends where there is another way: a loaded machine takes 1 s
 LEASE_MS = 2000  # a frozen process or cut link is noticed after this
 STUCK_MS = 1000  # so is a link that takes nothing
-# The same in the router, where all that comes from the writer waits meanwhile, several times over: at 300 ms that was
-# 2 s, after which writers are taken for lost. A link of which a mebibyte of states is to be taken yet is not just busy.
+# The same in the router, where all that comes from the writer waits meanwhile, several times over: with 300 ms for up
+# to 2 s, after which it is taken for lost. A link from which a mebibyte of states is yet to be taken is not just busy.
 ROUTER_STUCK_MS = 30
 LINK_RETRY_MS = (100, 1000)  # between two tries to reach the router of another host: at first, and at most
 LARGE_BYTES = 32 * 1024  # a stream with a larger message travels apart from then on: pictures and clouds

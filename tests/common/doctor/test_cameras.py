@@ -37,5 +37,17 @@ def test_cameras_that_are_plugged_in_are_told_with_what_reads_them(
         "camera /dev/video2: Other (camera_opencv)", "camera /dev/video10: HD Webcam (camera_opencv)"]
 
 
+def test_depth_camera_is_not_told_once_more_as_one_that_gives_only_pictures(tmp_path: Path) -> None:
+    plugged(tmp_path, "2-1", idVendor="8086", product="Intel(R) RealSense(TM) Depth Camera 435i")
+    plugged(tmp_path, "2-11")
+    for number, port in ((0, "2-1"), (1, "2-11")):
+        video(tmp_path, number, f"at {port}", 0)
+        interface = tmp_path / "bus/usb/devices" / port / f"{port}:1.0"
+        interface.mkdir()
+        (tmp_path / f"class/video4linux/video{number}/device").symlink_to(interface)
+    assert [finding.what[:22] for finding in cameras.cameras(tmp_path)] == [
+        "depth camera RealSense", "camera /dev/video1: at"]
+
+
 def test_where_there_are_none_nothing_is_told(tmp_path: Path) -> None:
     assert list(cameras.cameras(tmp_path)) == []
