@@ -28,6 +28,15 @@ def share_memory() -> None:
         tell(_ARENA_MAX, 1)
 
 
+def give_back() -> None:
+    """Give the system what is free between things that are not, where the C library can be told to: in 0.3 ms.
+
+    What was there for pictures that a busy machine had waiting at once would stay otherwise, a megabyte each.
+    """
+    if (tell := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+        tell(0)
+
+
 def usable_cores() -> float:
     """Processors that this process may use, also within the limit of a control group (v2), as containers have one."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

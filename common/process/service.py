@@ -16,7 +16,7 @@ from typing import Any, Generic, NoReturn, Protocol, TypeVar
 from common.clock import BOOTED_VARIABLE, EPOCH_VARIABLE, KEPT_VARIABLE, SPEED_VARIABLE, Clock
 from common.config import Cell, Parameters, Watchdogs, load_cell, service_config
 from common.errors import ConfigError, UnknownName, ZencellError
-from common.process.environment import share_memory
+from common.process.environment import give_back, share_memory
 from common.process.lifeline import Lifeline, fail, leave
 from common.process.log import BusLog, log_to_stderr
 from common.process.loop_watch import LoopWatch
@@ -38,6 +38,7 @@ _CLOSE_SECONDS = 0.4
 _PATIENCE_SECONDS = 2.0  # without a router before this is said
 # A thread that computes gives the loop a turn this often: without it a message waits 5 ms for each turn.
 _SWITCH_SECONDS = 0.0005
+_GIVE_BACK_SECONDS = 20.0
 
 
 class _Parser(argparse.ArgumentParser):
@@ -227,10 +228,14 @@ async def _watch_end(bus: Bus, credentials: Credentials | None) -> None:
 async def _settle(bus: Bus) -> None:
     """Leave out of the garbage collector's looks what is there when the service is ready: modules, models.
 
-    A whole look at them takes 50 ms, in which no set-point leaves.
+    A whole look at them takes 50 ms, in which no set-point leaves. From then on memory that is free goes back now and
+    then.
     """
     await bus.ready_event.wait()
     gc.freeze()
+    while True:
+        await asyncio.sleep(_GIVE_BACK_SECONDS)
+        give_back()
 
 
 def _patience(watchdogs: Watchdogs, ready: bool) -> float:
