@@ -203,10 +203,11 @@ class ControlCycle:
     def _meet(self, gripper: GripperController, now: float) -> None:
         """Have fingers that wait for the arm begin; one that they closed ahead of is not brought on."""
         waiting = self._waiting.command
-        if waiting is not None and (stopped := self.authority.inhibited(waiting, waiting.id)):
+        stopped = waiting and self.authority.inhibited(waiting, waiting.id)
+        if waiting is not None and stopped:
+            self._waiting.drop()
             gripper.call_off(waiting, str(stopped))
-            self._waiting.command = waiting = None
-        if waiting is not None and self._waiting.begins(now, self._q, gripper.state.width):
+        elif waiting is not None and self._waiting.begins(now, self._q, gripper.state.width):
             try:
                 gripper.begin(waiting, now)
             except HardwareFault as fault:
@@ -344,9 +345,8 @@ class ControlCycle:
             if not known:
                 self.authority.refused(request, state)
             if not known and state.state == "active":
-                if self._waiting.command is not None:
-                    self._gripper.call_off(self._waiting.command, f"replaced by {request.id!r}")
-                    self._waiting.command = None
+                if (replaced := self._waiting.drop()) is not None:
+                    self._gripper.call_off(replaced, f"replaced by {request.id!r}")
                 if waits:
                     self._waiting.wait(request)
             if objection is None:

@@ -30,6 +30,11 @@ class WaitingFingers:
         self.command = command
         self._end = self._place(self._arm.end) if self._arm.end is not None else None
 
+    def drop(self) -> GripperCommand | None:
+        """Have nothing wait any longer: what did."""
+        command, self.command = self.command, None
+        return command
+
     def begins(self, now: float, measured: Vector, width: float) -> bool:
         """Whether those that wait are to begin at a time [s]: they do.
 
