@@ -62,7 +62,8 @@ class Film:
 def moments(run: Gathering) -> list[tuple[float, str]]:
     """When [s] something went wrong for the first times, and what; what one film shows is told once.
 
-    What is lost goes before what was only tried again: a run may well end DONE after either.
+    What is lost goes before what was only tried again: a run may well end DONE after either. The last one is how it
+    stood in the end, where that was none.
     """
     lost = [(event.time, f"{event.what} {event.note}") for event in run.losses]
     wrong = [(event.time, " ".join(filter(None, (event.what, event.note)))) for event in run.failures]
@@ -74,6 +75,9 @@ def moments(run: Gathering) -> list[tuple[float, str]]:
     for at, what in [*sorted(lost), *sorted(wrong)]:
         if all(abs(at - other) > AFTER for other, _ in kept):
             kept.append((at, what))
+    begun = any(span.label != "IDLE" for span in run.tasks)
+    if begun and run.tasks[-1].label not in ("DONE", "ERROR") and all(run.end - at > AFTER for at, _ in kept[:MOST]):
+        kept[MOST - 1:] = [(run.end, f"it ends {run.tasks[-1].label} {run.tasks[-1].note}".strip())]
     return sorted(kept[:MOST])
 
 

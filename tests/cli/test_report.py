@@ -384,8 +384,8 @@ def test_only_pictures_that_a_film_shows_are_looked_at_and_each_film_has_the_siz
     tape.writer.abandon()
     assert app.execute(["report", str(tmp_path / "cut.mcap")]) == 0
     found = films_of((tmp_path / "cut.html").read_text())
-    assert [film.frames[0].shape[:2] for film in found] == [(80, 100), (60, 80)]
-    assert len(looked_at) == 2 * 7, "from 4 s before to 2 s after"
+    assert [film.frames[0].shape[:2] for film in found] == [(80, 100), (60, 80), (60, 80)]
+    assert len(looked_at) == 2 * 7 + 5, "from 4 s before to 2 s after, and the end of what was not over"
 
 
 def test_tall_pictures_are_made_small_and_of_many_cameras_some_are_shown(tmp_path):
@@ -436,7 +436,8 @@ def test_what_comes_to_lie_on_the_floor_is_listed_and_has_a_film_before_what_was
     assert app.execute(["report", str(tmp_path / "run.mcap")]) == 0
     text = (tmp_path / "run.html").read_text()
     told = re.findall(r"<figcaption[^>]*>([0-9.]+ s: .*) \(camera", text)
-    assert told == ["1.00 s: GRASPING", "5.00 s: GRASPING", "20.00 s: ball_1 lies elsewhere, at (0.900, 0.200, -0.500)"]
+    assert told == ["1.00 s: GRASPING", "20.00 s: ball_1 lies elsewhere, at (0.900, 0.200, -0.500)",
+                    "29.00 s: it ends GRASPING"]
     page = Page(text)
     assert page.table("problems") == [
         ["20.00", "lost, by truth", "ball_1", "lies elsewhere, at (0.900, 0.200, -0.500)"]]
@@ -455,6 +456,19 @@ def test_run_that_ends_done_with_something_left_that_it_does_not_name_has_a_film
     text = (tmp_path / "run.html").read_text()
     assert len(films_of(text)) == 1
     assert "8.00 s: DONE but left at (0.500, 0.200, 0.030): not among what was rejected" in text
+
+
+@pytest.mark.parametrize("state", ["PLACING", "IDLE"])
+def test_run_that_is_not_over_when_it_ends_has_a_film_of_how_it_stood(tmp_path, state):
+    tape = Tape(tmp_path / "run.mcap")
+    for t, label in ((0, "IDLE"), (1, "GRASPING"), (8, state)):
+        tape.put(t, "pick_place_status", PickPlaceStatus(header=tape.header(t), state=label, started=True))
+    for k in range(10):
+        tape.put(k, "camera/image_raw", picture(tape, k, 10 * k))
+    tape.writer.close({})
+    assert app.execute(["report", str(tmp_path / "run.mcap")]) == 0
+    text = (tmp_path / "run.html").read_text()
+    assert re.findall(r"<figcaption[^>]*>([^(]*) \(", text) == [f"9.00 s: it ends {state}"]
 
 
 def test_report_of_a_run_without_failures_or_pictures_has_no_film(recorded, tmp_path):
