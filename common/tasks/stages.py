@@ -139,9 +139,12 @@ class Execution:
         return answer.state != "rejected"
 
     def wait_no_more(self, motion: m.MotionStatus, gripper: m.GripperState) -> None:
-        """Fingers that waited for the arm began, or never will, by the time that its end was told of."""
+        """Fingers that waited for the arm began, or never will, by the time that its end was told of.
+
+        A report of that very time knows it already.
+        """
         if self.accepted is not None:
-            self.accepted = max(self.accepted, motion.header.stamp)
+            self.accepted = max(self.accepted, motion.header.stamp - 1)
         self.begun = self.begun or (gripper.id == self.command.id and gripper.state != "cancelled")
 
     def outcome(self, motion: m.MotionStatus, gripper: m.GripperState) -> Literal["running", "ended", "forgotten"]:

@@ -363,3 +363,15 @@ def test_what_was_let_go_is_not_done_when_the_controller_has_forgotten_where_the
     for _ in range(3):
         releasing.step()
     assert releasing.task.did[2:] == [] and releasing.task.status.failures == 1 and stage(releasing) != "bring"
+
+
+def test_executor_that_was_started_again_tells_in_its_first_reports_that_it_forgot_both() -> None:
+    hand = Hand()
+    hand.until_waiting()
+    stamp = int((hand.now + 1.0) * 1e9)
+    hand.motion = m.MotionStatus(header=m.Header(stamp=stamp))
+    hand.gripper = m.GripperState(header=m.Header(stamp=stamp), width=0.08)
+    before = len(hand.asked)
+    for _ in range(4):
+        hand.step()
+    assert any(isinstance(one, m.PlanRequest) for one in hand.asked[before:]), "it goes on at once"
