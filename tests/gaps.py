@@ -91,6 +91,7 @@ class Side:
     computing: float = 0.0  # [s] of the executor
     waiting: float = 0.0
     own: list[str] = field(default_factory=list)  # gaps that were not the machine's load
+    held_up: float = 0.0  # [s] in gaps that were not the machine's load, those on the way among them
 
     @property
     def gaps(self) -> int:
@@ -143,6 +144,8 @@ class Gaps:
                 side.own.append(told)
             elif computing + waiting > gap / 2:
                 side.waited += 1
+                continue
             else:
                 side.held += 1
                 side.own.append(told)
+            side.held_up += gap
