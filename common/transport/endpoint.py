@@ -25,8 +25,8 @@ NEAR_MS = 2000  # in which a try to connect ends where there is another way: a l
 LEASE_MS = 2000  # a frozen process or cut link is noticed after this
 STUCK_MS = 1000  # so is a link that takes nothing
 # The same in the router, where all that comes from the writer waits meanwhile, several times over: with 300 ms for up
-# to 2 s, after which it is taken for lost. A link from which a mebibyte of states is yet to be taken is not just busy.
-ROUTER_STUCK_MS = 30
+# to 2 s, after which it is taken for lost. With 30 ms readers were dropped that waited for a processor.
+ROUTER_STUCK_MS = 100
 LINK_RETRY_MS = (100, 1000)  # between two tries to reach the router of another host: at first, and at most
 LARGE_BYTES = 32 * 1024  # a stream with a larger message travels apart from then on: pictures and clouds
 LINKS = ("0-5", "6-7")  # priorities of each link between two: what is large has one of its own
@@ -38,6 +38,9 @@ MOST_SESSIONS = 512  # at one router: 50 cells of ten services
 MOST_PENDING = 32  # of these that have not shown who they are yet
 ACCEPT_MS = 3000  # in which they must; a loaded machine takes 1 s
 STATE_BATCHES = 16  # of states and events, the most there can be: seconds of them for a reader that is held up
+# Those of what a router sends that is small; with two batches each, as it comes, they are full wherever the thread that
+# empties them waits for a processor.
+SMALL_PRIORITIES = ("control", "real_time", "interactive_high", "interactive_low", "data_high", "data")
 STREAM_WAIT_US = 20_000  # that a stream's message waits for room before it is dropped, once until there is room again
 PARTS_WAIT_US = 300_000  # that one of several batches does, in all: a point cloud of 12 MB has 192 of them
 # The same in the router, where other readers of that writer's pictures wait meanwhile: less than makes a picture old.
@@ -219,7 +222,7 @@ def router_settings(
         qos__network=[apart, shared],
         transport__link__tx__queue__congestion_control__block__wait_before_close=ROUTER_STUCK_MS * 1000,
         transport__link__tx__queue__congestion_control__drop__max_wait_before_drop_fragments=ROUTER_PARTS_WAIT_US,
-        transport__link__tx__queue__size__data_high=STATE_BATCHES,
+        **{f"transport__link__tx__queue__size__{name}": STATE_BATCHES for name in SMALL_PRIORITIES},
         mode="router", listen__endpoints=list(endpoints),
         # One link each: where two were opened at once, nothing travelled over either in one start of four.
         connect__endpoints=list(links),
