@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from common import topics
 from common.applications.outlining import stage_files
 from common.applications.outlining.contours_choice import NoSuchContour, described, middle_of, parse_choice
-from common.applications.outlining.messages import Contours, OutlinePoints, OutlineSelect
+from common.applications.outlining.messages import Contours, OutlinePoints, OutlineSelect, OutlineSelection
 from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
-from common.errors import ConfigError, RemoteError, ZencellError
+from common.errors import ConfigError, RemoteError, RequestFailed, RequestLost, ZencellError
 from common.perception.depth import depth_of
 from common.perception.image import image_to_array
 from common.perception.intake import colour_picture
@@ -21,7 +22,9 @@ from common.terminal import printable
 if TYPE_CHECKING:
     from common.messages import Image
     from common.transport.bus import Bus, Reader
+    from common.transport.requests import Client
 
+TRIES = 3  # of a choice
 TIMEOUT = 30.0  # [s] for a picture and its outline
 KEPT = 100  # pictures of which contours and points are known until their path comes
 ALL_WITHIN = 3.0  # [s, cell time] after the first picture for a contour to be chosen
@@ -61,13 +64,23 @@ async def ask_person(bus: Bus, folder: Path) -> None:
             if wanted is not None:
                 if wanted.index is not None and wanted.index < len(found.contours):
                     wanted.at = middle_of(found.contours[wanted.index])  # in the picture that the person looks at
-                answer = await select.call(wanted)
+                answer = await _chosen(select, wanted)
                 say(f"{answer.label} is chosen")
                 return
         except NoSuchContour as error:
             say(str(error))
         except RemoteError as error:
             say(error.message)
+        except RequestFailed as error:
+            say(str(error))
+
+
+async def _chosen(select: Client[OutlineSelect, OutlineSelection], wanted: OutlineSelect) -> OutlineSelection:
+    """The answer to a choice, which is made again where its answer was lost: that chooses the same."""
+    for _ in range(TRIES - 1):
+        with suppress(RequestLost):
+            return await select.call(wanted)
+    return await select.call(wanted)
 
 
 def say(text: str, end: str = "\n") -> None:

@@ -15,6 +15,7 @@ from common.applications.outlining import asking, stage_files
 from common.applications.outlining.asking import ask_person, store
 from common.applications.outlining.messages import Contour, Contours, OutlinePoints, OutlineSelect, OutlineSelection
 from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
+from common.errors import RequestLost
 from common.perception.image import array_to_image
 from common.transport.local import LocalNetwork
 
@@ -101,3 +102,36 @@ async def test_the_person_looks_at_the_picture_whose_contours_are_asked_for(
     assert shown is not None
     middles = {100: (5 / 3, 4 / 3), 150: (23 / 3, 22 / 3)}
     assert chosen[0].at == pytest.approx(middles[int(shown[0, 0, 0])])
+
+
+async def test_choice_whose_answer_was_lost_is_made_again_and_one_that_nobody_answers_is_not_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network = LocalNetwork()
+    bus, detector = network.bus(), network.bus(service="contour_detector")
+    seen, drawn = detector.writer(CONTOURS), detector.writer(CONTOUR_IMAGE)
+    answers: asyncio.Queue[str] = asyncio.Queue()
+    monkeypatch.setattr(asking, "_line", answers.get)
+    choices = 0
+
+    class Losing:
+        async def call(self, _wanted: OutlineSelect) -> OutlineSelection:
+            nonlocal choices
+            choices += 1
+            if choices <= asking.TRIES + 1:
+                raise RequestLost(OUTLINE_SELECT.key)
+            return OutlineSelection(index=0, label="Object_0")
+
+    monkeypatch.setattr(bus, "client", lambda _topic: Losing())
+    asked = asyncio.create_task(ask_person(bus, tmp_path))
+    await soon()
+    seen.put(contours(1, RIGHT))
+    drawn.put(array_to_image(np.zeros((12, 16, 3), np.uint8), "bgr8", header(1)))
+    answers.put_nowait("0")
+    answers.put_nowait("0")
+    async with asyncio.timeout(5):
+        await asked
+    assert choices == asking.TRIES + 2
+    said = capsys.readouterr().out
+    assert said.count("outline which one?") == 2 and said.count("may have been carried out") == 1
+    assert said.endswith("Object_0 is chosen\n")
