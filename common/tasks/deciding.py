@@ -224,6 +224,11 @@ class Deciding(Generic[V]):
         return [one.stage for one in (self.running, self._early) if one is not None and one.begun]
 
     @property
+    def waits_for_the_arm(self) -> str:
+        """Name of the stage of fingers that were asked to begin before the arm stands; they may have, untold."""
+        return self._early.stage.name if self._early is not None else ""
+
+    @property
     def gripper(self) -> GripperConfig:
         """The robot's gripper.
 

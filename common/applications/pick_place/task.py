@@ -151,7 +151,7 @@ class PickPlace(Task[PickPlaceView]):
         # it may hang over others, and a picture of it shows one more.
         contained = self._counted(view)
         stages = {status.stage, *(stage.name for stage in self.under_way)}
-        if "release" in stages:
+        if "release" in stages or self.waits_for_the_arm == "release":
             self._contained.reset()
         elif self._contained.lasts(contained, view.scene_stamp) >= min(CONTAINED_FOR, self.p.empty):
             status.done = max(status.done, contained)
