@@ -11,6 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import psutil
 
@@ -63,6 +64,16 @@ class Child:
         with contextlib.suppress(psutil.Error):
             return self.pid is not None and psutil.Process(self.pid).status() == psutil.STATUS_STOPPED
         return False
+
+    @property
+    def waited(self) -> float:
+        """For how long [s] its first thread, which turns its loop, has been kept waiting for a processor so far.
+
+        0 where the system does not tell.
+        """
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            return int(Path(f"/proc/{self.pid}/schedstat").read_text().split()[1]) * 1e-9
+        return 0.0
 
     @property
     def alive_seconds(self) -> float:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from common.config import Watchdogs
 from common.messages import Notice, ServiceStatus, SupervisorStatus
@@ -33,11 +34,13 @@ class _Heard:
     pid: int | None
     state: str
     since: float  # waking time [s] of the newest sign of life
+    waited: float  # for a processor until then [s]
 
 
 class LivenessWatchdog:
     """Counts for how long each process has been silent, in time in which we ourselves were awake and connected.
 
+    Time in which it waited for a processor does not count: on a machine that has too much to do nobody is frozen.
     A service that is ready says each second what it has counted. While the router is not reached nobody can be heard,
     so nobody is blamed but the router; nor is a single service when all of them fall silent at once.
     """
@@ -47,16 +50,18 @@ class LivenessWatchdog:
         self._limits = watchdogs
         self._awake = Waking(2 * PERIOD)
         self._heard: dict[str, _Heard] = {}
+        self._waited: Mapping[str, float] = {}
         self._router_blamed = False
 
     def heard(self, name: str) -> None:
         """Take note of a sign of life of a service."""
         self._router_blamed = False
         if name in self._heard:
-            self._heard[name].since = self._awake.now
+            self._note(self._heard[name], name)
 
     def look(
         self, now: float, connected: bool, processes: Sequence[ServiceStatus], stopped: Collection[str] = (),
+        waited: Mapping[str, float] = MappingProxyType({}),
     ) -> list[Verdict]:
         """Which processes are to be killed now.
 
@@ -65,8 +70,9 @@ class LivenessWatchdog:
             connected: whether the router is reached.
             processes: those that are started again when they end.
             stopped: names of those that the system does not run (SIGSTOP).
+            waited: for how long each was kept waiting for a processor since it was started [s]; 0 where it is not told.
         """
-        awake = self._awake.look(now)
+        awake, self._waited = self._awake.look(now), waited
         if not self._limits.silence:
             return []
         verdicts = []
@@ -89,8 +95,12 @@ class LivenessWatchdog:
         # The router is there while we are connected; the others can be heard only then.
         blameless = connected if router and process.state == "ready" else not connected and not router
         if known is None or blameless or (known.pid, known.state) != (process.pid, process.state):
-            known = self._heard[process.name] = _Heard(process.pid, process.state, awake)
-        return awake - known.since
+            known = self._heard[process.name] = _Heard(process.pid, process.state, awake, 0.0)
+            self._note(known, process.name)
+        return awake - known.since - (self._waited.get(process.name, 0.0) - known.waited)
+
+    def _note(self, known: _Heard, name: str) -> None:
+        known.since, known.waited = self._awake.now, self._waited.get(name, 0.0)
 
     def _without_scapegoats(
         self, verdicts: list[Verdict], processes: Sequence[ServiceStatus], awake: float
@@ -102,7 +112,7 @@ class LivenessWatchdog:
             return verdicts
         self._router_blamed = True
         for name in ready:
-            self._heard[name].since = awake
+            self._note(self._heard[name], name)
         if any(process.name == ROUTER and process.state == "ready" for process in processes):
             return [Verdict(ROUTER, "lets none of the services be heard")]
         return []

@@ -235,7 +235,8 @@ async def _kill_frozen(bus: Bus, cell: Cell, supervisor: Supervisor) -> None:
     async def look() -> None:
         while True:
             await asyncio.sleep(PERIOD)
-            for verdict in silence.look(monotonic(), bus.connected, supervisor.kept, supervisor.stopped):
+            now, kept = monotonic(), supervisor.kept
+            for verdict in silence.look(now, bus.connected, kept, supervisor.stopped, supervisor.waited):
                 supervisor.kill(verdict.name, verdict.reason)
 
     await beside(listen(), look())

@@ -57,6 +57,10 @@ class AnyChild(Protocol):
         """Whether the process is there but was stopped."""
 
     @property
+    def waited(self) -> float:
+        """For how long [s] it has been kept waiting for a processor so far."""
+
+    @property
     def alive_seconds(self) -> float:
         """Time [s] since the process was started."""
 
@@ -206,6 +210,11 @@ class Supervisor:
     def stopped(self) -> list[str]:
         """Names of those of them that the system does not run (SIGSTOP)."""
         return [name for name in self.starting if self._by_name[name].child.stopped]
+
+    @property
+    def waited(self) -> dict[str, float]:
+        """For how long [s] each of those that are kept has been waiting for a processor so far."""
+        return {watched.child.name: watched.child.waited for watched in self._all if watched.again}
 
     def kill(self, name: str, reason: str) -> None:
         """End a process that is of no use any more; it is started again."""

@@ -226,6 +226,11 @@ class VirtualProcess:
         return False
 
     @property
+    def waited(self) -> float:
+        """Never for a processor."""
+        return 0.0
+
+    @property
     def alive_seconds(self) -> float:
         """Time [s] since it was started."""
         return monotonic() - self._began

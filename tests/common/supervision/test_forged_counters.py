@@ -21,7 +21,8 @@ async def test_counters_under_the_key_of_another_are_no_sign_of_life(monkeypatch
     killed: asyncio.Queue[str] = asyncio.Queue()
     names = ("camera_simulator", "vision_detector")
     supervisor = SimpleNamespace(
-        kept=[ServiceStatus(name=name, state="ready", pid=number) for number, name in enumerate(names, 1)], stopped=(),
+        kept=[ServiceStatus(name=name, state="ready", pid=number) for number, name in enumerate(names, 1)],
+        stopped=(), waited={},
         kill=lambda name, reason: killed.put_nowait(name),
     )
     camera = net.bus("camera_simulator", cell=cell.name)

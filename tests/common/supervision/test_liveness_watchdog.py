@@ -21,6 +21,8 @@ class Cell:
                        for k, name in enumerate(names or NAMES)}
         self.silent: set[str] = set()
         self.stopped: list[str] = []
+        self.starved: set[str] = set()
+        self.waited = dict.fromkeys(self.states, 0.0)
         self.connected = True
         self.now = 100.0
         self.killed: list[tuple[str, str]] = []
@@ -30,11 +32,14 @@ class Cell:
         before, end = len(self.killed), self.now + seconds
         while self.now < end:
             self.now += period
+            for name in self.starved:
+                self.waited[name] += 0.9 * period
             speaks = self.connected and "router" not in self.silent
             for name in set(self.states) - self.silent - {"router"}:
                 if speaks and self.states[name].state == "ready":
                     self.silence.heard(name)
-            for verdict in self.silence.look(self.now, self.connected, list(self.states.values()), self.stopped):
+            states = list(self.states.values())
+            for verdict in self.silence.look(self.now, self.connected, states, self.stopped, dict(self.waited)):
                 self.killed.append((verdict.name, verdict.reason))
                 self.restart(verdict.name, "ready")
                 self.silent.discard(verdict.name)
@@ -58,6 +63,18 @@ def test_a_service_that_falls_silent_is_killed_in_time_and_no_other() -> None:
     assert cell.wait(1.0) == ["detector"]
     assert "has not been heard for 7" in cell.killed[0][1]
     assert cell.wait(60) == []
+
+
+def test_a_service_that_waits_for_a_processor_is_silent_and_not_killed_for_that() -> None:
+    cell = Cell()
+    cell.wait(5)
+    cell.silent = cell.starved = {"detector"}
+    assert cell.wait(5 * LIMIT) == []
+    cell.silent = set()
+    assert cell.wait(5) == []
+    cell.silent, cell.starved = {"detector"}, set()
+    assert cell.wait(LIMIT - 0.5) == []
+    assert cell.wait(1.0) == ["detector"], "what it waited before is no credit"
 
 
 def test_a_service_that_never_speaks_once_it_is_ready_is_killed_too() -> None:
