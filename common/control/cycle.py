@@ -345,8 +345,7 @@ class ControlCycle:
             if not known:
                 self.authority.refused(request, state)
             if not known and state.state == "active":
-                if (replaced := self._waiting.drop()) is not None:
-                    self._gripper.call_off(replaced, f"replaced by {request.id!r}")
+                self._replaced_by(request)
                 if waits:
                     self._waiting.wait(request)
             if objection is None:
@@ -355,7 +354,13 @@ class ControlCycle:
         except HardwareFault as fault:
             self._hand_fault.failed(str(fault), now)
             self._gripper.fault(str(fault))
+            self._replaced_by(request)
             return self._gripper.command(request, now, self._hand_fault.objection)
+
+    def _replaced_by(self, request: GripperCommand) -> None:
+        if (replaced := self._waiting.drop()) is not None:
+            assert self._gripper is not None
+            self._gripper.call_off(replaced, f"replaced by {request.id!r}")
 
     @property
     def robot(self) -> RobotStatus:

@@ -88,6 +88,10 @@ class Hand(Rig):
         return float(self.cycle._q[1])
 
 
+def broken(*_given: object) -> None:
+    raise HardwareFault("no answer from the hand")
+
+
 @pytest.fixture(scope="session")
 def taking(limits: Limits, rest_to_rest: Make) -> Callable[[], Hand]:
     return lambda: Hand(limits, rest_to_rest, holding=False)
@@ -208,6 +212,19 @@ def test_newer_command_takes_the_place_of_one_that_waits(taking: Callable[[], Ha
     assert hand.command("close", width=0.0).state == "cancelled"
 
 
+def test_newer_command_that_the_fingers_cannot_do_takes_the_place_of_one_that_waits_too(
+    carrying: Callable[[], Hand], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand = carrying()
+    with monkeypatch.context() as faulty:
+        faulty.setattr(hand.hardware.gripper, "command", broken)
+        assert hand.command("firmer", after="", width=0.0).error == "hardware_fault"
+    assert hand.command("open", width=0.08).state == "cancelled"
+    hand.until(lambda: hand.motion.state != "active")
+    hand.run(1.0)
+    assert hand.gripper.holding, "nothing was let go"
+
+
 def test_what_the_fingers_do_is_judged_while_others_wait(carrying: Callable[[], Hand]) -> None:
     hand = carrying()
     assert hand.gripper.outcome == "grasped" and hand.gripper.id == "close"
@@ -221,10 +238,6 @@ def test_fingers_that_do_not_work_when_they_are_to_begin_stop_the_arm(
     taking: Callable[[], Hand], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     hand = taking()
-
-    def broken(*given: object) -> None:
-        raise HardwareFault("no answer from the hand")
-
     monkeypatch.setattr(hand.hardware.gripper, "command", broken)
     hand.until(lambda: hand.motion.state == "aborted")
     assert hand.motion.error == "hardware_fault" and "no answer" in hand.motion.message
