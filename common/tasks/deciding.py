@@ -79,6 +79,7 @@ class Deciding(Generic[V]):
         self.row: deque[Stage] = deque()
         self.running: Execution | None = None
         self._opening: Execution | None = None  # what was let go is free of the fingers, which open on
+        self._shut = False  # fingers that closed about nothing ahead of the arm have to be opened before what is next
         self._early: Execution | None = None  # of the fingers, which wait for the motion that runs to be nearly over
         self._held_up = False  # the arm was as fingers closed early: the next ones close once it stands
         self.patience = Patience()

@@ -149,7 +149,11 @@ class Task(Deciding[V]):
         if self.running is not None:
             self.decide_ahead(self.running.stage, view)
         elif not (self.row or self._early or view.motion.state == "active" or view.gripper.moving):
-            self.decide(view)  # not before what a task before this one began has ended
+            shut, self._shut = self._shut, False  # not before what a task before this one began has ended
+            if shut and not view.holding:
+                self.row.append(Grip("open", status.state, width=self.gripper.max_width))
+            else:
+                self.decide(view)
         if status.state not in ("DONE", "ERROR"):
             status.task_seconds = view.now - (self._began or view.now)
         self._count(view)
@@ -221,7 +225,8 @@ class Task(Deciding[V]):
         early.count(view.now, view.motion)
         if view.motion.state == "active":  # it comes to rest
             return
-        early.wait_no_more(view.motion, view.gripper)
+        if view.motion.id == getattr(early.command, "after", ""):
+            early.wait_no_more(view.motion, view.gripper)
         outcome = early.outcome(view.motion, view.gripper)
         if outcome == "running" and early.spent <= self.time_limit(early.stage):
             return
@@ -232,7 +237,9 @@ class Task(Deciding[V]):
         if stage.holds is False and reported.state == "succeeded" and not view.holding:
             self.succeeded(stage, view)
         elif stage.holds and isinstance(reported, m.GripperState) and reported.outcome in MISSES:
-            self.row.appendleft(Grip("open", stage.state, width=self.gripper.max_width))  # for the next try
+            self._shut = True
+        elif reported.error == "hardware_fault":
+            self.fail(f"{stage.name} {reported.state}: {reported.message}", view)
 
     def _watch_opening(self, view: V) -> list[Command]:
         """Follow fingers that open while the arm leaves already; one that they would not let through is stopped."""

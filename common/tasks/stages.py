@@ -143,7 +143,7 @@ class Execution:
 
         A report of that very time knows it already.
         """
-        if self.accepted is not None:
+        if self.accepted is not None and gripper.id in (self.before, self.command.id):  # nobody else told them anything
             self.accepted = max(self.accepted, motion.header.stamp - 1)
         self.begun = self.begun or (gripper.id == self.command.id and gripper.state != "cancelled")
 

@@ -222,6 +222,38 @@ def test_stop_on_the_way_begins_nothing_more(closing: Hand) -> None:
         assert closing.step() == []
 
 
+@pytest.mark.parametrize("holding", [True, False])
+def test_start_after_a_stop_lets_nothing_fall_that_somebody_put_in_the_hand_meanwhile(
+    closing: Hand, holding: bool
+) -> None:
+    closing.task.command("stop", closing.view)
+    closing.arm("cancelled")
+    closing.fingers(0.0, holding=False, state="aborted", outcome="empty")
+    for _ in range(5):
+        assert closing.step() == []
+    closing.fingers(SEEN if holding else 0.0, holding=holding, id="by hand", outcome="")
+    closing.task.command("start", closing.view)
+    before = len(closing.grips())
+    for _ in range(5):
+        closing.step()
+    assert [grip.width for grip in closing.grips()[before:] if not grip.after] == ([] if holding else [0.08])
+    assert not holding or stage(closing) == "bring"
+
+
+def test_fingers_that_somebody_told_something_else_while_they_waited_are_decided_about_anew_at_once() -> None:
+    hand = Hand()
+    hand.until_waiting()
+    hand.waits = None
+    hand.now += 0.05
+    hand.fingers(0.07, holding=False, id="of somebody")
+    hand.now += 0.05
+    hand.arm()
+    before = len(hand.asked)
+    for _ in range(4):
+        hand.step()
+    assert any(isinstance(one, m.PlanRequest) for one in hand.asked[before:]) and stage(hand) != "close"
+
+
 @pytest.mark.parametrize("error", ["stale_request", "hardware_fault", "unknown_goal"])
 def test_fingers_that_refuse_let_the_arm_arrive_and_are_asked_once_more_then(error: str) -> None:
     hand = Hand()
@@ -365,11 +397,12 @@ def test_what_was_let_go_is_not_done_when_the_controller_has_forgotten_where_the
     assert releasing.task.did[2:] == [] and releasing.task.status.failures == 1 and stage(releasing) != "bring"
 
 
-def test_executor_that_was_started_again_tells_in_its_first_reports_that_it_forgot_both() -> None:
+@pytest.mark.parametrize("later", [0, 1_000_000_000], ids=["together", "the arm again"])
+def test_executor_that_was_started_again_tells_in_its_first_reports_that_it_forgot_both(later: int) -> None:
     hand = Hand()
     hand.until_waiting()
     stamp = int((hand.now + 1.0) * 1e9)
-    hand.motion = m.MotionStatus(header=m.Header(stamp=stamp))
+    hand.motion = m.MotionStatus(header=m.Header(stamp=stamp + later))
     hand.gripper = m.GripperState(header=m.Header(stamp=stamp), width=0.08)
     before = len(hand.asked)
     for _ in range(4):
