@@ -213,7 +213,7 @@ class ControlCycle:
             except HardwareFault as fault:
                 self._hand_fault.failed(str(fault), now)
                 self._arm.abort("hardware_fault", str(fault), "hardware")
-                gripper.call_off(waiting, str(fault))
+                gripper.call_off(waiting, str(fault), "hardware_fault")
         if self._waiting.closed_before(now):
             self._arm.abort(CLOSED_BEFORE, "held up or slowed as the fingers began to close")
         if off := self._waiting.called_off():

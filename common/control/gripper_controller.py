@@ -89,9 +89,9 @@ class GripperController:
         self.state = GripperState.model_validate(begun)
         return self._memory.put(request.id, self.state)
 
-    def call_off(self, request: GripperCommand, why: str) -> None:
-        """Have a goal that waits be cancelled; the fingers go on with what they do."""
-        off = {"id": request.id, "state": "cancelled", "error": "", "message": why}
+    def call_off(self, request: GripperCommand, why: str, error: str = "") -> None:
+        """Have a goal that waits be cancelled, or aborted for an error; the fingers go on with what they do."""
+        off = {"id": request.id, "state": "aborted" if error else "cancelled", "error": error, "message": why}
         if self.state.state == "active":
             self._memory.put(request.id, self.state.model_copy(update=off))
         else:
