@@ -13,7 +13,7 @@ from common.applications.outlining import stage_files
 from common.applications.outlining.contours_choice import NoSuchContour, described, middle_of, parse_choice
 from common.applications.outlining.messages import Contours, OutlinePoints, OutlineSelect, OutlineSelection
 from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
-from common.errors import ConfigError, RemoteError, RequestFailed, RequestLost, ZencellError
+from common.errors import ConfigError, NoResponder, RemoteError, RequestFailed, RequestLost, ZencellError
 from common.perception.depth import depth_of
 from common.perception.image import image_to_array
 from common.perception.intake import colour_picture
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from common.transport.requests import Client
 
 TRIES = 3  # of a choice
+AGAIN_WITHIN = 5.0  # [s]
 TIMEOUT = 30.0  # [s] for a picture and its outline
 KEPT = 100  # pictures of which contours and points are known until their path comes
 ALL_WITHIN = 3.0  # [s, cell time] after the first picture for a contour to be chosen
@@ -80,6 +81,8 @@ async def _chosen(select: Client[OutlineSelect, OutlineSelection], wanted: Outli
     for _ in range(TRIES - 1):
         with suppress(RequestLost):
             return await select.call(wanted)
+        with suppress(NoResponder):  # the link to the router may be what was lost
+            await select.wait_available(AGAIN_WITHIN)
     return await select.call(wanted)
 
 
@@ -149,7 +152,7 @@ async def store(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
             chosen_at = -1  # stamp of the newest picture that may have had another choice
             if wanted is not None and wanted.rule != "auto":
                 await contours.next()
-                await bus.client(OUTLINE_SELECT).call(wanted)
+                await _chosen(bus.client(OUTLINE_SELECT), wanted)
                 chosen_at = max(each.latest.header.stamp for each in (pictures, contours) if each.latest is not None)
             noting += [asyncio.create_task(_note(*each, more))  # what comes while files are written, too
                        for each in ((points, found), (paths, cleared))]

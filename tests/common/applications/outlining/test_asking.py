@@ -15,7 +15,7 @@ from common.applications.outlining import asking, stage_files
 from common.applications.outlining.asking import ask_person, store
 from common.applications.outlining.messages import Contour, Contours, OutlinePoints, OutlineSelect, OutlineSelection
 from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
-from common.errors import RequestLost
+from common.errors import NoResponder, RequestLost
 from common.perception.image import array_to_image
 from common.transport.local import LocalNetwork
 
@@ -121,6 +121,9 @@ async def test_choice_whose_answer_was_lost_is_made_again_and_one_that_nobody_an
             if choices <= asking.TRIES + 1:
                 raise RequestLost(OUTLINE_SELECT.key)
             return OutlineSelection(index=0, label="Object_0")
+
+        async def wait_available(self, _timeout: float) -> None:
+            raise NoResponder(OUTLINE_SELECT.key)
 
     monkeypatch.setattr(bus, "client", lambda _topic: Losing())
     asked = asyncio.create_task(ask_person(bus, tmp_path))
