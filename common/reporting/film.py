@@ -75,7 +75,7 @@ def moments(run: Gathering) -> list[tuple[float, str]]:
     for at, what in [*sorted(lost), *sorted(wrong)]:
         if all(abs(at - other) > AFTER for other, _ in kept):
             kept.append((at, what))
-    begun = any(span.label != "IDLE" for span in run.tasks)
+    begun = len(lost) < MOST and any(span.label != "IDLE" for span in run.tasks)
     if begun and run.tasks[-1].label not in ("DONE", "ERROR") and all(run.end - at > AFTER for at, _ in kept[:MOST]):
         kept[MOST - 1:] = [(run.end, f"it ends {run.tasks[-1].label} {run.tasks[-1].note}".strip())]
     return sorted(kept[:MOST])
