@@ -97,7 +97,8 @@ class LivenessWatchdog:
         if known is None or blameless or (known.pid, known.state) != (process.pid, process.state):
             known = self._heard[process.name] = _Heard(process.pid, process.state, awake, 0.0)
             self._note(known, process.name)
-        return awake - known.since - (self._waited.get(process.name, 0.0) - known.waited)
+        waited = max(self._waited.get(process.name, 0.0) - known.waited, 0.0)  # nothing is told of one that just ended
+        return awake - known.since - waited
 
     def _note(self, known: _Heard, name: str) -> None:
         known.since, known.waited = self._awake.now, self._waited.get(name, 0.0)
