@@ -111,13 +111,13 @@ class FakeCamera:
 
         class Profile:
             def get_device(self) -> Any:
-                return space(first_depth_sensor=lambda: space(get_depth_scale=lambda: SCALE))
+                return space(first_depth_sensor=lambda: space(get_depth_scale=lambda: SCALE), is_playback=lambda: False)
 
             def get_stream(self, stream: str) -> Any:
                 fx, fy, ppx, ppy = fake.lenses[stream]
                 found = space(width=WIDTH, height=HEIGHT, fx=fx, fy=fy, ppx=ppx, ppy=ppy,
                               coeffs=fake.coeffs if stream == "color" else [0.0] * 5)
-                return space(as_video_stream_profile=lambda: space(get_intrinsics=lambda: found))
+                return space(as_video_stream_profile=lambda: space(get_intrinsics=lambda: found), format=lambda: "bgr8")
 
         class Pipeline:
             def __init__(self) -> None:
@@ -140,7 +140,7 @@ class FakeCamera:
                 require()
 
         module: Any = types.ModuleType("pyrealsense2")
-        module.stream, module.format = space(color="color", depth="depth"), space(z16="z16", bgr8="bgr8")
+        module.stream, module.format = space(color="color", depth="depth"), space(z16="z16", bgr8="bgr8", rgb8="rgb8")
         module.camera_info, module.timestamp_domain = space(serial_number="serial"), space(global_time="global")
         module.config, module.pipeline, module.align = Config, Pipeline, Align
         device = space(get_info=lambda what: "0123" if what == "serial" else "")

@@ -24,7 +24,8 @@ def say(what: str, **values: Any) -> None:
 async def motions(bus: Bus) -> None:
     """Say each state of the motion."""
     async for status in bus.reader(topics.MOTION_STATUS):
-        say("motion", id=status.id, state=status.state, progress=status.progress, held=status.held_by)
+        say("motion", id=status.id, state=status.state, progress=status.progress, held=status.held_by,
+            error=status.error)
 
 
 async def targets(bus: Bus) -> None:

@@ -54,7 +54,13 @@ async def in_motion(page: Page, joints: Reader[JointState]) -> None:
     """Have the task begin, if it does not run yet, and wait until the arm moves for it."""
     start = page.get_by_role("button", name="Start")
     runs = page.locator('[data-press="start"][title="it runs already"]')
-    await start.and_(page.locator(":not([aria-disabled])")).or_(runs).wait_for()
+    try:
+        await start.and_(page.locator(":not([aria-disabled])")).or_(runs).wait_for()
+    except BaseException as error:
+        said = await page.locator("body").inner_text(timeout=5000)
+        presses = await page.locator("[data-press=start]").evaluate_all("found => found.map(one => one.outerHTML)")
+        error.add_note(f"Start is {presses}; the page says {said!r}")
+        raise
     if not await runs.count():
         await start.click()
     await until(joints, is_moving, PATIENCE)

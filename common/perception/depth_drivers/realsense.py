@@ -1,9 +1,10 @@
-"""An Intel RealSense of the D400 series, with the maker's package `pyrealsense2`."""
+"""An Intel RealSense of the D400 series, or a recording of one, with the maker's package `pyrealsense2`."""
 
 from __future__ import annotations
 
 import contextlib
 import time
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -20,6 +21,8 @@ class Options(Parameters):
     """Which camera it is, and how its pictures are made."""
 
     serial: str = Field("", description="of the camera, as `rs-enumerate-devices -s` prints it; empty: the first")
+    file: str = Field("", description="recording of the maker's tools (.db3), played over and over in the place of a "
+                                      "camera, as fast as it was made and of the size it has")
     fps: int = Field(30, ge=1, le=90, description="frames per second it makes: it knows 6, 15, 30, 60 and 90 [Hz]")
     align: Literal["color", "depth"] = Field("color", description="the picture that the other one is made to fit")
 
@@ -31,10 +34,13 @@ class RealSense:
         """Take a pipeline that was started.
 
         Raises:
-            ConfigError: the lens of the picture that is kept as it is has distortion.
+            ConfigError: the lens of the picture that is kept as it is has distortion, or a recording is of colours
+                that are not read.
         """
         self._rs, self._pipeline = rs, pipeline
-        self._scale = float(profile.get_device().first_depth_sensor().get_depth_scale())  # [m] of one step of z16
+        device = profile.get_device()
+        self._recorded = bool(device.is_playback())
+        self._scale = float(device.first_depth_sensor().get_depth_scale())  # [m] of one step of z16
         stream = getattr(rs.stream, align)
         self._align = rs.align(stream)
         i = profile.get_stream(stream).as_video_stream_profile().get_intrinsics()
@@ -42,6 +48,10 @@ class RealSense:
             raise ConfigError("options.align", align,
                               f"has distortion {list(i.coeffs)}, which depth cannot have: depth")
         self.lens = Lens(i.width, i.height, i.fx, i.fy, i.ppx, i.ppy)
+        colours = profile.get_stream(rs.stream.color).format()
+        if colours not in (rs.format.bgr8, rs.format.rgb8):  # a camera gives what it is asked for
+            raise ConfigError("options.file", str(colours), "of its colours cannot be read: bgr8 and rgb8 can")
+        self._red_first = colours == rs.format.rgb8
 
     def read(self) -> Shot:
         """The next shot, depth and colour of the same instant."""
@@ -56,9 +66,12 @@ class RealSense:
             steps = np.asanyarray(depth.get_data())
             metres = np.where(steps > 0, steps * np.float32(self._scale), np.float32(np.nan)).astype(np.float32)
             pixels = np.array(color.get_data())  # a copy: what it gives is its own memory
+            if self._red_first:
+                pixels = np.ascontiguousarray(pixels[:, :, ::-1])
             age = 0.0
-            if color.get_frame_timestamp_domain() == self._rs.timestamp_domain.global_time:  # of this machine [ms]
-                age = max(0.0, time.time() - color.get_timestamp() * 1e-3)
+            ours = color.get_frame_timestamp_domain() == self._rs.timestamp_domain.global_time  # of this machine
+            if ours and not self._recorded:
+                age = max(0.0, time.time() - color.get_timestamp() * 1e-3)  # [ms]
             return Shot(pixels, metres, age)
 
     def close(self) -> None:
@@ -70,17 +83,49 @@ class RealSense:
 def open_camera(options: Options, size: tuple[int, int], rate: float) -> RealSense:
     """The camera: see `common.perception.depth_sources`."""
     rs = maker_of("realsense", "pyrealsense2")
+    config = _recording(rs, options) if options.file else _camera(rs, options, size)
+    pipeline = rs.pipeline()
+    try:
+        profile = pipeline.start(config)
+    except RuntimeError as error:  # no such mode, or somebody else has it
+        what = options.file or f"{size[0]}x{size[1]} at {options.fps} Hz"
+        raise CameraGone(f"{what}: {error}") from None
+    try:
+        return RealSense(rs, pipeline, profile, options.align)
+    except RuntimeError as error:  # a recording without one of the two
+        pipeline.stop()
+        raise CameraGone(f"{options.file}: {error}") from None
+
+
+def _camera(rs: Any, options: Options, size: tuple[int, int]) -> Any:
+    """What asks for a camera that is plugged in, and its streams.
+
+    Raises:
+        CameraGone: it is not there.
+    """
     there = [device.get_info(rs.camera_info.serial_number) for device in rs.context().query_devices()]
     if not there:
         raise CameraGone("no RealSense is plugged in")
     if options.serial and options.serial not in there:
         raise CameraGone(f"RealSense {options.serial} is not plugged in; there are: {', '.join(there)}")
-    width, height = size
-    config, pipeline = rs.config(), rs.pipeline()  # a new one each time: one that lost its camera stays without
+    config = rs.config()  # a new one each time: one that lost its camera stays without
     config.enable_device(options.serial or there[0])
-    config.enable_stream(rs.stream.depth, width, height, rs.format.z16, options.fps)
-    config.enable_stream(rs.stream.color, width, height, rs.format.bgr8, options.fps)
-    try:
-        return RealSense(rs, pipeline, pipeline.start(config), options.align)
-    except RuntimeError as error:  # no such mode, or somebody else has it
-        raise CameraGone(f"{width}x{height} at {options.fps} Hz: {error}") from None
+    config.enable_stream(rs.stream.depth, *size, rs.format.z16, options.fps)
+    config.enable_stream(rs.stream.color, *size, rs.format.bgr8, options.fps)
+    return config
+
+
+def _recording(rs: Any, options: Options) -> Any:
+    """What asks for a recording, of which nothing can be chosen.
+
+    Raises:
+        ConfigError: there is none, or a camera is asked for as well.
+    """
+    file = Path(options.file).expanduser()
+    if not file.is_file():
+        raise ConfigError("options.file", options.file, "is no file")
+    if options.serial:
+        raise ConfigError("options.serial", options.serial, f"is of a camera; there is a recording too: {options.file}")
+    config = rs.config()
+    config.enable_device_from_file(str(file), repeat_playback=True)
+    return config
