@@ -26,7 +26,7 @@ from common.sim.rendering import Renderer
 from common.transport.local import LocalNetwork
 from services import real_depth_camera
 
-rs = pytest.importorskip("pyrealsense2", reason="make setup EXTRAS=cameras")
+rs = pytest.importorskip("pyrealsense2", reason="make setup EXTRAS=realsense", exc_type=ImportError)
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 SCALE = 0.001  # [m] of one step of depth

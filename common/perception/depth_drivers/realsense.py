@@ -21,8 +21,8 @@ class Options(Parameters):
     """Which camera it is, and how its pictures are made."""
 
     serial: str = Field("", description="of the camera, as `rs-enumerate-devices -s` prints it; empty: the first")
-    file: str = Field("", description="recording of the maker's tools (.db3), played over and over in the place of a "
-                                      "camera, as fast as it was made and of the size it has")
+    file: str = Field("", description="recording of the maker's tools (.db3; before 2.58 .bag), played over and over "
+                                      "in the place of a camera, as fast as it was made and of the size it has")
     fps: int = Field(30, ge=1, le=90, description="frames per second it makes: it knows 6, 15, 30, 60 and 90 [Hz]")
     align: Literal["color", "depth"] = Field("color", description="the picture that the other one is made to fit")
 
