@@ -76,7 +76,7 @@ def main() -> None:
     silhouettes, detector = Silhouettes(robot, around.ball_radius), Detector(around, DetectorOptions())
     print(f"drawn by {chosen_gl() or 'rays'}")
     errors: list[tuple[float, str]] = []
-    missed, surplus, shown, spent = 0, 0, 0, 0.0
+    missed, surplus, reported, shown, spent = 0, 0, 0, 0, 0.0
     for number in range(options.scenes):
         rng = np.random.default_rng((options.seed, number))
         places, light, joints = balls(rng, around), scenery(rng, "mujoco"), at_random(robot, rng)
@@ -106,6 +106,9 @@ def main() -> None:
                     wrong.append(f"{near:.1f} mm at {place[:2].round(3)}")
         extra = [d for d in seen if all(math.dist(place[:2], d.position[:2]) * 1e3 > FAR for place in places)]
         surplus += len(extra)
+        odd = [one for one in detector.odd if not hidden.touches([one.position], around.ball_radius)[0]]
+        reported += len(odd)
+        wrong += [f"at ({one.position[0]:.3f}, {one.position[1]:.3f}) {one.reason}" for one in odd]
         wrong += [f"surplus at ({d.position[0]:.3f}, {d.position[1]:.3f})" for d in extra]
         shown += len(clear)
         if wrong:
@@ -115,7 +118,8 @@ def main() -> None:
                 cv2.imwrite(str(options.save / f"{number}.png"), picture)
     off = np.array([error for error, _ in errors])
     print(f"{shown} balls in {options.scenes} scenes: median {np.median(off):.2f}, p99 {np.percentile(off, 99):.2f}, "
-          f"most {off.max():.2f} mm; over 3 mm {int((off > 3).sum())}, missed {missed}, surplus {surplus}; "
+          f"most {off.max():.2f} mm; over 3 mm {int((off > 3).sum())}, missed {missed}, surplus {surplus}, "
+          f"reported as no ball {reported}; "
           f"{1e3 * spent / options.scenes:.1f} ms a picture")
 
 

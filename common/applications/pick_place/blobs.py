@@ -123,6 +123,26 @@ def middles(closed: Mask, min_area: float) -> list[tuple[tuple[float, float], Co
     return found
 
 
+def long_ones(narrow: Mask, camera: Pinhole, plane: float, least: float) -> list[tuple[float, float]]:
+    """Where a mask of narrow things has one that is long: a pixel (u, v) on it, in the middle of its outline [px].
+
+    Args:
+        narrow: the mask.
+        camera: the camera.
+        plane: height at which its length is taken [m].
+        least: shorter ones are left out [m].
+    """
+    outer, _ = cv2.findContours(narrow, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    found = []
+    for contour in outer:
+        points = np.asarray(contour).reshape(-1, 2).astype(float)
+        ground = camera.on_plane(points[[*points.argmin(axis=0), *points.argmax(axis=0)]], plane)
+        if np.isfinite(ground).all() and np.linalg.norm(np.ptp(ground, axis=0)) >= least:
+            u, v = points[np.linalg.norm(points - points.mean(axis=0), axis=1).argmin()].tolist()
+            found.append((float(u), float(v)))
+    return found
+
+
 def _off_border(pixels: Array, camera: Pinhole) -> npt.NDArray[np.bool_]:
     u, v = pixels[:, 0], pixels[:, 1]
     clear: npt.NDArray[np.bool_] = (u >= 1) & (u <= camera.width - 2) & (v >= 1) & (v <= camera.height - 2)

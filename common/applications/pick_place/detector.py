@@ -10,18 +10,29 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from common.applications.pick_place.blobs import Blob, Mask, Outline, Traced, find_blobs, middles, small_blobs
+from common.applications.pick_place.blobs import (
+    Blob,
+    Mask,
+    Outline,
+    Traced,
+    find_blobs,
+    long_ones,
+    middles,
+    small_blobs,
+)
 from common.applications.pick_place.depth_balls import find_in_depth
 from common.applications.pick_place.fit import Fit, fit_each, fit_spheres
-from common.applications.pick_place.masks import Colours, Masks
+from common.applications.pick_place.masks import Colours, Masks, RedMasks
 from common.applications.pick_place.odd import (
     BELOW,
     EXPLAINED,
     FALLING,
     FLAT,
+    LONG,
     MOST_OVAL,
     MOST_UNLIKE,
     NOT_ROUND,
+    THIN,
     Odd,
     oval,
     sized,
@@ -129,8 +140,8 @@ class Detector:
         self.too_large = 0  # round blobs in it that look larger than a stack, but for those in the container
         self._last: tuple[Mask, Pinhole, DetectorOptions, list[Detection]] | None = None
 
-    def masks(self, picture: Picture) -> tuple[Mask, Mask]:
-        """What is red in a bgr8 picture: opened, and then closed; 255 where it is. They are not to be written to."""
+    def masks(self, picture: Picture) -> RedMasks:
+        """What is red in a bgr8 picture. The masks are not to be written to."""
         o = self.options
         windows = (o.hsv_red_lo1, o.hsv_red_hi1), (o.hsv_red_lo2, o.hsv_red_hi2)
         return self._masks.of(picture, Colours(windows, o.morph_kernel_px))
@@ -140,18 +151,18 @@ class Detector:
 
         A picture that is the last one again, as drawn ones without noise often are, is not looked at again.
         """
-        fine, closed = self.masks(picture)
+        masks = self.masks(picture)
         last = self._last
-        if last and closed is last[0] and camera is last[1] and self.options == last[2]:
+        if last and masks.closed is last[0] and camera is last[1] and self.options == last[2]:
             return list(last[3])
-        found = self._look_at(fine, closed, camera)
+        found = self._look_at(masks, camera)
         self.blind = "" if found else blindness(picture)
-        self._last = (closed, camera, self.options.model_copy(), found)
+        self._last = (masks.closed, camera, self.options.model_copy(), found)
         return list(found)
 
     def detect_in_depth(self, picture: Picture, depth: Depth, camera: Pinhole) -> list[Detection]:
         """The same by a picture with depth (height, width) [m]: balls are where they are, on the table or on others."""
-        fine, closed = self.masks(picture)
+        fine, closed, narrow = self.masks(picture)
         centers = find_in_depth(fine, depth, camera, self.resting.radius)
         found = []
         if len(centers):
@@ -165,11 +176,12 @@ class Detector:
             self._odd(np.array(middle), camera, NOT_ROUND)
             for middle, contour in middles(closed, self.options.min_contour_area_px)
             if not any(cv2.pointPolygonTest(contour, one.pixel, False) >= 0 for one in found)
-        ])
+        ] + self._thin(narrow, camera))
         self.blind, self.too_small = "" if found else blindness(picture), 0
         return sorted(found, key=lambda d: (d.pixel[1], d.pixel[0]))
 
-    def _look_at(self, fine: Mask, closed: Mask, camera: Pinhole) -> list[Detection]:
+    def _look_at(self, masks: RedMasks, camera: Pinhole) -> list[Detection]:
+        fine, closed, narrow = masks
         if self._last is None or camera is not self._last[1]:
             self._outlines.clear()
             self._fits.clear()
@@ -181,7 +193,7 @@ class Detector:
         pixel_size = abs(float(camera.position[2]) - self.resting.plane) / camera.fx  # at the plane of the balls
         offset = self.options.outline_offset_px * pixel_size
         seen: list[_Seen] = []
-        self.odd, self.too_large = [], 0
+        self.odd, self.too_large = self._thin(narrow, camera), 0
         alone, crowded, offsets = self._alone(blobs, camera, offset, pixel_size)
         seen += alone
         # All outlines of a picture are off by as much: balls that stand alone say by how much.
@@ -291,6 +303,12 @@ class Detector:
         if offsets[upper] - usual <= MOST_UNLIKE * pixel_size:
             return []
         return [sized(float(offsets[k]), usual) if k == upper else BELOW for k in range(len(offsets))]
+
+    def _thin(self, narrow: Mask, camera: Pinhole) -> list[Odd]:
+        """What is long and thin."""
+        least = LONG * 2 * self.resting.radius
+        return [self._odd(np.array(pixel), camera, THIN)
+                for pixel in long_ones(narrow, camera, self.resting.table_height, least)]
 
     def _on_table(self, camera: Pinhole, odd: list[Odd]) -> list[Odd]:
         """Those that are not in the container, nor above the horizon, where no ray meets the table."""

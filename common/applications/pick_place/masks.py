@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ Picture = npt.NDArray[np.uint8]
 Window = tuple[tuple[int, int, int], tuple[int, int, int]]  # lower and upper end: hue, saturation, value
 Part = tuple[slice, slice]  # rows and columns
 
+_SQUARE = np.ones((2, 2), np.uint8)
 _MOST = 0.5  # of a picture: where more has changed, all of it is looked at
 
 
@@ -26,13 +28,20 @@ class Colours:
     kernel_px: int
 
 
+class RedMasks(NamedTuple):
+    """What is red, 255 where it is: opened; then closed; and what is too narrow to outlive opening."""
+
+    opened: Mask
+    closed: Mask
+    narrow: Mask
+
+
 @dataclass(frozen=True)
 class _Known:
     picture: Picture
     colours: Colours
     gain: float  # of green, for the colour of the light
-    opened: Mask
-    closed: Mask
+    masks: RedMasks
 
 
 class Masks:
@@ -42,29 +51,29 @@ class Masks:
         """Nothing was seen yet."""
         self._known: _Known | None = None
 
-    def of(self, picture: Picture, colours: Colours) -> tuple[Mask, Mask]:
-        """What is red in a bgr8 picture: opened, and then closed; 255 where it is. They are not to be written to."""
+    def of(self, picture: Picture, colours: Colours) -> RedMasks:
+        """What is red in a bgr8 picture. The masks are not to be written to."""
         known, part = self._known, None
         if known is not None and known.colours == colours and known.picture.shape == picture.shape:
             part = changed(known.picture, picture)
             if part is None:
-                return known.opened, known.closed
+                return known.masks
         gain = green_gain(picture)
         if known is None or part is None or gain != known.gain or _share(part, picture) > _MOST:
-            opened, closed = _masks(with_green(picture, gain), colours)
-            self._known = _Known(picture.copy(), colours, gain, opened, closed)
-            return opened, closed
+            masks = _masks(with_green(picture, gain), colours)
+            self._known = _Known(picture.copy(), colours, gain, masks)
+            return masks
         reach = 4 * (colours.kernel_px // 2)  # erosion and dilation, twice: so far a pixel acts on the masks
         inner, outer = _grown(part, reach, picture), _grown(part, 2 * reach, picture)
-        new = known.picture, known.opened.copy(), known.closed.copy()
-        new[0][part] = picture[part]
+        masks = RedMasks(*(mask.copy() for mask in known.masks))
+        known.picture[part] = picture[part]
         offset = inner[0].start - outer[0].start, inner[1].start - outer[1].start
         size = inner[0].stop - inner[0].start, inner[1].stop - inner[1].start
         within = slice(offset[0], offset[0] + size[0]), slice(offset[1], offset[1] + size[1])
-        for whole, fresh in zip(new[1:], _masks(with_green(picture[outer], gain), colours), strict=True):
+        for whole, fresh in zip(masks, _masks(with_green(picture[outer], gain), colours), strict=True):
             whole[inner] = fresh[within]
-        self._known = _Known(new[0], colours, gain, new[1], new[2])
-        return new[1], new[2]
+        self._known = _Known(known.picture, colours, gain, masks)
+        return masks
 
 
 def changed(before: Picture, after: Picture) -> Part | None:
@@ -98,7 +107,7 @@ def _grown(part: Part, by: int, picture: Picture) -> Part:
     return rows, columns
 
 
-def _masks(picture: Picture, colours: Colours) -> tuple[Mask, Mask]:
+def _masks(picture: Picture, colours: Colours) -> RedMasks:
     hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
     red = np.zeros(picture.shape[:2], np.uint8)
     for low, high in colours.windows:
@@ -106,4 +115,6 @@ def _masks(picture: Picture, colours: Colours) -> tuple[Mask, Mask]:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (colours.kernel_px, colours.kernel_px))
     opened = cv2.morphologyEx(red, cv2.MORPH_OPEN, kernel)
     closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel)
-    return np.asarray(opened, np.uint8), np.asarray(closed, np.uint8)
+    # Not the rim of what outlived, nor specks: noise has no squares of four pixels in a row.
+    narrow = cv2.morphologyEx(cv2.subtract(red, cv2.dilate(opened, kernel)), cv2.MORPH_OPEN, _SQUARE)
+    return RedMasks(*(np.asarray(mask, np.uint8) for mask in (opened, closed, narrow)))

@@ -1,6 +1,7 @@
 """What has the colour of balls and is none that lies on the table: told by its outline and by how large it looks.
 
-The outline of a sphere of known size at a known place is known; that of a cube or a cable is another one. A disc, such
+The outline of a sphere of known size at a known place is known; that of a cube or a can is another one, and a cable may
+be too thin to have one. A disc, such
 as the picture of a ball on a sheet, is seen as an ellipse of another shape the further it is off the axis of a camera;
 straight below it cannot be told from a ball. A ball on top of something looks larger than one on the table.
 """
@@ -20,10 +21,12 @@ Array = npt.NDArray[np.float64]
 
 NOT_ROUND = "it has not the outline of a ball"
 FLAT = "it is not as round as a ball there: flat, such as a picture of one"
+THIN = "it is long and thinner than a ball, such as a cable"
 BELOW = "it is seen together with one that lies higher, as on it"
 EXPLAINED = 0.8  # part of the outline of a blob that lies on those of its balls, at least
 MOST_OVAL = 0.55  # [px] by which the outline of a ball may be longer one way than the other
 MOST_UNLIKE = 0.5  # [px] by which balls of one picture may differ in how large they look
+LONG = 2.0  # diameters of a ball: what shows of one beside the arm or another ball is shorter
 FALLING = 0.006  # [m] what looks so much larger is higher than a stack: it falls, or hangs in the hand
 FEWEST = 3  # balls by which it is told how large they look
 

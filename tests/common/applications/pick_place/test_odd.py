@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from common.applications.pick_place.detector import Detector
-from common.applications.pick_place.odd import FLAT, NOT_ROUND
+from common.applications.pick_place.odd import FLAT, NOT_ROUND, THIN
 from common.applications.pick_place.validation import Validation
 from common.config import CameraConfig, Surroundings, load_cell
 from common.messages import Color, Vector3, WorldObject
@@ -23,6 +23,7 @@ from tests.simulated.visited import SimulatedCell
 AROUND = load_cell("panda").section(Surroundings)
 assert isinstance(AROUND, Surroundings)
 CAMERA = Pinhole.from_config(AROUND.camera)
+SIDE = CameraConfig(position=(1.15, 0.0, 0.85), rpy=(-2.4, 0.0, math.pi / 2))
 PLACES = [(0.40, 0.0), (0.50, -0.10), (0.30, 0.20), (0.60, -0.30), (0.20, -0.35)]
 OTHERS = [(0.25, -0.10), (0.62, 0.05), (0.15, 0.10)]
 
@@ -62,6 +63,31 @@ def test_cable_is_told_by_its_outline(place: tuple[float, float]) -> None:
     assert {one.reason for one in odd} == {NOT_ROUND}
 
 
+@pytest.mark.parametrize("eye", [AROUND.camera, SIDE])
+def test_thin_cable_is_reported_beside_balls(eye: CameraConfig) -> None:
+    camera, around = Pinhole.from_config(eye), AROUND.model_copy(update={"camera": eye})
+    draw = Renderer(around, camera=camera)
+    for width in (0.004, 0.006, 0.008):
+        for place in PLACES:
+            cable = red("cylinder", (*place, width / 2), (width, width, 0.25), roll=math.pi / 2)
+            beside = [ball(x, y) for x, y in OTHERS if math.dist((x, y), place) > 0.17]
+            detector = Detector(around)
+            assert len(detector.detect(draw.see([cable, *beside]).colour, camera)) == len(beside)
+            assert [one.reason for one in detector.odd] in ([THIN], [NOT_ROUND] * (width > 0.006)), (width, place)
+            assert math.dist(detector.odd[0].position[:2], place) < 0.06
+
+
+def test_picture_full_of_red_specks_shows_no_cable() -> None:
+    rng = np.random.default_rng(5)
+    picture = Renderer(AROUND, camera=CAMERA).see([ball(x, y) for x, y in OTHERS]).colour.copy()
+    for share in (0.01, 0.1, 0.3):
+        noisy = picture.copy()
+        noisy[rng.random(picture.shape[:2]) < share] = (20, 20, 200)
+        detector = Detector(AROUND)
+        detector.detect(noisy, CAMERA)
+        assert THIN not in {one.reason for one in detector.odd}
+
+
 @pytest.mark.parametrize("place", [(0.60, -0.30), (0.20, -0.35), (0.62, -0.25)])
 def test_disc_away_from_the_axis_is_told_by_its_shape(place: tuple[float, float]) -> None:
     for diameter in (0.06, 0.0624):  # the second one is as large in the picture as a ball
@@ -88,9 +114,6 @@ def test_of_a_stack_neither_ball_is_offered(place: tuple[float, float]) -> None:
     assert detector.odd
     frame = markers([], AROUND, 1, odd=detector.odd)
     assert all(marker.text for marker in frame.markers)
-
-
-SIDE = CameraConfig(position=(1.15, 0.0, 0.85), rpy=(-2.4, 0.0, math.pi / 2))
 
 
 @pytest.mark.parametrize("place", PLACES)
