@@ -42,8 +42,8 @@ test: setup
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 test-all: setup  ## `make test`, and what takes long
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not container and not alone and not cell"
-	$(BIN)/python -m pytest -q -m "cell and not container and not alone"  # ten processes each: one after another
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not container and not alone and not browser"
+	$(BIN)/python -m pytest -q -m "browser and not container and not alone"  # cells and Chromium: one after another
 	$(BIN)/python -m pytest -q -m alone || [ $$? = 5 ]  # none where no driver is installed
 
 containers: setup  ## build the image and run a cell in containers; needs a container engine

@@ -25,6 +25,7 @@ from common.applications.pick_place.fit import Fit, fit_each, fit_spheres
 from common.applications.pick_place.masks import Colours, Masks, RedMasks
 from common.applications.pick_place.odd import (
     BELOW,
+    COVERED,
     EXPLAINED,
     FALLING,
     FLAT,
@@ -34,6 +35,7 @@ from common.applications.pick_place.odd import (
     NOT_ROUND,
     THIN,
     Odd,
+    covered,
     oval,
     sized,
     unlike,
@@ -208,7 +210,7 @@ class Detector:
                     self.odd += [self._odd(camera.project(center + camera.position), camera, NOT_ROUND)
                                  for center in fit.centers]
                     continue
-                reasons = self._higher(blob, fit, camera, offset if offsets else None, pixel_size)
+                reasons = self._higher(blob, fit, camera, fine, offset if offsets else None, pixel_size)
                 if reasons:
                     self.odd += [self._odd(camera.project(center + camera.position), camera, reason)
                                  for center, reason in zip(fit.centers, reasons, strict=True)]
@@ -286,13 +288,17 @@ class Detector:
             return True
         return float(np.mean(owner >= 0)) >= EXPLAINED
 
-    def _higher(self, blob: Blob, fit: Fit, camera: Pinhole, usual: float | None, pixel_size: float) -> list[str]:
-        """Why the balls of a blob are none on the table: one looks too large, it lies on others. Empty if none does.
+    def _higher(
+        self, blob: Blob, fit: Fit, camera: Pinhole, fine: Mask, usual: float | None, pixel_size: float
+    ) -> list[str]:
+        """Why the balls of a blob are not to be taken: one lies on others. Empty if none does.
 
         `usual` is the offset of balls that stand alone [m]; without any, that of the ball that looks smallest is.
         """
         if len(blob.border) or self.resting.shows_container(camera, blob.centroid):
             return []
+        if covered(fit.centers, self.resting.radius, fine, camera):
+            return [COVERED] * len(fit.centers)
         distance, _ = ray_distances(blob.outline.rays, fit.centers)
         own = [distance[fit.owner == k, k] for k in range(len(fit.centers))]
         offsets = np.array([np.mean(one) - self.resting.radius if len(one) else np.nan for one in own])

@@ -130,6 +130,20 @@ def test_of_a_stack_neither_ball_is_offered_where_the_camera_sees_it_from_the_si
     assert any(math.dist(one.position[:2], place) < 0.01 for one in detector.odd), "the lower one is where it is"
 
 
+@pytest.mark.parametrize("gap", [0.0, 0.006])
+def test_three_balls_that_carry_one_are_not_offered_and_without_it_they_are(gap: float) -> None:
+    draw, away = Renderer(AROUND, camera=CAMERA), (0.06 + gap) / math.sqrt(3)
+    for place in PLACES:
+        for turn in (0.0, 0.7):
+            around = [complex(*place) + away * np.exp(1j * (turn + third * math.tau / 3)) for third in range(3)]
+            lower, top = [ball(z.real, z.imag) for z in around], ball(*place, 0.03 + math.sqrt(0.06**2 - away**2))
+            found = Detector(AROUND).detect(draw.see(lower).colour, CAMERA)
+            assert len(found) == 3, (place, turn)
+            detector = Detector(AROUND)
+            assert detector.detect(draw.see([*lower, top]).colour, CAMERA) == [], (place, turn)
+            assert detector.odd and "lies" in detector.odd[0].reason
+
+
 @pytest.mark.parametrize("eye", [AROUND.camera, SIDE])
 @pytest.mark.parametrize("others", [True, False])
 def test_balls_that_touch_do_not_lie_on_each_other(eye: CameraConfig, others: bool) -> None:
