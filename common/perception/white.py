@@ -17,7 +17,7 @@ STRIDE = 8  # [px] between the pixels that are looked at
 DIM = 20  # [0..255] what is darker tells no colour
 SHARE = 60  # percentile: so much of the picture may be redder than what tells the light
 LEAST_GREEN = -0.7  # log(green / red) of what is still taken for a surface in white light
-USUAL_GREEN = -0.5  # to which that of anything redder is raised
+USUAL_GREEN = -0.65  # to which that of anything redder is raised: further, and the highlights of what is red are orange
 MOST = 1.0  # of the logarithm: no lamp is redder
 STEP = 0.1  # of the logarithm: a little more or less changes nothing
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -36,3 +37,10 @@ def test_green_is_raised_in_warm_light_to_about_what_it_is_in_daylight(light: fl
 def test_grey_and_dark_pictures_stay_as_they_are() -> None:
     assert green_gain(np.full((48, 64, 3), 128, np.uint8)) == 1.0
     assert green_gain(np.zeros((48, 64, 3), np.uint8)) == 1.0
+
+
+def test_in_warm_light_a_highlight_on_a_ball_stays_red_and_the_table_is_none() -> None:
+    picture = np.full((240, 320, 3), (4, 67, 238), np.uint8)  # of a lamp of 2700 K, overexposed
+    picture[100:110, 100:110] = (6, 48, 255)
+    hue = cv2.cvtColor(with_green(picture, green_gain(picture)), cv2.COLOR_BGR2HSV)[..., 0]
+    assert hue[105, 105] <= 10 and hue[0, 0] > 12
