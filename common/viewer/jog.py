@@ -152,7 +152,7 @@ class JogPanel:
 
     def _pad(self) -> str:
         if self._mode == JOINTS:
-            rows = [self._row(short, f"joint:{name}", f"joint {name}", f"j:{name}")
+            rows = [self._row(short, f"joint:{name}", _said(short), f"j:{name}")
                     for name, short in zip(self._joints, short_names(self._joints), strict=True)]
         else:
             frame = FRAMES[self._mode]
@@ -173,3 +173,8 @@ class JogPanel:
 
     def _set_speed(self, percent: float) -> None:
         self._share = min(max(percent, 1.0), 100.0) / 100
+
+
+def _said(short: str) -> str:
+    """What a screen reader calls a joint: as it is written beside its buttons, with the word once."""
+    return short if "joint" in short.lower() else f"joint {short}"

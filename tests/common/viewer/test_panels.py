@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,6 +15,7 @@ from common.viewer.arm_panel import ArmPanel
 from common.viewer.console import Desk
 from common.viewer.doors import Doors, Visitor
 from common.viewer.guard import close_server, make_server
+from common.viewer.jog import JogPanel
 from common.viewer.pictures import rgb_picture
 from common.viewer.plots import SAMPLE, SECONDS, Limits, PlotPanel
 
@@ -87,3 +89,16 @@ async def test_who_only_looks_has_the_arm_do_nothing(gui: viser.GuiApi) -> None:
     roles = {role: doors.admit(Visitor(n, "10.0.0.5", frozenset({"look", role})), buttons)
              for n, role in enumerate(("look", "tune", "operate"))}
     assert roles == {"look": False, "tune": False, "operate": True}
+
+
+@pytest.mark.parametrize(("joints", "said"), [
+    (["panda_joint1", "panda_joint2"], ["joint1", "joint2"]),
+    (["shoulder_pan_joint", "elbow_joint"], ["joint shoulder pan", "joint elbow"]),
+    (["1", "2"], ["joint 1", "joint 2"]),
+])
+async def test_what_is_said_of_the_buttons_of_a_joint_names_it_as_it_is_written(
+    gui: viser.GuiApi, joints: list[str], said: list[str]
+) -> None:
+    panel = JogPanel(gui, Desk(), joints, [1.0, 1.0])
+    labels = re.findall(r'aria-label="([^"]*)"', panel._html.content)
+    assert labels == [f"jog {name}, {way}" for name in said for way in ("minus", "plus")]
