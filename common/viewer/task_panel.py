@@ -55,7 +55,7 @@ class TaskPanel:
         console.on_press("home", home, "Go home")
         console.on_press("take", partial(self._own, "take"), "Take the arm")
         console.on_press("give", partial(self._own, "give"), "Give the arm back")
-        console.on_press("operate", lambda: self.tell("You operate", "good"), "Take over", "take")
+        console.on_press("operate", self._operate, "Take over", "take")
         console.on_press("leave", self._leave, "Let others operate", "look")
         self._buttons = gui.add_html("")
         self._speed = gui.add_slider("Speed [%]", SLOWEST, 100, 5, 100, hint="share of the planned speed, at once")
@@ -150,11 +150,15 @@ class TaskPanel:
         with contextlib.suppress(ZencellError):  # it is told
             await self.stop()
 
+    def _operate(self) -> None:
+        self.tell(f"{VISITOR.get()} operates now", "good")  # by its name: every page shows the line
+
     def _leave(self) -> None:
-        if self._console.doors.give_back(VISITOR.get()):
+        visitor = VISITOR.get()
+        if self._console.doors.give_back(visitor):
             self.tell("Nobody operates now", "good")
         else:
-            self.tell("This page does not operate")
+            self.tell(f"{visitor or 'This page'} does not operate")
 
     @property
     def _others(self) -> object:
@@ -173,7 +177,9 @@ class TaskPanel:
             self._refused = asked
             self.tell(f"{problem(error)}: press Take again for that")
         else:
-            self.tell(f"The motion is {now.told}", "good")
+            kept = act == "give" and now.owner not in ("", self._console.doors.person)
+            self.tell(f"Nothing to give back: the motion is {now.told}" if kept else f"The motion is {now.told}",
+                      "bad" if kept else "good")
 
     async def _command(self, chosen: str) -> None:
         if chosen in COMMANDS:
