@@ -61,6 +61,7 @@ class Jogger(Holder):
         self._who: object = None
         self._press: tuple[object, int] | None = None  # the newest that was begun or refused
         self._at, self._began, self._heard = 0.0, 0.0, 0
+        self._taken = False  # whether the arm has moved for this press
 
     def hold(self, who: object, what: str, press: int, refuse: Callable[[str], None]) -> None:
         """Move the arm for the next 0.1 s as the button says, or tell why not: that press never counts again then."""
@@ -78,9 +79,13 @@ class Jogger(Holder):
         why = self._kept() or self._inhibited(motion)
         if not (why or begins) and motion is not None and newest > self._heard:
             why = f"it is {motion.inhibits[-1].told}"
-        ours = owner is None or (owner.jogging and owner.owner == self._jogs.doors.person)
-        if not (why or begins or ours) and now - self._began > UNANSWERED:
-            why = f"its controller does not take it; the motion is {owner.told if owner is not None else ''}"
+        jogged = owner is not None and owner.jogging and owner.owner == self._jogs.doors.person
+        self._taken = jogged or (self._taken and not begins)
+        if owner is not None and not (why or begins or jogged) and now - self._began > UNANSWERED:
+            if self._taken and owner.kind == "none":
+                why = "nothing was heard of the button for a moment (a slow link, or a busy machine): press it again"
+            else:
+                why = f"its controller does not take it; the motion is {owner.told}"
         if begins:
             self._press, self._began = (who, press), now
             if newest != self._heard:  # the executor wants a pause after a stop: else this press would never count
