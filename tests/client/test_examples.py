@@ -86,6 +86,7 @@ def test_what_a_page_says_works_from_top_to_bottom(
     for block in blocks:
         exec(block, names)
     assert says in capsys.readouterr().out and not left(tmp_path)
+    assert names["status"].state in ("DONE", "ERROR"), "the task was not stopped on its way"  # type: ignore[attr-defined]
 
 
 SLOWLY = """
