@@ -17,7 +17,9 @@ STRIDE = 8  # [px] between the pixels that are looked at
 DIM = 20  # [0..255] what is darker tells no colour
 SHARE = 60  # percentile: so much of the picture may be redder than what tells the light
 LEAST_GREEN = -0.7  # log(green / red) of what is still taken for a surface in white light
-USUAL_GREEN = -0.65  # to which that of anything redder is raised: further, and the highlights of what is red are orange
+USUAL_GREEN = -0.5  # to which that of anything redder is raised
+ENOUGH = 0.6  # of the logarithm: raised further, and the highlights of what is red are orange
+NOT_RED = -0.75  # to which it is raised all the same
 MOST = 1.0  # of the logarithm: no lamp is redder
 STEP = 0.1  # of the logarithm: a little more or less changes nothing
 
@@ -31,7 +33,8 @@ def green_gain(picture: Picture) -> float:
     green = float(np.percentile(np.log((pixels[:, 1] + 1) / (pixels[:, 2] + 1)), SHARE))
     if green >= LEAST_GREEN:
         return 1.0
-    return math.exp(STEP * round(min(USUAL_GREEN - green, MOST) / STEP))
+    missing = min(USUAL_GREEN - green, max(ENOUGH, NOT_RED - green), MOST)
+    return math.exp(STEP * round(missing / STEP))
 
 
 def with_green(picture: Picture, gain: float) -> Picture:
