@@ -63,7 +63,7 @@ class Masks:
             masks = _masks(with_green(picture, gain), colours)
             self._known = _Known(picture.copy(), colours, gain, masks)
             return masks
-        reach = 4 * (colours.kernel_px // 2)  # erosion and dilation, twice: so far a pixel acts on the masks
+        reach = 4 * (colours.kernel_px // 2) + 2  # of erosion and dilation, twice: so far a pixel acts on the masks
         inner, outer = _grown(part, reach, picture), _grown(part, 2 * reach, picture)
         masks = RedMasks(*(mask.copy() for mask in known.masks))
         known.picture[part] = picture[part]
