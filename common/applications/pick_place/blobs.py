@@ -18,6 +18,7 @@ Part = tuple[Contour, bool]  # a contour, and whether it is that of a hole
 Traced = tuple[tuple[bytes, bool], ...]  # the parts of an outline
 
 _REACH = 3  # contour points to either side from which the direction of the outline is taken
+MOST_NARROW = 0.05  # part of a picture that may be narrow for what is long in it to be told
 _LEAST_POINTS = 16  # shorter contours are specks or pin holes
 
 
@@ -132,12 +133,17 @@ def long_ones(narrow: Mask, camera: Pinhole, plane: float, least: float) -> list
         plane: height at which its length is taken [m].
         least: shorter ones are left out [m].
     """
+    if cv2.countNonZero(narrow) > MOST_NARROW * narrow.size:  # specks all over, of which some are long by chance
+        return []
     outer, _ = cv2.findContours(narrow, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    long = [np.asarray(c).reshape(-1, 2).astype(float) for c in outer if max(cv2.boundingRect(c)[2:]) >= _LEAST_POINTS]
+    if not long:
+        return []
+    ends = np.array([points[[*points.argmin(axis=0), *points.argmax(axis=0)]] for points in long])
+    ground = np.asarray(camera.on_plane(ends.reshape(-1, 2), plane)).reshape(len(long), 4, 2)
     found = []
-    for contour in outer:
-        points = np.asarray(contour).reshape(-1, 2).astype(float)
-        ground = camera.on_plane(points[[*points.argmin(axis=0), *points.argmax(axis=0)]], plane)
-        if np.isfinite(ground).all() and np.linalg.norm(np.ptp(ground, axis=0)) >= least:
+    for points, on in zip(long, ground, strict=True):
+        if np.isfinite(on).all() and np.linalg.norm(np.ptp(on, axis=0)) >= least:
             u, v = points[np.linalg.norm(points - points.mean(axis=0), axis=1).argmin()].tolist()
             found.append((float(u), float(v)))
     return found

@@ -25,6 +25,7 @@ from common.applications.pick_place.fit import Fit, fit_each, fit_spheres
 from common.applications.pick_place.masks import Colours, Masks, RedMasks
 from common.applications.pick_place.odd import (
     BELOW,
+    BLURRED,
     COVERED,
     EXPLAINED,
     FALLING,
@@ -297,7 +298,8 @@ class Detector:
         """
         if len(blob.border) or self.resting.shows_container(camera, blob.centroid):
             return []
-        if covered(fit.centers, self.resting.radius, fine, camera):
+        reach = self.resting.radius + max(0.0, fit.offset + BLURRED * pixel_size)
+        if covered(fit.centers, reach, fine, camera):
             return [COVERED] * len(fit.centers)
         distance, _ = ray_distances(blob.outline.rays, fit.centers)
         own = [distance[fit.owner == k, k] for k in range(len(fit.centers))]

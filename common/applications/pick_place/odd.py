@@ -30,8 +30,9 @@ EXPLAINED = 0.8  # part of the outline of a blob that lies on those of its balls
 MOST_OVAL = 0.55  # [px] by which the outline of a ball may be longer one way than the other
 MOST_UNLIKE = 0.5  # [px] by which balls of one picture may differ in how large they look
 LONG = 2.0  # diameters of a ball: what shows of one beside the arm or another ball is shorter
-NEIGHBOURS = 3.0  # radii between the centres of balls that may carry one, at most
+NEIGHBOURS = 3.5  # radii between the centres of balls that may carry one, at most: 2 sqrt(3)
 GAP = 8  # [px] of the table that three balls leave to be seen, at least, for one on them to be told
+BLURRED = 0.3  # [px] by which balls are taken for larger than their outlines say, so that a gap is surely one
 SEEN = 0.3  # part of a gap that is not red where nothing lies on it, at least
 FALLING = 0.006  # [m] what looks so much larger is higher than a stack: it falls, or hangs in the hand
 FEWEST = 3  # balls by which it is told how large they look
@@ -90,7 +91,7 @@ def covered(centers: Array, radius: float, red: Mask, camera: Pinhole) -> bool:
 
     Args:
         centers: (n, 3) relative to the optical centre [m].
-        radius: of the balls [m].
+        radius: of the balls, as far as they are red at most [m]: what is blurred closes a gap.
         red: what is red, not closed.
         camera: the camera.
     """
@@ -100,10 +101,15 @@ def covered(centers: Array, radius: float, red: Mask, camera: Pinhole) -> bool:
             if max(apart[a, b] for a, b in combinations(trio, 2)) < NEIGHBOURS * radius]
     if not near:
         return False
-    outlines = np.rint(silhouettes(camera, places, radius, 32)).astype(np.int32)
+    drawn = silhouettes(camera, places, radius, 32)
+    if not np.isfinite(drawn).all():
+        return False
+    outlines = np.rint(drawn).astype(np.int32)
     middles = np.rint(camera.project(places)).astype(np.int32)
     for trio in near:
         corner = middles[list(trio)].min(axis=0)
+        if (corner < 0).any():
+            continue
         width, height = (np.ptp(middles[list(trio)], axis=0) + 1).tolist()
         free = np.zeros((height, width), np.uint8)
         cv2.fillConvexPoly(free, middles[list(trio)] - corner, 255)

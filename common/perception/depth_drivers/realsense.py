@@ -15,6 +15,7 @@ from common.errors import ConfigError
 from common.perception.depth_sources import CameraGone, Lens, Shot, maker_of
 
 PATIENCE = 1000  # [ms] without a frame after which the camera is gone
+REWIND = 10_000  # [ms] without one after which a recording is, which a busy machine begins again only after a while
 
 
 class Options(Parameters):
@@ -57,7 +58,7 @@ class RealSense:
         """The next shot, depth and colour of the same instant."""
         while True:
             try:
-                frames = self._align.process(self._pipeline.wait_for_frames(PATIENCE))
+                frames = self._align.process(self._pipeline.wait_for_frames(REWIND if self._recorded else PATIENCE))
             except RuntimeError as error:  # unplugged, or it hangs
                 raise CameraGone(str(error)) from None
             depth, color = frames.get_depth_frame(), frames.get_color_frame()
@@ -95,6 +96,9 @@ def open_camera(options: Options, size: tuple[int, int], rate: float) -> RealSen
     except RuntimeError as error:  # a recording without one of the two
         pipeline.stop()
         raise CameraGone(f"{options.file}: {error}") from None
+    except ConfigError:
+        pipeline.stop()
+        raise
 
 
 def _camera(rs: Any, options: Options, size: tuple[int, int]) -> Any:

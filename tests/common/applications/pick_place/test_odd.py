@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from common.applications.pick_place.detector import Detector
-from common.applications.pick_place.odd import FLAT, NOT_ROUND, THIN
+from common.applications.pick_place.detector import Detector, DetectorOptions
+from common.applications.pick_place.odd import COVERED, FLAT, NOT_ROUND, THIN
 from common.applications.pick_place.validation import Validation
 from common.config import CameraConfig, Surroundings, load_cell
 from common.messages import Color, Vector3, WorldObject
 from common.perception.pinhole import Pinhole
+from common.perception.sphere import silhouettes
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
 from common.sim.rendering import Renderer
 from services.vision_detector import _remark, markers
@@ -80,7 +81,7 @@ def test_thin_cable_is_reported_beside_balls(eye: CameraConfig) -> None:
 def test_picture_full_of_red_specks_shows_no_cable() -> None:
     rng = np.random.default_rng(5)
     picture = Renderer(AROUND, camera=CAMERA).see([ball(x, y) for x, y in OTHERS]).colour.copy()
-    for share in (0.01, 0.1, 0.3):
+    for share in (0.01, 0.1, 0.3, 0.7):
         noisy = picture.copy()
         noisy[rng.random(picture.shape[:2]) < share] = (20, 20, 200)
         detector = Detector(AROUND)
@@ -141,7 +142,19 @@ def test_three_balls_that_carry_one_are_not_offered_and_without_it_they_are(gap:
             assert len(found) == 3, (place, turn)
             detector = Detector(AROUND)
             assert detector.detect(draw.see([*lower, top]).colour, CAMERA) == [], (place, turn)
-            assert detector.odd and "lies" in detector.odd[0].reason
+            assert {one.reason for one in detector.odd} == {COVERED}
+
+
+@pytest.mark.parametrize("blur", [0.6, 1.3])
+def test_three_balls_that_touch_are_offered_in_a_picture_that_is_blurred(blur: float) -> None:
+    away = 0.06 / math.sqrt(3)
+    at = [0.30 + 0.20j + away * np.exp(1j * third * math.tau / 3) for third in range(3)]
+    places = np.array([(z.real, z.imag, 0.03) for z in at] + [(x, y, 0.03) for x, y in OTHERS[:2]])
+    picture = np.full((CAMERA.height, CAMERA.width, 3), 40, np.uint8)
+    for outline in silhouettes(CAMERA, places, 0.03, 64):
+        cv2.fillConvexPoly(picture, np.rint(outline).astype(np.int32), (25, 35, 200))
+    detector = Detector(AROUND, DetectorOptions(outline_offset_px=1.0))
+    assert len(detector.detect(cv2.GaussianBlur(picture, (0, 0), blur), CAMERA)) == len(places), detector.odd
 
 
 @pytest.mark.parametrize("eye", [AROUND.camera, SIDE])
