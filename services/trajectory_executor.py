@@ -59,6 +59,7 @@ T = TypeVar("T")
 
 MOST_TOLD = 16  # who jogs in vain, told of once
 MOST_CYCLES = 250.0  # per second of wall time
+MOST_STOPS = 50  # requests to stop that may wait to be read: each takes about 1 ms
 REACH_MARGIN = 0.008  # [m] random places keep from the ends of the reach: what is seen is a few millimetres off
 
 
@@ -180,6 +181,19 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
             bus.log.info("stopped by %s: %s", request.owner or SOMEBODY, request.reason)
         return await kept_answer(cycle.authority.stop(request, bus.clock.now()))
 
+    stopping: asyncio.Task[MotionStatus] | None = None
+
+    def stops_unread() -> None:
+        """Stop the robot, as one of the requests to stop that nobody has time to read may be a person's."""
+        nonlocal stopping
+        if stopping is not None and stopping.done():
+            stopping.result()
+            stopping = None
+        if stopping is None and not any(one.by == bus.service for one in inhibits.stops):
+            bus.log.error("more than %d requests to stop wait: the robot is stopped for all of them", MOST_STOPS)
+            unread = StopRequest(owner=bus.service, reason="more requests to stop come than can be read")
+            stopping = asyncio.create_task(stop(unread), name="stop")
+
     async def hold(request: HoldRequest) -> MotionStatus:
         before, owned = len(inhibits.all), cycle.authority.owner
         status, let_go = cycle.authority.hold(request, bus.clock.now())
@@ -294,7 +308,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     bus.keep_parameters = keep_speed
     bus.serve(topics.MOTION_EXECUTE, execute)
     bus.serve(topics.MOTION_FOLLOWED, followed)
-    bus.serve(topics.MOTION_STOP, stop)
+    bus.serve(topics.MOTION_STOP, stop, most=MOST_STOPS, crowded=stops_unread)
     bus.serve(topics.MOTION_HOLD, hold)
     bus.serve(topics.MOTION_OWN, own)
     bus.serve(topics.ROBOT_COMMAND, order)

@@ -210,6 +210,10 @@ def checked(config: Parameters, service: str, values: Mapping[str, Any]) -> list
         raise Refused("bad_value", _with_bounds(error, known)) from None
     changes = [Change(known[path], leaf.value) for path, leaf in candidate.items() if path in values]
     for change in changes:
+        # Models read cell files, too, in which a text may be a number: here it is a slip, and true is the number 1.
+        number = kind_of(change.leaf.info.annotation) in ("number", "integer")
+        if number and isinstance(given := values[change.leaf.path], bool | str):
+            raise Refused("bad_value", _with_bounds(ConfigError(change.leaf.path, given, "must be a number"), known))
         if not _is_finite(change.value):
             raise Refused("bad_value", str(ConfigError(change.leaf.path, change.value, "must be finite")))
     return [change for change in changes if change.value != change.leaf.value]

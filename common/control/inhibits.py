@@ -6,9 +6,9 @@ Those of persons are part of a record, which outlives this process; what the wat
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from common.errors import Refused
 from common.messages import HoldRequest, Inhibit, StopRequest
@@ -22,6 +22,13 @@ MOST_REASON = 300  # characters
 MOST_GOALS = 200  # ids of goals that were stopped
 SLOWEST = 0.05  # share of the speed when nobody knows what it was set to
 STOPPED = "stopped"
+LATEST = 7 * 10**18  # [ns since the Unix epoch], in the year 2191: a later `since` leaves no room for those after it
+
+
+def _not_late(inhibit: Inhibit) -> Inhibit:
+    if inhibit.since > LATEST:
+        raise ValueError(f"since {inhibit.since} is later than {LATEST}")
+    return inhibit
 
 
 class Speed(BaseModel):
@@ -39,10 +46,10 @@ class Record(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     version: Literal[1] = 1
-    inhibits: list[Inhibit] = []
-    goals: list[str] = []
+    inhibits: list[Annotated[Inhibit, AfterValidator(_not_late)]] = Field([], max_length=2 * MOST - 8)  # and our own
+    goals: list[str] = Field([], max_length=MOST_GOALS)
     speed: Speed | None = None
-    newest: int = 0  # `since` of the newest inhibit there ever was
+    newest: int = Field(0, ge=0, le=LATEST)  # `since` of the newest inhibit there ever was
     arm_stopped: bool = False  # the arm's own controller had stopped it for safety, and nobody has had it recover yet
 
 

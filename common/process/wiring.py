@@ -87,10 +87,10 @@ class Recorder(Bus):
         self.wiring.writes.add(self._in_cell(topic))
         return super().writer(topic)
 
-    def serve(self, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]]) -> None:
+    def serve(self, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]], **how: Any) -> None:
         """Note what is served."""
         self.wiring.serves.add(self._in_cell(topic))
-        super().serve(topic, handler)
+        super().serve(topic, handler, **how)
 
     def client(self, topic: Request[Q, A]) -> Client[Q, A]:
         """A client whose calls nobody answers."""

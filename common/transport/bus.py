@@ -139,8 +139,13 @@ class Bus:
         self._writers.append(writer)
         return writer
 
-    def serve(self, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]]) -> None:
+    def serve(
+        self, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]], *, most: int | None = None,
+        crowded: Callable[[], None] | None = None,
+    ) -> None:
         """Answer requests with `await handler(request)`, concurrently, from `ready` on.
+
+        Of more than `most`, else 1000, that wait the rest is refused, unread, and `crowded()` called for each.
 
         The handler raises `Refused` to refuse one; any other exception is told to the requester and ends the service.
         """
@@ -149,7 +154,7 @@ class Bus:
         self._servers.append(
             Server(
                 self._session, self.cell, self.service, served, handler, loop=self._loop, log=self.log,
-                ready=self.ready_event, crash=self._on_crash, limit=self._limit,
+                ready=self.ready_event, crash=self._on_crash, limit=self._limit, most=most, crowded=crowded,
             )
         )
         if self.ready_event.is_set():

@@ -46,10 +46,12 @@ class Server(Generic[Q, A]):
     def __init__(
         self, session: Session, cell: str, service: str, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]],
         *, loop: asyncio.AbstractEventLoop, log: logging.Logger, ready: asyncio.Event,
-        crash: Callable[[BaseException], None], limit: int,
+        crash: Callable[[BaseException], None], limit: int, most: int | None = None,
+        crowded: Callable[[], None] | None = None,
     ) -> None:
         self.topic = topic
         self.received = 0
+        self._most, self._crowded = most, crowded
         self._key = f"{cell}/{topic.key}"
         self._service = service
         self._sequence = 0
@@ -81,9 +83,12 @@ class Server(Generic[Q, A]):
             query.finish()
             return
         self.received += 1
-        if len(self._waiting) >= _MOST_WAITING:
-            query.refuse(encode_error("busy", f"{_MOST_WAITING} requests wait already"))
+        most = self._most or _MOST_WAITING
+        if len(self._waiting) >= most:
+            query.refuse(encode_error("busy", f"{most} requests wait already"))
             query.finish()
+            if self._crowded is not None:
+                self._crowded()
             return
         if self._beginning:
             self._waiting.append(query)

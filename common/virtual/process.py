@@ -134,7 +134,7 @@ class VirtualBus(Bus):
         client.noted = self._noted
         return client
 
-    def serve(self, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]]) -> None:
+    def serve(self, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]], **how: Any) -> None:
         """Answer requests, of which is noted what is answered."""
 
         async def watched(request: Q) -> A:
@@ -142,7 +142,7 @@ class VirtualBus(Bus):
             self._noted.on_serve(self.session.life, request, answer)
             return answer
 
-        super().serve(topic, watched)
+        super().serve(topic, watched, **how)
 
     def reader(self, topic: Topic[M], *, size: int = 1000, listening: bool = True) -> Reader[M]:
         """A reader of the topic."""

@@ -122,6 +122,21 @@ async def test_task_whose_fingers_were_kept_from_moving_does_not_go_on_when_the_
         assert refused.error == "stopped" and "by ann (the motion is ann's" in refused.message
 
 
+async def test_robot_is_stopped_when_more_requests_to_stop_come_than_can_be_read(robot: RobotModel) -> None:
+    home = robot.named("home")
+    async with executor() as person:
+        await person.execute.call(person.asks(id="a", trajectory=move(robot, home, home + 0.5, 0.02)))
+        await person.see(person.motion, lambda m: m.progress > 0.2)
+        nobodys = StopRequest(id="nothing", by="requester")
+        flood = [asyncio.create_task(person.stop.call(nobodys)) for _ in range(60)]
+        last = asyncio.create_task(person.stop.call(StopRequest(owner="anna")))
+        told = await person.see(person.motion, lambda m: bool(m.stopped))
+        assert "by trajectory_executor (more requests to stop come than can be read" in told.stopped
+        await asyncio.gather(*flood, last, return_exceptions=True)
+        await person.see(person.motion, lambda m: m.state == "cancelled")
+        assert not (await person.hold.call(HoldRequest(hold=False, owner="bert", stops=True))).stopped
+
+
 async def test_goal_that_is_stopped_before_it_comes_never_moves_also_after_a_restart(robot: RobotModel) -> None:
     home = robot.named("home")
     there = move(robot, home, home + 0.2)

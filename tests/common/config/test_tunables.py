@@ -171,3 +171,10 @@ def test_a_service_has_a_copy_of_its_sections() -> None:
     cell = load_cell("panda")
     apply(checked(service_config(cell, "mover", Mover), "mover", {"motion.velocity_scaling": 0.9}))
     assert cell.motion.velocity_scaling == service_config(cell, "mover", Mover).motion.velocity_scaling == 0.2
+
+
+@pytest.mark.parametrize("value", [True, "1"])
+@pytest.mark.parametrize("path", ["services.it.wait", "services.it.high", "motion.velocity_scaling"])
+def test_neither_a_truth_nor_a_text_is_a_number(path: str, value: object) -> None:
+    code, told = refusal(config(), {path: value})
+    assert code == "bad_value" and told.startswith(f"{path}: {value!r} must be a number")

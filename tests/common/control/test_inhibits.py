@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -289,7 +290,14 @@ def test_what_is_not_kept_is_told_so_and_what_was_before_is_not() -> None:
     assert not MotionStatus(inhibits=inhibits.all).not_kept
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff" * 99, b'{"version": 2}', b'{"version": 1, "inhibits": [{}]}'])
+MANY = json.dumps({"inhibits": [{"kind": "held", "by": f"p{number}", "since": 1} for number in range(40)]}).encode()
+
+
+@pytest.mark.parametrize("content", [
+    b"", b"{", b"\xff" * 99, b'{"version": 2}', b'{"version": 1, "inhibits": [{}]}', MANY,
+    b'{"newest": 9223372036854775807}', b'{"newest": -1}', b'{"newest": 1e30}',
+    b'{"inhibits": [{"kind": "stopped", "by": "a", "since": 9223372036854775807}]}',
+])
 def test_record_that_cannot_be_read_counts_as_stopped_and_slow(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "r"
     path.write_bytes(content)
