@@ -54,6 +54,7 @@ from common.sim.standing import Standing
 
 PROGRESS_PERIOD = 0.1  # cell time between reports of progress [s]
 FINGERS_PERIOD = 0.02  # cell time between reports of fingers that move [s]: by their width one goes on
+PRESSES = 1e-3  # [m] by which fingers may be further apart than what they press on
 WORLD_PERIOD = 0.05  # cell time between reports of an object that moves [s]
 
 
@@ -246,10 +247,15 @@ class ControlCycle:
         if self._gripper is None or not isinstance(fingers, PlacedGripper) or state.width is None:
             return
         fingers.place(state.width)
+        told = state.told_width
         if self._felt is not None and self._obstructible is not None and self._kinematics is not None:
-            self._obstructible.obstruct(self._felt.obstruction(self._kinematics.fk(self._q), state.width))
-        if state.told_width is not None:
-            self._gripper.resume(state.told_width, now, state.told_effort)
+            between = self._felt.obstruction(self._kinematics.fk(self._q), state.width)
+            self._obstructible.obstruct(between)
+            holds = told is not None and told < state.width <= between + PRESSES
+            if self._inhibits.stops and not holds:  # they go on pressing, and on no way
+                told = state.width
+        if told is not None:
+            self._gripper.resume(told, now, state.told_effort)
         self._gripper.update(fingers.read(now), now)
 
     def takes_long(self, request: ExecuteRequest) -> bool:

@@ -157,6 +157,22 @@ def test_after_a_restart_what_is_held_is_pressed_as_before_and_watched(limits, r
     assert again.grippers[-1].outcome == "slipping"
 
 
+@pytest.mark.parametrize("held", [False, True])
+def test_after_a_restart_fingers_that_a_stop_forbids_to_move_stay_where_they_are_and_press(limits, rig, held):
+    rig.cycle.command(GripperCommand(id="close", width=0.0, effort=40.0), rig.now)
+    rig.run(1.0 if held else 0.05)
+    width = rig.grippers[-1].width
+    again = Rig(limits)
+    again.stamp = rig.stamp
+    again.cycle.authority.stop(StopRequest(owner="anna"), again.now)
+    again.cycle.restore(rig.cycle.standing(), again.now)
+    again.run(1.0)
+    told = again.grippers[-1]
+    assert told.holding == held and told.width == pytest.approx(width, abs=2e-3)
+    if held:
+        assert told.effort == 40.0
+
+
 def test_same_gripper_id_again_moves_nothing(rig):
     rig.grip("close", 0.0)
     rig.run(1.0)
