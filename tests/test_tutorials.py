@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests import pages
+from tests.common.hardware.driven_rig import HELD_UP
 from tests.harness import Place, ask, environment, free_domain, place_of
 from tests.simulated.visited import no_processes
 
@@ -58,8 +59,11 @@ def follow(name: str, folder: Path, domain: int) -> list[str]:
         if not step.line.startswith("zencell up "):
             ran = tell(step.line, folder, domain)
             deadline = time.monotonic() + PATIENCE
-            while "robot status" in step.line and not step.shown_in(ran.stdout) and time.monotonic() < deadline:
-                ran = tell(step.line, folder, domain)  # an arm needs its time
+            while time.monotonic() < deadline and (
+                ("robot status" in step.line and not step.shown_in(ran.stdout))  # an arm needs its time
+                or ("robot jog" in step.line and any(reason in ran.stderr for reason in (*HELD_UP, "connecting to")))
+            ):
+                ran = tell(step.line, folder, domain)
             said = ran.stdout + ran.stderr
             assert step.shown_in(said), (step, said)
             assert ran.returncode == 0 or step.shows.startswith("zencell:"), (step, said)  # the page shows the error

@@ -6,6 +6,7 @@ that process or the network dies. Nothing is powered, released or recovered unle
 
 from __future__ import annotations
 
+import math
 import re
 import threading
 import time
@@ -24,6 +25,7 @@ from common.messages import RobotMode
 MODELS = r"^ur((3|5|10)e?|16e|15|20|30)$"
 CB3 = re.compile(r"^ur(3|5|10)$")
 LATEST = 0.15  # [s] without a new state of the arm, after which it counts as gone
+LOOK = 0.02  # [s] of them that count at most from one look to the next: who was held up has not listened
 WATCHDOG = 10.0  # [Hz] less often, the arm's program ends by itself
 MOVES = 0.02  # [rad/s] faster than this, a joint does not rest
 SETTLES = 0.5  # [s] in which the arm rests once its set-points do
@@ -92,6 +94,20 @@ def connect(options: dict[str, Any], limits: Limits) -> UrArm:
     return UrArm(Options(**options), limits)
 
 
+class Silence:
+    """How long [s] nothing was heard by somebody who listened."""
+
+    def __init__(self) -> None:
+        """Nothing was heard yet."""
+        self._looked, self._silent = -math.inf, 0.0
+
+    def lasts(self, now: float, heard: bool) -> float:
+        """Its length at a look at some time [s]; of the time since the look before no more than LOOK counts."""
+        self._silent = 0.0 if heard else self._silent + min(now - self._looked, LOOK)
+        self._looked = now
+        return self._silent
+
+
 class UrArm:
     """The three connections to a controller: what it says, the program that moves it, and its dashboard."""
 
@@ -111,10 +127,10 @@ class UrArm:
         self._control: Any = None
         self._using = threading.Lock()  # the control interface, which is not made for two
         self._stamp, self._since = -1.0, time.monotonic()
+        self._states, self._taking = Silence(), Silence()
         self._freedrive = self._servoing = False
         self._began = False  # whether the program that was uploaded was seen to run
         self._ending: threading.Thread | None = None
-        self._taken = 0.0  # monotonic time of the newest set-point that the arm took [s]
 
     def read(self) -> ArmState:
         """The newest state; the program is uploaded where the arm is ready and has none.
@@ -123,9 +139,10 @@ class UrArm:
             ConnectionError: nothing new came for a while.
         """
         stamp, now = self._receive.getTimestamp(), time.monotonic()
-        if stamp != self._stamp:
+        silent = self._states.lasts(now, stamp != self._stamp)
+        if silent == 0.0:
             self._stamp, self._since = stamp, now
-        elif now - self._since > LATEST:
+        elif silent > LATEST:
             raise ConnectionError(f"no word from the controller for {now - self._since:.2f} s")
         mode, message = self._mode()
         if self._control is not None:
@@ -183,12 +200,8 @@ class UrArm:
         with self._using:
             taken = self._control is not None and self._control.servoJ(
                 points[-1].tolist(), 0.0, 0.0, 1 / self.rate, self._options.lookahead, self._options.gain)
-            self._taken = self._taken if self._servoing else time.monotonic()
-            self._servoing = True
-        now = time.monotonic()
-        if taken:
-            self._taken = now
-        elif now - self._taken > LATEST:  # else it may be about to say why
+            begun, self._servoing = not self._servoing, True
+        if self._taking.lasts(time.monotonic(), taken or begun) > LATEST:  # else it may be about to say why
             raise ConnectionError("the arm's program does not take set-points")
 
     def wait(self) -> None:

@@ -19,7 +19,7 @@ from common.hardware.interface import HardwareFault, Limits
 from common.hardware.loading import load_hardware
 from common.messages import GripperCommand
 from common.robot.model import RobotModel
-from tests.common.hardware.driven_rig import PERIOD, TIMEOUT, Rig
+from tests.common.hardware.driven_rig import PERIOD, SWING, TIMEOUT, Rig
 from tests.doubles.franka_host import PYTHON, FrankaHost
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(120)]
@@ -132,9 +132,8 @@ def test_the_arm_finds_nothing_against_motions_at_all_limits() -> None:
 def test_a_reflex_says_why_and_is_left_only_when_somebody_asks() -> None:
     with FrankaHost("--enforce-comm-constraints"), rigged() as rig:
         rig.until("")
-        q = rig.measured
         for _ in range(30):
-            rig.cycle(q, np.zeros(7))
+            rig.cycle(None, np.zeros(7))
         (driver,) = [child for child in multiprocessing.active_children() if "hand" not in child.name]
         os.kill(driver.pid or 0, signal.SIGSTOP)
         time.sleep(0.2)  # the arm does without for 20 ms at most
@@ -161,7 +160,7 @@ def test_nothing_moves_before_somebody_asks_and_it_follows_from_where_it_stands(
 
 def test_set_points_that_cease_bring_the_arm_to_rest_by_itself(rig: Rig) -> None:
     rig.until("")
-    assert rig.wave(0.7) == ""
+    assert rig.swing(SWING / 4) == ""
     end = time.monotonic() + TIMEOUT
     while max(map(abs, rig.arm.state.dq)) > 1e-3:  # nobody sends anything
         assert time.monotonic() < end
