@@ -45,6 +45,19 @@ class Unreadable(ZencellError):
         self.path, self.why = path, why
 
 
+def open_regular(path: Path, flags: int) -> int:
+    """A descriptor of a file; one that is made is for us alone.
+
+    Raises:
+        OSError: it cannot be opened, or is something else than a file.
+    """
+    descriptor = os.open(path, flags | os.O_NONBLOCK, 0o600)  # a pipe would have us wait for its other end
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return descriptor
+    os.close(descriptor)
+    raise OSError(errno.EINVAL, "it is not a regular file")
+
+
 class KeptFile(Generic[R]):
     """A record that is always whole: a new file takes the place of the old one, which is the next new one.
 
@@ -76,10 +89,7 @@ class KeptFile(Generic[R]):
         raise Unreadable(self.path, why)
 
     def _text(self) -> bytes:
-        descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe would have us wait for a writer
-        with open(descriptor, "rb") as file:
-            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise OSError(errno.EINVAL, "it is not a regular file")
+        with open(open_regular(self.path, os.O_RDONLY), "rb") as file:
             return file.read(LARGEST)
 
     def save(self, record: R) -> None:

@@ -183,7 +183,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
 
     stopping: asyncio.Task[MotionStatus] | None = None
 
-    def stops_unread() -> None:
+    def stops_unread() -> str:
         """Stop the robot, as one of the requests to stop that nobody has time to read may be a person's."""
         nonlocal stopping
         if stopping is not None and stopping.done():
@@ -193,6 +193,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
             bus.log.error("more than %d requests to stop wait: the robot is stopped for all of them", MOST_STOPS)
             unread = StopRequest(owner=bus.service, reason="more requests to stop come than can be read")
             stopping = asyncio.create_task(stop(unread), name="stop")
+        return "the robot is stopped for all of them"
 
     async def hold(request: HoldRequest) -> MotionStatus:
         before, owned = len(inhibits.all), cycle.authority.owner

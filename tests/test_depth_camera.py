@@ -425,7 +425,7 @@ async def test_package_that_is_not_installed_is_told_with_its_extra(
     monkeypatch: pytest.MonkeyPatch, driver: str, package: str,
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ConfigError, match=rf"'{driver}' needs the extra `cameras`: pip install 'zencell\[cameras\]'"):
+    with pytest.raises(ConfigError, match=rf"'{driver}' needs the extra `{driver}`: pip install 'zencell\[{driver}\]'"):
         async with running_service(LocalNetwork(), real_depth_camera.run, config_of(driver=driver, options={}),
                                    name="camera"):
             await asyncio.sleep(10)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Awaitable
 from dataclasses import replace
+from typing import TypeVar
 
 from common import topics
 from common.application import find_application
@@ -18,6 +19,14 @@ from common.topics import Topic
 
 TIMEOUT = 5.0  # [s] wall for an answer
 ENDED = ("DONE", "ERROR")
+A = TypeVar("A")
+
+
+async def _answer(asked: Awaitable[A]) -> A | RequestFailed:
+    try:
+        return await asked
+    except RequestFailed as error:
+        return error
 
 
 class ArmOnly(ZencellError):
@@ -27,6 +36,15 @@ class ArmOnly(ZencellError):
 
     def __init__(self, error: ZencellError) -> None:
         super().__init__(f"the arm is stopped and stays so until a start; the task did not hear of it: {error}")
+
+
+class TaskOnly(ZencellError):
+    """The task has stopped, though nobody has said that the arm is stopped."""
+
+    exit_code = 1
+
+    def __init__(self, error: ZencellError) -> None:
+        super().__init__(f"the task has stopped, but who moves the arm has not said that it is stopped: {error}")
 
 
 class TaskControl(Part):
@@ -58,19 +76,17 @@ class TaskControl(Part):
 
         Raises:
             ArmOnly: the arm is stopped, but the task did not hear of it.
+            TaskOnly: the task has stopped, but who moves the arm has not answered.
             RequestFailed: neither heard of it.
         """
         stop = StopRequest(owner=self._owner)
-        arm = asyncio.create_task(self._bus.client(topics.MOTION_STOP).call(stop, TIMEOUT))
-        try:
-            told = await self._tell("stop")
-        except RequestFailed as error:
-            with contextlib.suppress(RequestFailed):
-                self._note(await arm)
-                raise ArmOnly(error) from None
-            raise
-        with contextlib.suppress(RequestFailed):
-            self._note(await arm)
+        arm, told = await asyncio.gather(
+            _answer(self._bus.client(topics.MOTION_STOP).call(stop, TIMEOUT)), _answer(self._tell("stop")))
+        if isinstance(arm, RequestFailed):
+            raise told if isinstance(told, RequestFailed) else TaskOnly(arm)
+        self._note(arm)
+        if isinstance(told, RequestFailed):
+            raise ArmOnly(told)
         return told
 
     @property

@@ -41,7 +41,7 @@ def _depth_cameras(sys: Path) -> Iterator[tuple[Path, Finding]]:
             told = " ".join(part for part in (what, product, _read(path / "serial")) if part)
             if find_spec(package) is None:
                 found = warn(f"depth camera {told}: {package} is not installed",
-                             f"pip install 'zencell[cameras]' for driver: {driver} of real_depth_camera")
+                             f"pip install 'zencell[{driver}]' for driver: {driver} of real_depth_camera")
             else:
                 found = ok(f"depth camera {told} (driver: {driver} of real_depth_camera)")
             yield path.resolve(), found

@@ -113,7 +113,7 @@ def maker_of(driver: str, package: str) -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        raise ConfigError("driver", driver, f"needs the extra `cameras`: pip install 'zencell[cameras]' ({error})"
+        raise ConfigError("driver", driver, f"needs the extra `{driver}`: pip install 'zencell[{driver}]' ({error})"
                           ) from None
 
 

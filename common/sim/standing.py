@@ -7,6 +7,7 @@ ones do not either, their state is kept in a file, which survives the process ho
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import socket
 import struct
@@ -18,7 +19,7 @@ from pathlib import Path
 import msgpack
 from pydantic import BaseModel, ConfigDict
 
-from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE
+from common.kept_file import STANDING_VARIABLE, STATE_VARIABLE, Unreadable, open_regular
 from common.sim.interface import SIMULATORS, StandingObject
 
 SLOT = 4 * 1024 * 1024  # [bytes] for each of the two newest states
@@ -47,9 +48,16 @@ class StateFile:
     """Keeps the newest state in a file: two places are written in turn, so that one of them is always whole."""
 
     def __init__(self, path: Path) -> None:
-        """Open the file, which need not be there yet."""
+        """Open the file, which need not be there yet.
+
+        Raises:
+            Unreadable: it cannot be opened, or is a link, which may be to something of somebody else's.
+        """
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            self._descriptor = open_regular(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW)
+        except OSError as error:
+            raise Unreadable(path, "it is a link" if path.is_symlink() else error.strerror or str(error)) from None
         self._number = 0
         self._packer = msgpack.Packer(default=vars)
         self._packed: dict[str, tuple[object, bytes]] = {}  # of the maps in the newest state, most of which stay
@@ -66,7 +74,9 @@ class StateFile:
             if number <= self._number or _checksum(number, body) != checksum:
                 continue
             try:
-                newest, self._number = Standing.model_validate(msgpack.unpackb(body)), number
+                kept = msgpack.unpackb(body)
+                if _finite(kept):  # else nothing could be put there
+                    newest, self._number = Standing.model_validate(kept), number
             except ValueError:  # of another version
                 continue
         return newest
@@ -128,6 +138,12 @@ class SavedBeside:
                 return self._file.close()
             with contextlib.suppress(OSError):  # a full disk stops no arm; what was kept before stays
                 self._file.save(state)
+
+
+def _finite(kept: object) -> bool:
+    if isinstance(kept, dict):
+        kept = list(kept.values())
+    return all(map(_finite, kept)) if isinstance(kept, list) else not isinstance(kept, float) or math.isfinite(kept)
 
 
 def _checksum(number: int, body: bytes) -> int:

@@ -141,11 +141,11 @@ class Bus:
 
     def serve(
         self, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]], *, most: int | None = None,
-        crowded: Callable[[], None] | None = None,
+        crowded: Callable[[], str] | None = None,
     ) -> None:
         """Answer requests with `await handler(request)`, concurrently, from `ready` on.
 
-        Of more than `most`, else 1000, that wait the rest is refused, unread, and `crowded()` called for each.
+        Of more than `most`, else 1000, that wait the rest is refused, unread, with what `crowded()` did about it.
 
         The handler raises `Refused` to refuse one; any other exception is told to the requester and ends the service.
         """

@@ -47,7 +47,7 @@ class Server(Generic[Q, A]):
         self, session: Session, cell: str, service: str, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]],
         *, loop: asyncio.AbstractEventLoop, log: logging.Logger, ready: asyncio.Event,
         crash: Callable[[BaseException], None], limit: int, most: int | None = None,
-        crowded: Callable[[], None] | None = None,
+        crowded: Callable[[], str] | None = None,
     ) -> None:
         self.topic = topic
         self.received = 0
@@ -85,10 +85,9 @@ class Server(Generic[Q, A]):
         self.received += 1
         most = self._most or _MOST_WAITING
         if len(self._waiting) >= most:
-            query.refuse(encode_error("busy", f"{most} requests wait already"))
+            done = f": {self._crowded()}" if self._crowded is not None else ""
+            query.refuse(encode_error("busy", f"{most} requests wait already{done}"))
             query.finish()
-            if self._crowded is not None:
-                self._crowded()
             return
         if self._beginning:
             self._waiting.append(query)

@@ -132,7 +132,9 @@ async def test_robot_is_stopped_when_more_requests_to_stop_come_than_can_be_read
         last = asyncio.create_task(person.stop.call(StopRequest(owner="anna")))
         told = await person.see(person.motion, lambda m: bool(m.stopped))
         assert "by trajectory_executor (more requests to stop come than can be read" in told.stopped
-        await asyncio.gather(*flood, last, return_exceptions=True)
+        answers = await asyncio.gather(*flood, last, return_exceptions=True)
+        refused = [str(answer) for answer in answers if isinstance(answer, RemoteError)]
+        assert refused and all("requests wait already: the robot is stopped for all of them" in why for why in refused)
         await person.see(person.motion, lambda m: m.state == "cancelled")
         assert not (await person.hold.call(HoldRequest(hold=False, owner="bert", stops=True))).stopped
 

@@ -31,7 +31,7 @@ def test_cameras_that_are_plugged_in_are_told_with_what_reads_them(
         video(tmp_path, number, name, index)
     realsense, oak, *others = cameras.cameras(tmp_path)
     assert realsense.level == "warn" and "435i 0123: pyrealsense2 is not installed" in realsense.what
-    assert "zencell[cameras]" in realsense.remedy
+    assert "zencell[realsense]" in realsense.remedy
     assert (oak.level, oak.what) == ("ok", "depth camera OAK Luxonis Device (driver: oak of real_depth_camera)")
     assert [finding.what for finding in others] == [
         "camera /dev/video2: Other (camera_opencv)", "camera /dev/video10: HD Webcam (camera_opencv)"]

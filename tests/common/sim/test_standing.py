@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import socket
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.config import World
-from common.kept_file import STATE_VARIABLE
+from common.kept_file import STATE_VARIABLE, Unreadable
 from common.messages import Header
 from common.robot.transforms import tool_down
 from common.sim.interface import StandingObject
@@ -98,6 +100,23 @@ def test_balls_that_are_held_that_fall_and_that_lie_in_the_box_go_on_where_they_
 
 def test_without_a_file_there_is_nothing(tmp_path: Path) -> None:
     assert StateFile(tmp_path / "new" / "state").load() is None
+
+
+def test_a_link_and_a_pipe_in_its_place_are_named_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "state").symlink_to(tmp_path / "other")
+    os.mkfifo(tmp_path / "pipe")
+    for name, why in (("state", "it is a link"), ("pipe", "it is not a regular file")):
+        with pytest.raises(Unreadable, match=f"{tmp_path}/{name} cannot be read: {why}"):
+            StateFile(tmp_path / name)
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_numbers_that_are_none_are_passed_over_for_the_state_before(value: float, tmp_path: Path) -> None:
+    file = StateFile(tmp_path / "state")
+    file.save(a_state(1))
+    file.save(Standing.model_construct(**vars(a_state(2)) | {"q": [0.0, value]}))
+    assert StateFile(tmp_path / "state").load() == a_state(1)
 
 
 def test_the_newest_of_many_is_found_and_what_is_written_after_it_is_newer(tmp_path: Path) -> None:

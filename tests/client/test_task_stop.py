@@ -1,0 +1,52 @@
+"""Stopping by the client, which tells the arm and the task: what is said when one of the two does not take it."""
+
+from __future__ import annotations
+
+import pytest
+
+from common import messages as m
+from common import topics
+from common.client.hearing import Ear
+from common.client.task import ArmOnly, TaskControl, TaskOnly
+from common.errors import Refused, RemoteError, ZencellError
+from common.messages.execution import NOT_KEPT
+from common.transport.local import LocalNetwork
+
+UNKEPT = m.Inhibit(kind="stopped", by="ann", reason=f"{NOT_KEPT}: the disk is full", since=1)
+
+
+@pytest.mark.parametrize(("arm", "task", "raised", "said"), [
+    (True, True, None, ""),
+    (True, False, ArmOnly, "the arm is stopped and stays so until a start; the task did not hear.*from the task"),
+    (False, True, TaskOnly, "the task has stopped, but who moves the arm has not said.*from the arm"),
+    (False, False, RemoteError, "from the task"),
+])
+async def test_stop_says_who_of_arm_and_task_did_not_take_it(
+    arm: bool, task: bool, raised: type[ZencellError] | None, said: str,
+) -> None:
+    network, told = LocalNetwork(), list[str]()
+    cell, person = network.bus("cell"), network.bus("person")
+
+    async def stop_arm(_: m.StopRequest) -> m.MotionStatus:
+        told.append("arm")
+        if not arm:
+            raise Refused("busy", "from the arm")
+        return m.MotionStatus(inhibits=[UNKEPT])
+
+    async def stop_task(_: m.TaskCommand) -> m.TaskStatus:
+        told.append("task")
+        if not task:
+            raise Refused("busy", "from the task")
+        return m.TaskStatus(state="READY")
+
+    cell.serve(topics.MOTION_STOP, stop_arm)
+    cell.serve(topics.TASK_COMMAND, stop_task)
+    await cell.ready()
+    control = TaskControl(Ear(person), "ann")
+    if raised is None:
+        assert (await control.stop()).state == "READY"
+    else:
+        with pytest.raises(raised, match=said):
+            await control.stop()
+    assert sorted(told) == ["arm", "task"], "both, whatever the other says"
+    assert ("disk is full" in control.unkept) == arm
