@@ -48,6 +48,7 @@ SCENE_KNOWS = 0.5  # [s] wall until the planning scene has what is held, if it c
 FINGERS = 10.0  # [s] wall in which fingers have come to their end
 ARCS = "circ"  # plans arcs, and need not be in the pipeline of a cell
 ACTIVE = ("active", "none")
+NO_WAY = "the arm cannot go that way, or its controller does not take it"
 
 
 class NotJogged(ZencellError):
@@ -291,8 +292,8 @@ class Arm(Part):
                     await asyncio.sleep(LET_GO)
                     began = clock()
                 elif not goes and not waits:
-                    late = "words of this program came too late" if ours and now.kind == "none" else ""
-                    raise NotJogged(now.told, _kept(state) or late)
+                    late = "words of this program came too late" if ours else NO_WAY
+                    raise NotJogged(now.told, _kept(state) or ("" if another else late))
                 ours = ours or goes
         finally:
             writer.put(JogCommand(header=self._bus.header(), owner=self.owner, heard=heard))
@@ -304,7 +305,7 @@ class Arm(Part):
         if not ours:
             now, state = owners.latest, motion.latest
             assert now is not None and state is not None
-            raise NotJogged(now.told, _kept(state))
+            raise NotJogged(now.told, _kept(state) or (NO_WAY if now.kind == "none" else ""))
 
     # --- whose the motion is --------------------------------------------------------------------------------------
 

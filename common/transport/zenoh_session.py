@@ -134,7 +134,8 @@ class ZenohSession:
     def watch_connection(self, on_change: Callable[[], None]) -> None:
         """Call back when the router may have been lost or reached."""
         # The events themselves do not add up: after a frozen router some come twice and some out of order.
-        self._session.info.declare_transport_events_listener(_direct(lambda _event: on_change()))
+        listener = self._session.info.declare_transport_events_listener(_direct(lambda _event: on_change()))
+        self._keep(_Undeclare(listener.undeclare))  # else it calls into an interpreter that ends
 
     def _keep(self, declared: Declared) -> Declared:
         self._declared.append(declared)

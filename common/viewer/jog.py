@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import viser
 
+from common.client.arm import NO_WAY
 from common.client.operator_motion import OURSELVES, SOMEBODY
 from common.control.jogging import PAUSE
 from common.messages import MotionOwner, MotionStatus
@@ -85,7 +86,7 @@ class Jogger(Holder):
             if self._taken and owner.kind == "none":
                 why = "nothing was heard of the button for a moment (a slow link, or a busy machine): press it again"
             else:
-                why = f"its controller does not take it; the motion is {owner.told}"
+                why = f"{NO_WAY}; the motion is {owner.told}"
         if begins:
             self._press, self._began = (who, press), now
             if newest != self._heard:  # the executor wants a pause after a stop: else this press would never count

@@ -74,8 +74,7 @@ class PhysicsFingers:
         wanted = self._profile.read(now)
         width, rate = (self._target, 0.0) if self._at_once else (wanted.width, wanted.velocity)
         slope = self._slope
-        effort = self._effort if self._target < self._width else self._config.max_effort
-        limit_force(self._cell.model, self._actuator, effort * abs(slope))
+        limit_force(self._cell.model, self._actuator, self._effort * abs(slope))
         self._data.ctrl[self._actuator] = driven_position(self._config, width) + FINGER_LEAD * rate / slope
 
     def sense(self, now: float) -> None:

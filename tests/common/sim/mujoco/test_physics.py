@@ -190,6 +190,16 @@ def test_fingers_close_on_nothing_and_say_so() -> None:
     assert rig.fingers.read(rig.now).width == pytest.approx(0.08, abs=1e-3)
 
 
+def test_fingers_that_open_against_something_do_not_push_the_arm_away() -> None:
+    rig = Rig({**CUBE, "size": [0.1, 0.1, 0.07], "y": 0.085, "mass": 80.0})  # beside the closed fingers
+    rig.grip(0.0)
+    rig.move(rig.above(0.45, 0.0, 0.1))
+    rig.move(rig.above(0.45, 0.0, 0.05))
+    rig.grip(GRIPPER.max_width, GRIPPER.effort, 2.0)
+    assert rig.fingers.read(rig.now).width < GRIPPER.max_width - 0.01, "they are kept from opening"
+    assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3
+
+
 @pytest.mark.parametrize("cell", ["panda", "ur5"])
 def test_all_joints_of_the_gripper_follow_the_driven_one(cell: str) -> None:
     rig = Rig(cell=cell)
