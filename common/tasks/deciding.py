@@ -5,6 +5,7 @@ A task of one's own says in `decide` what comes next, and of the rest only what 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Generic, Literal, TypeVar
 
@@ -19,6 +20,7 @@ from common.tasks.watchdogs import FrameAge, Patience
 V = TypeVar("V", bound=View)
 
 MOST_FAILURES = 10
+PAUSE, LONGEST_PAUSE = 0.25, 2.0  # [s] after the second failure in a row, doubled with each more, and at most
 OVERTIME = 30.0  # [s] a motion that takes so much longer than planned is stopped
 RETREAT = 0.1  # [m] upwards
 MOVED = 0.005  # [m] what stands this far from where anything stood before is new there
@@ -92,6 +94,7 @@ class Deciding(Generic[V]):
         self._began: float | None = None
         self._minted = 0
         self._failures_in_a_row = self._done_before = 0
+        self._again_at = -math.inf  # not before this is anything tried after failures [s]
 
     # --- what a task decides ---------------------------------------------------------------------------------
 
@@ -169,6 +172,8 @@ class Deciding(Generic[V]):
             self.status.message = f"{message}; that makes {self._failures_in_a_row} failures in a row"
         elif go_home:
             self.row += [self.home(view), Look()]
+        if self._failures_in_a_row > 1:  # what is known may be older than the world: let it come
+            self._again_at = view.now + min(PAUSE * 2 ** (self._failures_in_a_row - 2), LONGEST_PAUSE)
 
     def began_anew(self) -> None:
         """A person has started it once more after its end."""

@@ -55,6 +55,7 @@ class Task(Deciding[V]):
             if command == "start" and status.state in ("DONE", "ERROR"):
                 status.state, status.message = "IDLE", ""
                 self._began, self._failures_in_a_row = None, 0
+                self._again_at = -math.inf
                 self.began_anew()
             return [m.HoldRequest(hold=False, reason=reason, stops=command == "start")]
         status.paused = status.started = False
@@ -140,7 +141,7 @@ class Task(Deciding[V]):
         elif status.message.startswith(NO_ARM):
             status.message = ""
         waits = status.paused or view.motion.held or view.motion.fault or not status.started or status.state == "ERROR"
-        if waits or view.motion.stopped or commands or self._stopping:
+        if waits or view.motion.stopped or commands or self._stopping or view.now < self._again_at:
             self._count(view)
             return commands
         while self.running is None and self.row and isinstance(self.row[0], Look):
