@@ -181,18 +181,18 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
             bus.log.info("stopped by %s: %s", request.owner or SOMEBODY, request.reason)
         return await kept_answer(cycle.authority.stop(request, bus.clock.now()))
 
-    stopping: asyncio.Task[MotionStatus] | None = None
+    noting: list[asyncio.Task[MotionStatus]] = []
 
     def stops_unread() -> str:
         """Stop the robot, as one of the requests to stop that nobody has time to read may be a person's."""
-        nonlocal stopping
-        if stopping is not None and stopping.done():
-            stopping.result()
-            stopping = None
-        if stopping is None and not any(one.by == bus.service for one in inhibits.stops):
+        for done in [each for each in noting if each.done()]:
+            noting.remove(done)
+            done.result()
+        if not any(one.by == bus.service for one in inhibits.stops):
             bus.log.error("more than %d requests to stop wait: the robot is stopped for all of them", MOST_STOPS)
             unread = StopRequest(owner=bus.service, reason="more requests to stop come than can be read")
-            stopping = asyncio.create_task(stop(unread), name="stop")
+            status = cycle.authority.stop(unread, bus.clock.now())
+            noting.append(asyncio.create_task(kept_answer(status), name="stop"))
         return "the robot is stopped for all of them"
 
     async def hold(request: HoldRequest) -> MotionStatus:

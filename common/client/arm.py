@@ -48,7 +48,7 @@ SCENE_KNOWS = 0.5  # [s] wall until the planning scene has what is held, if it c
 FINGERS = 10.0  # [s] wall in which fingers have come to their end
 ARCS = "circ"  # plans arcs, and need not be in the pipeline of a cell
 ACTIVE = ("active", "none")
-NO_WAY = "the arm cannot go that way, or its controller does not take it"
+NO_WAY = "the arm cannot go that way, or its controller does not take it in time"
 
 
 class NotJogged(ZencellError):
@@ -292,8 +292,9 @@ class Arm(Part):
                     await asyncio.sleep(LET_GO)
                     began = clock()
                 elif not goes and not waits:
-                    late = "words of this program came too late" if ours else NO_WAY
-                    raise NotJogged(now.told, _kept(state) or ("" if another else late))
+                    late = ours and not now.jogging
+                    why = "" if another else "words of this program came too late" if late else NO_WAY
+                    raise NotJogged(now.told, _kept(state) or why)
                 ours = ours or goes
         finally:
             writer.put(JogCommand(header=self._bus.header(), owner=self.owner, heard=heard))
@@ -305,7 +306,8 @@ class Arm(Part):
         if not ours:
             now, state = owners.latest, motion.latest
             assert now is not None and state is not None
-            raise NotJogged(now.told, _kept(state) or (NO_WAY if now.kind == "none" else ""))
+            another = now.kind != "none" and now.owner != self.owner
+            raise NotJogged(now.told, _kept(state) or ("" if another else NO_WAY))
 
     # --- whose the motion is --------------------------------------------------------------------------------------
 

@@ -39,12 +39,12 @@ class ArmOnly(ZencellError):
 
 
 class TaskOnly(ZencellError):
-    """The task has stopped, though nobody has said that the arm is stopped."""
+    """The task has stopped; who moves the arm has refused to be told, or not answered."""
 
     exit_code = 1
 
     def __init__(self, error: ZencellError) -> None:
-        super().__init__(f"the task has stopped, but who moves the arm has not said that it is stopped: {error}")
+        super().__init__(f"the task has stopped; who moves the arm did not take that: {error}")
 
 
 class TaskControl(Part):
@@ -54,6 +54,7 @@ class TaskControl(Part):
         """The task of a cell; of an application of one's own, its dotted module is needed to hear of it."""
         self._ear, self._bus, self._owner, self._application = ear, ear.bus, owner, application
         self._unkept = ""
+        self._stopping: asyncio.Future[tuple[MotionStatus | RequestFailed, TaskStatus | RequestFailed]]
 
     async def start(self, *, override: bool = False) -> TaskStatus:
         """Start it, or start it again; a robot that you hold is let go, with `override` also one that others hold.
@@ -76,12 +77,13 @@ class TaskControl(Part):
 
         Raises:
             ArmOnly: the arm is stopped, but the task did not hear of it.
-            TaskOnly: the task has stopped, but who moves the arm has not answered.
+            TaskOnly: the task has stopped; who moves the arm has refused to be told, or not answered.
             RequestFailed: neither heard of it.
         """
         stop = StopRequest(owner=self._owner)
-        arm, told = await asyncio.gather(
+        self._stopping = asyncio.gather(
             _answer(self._bus.client(topics.MOTION_STOP).call(stop, TIMEOUT)), _answer(self._tell("stop")))
+        arm, told = await asyncio.shield(self._stopping)  # who is cancelled now has asked all the same
         if isinstance(arm, RequestFailed):
             raise told if isinstance(told, RequestFailed) else TaskOnly(arm)
         self._note(arm)

@@ -135,8 +135,9 @@ class DrivenArm:
         if newest is None:
             raise HardwareFault(self._process.problem or f"{self._name}: its driver has ended")
         silent = time.monotonic() - newest.stamp
-        if silent > SILENT:
-            raise HardwareFault(self._process.problem or f"no word from {self._name} for {silent:.1f} s")
+        if silent > SILENT or silent + newest.state.age > 2 * SILENT:
+            told = f"no word from {self._name} for {silent + newest.state.age:.1f} s"
+            raise HardwareFault(self._process.problem or told)
         self._older = silent + newest.state.age + newest.behind
         return np.array(newest.state.q), np.array(newest.state.dq)
 

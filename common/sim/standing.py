@@ -7,6 +7,7 @@ ones do not either, their state is kept in a file, which survives the process ho
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
 import os
 import socket
@@ -53,11 +54,12 @@ class StateFile:
         Raises:
             Unreadable: it cannot be opened, or is a link, which may be to something of somebody else's.
         """
-        path.parent.mkdir(parents=True, exist_ok=True)
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
             self._descriptor = open_regular(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW)
         except OSError as error:
-            raise Unreadable(path, "it is a link" if path.is_symlink() else error.strerror or str(error)) from None
+            raise Unreadable(path, "it is a link" if error.errno == errno.ELOOP else error.strerror or str(error)
+                             ) from None
         self._number = 0
         self._packer = msgpack.Packer(default=vars)
         self._packed: dict[str, tuple[object, bytes]] = {}  # of the maps in the newest state, most of which stay
@@ -74,10 +76,10 @@ class StateFile:
             if number <= self._number or _checksum(number, body) != checksum:
                 continue
             try:
-                kept = msgpack.unpackb(body)
-                if _finite(kept):  # else nothing could be put there
-                    newest, self._number = Standing.model_validate(kept), number
-            except ValueError:  # of another version
+                found = Standing.model_validate(msgpack.unpackb(body))
+                if _finite(found.model_dump()):  # else nothing could be put there
+                    newest, self._number = found, number
+            except (ValueError, RecursionError):  # of another version, or nobody's
                 continue
         return newest
 
@@ -141,9 +143,8 @@ class SavedBeside:
 
 
 def _finite(kept: object) -> bool:
-    if isinstance(kept, dict):
-        kept = list(kept.values())
-    return all(map(_finite, kept)) if isinstance(kept, list) else not isinstance(kept, float) or math.isfinite(kept)
+    parts = kept.values() if isinstance(kept, dict) else kept if isinstance(kept, list | tuple) else None
+    return all(map(_finite, parts)) if parts is not None else not isinstance(kept, float) or math.isfinite(kept)
 
 
 def _checksum(number: int, body: bytes) -> int:

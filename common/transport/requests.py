@@ -85,9 +85,12 @@ class Server(Generic[Q, A]):
         self.received += 1
         most = self._most or _MOST_WAITING
         if len(self._waiting) >= most:
-            done = f": {self._crowded()}" if self._crowded is not None else ""
-            query.refuse(encode_error("busy", f"{most} requests wait already{done}"))
-            query.finish()
+            told = f"{most} requests wait already"
+            try:
+                told += f": {self._crowded()}" if self._crowded is not None else ""
+            finally:
+                query.refuse(encode_error("busy", told))
+                query.finish()
             return
         if self._beginning:
             self._waiting.append(query)

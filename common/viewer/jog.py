@@ -83,7 +83,7 @@ class Jogger(Holder):
         jogged = owner is not None and owner.jogging and owner.owner == self._jogs.doors.person
         self._taken = jogged or (self._taken and not begins)
         if owner is not None and not (why or begins or jogged) and now - self._began > UNANSWERED:
-            if self._taken and owner.kind == "none":
+            if self._taken and owner.kind == "none" and not owner.jogging:
                 why = "nothing was heard of the button for a moment (a slow link, or a busy machine): press it again"
             else:
                 why = f"{NO_WAY}; the motion is {owner.told}"

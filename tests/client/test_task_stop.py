@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 
 from common import messages as m
@@ -18,7 +20,7 @@ UNKEPT = m.Inhibit(kind="stopped", by="ann", reason=f"{NOT_KEPT}: the disk is fu
 @pytest.mark.parametrize(("arm", "task", "raised", "said"), [
     (True, True, None, ""),
     (True, False, ArmOnly, "the arm is stopped and stays so until a start; the task did not hear.*from the task"),
-    (False, True, TaskOnly, "the task has stopped, but who moves the arm has not said.*from the arm"),
+    (False, True, TaskOnly, "the task has stopped; who moves the arm did not take that.*from the arm"),
     (False, False, RemoteError, "from the task"),
 ])
 async def test_stop_says_who_of_arm_and_task_did_not_take_it(
@@ -50,3 +52,29 @@ async def test_stop_says_who_of_arm_and_task_did_not_take_it(
             await control.stop()
     assert sorted(told) == ["arm", "task"], "both, whatever the other says"
     assert ("disk is full" in control.unkept) == arm
+
+
+@pytest.mark.parametrize("turns", range(1, 6))
+async def test_stop_that_is_cancelled_reaches_both_all_the_same(turns: int) -> None:
+    network, arm, task = LocalNetwork(), asyncio.Event(), asyncio.Event()
+    cell, person = network.bus("cell"), network.bus("person")
+
+    async def stop_arm(_: m.StopRequest) -> m.MotionStatus:
+        arm.set()
+        return m.MotionStatus()
+
+    async def stop_task(_: m.TaskCommand) -> m.TaskStatus:
+        task.set()
+        return m.TaskStatus()
+
+    cell.serve(topics.MOTION_STOP, stop_arm)
+    cell.serve(topics.TASK_COMMAND, stop_task)
+    await cell.ready()
+    control = TaskControl(Ear(person), "ann")
+    stopping = asyncio.create_task(control.stop())
+    for _ in range(turns):
+        await asyncio.sleep(0)
+    stopping.cancel()
+    async with asyncio.timeout(10):
+        await arm.wait()
+        await task.wait()

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 from common import topics
-from common.messages import MotionOwner
+from common.messages import JointState, MotionOwner
 from tests.harness import until
-from tests.viewer.conftest import IN_BROWSER, PATIENCE, Bring, Watched
+from tests.viewer.conftest import IN_BROWSER, PATIENCE, Bring, Opened, Watched
 
 if TYPE_CHECKING:
     from playwright.async_api import Page
@@ -20,6 +21,7 @@ pytestmark = IN_BROWSER
 
 LAYOUT = Path(__file__).with_name("nothing_to_draw.yaml")
 PANDA = ("up", "panda", "--set", "autostart=false", "--set", f"services.viewer.layout={LAYOUT}")
+MOVING = 0.01  # [rad/s]
 SIZES = {"large": (1600, 1000), "usual": (1280, 800), "small": (800, 600), "phone": (390, 844)}
 
 # What lies at the middle and the corners of STOP, how large that is, and whether the bar covers anything of the page,
@@ -120,6 +122,34 @@ async def test_arm_is_jogged_only_while_the_button_is_held(bring: Bring, watched
             await ended()
             if let_go != "close":
                 await page.mouse.up()
+
+
+async def test_of_two_pages_that_jog_one_moves_the_arm_and_the_other_is_told_why_it_does_not(
+    bring: Bring, watched: Watched, opened: Opened
+) -> None:
+    cell = await bring(*PANDA)
+    async with opened() as other, cell.listen() as bus:
+        pages = [await watched.open(cell.address), await other.open(cell.address)]
+        joints = bus.reader(topics.JOINT_STATES)
+        for page in pages:
+            await page.get_by_text("Move", exact=True).first.click()
+            await page.get_by_role("button", name="jog joint1, plus").hover()
+
+        def moves(index: int) -> Callable[[JointState], bool]:
+            return lambda state: abs(state.velocity[index]) > MOVING and abs(state.velocity[1 - index]) < MOVING
+
+        await pages[0].mouse.down()
+        await until(joints, moves(0), PATIENCE)
+        await pages[1].get_by_role("button", name="jog joint2, plus").hover()
+        await pages[1].mouse.down()
+        await pages[1].get_by_text("Another page jogs the arm").first.wait_for()
+        await until(joints, moves(0), PATIENCE)
+        await pages[0].mouse.up()
+        await until(joints, lambda state: max(map(abs, state.velocity)) < MOVING, PATIENCE)
+        await pages[1].mouse.up()
+        await pages[1].mouse.down()  # the one before does not count any more
+        await until(joints, moves(1), PATIENCE)
+        await pages[1].mouse.up()
 
 
 async def test_server_that_does_not_answer_is_a_banner_and_stop_says_so_until_it_is_back(

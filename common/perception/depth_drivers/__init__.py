@@ -1,1 +1,1 @@
-"""Drivers of depth cameras that come with the project (extra `cameras`): one file each, imported only when named."""
+"""Drivers of depth cameras that come with the project (extras of the same names): a file each, imported when named."""

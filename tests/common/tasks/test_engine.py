@@ -174,6 +174,22 @@ def test_failure_sends_the_arm_home_and_too_many_in_a_row_are_an_error() -> None
     cell.until("reach")
 
 
+def test_plans_that_are_refused_for_some_seconds_do_not_use_up_all_tries_at_once() -> None:
+    cell = Cell()
+    answer, began = cell.answer, cell.now
+
+    def refuse(command: Command) -> None:
+        if isinstance(command, m.PlanRequest) and cell.now - began < 5.0:
+            cell.task.on_plan(m.PlanResponse(id=command.id, ok=False, message="unknown object 'cube'"), cell.view)
+        else:
+            answer(command)
+
+    cell.answer = refuse  # type: ignore[method-assign]
+    cell.until("lift")
+    assert 5 <= cell.task.status.failures < cell.task.most_failures
+    assert cell.now - began < 10.0
+
+
 def late_answer(cell: Cell, state: str) -> None:
     """The fingers were told something else by another; who asks for the goal again hears what became of it."""
     running = cell.task.running
