@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 pytestmark = IN_BROWSER
 
 MIDDLE = (0.5, 0.0)  # [m] of the table
+CHOSEN = """() => [...document.querySelectorAll('[aria-label="At [mm]"]')].some(each => Number(each.value))"""
 
 # Buttons and fields that are in view without a word that a screen reader could say.
 NAMELESS = """() => [...document.querySelectorAll("#zc-bar button, .zc button, #root input, #root select")]
@@ -84,6 +85,7 @@ async def test_object_is_moved_on_the_page_and_that_is_undone(bring: Bring, watc
         await tab(page, "View")
         tick = page.get_by_text("Edit the simulated world", exact=True)
         await tick.click()
+        await page.wait_for_function(CHOSEN)
         fields = page.get_by_label("At [mm]", exact=True)
         x, y = [1e-3 * float(await field.input_value()) for field in (fields.nth(0), fields.nth(1))]
         there = min(free_places(x, y, 0.06, before), key=lambda at: math.dist(at, MIDDLE))
