@@ -61,7 +61,7 @@ def follow(name: str, folder: Path, domain: int) -> list[str]:
             deadline = time.monotonic() + PATIENCE
             while time.monotonic() < deadline and (
                 ("robot status" in step.line and not step.shown_in(ran.stdout))  # an arm needs its time
-                or ("robot jog" in step.line and any(reason in ran.stderr for reason in (*HELD_UP, "connecting to")))
+                or ("robot " in step.line and any(reason in ran.stderr for reason in (*HELD_UP, "connecting to")))
             ):
                 ran = tell(step.line, folder, domain)
             said = ran.stdout + ran.stderr
