@@ -38,6 +38,7 @@ class PickPlace(Task[PickPlaceView]):
         self._choice = Choice(config, config.world.container, config.world.ball_radius, lambda: self.status.done)
         self._contained, self._released = Patience(), False
         self._looking, self._hidden = Looking(config), Patience()
+        self._carried, self._due = False, 0  # how many there were as one fell out of the hand, until all are seen again
 
     # --- what to do next -------------------------------------------------------------------------------------
 
@@ -107,7 +108,10 @@ class PickPlace(Task[PickPlaceView]):
             seen = max(self.look_after, min(view.stamps))
             done = self.patience.lasts(bool(left), seen) >= (self.p.grace if left else self.p.empty)
             done = done and self._counted(view) <= self.status.done  # else it is about to be counted
-            remark = view.seen.remark if view.seen else ""
+            missing = self._due - self.status.done - left
+            remarks = [view.seen.remark if view.seen else "",
+                       f"of what fell out of the hand {missing} was not seen again" if missing > 0 else ""]
+            remark = "; ".join(filter(None, remarks))
             message = f"{left} objects are left that cannot be taken" if left else "the table looks empty"
             self.status.overlooked = f"{message}{':' if left else ', but'} {remark}"[:MOST] if remark else ""
             self.status.message = self.status.overlooked or message
@@ -151,13 +155,19 @@ class PickPlace(Task[PickPlaceView]):
         # it may hang over others, and a picture of it shows one more.
         contained = self._counted(view)
         stages = {status.stage, *(stage.name for stage in self.under_way)}
-        if "release" in stages or self.waits_for_the_arm == "release":
+        releases = "release" in stages or self.waits_for_the_arm == "release"
+        if self._carried and not view.holding and not releases:
+            self._due = max(self._due, status.total)
+        self._carried = view.holding and not releases
+        if releases:
             self._contained.reset()
         elif self._contained.lasts(contained, view.scene_stamp) >= min(CONTAINED_FOR, self.p.empty):
             status.done = max(status.done, contained)
         looked = not self._around.on_hand or min(view.stamps) > self.look_after
         if looked and not view.holding and not stages & {"close", "lift", "across", "release"}:
-            status.total = status.done + len(view.targets)
+            found = status.done + len(view.targets)
+            self._due = self._due if found < self._due else 0
+            status.total = max(found, self._due)
 
     def _counted(self, view: PickPlaceView) -> int:
         """How many lie in the container. Once this task put some there itself, no more than are seen.
@@ -179,6 +189,7 @@ class PickPlace(Task[PickPlaceView]):
         """What was in the way of looking before may be gone."""
         self._looking.found()
         self._hidden.reset()
+        self._due = 0
 
     def succeeded(self, stage: Stage, view: PickPlaceView) -> None:
         """A ball that was let go is done."""
