@@ -116,7 +116,7 @@ class DrivenArm:
     @property
     def state(self) -> ArmState:
         """What the arm said last, or that it says nothing."""
-        if self._newest is None or time.monotonic() - self._newest.stamp > SILENT:
+        if self._newest is None or self._is_silent(self._newest):
             q = self._newest.state.q if self._newest else [0.0] * self._dof
             return ArmState(q, [0.0] * self._dof, "disconnected", self._process.problem)
         newest = self._newest.state
@@ -134,12 +134,17 @@ class DrivenArm:
         newest = self._newest
         if newest is None:
             raise HardwareFault(self._process.problem or f"{self._name}: its driver has ended")
-        silent = time.monotonic() - newest.stamp
-        if silent > SILENT or silent + newest.state.age > 2 * SILENT:
-            told = f"no word from {self._name} for {silent + newest.state.age:.1f} s"
-            raise HardwareFault(self._process.problem or told)
-        self._older = silent + newest.state.age + newest.behind
+        old = time.monotonic() - newest.stamp + newest.state.age
+        if self._is_silent(newest):
+            raise HardwareFault(self._process.problem or f"no word from {self._name} for {old:.1f} s")
+        self._older = old + newest.behind
         return np.array(newest.state.q), np.array(newest.state.dq)
+
+    @staticmethod
+    def _is_silent(newest: Reading) -> bool:
+        """Whether the process says nothing any more, or for too long nothing new of the arm, as one held up may."""
+        silent = time.monotonic() - newest.stamp
+        return silent > SILENT or silent + newest.state.age > 2 * SILENT
 
     def write(self, positions: Vector, velocities: Vector, now: float) -> None:
         """Send set-points (dof,) [rad], [rad/s]: for when they were made, however late they are sent.
