@@ -24,12 +24,12 @@ def tell(cell: str, found: list[Intrusion], ended: list[str]) -> None:
     """One line of figures."""
     nearest = np.array([one.nearest for one in found])
     latency = 1e3 * np.array([one.latency for one in found])
-    given_up = sum(one.given_up for one in found)
+    given_up, free = sum(one.given_up for one in found), int(np.isnan(latency).sum())
     print(  # noqa: T201
         f"{cell}: {len(found)} times in {len(ended)} runs ({', '.join(sorted(set(ended)))}), {(nearest <= 0).sum()} "
         f"contacts, nearest {1e3 * nearest.min():.1f} mm (median {1e3 * np.median(nearest):.0f} mm); brakes after "
-        f"{latency.max():.1f} ms at most (median {np.median(latency):.1f} ms); {len(found) - given_up} went on, "
-        f"{given_up} were planned anew", flush=True)
+        f"{np.nanmax(latency):.1f} ms at most (median {np.nanmedian(latency):.1f} ms); {len(found) - given_up} went "
+        f"on, {given_up} were planned anew; {free} were not held: the task was first, or they passed by", flush=True)
 
 
 def main() -> None:

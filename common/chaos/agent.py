@@ -8,7 +8,7 @@ import logging
 import math
 import os
 import signal
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,8 @@ import numpy as np
 from common import topics
 from common.application import all_topics
 from common.chaos.plan import STATELESS_FORMS, Fault, Form
-from common.config import Container
+from common.chaos.slipping import Slipping
+from common.config import World
 from common.errors import DecodeError, RequestFailed
 from common.messages import Message, WorldEdit
 from common.sources import monotonic
@@ -42,7 +43,6 @@ SLIP_PATIENCE = 20.0  # [s] that an object has to be taken before it slips
 SAMPLE_SECONDS = 1.5  # within which a state is repeated
 DROP_TIMEOUT = 1.0  # [s]
 SPACING = 0.02  # [s] between bad messages in a row
-CLEARANCE = 0.12  # [m] from the container's edge: what falls between its wall and this may be hidden by it
 
 log = logging.getLogger("chaos")
 
@@ -61,7 +61,7 @@ class Chaos:
 
     def __init__(
         self, bus: Bus, plan: Iterable[Fault], pids: Callable[[], dict[str, int]],
-        containers: Sequence[Container] | None, patience: float = SLIP_PATIENCE,
+        world: World | None, patience: float = SLIP_PATIENCE,
         known: Mapping[str, AnyTopic] | None = None,
     ) -> None:
         """Declare what is listened to.
@@ -70,15 +70,16 @@ class Chaos:
             bus: of the cell.
             plan: faults in order of time.
             pids: the processes that run now, by name.
-            containers: objects are let slip clear of their edges; None where no object is taken.
+            world: objects are let slip where they can be seen and taken again; None where no object is taken.
             patience: that there has to be something in the hand before it slips [s, wall time].
             known: topics whose messages are damaged, by key of the cell; else those that come with the project.
         """
         self.happened: list[Happened] = []
-        self._bus, self._plan, self._pids, self._containers = bus, plan, pids, containers
+        self._bus, self._plan, self._pids = bus, plan, pids
         self._patience = patience
         self._known = all_topics() if known is None else known
-        taken = containers is not None
+        taken = world is not None
+        self._slipping = Slipping(world) if world is not None else None
         self._gripper = bus.reader(topics.GRIPPER_STATE) if taken else None
         self._objects = bus.reader(topics.SCENE_OBJECTS) if taken else None
         self._edit = bus.client(topics.WORLD_EDIT) if taken else None
@@ -145,14 +146,7 @@ class Chaos:
         return latest is not None and latest.holding
 
     def _may_slip(self) -> bool:
-        """Whether what is in the hand would fall to where it can be seen and taken again, or into a container."""
-        latest = self._objects.latest if self._objects else None
-        held = next((thing for thing in latest.objects if thing.state == "held"), None) if latest else None
-        if held is None:
-            return False
-        p = held.pose.position
-        off = [(max(abs(p.x - c.x), abs(p.y - c.y)) - c.half_side, c.wall_thickness) for c in self._containers or ()]
-        return all(far > CLEARANCE or far < -wall for far, wall in off)
+        return self._slipping is not None and self._slipping.may(self._objects.latest if self._objects else None)
 
     async def _drop(self, fault: Fault) -> None:
         rng = np.random.default_rng(fault.seed)

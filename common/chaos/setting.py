@@ -46,7 +46,7 @@ def chaos_in(
     def pids() -> dict[str, int]:
         return {status.name: status.pid for status in supervisor.statuses if status.pid is not None}
 
-    return Chaos(bus, planned, pids, list(cell.world.containers.values()) if objects else None, known=known)
+    return Chaos(bus, planned, pids, cell.world if objects else None, known=known)
 
 
 def keys_of(owners: Iterable[Owner], services: Iterable[str]) -> dict[str, AnyTopic]:

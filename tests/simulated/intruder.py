@@ -19,6 +19,7 @@ from common.messages import CollisionObject, FollowedRequest, MotionStatus, Pose
 from common.planning.retiming import sample
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.validation import timed_path
+from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 from tests.harness import beside, until
@@ -52,7 +53,7 @@ class Intrusion:
     expected: float  # [s] later the arm would have touched it
     stays: float  # [s] from when the arm is held
     nearest: float = np.inf  # [m] that any link came to it while it stood there, by coal
-    latency: float = np.inf  # [s] from the scene message to the first set-point that brakes
+    latency: float = np.inf  # [s] from the scene message to the first set-point that brakes; nan: it was not held
     given_up: bool = False  # the motion, before the pillar was gone
 
 
@@ -70,7 +71,8 @@ class Intruder:
         SEEN.clear()
         self._rng, self._world = np.random.default_rng(self.seed), simulated.cell.world
         self._robot = RobotModel.load(simulated.cell.robot)
-        self._links = RobotGeometry(self._robot).geometry
+        self._hulls = RobotGeometry(self._robot)
+        self._links = self._hulls.geometry
         self._data, self._placed = self._robot.model.createData(), pin.GeometryData(self._links)
         self._bus, self._motion = bus, bus.reader(topics.MOTION_STATUS)
         self._joints = bus.reader(topics.JOINT_STATES)
@@ -115,13 +117,19 @@ class Intruder:
         await asyncio.sleep(SEES_AFTER)
         SAID.clear()
         SEEN[pillar.id] = pillar
-        held = await until(self._motion, lambda m: "scene_monitor" in m.held_by, 5.0)
-        said = loop.time() - SAID[pillar.id,]
-        intrusion.latency = said - (self._bus.clock.now() - held.header.stamp * 1e-9)
+        braked = await until(
+            self._motion, lambda m: "scene_monitor" in m.held_by or m.id != goal or m.state != "active", 5.0)
+        said_at = SAID.get((pillar.id,), loop.time())
+        said = loop.time() - said_at
+        # The task may have been first, as what it was on its way to is hidden by the pillar; or fingers that are closer
+        # together than those of the robot file pass it by.
+        held = "scene_monitor" in braked.held_by
+        intrusion.latency = said - (self._bus.clock.now() - braked.header.stamp * 1e-9) if held else np.nan
+        intrusion.given_up = not held and braked.state == "cancelled"
         with contextlib.suppress(TimeoutError):
             await until(self._motion, lambda m: m.id != goal or m.state != "active", intrusion.stays)
-            intrusion.given_up = True
-        left = intrusion.stays - (loop.time() - SAID[pillar.id,])
+            intrusion.given_up = intrusion.given_up or held
+        left = intrusion.stays - (loop.time() - said_at)
         await asyncio.sleep(max(left, 0.0))
         self._pillar = None
         await self._edit.call(WorldEdit(op="remove", id=pillar.id))
@@ -143,11 +151,17 @@ class Intruder:
             q = self._robot.order(state.name, state.position)
             if self._pillar is not None and q is not None:
                 box, at, intrusion = self._pillar
-                intrusion.nearest = min(intrusion.nearest, self._distance(q, box, at))
+                width = measured_width(self._robot.config.gripper, state.name, state.position)
+                intrusion.nearest = min(intrusion.nearest, self._distance(q, box, at, width))
 
-    def _distance(self, q: Array, box: coal.Box, at: coal.Transform3s) -> float:
-        """[m] between the nearest link and a pillar, by coal; 0 or less where they touch."""
+    def _distance(self, q: Array, box: coal.Box, at: coal.Transform3s, width: float | None = None) -> float:
+        """[m] between the nearest link and a pillar, by coal; 0 or less where they touch.
+
+        The fingers are as far apart as measured [m]; None: as the robot file holds them.
+        """
         pin.updateGeometryPlacements(self._robot.model, self._data, self._links, self._placed, q)
+        for number, T_joint_hull in self._hulls.finger_placements(width):
+            self._placed.oMg[number] = self._data.oMi[self._hulls.joints[number]] * T_joint_hull
         nearest = np.inf
         for number, item in enumerate(self._links.geometryObjects):
             if item.parentJoint != 0:
