@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from common import topics
 from common.config import Cell, load_cell
 from common.errors import RequestFailed
-from common.messages import CollisionObject, FollowedRequest, MotionStatus, Pose, Vector3, WorldEdit
+from common.messages import CollisionObject, FollowedRequest, JointState, MotionStatus, Pose, Vector3, WorldEdit
 from common.planning.retiming import sample
 from common.planning.robot_geometry import RobotGeometry
 from common.planning.validation import timed_path
@@ -91,13 +91,14 @@ class Intruder:
         timed = timed_path(asked.trajectory)
         now = status.progress * timed.times[-1] + (self._bus.clock.now() - status.header.stamp * 1e-9)
         rest = sample(timed, np.arange(now, timed.times[-1], STEP))
+        width = self._width(self._joints.latest)
         for _ in range(TRIES if len(rest) * STEP > SOONEST else 0):
             side, height = float(self._rng.uniform(*SIDES)), float(self._rng.uniform(*HEIGHTS))
             aim = self._robot.fk(rest[self._rng.integers(int(SOONEST / STEP), len(rest))])[:2, 3]
             x, y = (float(v) for v in aim + self._rng.uniform(-0.05, 0.05, 2))
             place = Vector3(x=x, y=y, z=self._ground(x, y) + height / 2)
             box, at = coal.Box(side, side, height), coal.Transform3s(np.eye(3), np.array([x, y, place.z]))
-            touches = next((k for k, q in enumerate(rest) if self._distance(q, box, at) <= 0.0), None)
+            touches = next((k for k, q in enumerate(rest) if self._distance(q, box, at, width) <= 0.0), None)
             if touches is None or not SOONEST <= touches * STEP <= LATEST or self._in_a_container(x, y):
                 continue
             size = Vector3(x=side, y=side, z=height)
@@ -151,10 +152,13 @@ class Intruder:
             q = self._robot.order(state.name, state.position)
             if self._pillar is not None and q is not None:
                 box, at, intrusion = self._pillar
-                width = measured_width(self._robot.config.gripper, state.name, state.position)
-                intrusion.nearest = min(intrusion.nearest, self._distance(q, box, at, width))
+                intrusion.nearest = min(intrusion.nearest, self._distance(q, box, at, self._width(state)))
 
-    def _distance(self, q: Array, box: coal.Box, at: coal.Transform3s, width: float | None = None) -> float:
+    def _width(self, state: JointState | None) -> float | None:
+        """Between the fingers as measured [m]."""
+        return None if state is None else measured_width(self._robot.config.gripper, state.name, state.position)
+
+    def _distance(self, q: Array, box: coal.Box, at: coal.Transform3s, width: float | None) -> float:
         """[m] between the nearest link and a pillar, by coal; 0 or less where they touch.
 
         The fingers are as far apart as measured [m]; None: as the robot file holds them.
