@@ -103,7 +103,7 @@ class Authority:
             Refused: it is somebody else's.
         """
         if request.act == "give":
-            self._owners.give(request.owner)
+            self._owners.give(request.owner, bool(self._arm.goal) or not self._arm.at_rest)
             return self.owner
         before = self._owners.take(request, monotonic())
         reason = f"{request.owner} took the motion over{before and f', which was {before}'}"

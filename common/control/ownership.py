@@ -49,9 +49,14 @@ class Ownership:
         self._lease, self._used = request.lease, now
         return before
 
-    def give(self, owner: str) -> bool:
-        """Whether somebody had it, and now nobody has."""
-        return self.now.kind != "none" and self.now.owner == owner and self.end()
+    def give(self, owner: str, moving: bool) -> None:
+        """Take note that somebody gives back what is theirs: what moves the arm yet is, until that has ended."""
+        if self.now.kind == "none" or self.now.owner != owner:
+            return
+        if moving:
+            self.let_end()
+        else:
+            self.end()
 
     def end(self) -> bool:
         """Have it be nobody's from now on; whether it was somebody's."""

@@ -311,6 +311,25 @@ def test_what_was_asked_for_stays_until_it_is_given_back(arm):
     assert arm.owner == ("", "none") and arm.execute("two", "bob").state == "active"
 
 
+def test_what_is_given_back_in_a_motion_is_nobody_elses_before_that_has_ended(arm):
+    arm.own()
+    assert arm.execute("one", "ann").state == "active"
+    arm.run(0.3)
+    arm.own("give")
+    arm.step()
+    assert arm.cycle.goal == "one" and arm.owner == ("ann", "operator")
+    with pytest.raises(Refused, match=r"the motion is ann's \(operator\)"):
+        arm.own(owner="bob")
+    arm.run(3.0)
+    assert arm.owner == ("", "none")
+    arm.own(owner="bob")
+    arm.jog(0.3, owner="bob", joints={arm.robot.joint_names[0]: 0.2})
+    arm.own("give", "bob")
+    assert arm.owner == ("bob", "operator"), "the arm is not at rest yet"
+    arm.run(0.5)
+    assert arm.owner == ("", "none")
+
+
 def test_a_lease_ends_when_its_owner_says_nothing_more_but_not_in_a_motion(arm):
     arm.own(kind="script", lease=1.0)
     arm.run(0.8)
