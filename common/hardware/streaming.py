@@ -102,6 +102,9 @@ class SetPointStream:
             j = int(np.argmax(np.where(np.isfinite(off), off, np.inf)))
             self.ceased = f"{self._limits.names[j]} would jump by {abs(q[j] - q0[j]):.4g} rad in {step * 1e3:.1f} ms"
             return
+        if not np.isfinite(dq).all():
+            self.ceased = f"the velocity of {self._limits.names[int(np.argmin(np.isfinite(dq)))]} is no finite number"
+            return
         piece = Piece(step, *accelerations(step, q0, dq0, q, dq))
         if np.all(np.abs(dq0) <= REST) and np.all(q == q0):
             self._points.pop()  # rests: a later motion begins where the rest ends

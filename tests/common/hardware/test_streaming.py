@@ -91,6 +91,20 @@ def test_a_rest_may_last() -> None:
     assert np.all(before[1] > TWO) and np.all(before[1] < 1.005 * TWO), "it begins with no acceleration"
 
 
+@pytest.mark.parametrize(("q", "dq", "said"), [
+    (np.nan, 0.0, "shoulder would jump"), (0.0, np.nan, "the velocity of shoulder is no finite number"),
+    (0.0, np.inf, "the velocity of shoulder is no finite number"),
+])
+def test_what_is_no_number_is_not_played(q: float, dq: float, said: str) -> None:
+    stream = SetPointStream(LIMITS, AHEAD)
+    stream.begin(0 * TWO, 0.0)
+    for n in range(20):
+        numbers = (0.0, 0.0) if n < 10 else (q, dq)
+        stream.put(n * PERIOD, numbers[0] * TWO, numbers[1] * TWO)
+        assert np.isfinite(stream.at(n * PERIOD)).all()
+    assert said in stream.ceased
+
+
 def swing(time: float) -> tuple[np.ndarray, np.ndarray]:
     """The second joint does twice what the first one does; rest, 1 s of motion at 90 % of a limit, and rest again."""
     u = min(max(time - 0.1, 0.0), 1.0)
