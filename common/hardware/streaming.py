@@ -108,7 +108,7 @@ class SetPointStream:
         piece = Piece(step, *accelerations(step, q0, dq0, q, dq))
         if np.all(np.abs(dq0) <= REST) and np.all(q == q0):
             self._points.pop()  # rests: a later motion begins where the rest ends
-            if self._points and np.any(self._points[-1].dq):
+            if self._points and (np.any(self._points[-1].dq) or np.any(self._points[-1].q != q0)):
                 self._points.append(Point(before, q0, 0 * q0, ddq=0 * q0))
             piece = Piece(math.inf, 0 * q0, 0 * q0)
         elif newest.ddq is None:
@@ -124,6 +124,8 @@ class SetPointStream:
         self._points.append(Point(time, q.copy(), dq.copy(), min(max(1 / max(over, 1e-9), 1.0), FASTER)))
         if piece.step == math.inf:
             self._points[-1].ddq = piece.ends
+        elif before <= self._time and np.all(np.abs(dq) <= REST):  # on the way there before the next one comes
+            self._points[-1].ddq = 0 * q
 
     def at(self, now: float) -> tuple[Vector, Vector]:
         """Where to be (dof,) [rad], and how fast [rad/s], at a time that does not go back.

@@ -91,6 +91,20 @@ def test_a_rest_may_last() -> None:
     assert np.all(before[1] > TWO) and np.all(before[1] < 1.005 * TWO), "it begins with no acceleration"
 
 
+def test_a_rest_beside_where_the_arm_is_kept_is_come_to_once() -> None:
+    stream, off = SetPointStream(LIMITS, AHEAD, 1e-3), 5e-4
+    stream.begin(0 * TWO, 0.0)
+    rows, number = [], 0
+    for now in np.arange(0.0, 0.3, 1e-3):
+        while number * PERIOD <= now:
+            stream.put(number * PERIOD, off * TWO, 0 * TWO)
+            number += 1
+        rows.append(stream.at(float(now))[0])
+    v, a, j = (np.diff(rows, n, axis=0) / 1e-3**n for n in (1, 2, 3))
+    assert v.min() >= 0.0 and not v[60:].any() and np.allclose(rows[-1], off)
+    assert np.abs(a).max() <= 10.0 and np.abs(j).max() <= 400.0
+
+
 @pytest.mark.parametrize(("q", "dq", "said"), [
     (np.nan, 0.0, "shoulder would jump"), (0.0, np.nan, "the velocity of shoulder is no finite number"),
     (0.0, np.inf, "the velocity of shoulder is no finite number"),
