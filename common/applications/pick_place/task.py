@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from common import messages as m
-from common.applications.pick_place.choice import Choice, Pick, PickPlaceView, Spots, Target, same_place
+from common.applications.pick_place.choice import Choice, Pick, PickPlaceView, Spot, Spots, Target, same_place
 from common.applications.pick_place.looking import Looking
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.parameters import Config
@@ -22,6 +22,7 @@ GONE = "the ball is no longer where it was seen"
 MOST = 400  # characters of a message
 STANDING = 0.5  # [s] for which the arm hides something before it goes out of the way: pictures are a little late
 CONTAINED_FOR = 0.5  # [s] balls that are seen in the container for so long are there
+AT_REST = 0.3  # [s] for which what fell is seen in one place before it counts as seen again: it may roll out of view
 
 
 class PickPlace(Task[PickPlaceView]):
@@ -39,6 +40,7 @@ class PickPlace(Task[PickPlaceView]):
         self._contained, self._released = Patience(), False
         self._looking, self._hidden = Looking(config), Patience()
         self._carried, self._due = False, 0  # how many there were as one fell out of the hand, until all are seen again
+        self._still, self._places = Patience(), list[Spot]()  # where everything is seen to lie since then
 
     # --- what to do next -------------------------------------------------------------------------------------
 
@@ -157,7 +159,7 @@ class PickPlace(Task[PickPlaceView]):
         stages = {status.stage, *(stage.name for stage in self.under_way)}
         releases = "release" in stages or self.waits_for_the_arm == "release"
         if self._carried and not view.holding and not releases:
-            self._due = max(self._due, status.total)
+            self._due, self._places = max(self._due, status.total), []
         self._carried = view.holding and not releases
         if releases:
             self._contained.reset()
@@ -166,8 +168,17 @@ class PickPlace(Task[PickPlaceView]):
         looked = not self._around.on_hand or min(view.stamps) > self.look_after
         if looked and not view.holding and not stages & {"close", "lift", "across", "release"}:
             found = status.done + len(view.targets)
-            self._due = self._due if found < self._due else 0
+            if found >= self._due and self._lie_still(view):
+                self._due = 0
             status.total = max(found, self._due)
+
+    def _lie_still(self, view: PickPlaceView) -> bool:
+        """Whether everything on the table is seen where it was some time ago."""
+        spots = [place[:2] for place in view.targets]
+        if any(all(math.dist(spot, before) > self.p.moved for before in self._places) for spot in spots):
+            self._places = spots
+            self._still.reset()
+        return self._still.lasts(True, min(view.stamps)) >= AT_REST
 
     def _counted(self, view: PickPlaceView) -> int:
         """How many lie in the container. Once this task put some there itself, no more than are seen.

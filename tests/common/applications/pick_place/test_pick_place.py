@@ -57,6 +57,23 @@ def test_ball_that_fell_out_of_the_hand_and_is_not_seen_again_is_told_at_the_end
     assert status.overlooked == "the table looks empty, but of what fell out of the hand 1 was not seen again"
 
 
+def test_ball_that_fell_out_of_the_hand_is_told_at_the_end_if_it_was_only_seen_as_it_rolled_away() -> None:
+    cell = CellDouble([(0.40, -0.30), (0.52, -0.30), (0.40, -0.17)])
+    cell.until("across")
+    cell.drop()
+    fallen = next(reversed(cell.balls))
+    x, y, z = cell.balls[fallen]
+    for way in range(1, 13):
+        cell.step()
+        cell.balls[fallen] = (x - 0.03 * way, y, z)
+    cell.step()
+    del cell.balls[fallen]
+    cell.until("DONE")
+    status = cell.task.status
+    assert (status.done, status.total) == (2, 3)
+    assert status.overlooked == "the table looks empty, but of what fell out of the hand 1 was not seen again"
+
+
 def test_ball_that_fell_out_of_the_hand_and_was_taken_again_is_no_loss_even_if_a_person_takes_another() -> None:
     cell = CellDouble([(0.40, -0.30), (0.52, -0.30), (0.40, -0.17)])
     cell.until("across")
