@@ -70,7 +70,8 @@ class Chaos:
             bus: of the cell.
             plan: faults in order of time.
             pids: the processes that run now, by name.
-            world: objects are let slip where they can be seen and taken again; None where no object is taken.
+            world: with its cameras fixed; objects are let slip where they can be seen and taken again. None where no
+                object is taken.
             patience: that there has to be something in the hand before it slips [s, wall time].
             known: topics whose messages are damaged, by key of the cell; else those that come with the project.
         """

@@ -8,6 +8,7 @@ from dataclasses import replace
 from common.application import all_topics, find_application
 from common.chaos.agent import Chaos
 from common.chaos.plan import CELL_SECONDS, faults, plan
+from common.checking.cell import seen_from_home
 from common.config import Cell
 from common.hardware.loading import is_simulated
 from common.supervision.supervisor import Supervisor
@@ -46,7 +47,8 @@ def chaos_in(
     def pids() -> dict[str, int]:
         return {status.name: status.pid for status in supervisor.statuses if status.pid is not None}
 
-    return Chaos(bus, planned, pids, cell.world if objects else None, known=known)
+    world = seen_from_home(cell).world if objects else None  # a camera on the hand looks from there
+    return Chaos(bus, planned, pids, world, known=known)
 
 
 def keys_of(owners: Iterable[Owner], services: Iterable[str]) -> dict[str, AnyTopic]:

@@ -1,11 +1,15 @@
 """What is in the hand is let slip only where a cell can see it afterwards and take it again."""
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from common.application import all_topics
+from common.chaos import setting
 from common.chaos.slipping import Slipping, thrown
-from common.config import load_cell
+from common.config import World, load_cell
 from common.messages import Header, Pose, Vector3, WorldObject, WorldObjects
 from common.sim.mujoco.contact import THING, TIMESTEP, touches
 
@@ -52,6 +56,18 @@ def test_nothing_slips_before_it_is_known_how_fast_the_hand_goes() -> None:
     assert slipping.may(held_at(0.4, -0.2, 2 * EVERY)) and slipping.may(held_at(0.4, -0.2, 2 * EVERY))
     assert not slipping.may(held_at(0.4, -0.2, 20 * EVERY)), "what was known was too long ago"
     assert slipping.may(held_at(0.4, -0.2, 21 * EVERY))
+
+
+def test_a_camera_on_the_hand_sees_what_it_sees_from_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    cell = load_cell("panda", ["world.simulator=mujoco",
+                               "world.camera={mount: tcp, position: [0.06, 0.0, -0.1], rpy: [0, 0, 1.5708]}"])
+    worlds: list[World] = []
+    monkeypatch.setattr(setting, "Chaos", lambda bus, plan, pids, world, known: worlds.append(world))
+    statuses = [SimpleNamespace(name=entry.name, pid=1) for entry in cell.services.values()]
+    bus: Any = SimpleNamespace(clock=SimpleNamespace(speed=1.0))
+    supervisor: Any = SimpleNamespace(statuses=statuses)
+    setting.chaos_in(bus, cell, supervisor, all_topics(), 1, 6.0, until_ended=True)
+    assert may(Slipping(worlds[0]), 0.40, -0.05) and not may(Slipping(worlds[0]), 0.40, -0.60)
 
 
 @pytest.mark.parametrize("speed", [0.2, 0.5, 0.9])
