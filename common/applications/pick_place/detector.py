@@ -284,8 +284,8 @@ class Detector:
         return alone, crowded, offsets
 
     def _is_explained(self, blob: Blob, owner: npt.NDArray[np.intp], camera: Pinhole) -> bool:
-        """Whether a blob is nothing but its balls; one that is cut off or in the container may be."""
-        if len(blob.border) or self.resting.shows_container(camera, blob.centroid):
+        """Whether a blob is nothing but its balls, as far as its outline shows; one in the container may be."""
+        if self.resting.shows_container(camera, blob.centroid):
             return True
         return float(np.mean(owner >= 0)) >= EXPLAINED
 

@@ -58,6 +58,13 @@ def test_cube_is_told_by_its_outline(place: tuple[float, float], side: float, ot
     assert {one.reason for one in odd} == {NOT_ROUND} and math.dist(odd[0].position[:2], place) < 0.03
 
 
+@pytest.mark.parametrize("place", [(0.30, 0.455), (0.44, 0.455), (0.74, -0.08), (0.06, -0.12)])
+def test_cube_that_the_border_cuts_is_told_by_what_shows_of_its_outline(place: tuple[float, float]) -> None:
+    odd = look(red("box", (*place, 0.035), (0.07, 0.07, 0.07))).odd
+    assert {one.reason for one in odd} == {NOT_ROUND}
+    assert min(math.dist(one.position[:2], place) for one in odd) < 0.06
+
+
 @pytest.mark.parametrize("place", PLACES)
 def test_cable_is_told_by_its_outline(place: tuple[float, float]) -> None:
     odd = look(red("cylinder", (*place, 0.01), (0.02, 0.02, 0.2), roll=math.pi / 2)).odd
