@@ -10,8 +10,10 @@ import math
 import re
 import threading
 import time
+from collections import deque
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field
 
 from common.config import Parameters, RobotConfig
@@ -27,6 +29,7 @@ CB3 = re.compile(r"^ur(3|5|10)$")
 LATEST = 0.15  # [s] without a new state of the arm, after which it counts as gone
 LOOK = 0.02  # [s] of them that count at most from one look to the next: who was held up has not listened
 WATCHDOG = 10.0  # [Hz] less often, the arm's program ends by itself
+SMOOTHED = 0.02  # [s] whose mean is commanded: between the cycles of who sends them the jerk is up to 5 times as much
 MOVES = 0.02  # [rad/s] faster than this, a joint does not rest
 SETTLES = 0.5  # [s] in which the arm rests once its set-points do
 PROGRAM_RUNS = 2  # of the robot's status bits
@@ -85,13 +88,37 @@ def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) 
         gripper = DrivenGripper(
             "common.hardware.robotiq", {"host": options.host, "model": options.gripper}, robot.gripper,
             name=f"{options.gripper} at {options.host}")
+    delay = options.ahead + options.lookahead + Smoothing(rate_of(options.model)).delay
     return DrivenArm("common.hardware.ur", options.model_dump(), limits, gripper=gripper, name=f"{options.model} at "
-                     f"{options.host}", ahead=options.ahead, delay=options.ahead + options.lookahead)
+                     f"{options.host}", ahead=options.ahead, delay=delay)
 
 
 def connect(options: dict[str, Any], limits: Limits) -> UrArm:
     """The arm, from inside the driver's process; raises what the library raises when nobody answers."""
     return UrArm(Options(**options), limits)
+
+
+def rate_of(model: str) -> float:
+    """How often its controller wants a set-point [Hz]."""
+    return 125.0 if CB3.match(model) else 500.0
+
+
+class Smoothing:
+    """The mean of the newest set-points, which the arm is `delay` [s] behind for that."""
+
+    def __init__(self, rate: float) -> None:
+        """Take set-points that come at a rate [Hz]."""
+        self._newest: deque[Vector] = deque(maxlen=max(1, round(SMOOTHED * rate)))
+        self.delay = (max(1, round(SMOOTHED * rate)) - 1) / (2 * rate)
+
+    def begin(self) -> None:
+        """The arm rests where the next set-point is."""
+        self._newest.clear()
+
+    def after(self, q: Vector) -> Vector:
+        """Where to be (dof,) [rad] now that a set-point has come."""
+        self._newest.append(q)
+        return np.asarray(np.mean(self._newest, axis=0))
 
 
 class Silence:
@@ -120,7 +147,8 @@ class UrArm:
 
         self._options = options
         self._deceleration = float(limits.braking.min())
-        self.rate = 125.0 if CB3.match(options.model) else 500.0
+        self.rate = rate_of(options.model)
+        self._smoothing = Smoothing(self.rate)
         self._dashboard = DashboardClient(options.host)
         self._dashboard.connect()
         self._receive = rtde_receive.RTDEReceiveInterface(options.host, self.rate, VARIABLES)
@@ -192,14 +220,17 @@ class UrArm:
         return [time.monotonic()]
 
     def servo(self, points: list[Vector]) -> None:
-        """Go to the last of the set-points (6,) [rad] within one period.
+        """Go to the last of the set-points (6,) [rad], as it is smoothed, within one period.
 
         Raises:
             ConnectionError: the program in the arm does not run any more.
         """
         with self._using:
+            if not self._servoing:
+                self._smoothing.begin()
+            q = self._smoothing.after(points[-1]).tolist()
             taken = self._control is not None and self._control.servoJ(
-                points[-1].tolist(), 0.0, 0.0, 1 / self.rate, self._options.lookahead, self._options.gain)
+                q, 0.0, 0.0, 1 / self.rate, self._options.lookahead, self._options.gain)
             begun, self._servoing = not self._servoing, True
         if self._taking.lasts(time.monotonic(), taken or begun) > LATEST:  # else it may be about to say why
             raise ConnectionError("the arm's program does not take set-points")

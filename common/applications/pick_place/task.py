@@ -112,7 +112,8 @@ class PickPlace(Task[PickPlaceView]):
             done = done and self._counted(view) <= self.status.done  # else it is about to be counted
             missing = self._due - self.status.done - left
             remarks = [view.seen.remark if view.seen else "",
-                       f"of what fell out of the hand {missing} was not seen again" if missing > 0 else ""]
+                       f"{missing} that was seen before something fell out of the hand was not seen again"
+                       if missing > 0 else ""]
             remark = "; ".join(filter(None, remarks))
             message = f"{left} objects are left that cannot be taken" if left else "the table looks empty"
             self.status.overlooked = f"{message}{':' if left else ', but'} {remark}"[:MOST] if remark else ""

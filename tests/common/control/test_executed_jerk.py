@@ -9,6 +9,8 @@ import ruckig
 from common.control.controller import PERIOD, TrajectoryController
 from common.control.limiter import SLACK
 from common.hardware.interface import Limits
+from common.hardware.streaming import SetPointStream
+from common.hardware.ur import Smoothing
 from common.messages import JointTrajectory, JointTrajectoryPoint
 
 DOF = 6
@@ -31,30 +33,57 @@ def motion(rng: np.random.Generator) -> JointTrajectory:
     return JointTrajectory(joint_names=list(LIMITS.names), points=points)
 
 
+def executed(event: str, seed: int) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """When [s], where [rad] and how fast [rad/s] to be in each cycle, with an event in mid-motion, until its end."""
+    rng = np.random.default_rng(seed)
+    planned = motion(rng)
+    q = np.array(planned.points[0].positions)
+    controller, now, dq, sent = TrajectoryController(LIMITS, q), 100.0, 0 * q, [(100.0, q, 0 * q)]
+    controller.update(now, q, dq)
+    assert controller.accept("a", planned, now, q).state == "active"
+    at = rng.integers(10, int(0.9 * planned.points[-1].time_from_start / PERIOD))
+    for cycle in range(400):
+        now += PERIOD
+        if cycle == at and event == "stop":
+            controller.cancel("a", "enough", now)
+        elif cycle == at and event in ("hold", "held"):
+            controller.hold(True, "wait")
+        elif cycle == at + 50 and event == "held":
+            controller.hold(False, "go on")
+        elif cycle in (at, at + 50) and event == "speed":
+            controller.speed_scaling = 0.3 if cycle == at else 1.0
+        set_point = controller.update(now, q, dq)
+        assert set_point is not None
+        q, dq = set_point
+        sent.append((now, q, dq))
+    assert controller.at_rest
+    return sent
+
+
 @pytest.mark.parametrize(("event", "over"), [("stop", SLACK), ("hold", SLACK), ("held", 0.2), ("speed", 0.2)])
 def test_jerk_limits_hold_in_a_stop_and_nearly_where_the_speed_comes_back(event: str, over: float) -> None:
     for seed in range(20, 28):
-        rng = np.random.default_rng(seed)
-        planned = motion(rng)
-        q = np.array(planned.points[0].positions)
-        controller, now, dq, sent = TrajectoryController(LIMITS, q), 100.0, 0 * q, [q] * 4
-        controller.update(now, q, dq)
-        assert controller.accept("a", planned, now, q).state == "active"
-        at = rng.integers(10, int(0.9 * planned.points[-1].time_from_start / PERIOD))
-        for cycle in range(400):
-            now += PERIOD
-            if cycle == at and event == "stop":
-                controller.cancel("a", "enough", now)
-            elif cycle == at and event in ("hold", "held"):
-                controller.hold(True, "wait")
-            elif cycle == at + 50 and event == "held":
-                controller.hold(False, "go on")
-            elif cycle in (at, at + 50) and event == "speed":
-                controller.speed_scaling = 0.3 if cycle == at else 1.0
-            set_point = controller.update(now, q, dq)
-            assert set_point is not None
-            q, dq = set_point
-            sent.append(q)
-        assert controller.at_rest
-        jerk = np.abs(np.diff(sent, n=3, axis=0)) / PERIOD**3
+        sent = [q for _, q, _ in executed(event, seed)]
+        jerk = np.abs(np.diff([sent[0]] * 3 + sent, n=3, axis=0)) / PERIOD**3
         assert jerk.max() <= LIMITS.jerks[0] * (1 + over), (seed, jerk.max())
+
+
+@pytest.mark.parametrize("event", ["stop", "hold", "held", "speed"])
+def test_an_arm_that_wants_500_set_points_a_second_is_told_little_more_jerk_than_there_is_from_cycle_to_cycle(
+    event: str,
+) -> None:
+    period, most = 0.002, {"as they come": 0.0, "smoothed": 0.0}
+    for seed in range(20, 28):
+        stream, smoothing, told = SetPointStream(LIMITS, 0.05, period), Smoothing(1 / period), []
+        (begun, start, _), *sent = executed(event, seed)
+        stream.begin(start, begun)
+        for tick in range(int(4.2 / period)):
+            now = begun + (tick + 0.5) * period
+            while sent and sent[0][0] <= now:
+                stream.put(*sent.pop(0))
+            told.append(stream.at(now)[0])
+        assert not stream.ceased
+        for name, rows in (("as they come", told), ("smoothed", [smoothing.after(q) for q in told])):
+            jerk = np.abs(np.diff([start] * 3 + rows, n=3, axis=0)).max() / period**3
+            most[name] = max(most[name], jerk / LIMITS.jerks[0])
+    assert most["smoothed"] <= 1.1 < most["as they come"], most

@@ -54,7 +54,8 @@ def test_ball_that_fell_out_of_the_hand_and_is_not_seen_again_is_told_at_the_end
     cell.until("DONE")
     status = cell.task.status
     assert (status.done, status.total) == (2, 3)
-    assert status.overlooked == "the table looks empty, but of what fell out of the hand 1 was not seen again"
+    assert status.overlooked == (
+        "the table looks empty, but 1 that was seen before something fell out of the hand was not seen again")
 
 
 def test_ball_that_fell_out_of_the_hand_is_told_at_the_end_if_it_was_only_seen_as_it_rolled_away() -> None:
@@ -71,7 +72,8 @@ def test_ball_that_fell_out_of_the_hand_is_told_at_the_end_if_it_was_only_seen_a
     cell.until("DONE")
     status = cell.task.status
     assert (status.done, status.total) == (2, 3)
-    assert status.overlooked == "the table looks empty, but of what fell out of the hand 1 was not seen again"
+    assert status.overlooked == (
+        "the table looks empty, but 1 that was seen before something fell out of the hand was not seen again")
 
 
 def test_ball_that_fell_out_of_the_hand_and_was_taken_again_is_no_loss_even_if_a_person_takes_another() -> None:
