@@ -152,7 +152,7 @@ async def run(bus: Bus, config: Config) -> None:
             if shown.matched:
                 shown.put(array_to_image(annotate(picture, detections), "bgr8", image.header))
             if masks.matched:
-                masks.put(array_to_image(detector.masks(picture).closed, "mono8", image.header))
+                masks.put(array_to_image(detector.masks(picture, camera).closed, "mono8", image.header))
 
     async with asyncio.TaskGroup() as group:
         group.create_task(cameras.follow())

@@ -1,7 +1,7 @@
-"""The colour of the light, judged by what most of a picture shows: in warm light a brown table is as red as red things.
+"""The colour of the light, judged by what most of a table shows: in warm light a brown one is as red as red things.
 
-A lamp of 2700 K gives surfaces less than half the green, compared with red, that daylight gives them. Where most of a
-picture has so little green that no usual surface would have it in daylight, it is the light, and green is raised again.
+A lamp of 2700 K gives surfaces less than half the green, compared with red, that daylight gives them. Where most of
+it has so little green that no usual surface would have it in daylight, it is the light, and green is raised again.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 Picture = npt.NDArray[np.uint8]
+Chosen = npt.NDArray[np.bool_]
 
 STRIDE = 8  # [px] between the pixels that are looked at
 DIM = 20  # [0..255] what is darker tells no colour
-SHARE = 60  # percentile: so much of the picture may be redder than what tells the light
+SHARE = 60  # percentile: so much may be redder than what tells the light
 LEAST_GREEN = -0.7  # log(green / red) of what is still taken for a surface in white light
 USUAL_GREEN = -0.5  # to which that of anything redder is raised
 ENOUGH = 0.6  # of the logarithm: raised further, and the highlights of what is red are orange
@@ -24,9 +25,21 @@ MOST = 1.0  # of the logarithm: no lamp is redder
 STEP = 0.1  # of the logarithm: a little more or less changes nothing
 
 
-def green_gain(picture: Picture) -> float:
-    """By how much green is too weak in a bgr8 picture (height, width, 3); 1 in any usual light."""
-    pixels = picture[::STRIDE, ::STRIDE].reshape(-1, 3).astype(np.float32)
+def looked_at(height: int, width: int) -> npt.NDArray[np.float64]:
+    """The pixels (rows, columns, 2) as (u, v) that the light is judged by in a picture of that size."""
+    u, v = np.meshgrid(np.arange(0, width, STRIDE), np.arange(0, height, STRIDE))
+    return np.stack([u, v], axis=-1).astype(float)
+
+
+def green_gain(picture: Picture, table: Chosen | None = None) -> float:
+    """By how much green is too weak in a bgr8 picture (height, width, 3); 1 in any usual light.
+
+    Args:
+        picture: the picture.
+        table: (rows, columns) which of the pixels `looked_at` show it; without, all of them count.
+    """
+    few = picture[::STRIDE, ::STRIDE]
+    pixels = (few if table is None else few[table]).reshape(-1, 3).astype(np.float32)
     pixels = pixels[pixels.max(axis=1) > DIM]
     if not len(pixels):
         return 1.0

@@ -41,18 +41,20 @@ from common.applications.pick_place.odd import (
     sized,
     unlike,
 )
-from common.applications.pick_place.resting import Resting
+from common.applications.pick_place.resting import Resting, shows_table
 from common.applications.pick_place.separation import separate
 from common.config import CameraConfig, Parameters, Surroundings, Tunable
 from common.perception.depth import Depth
 from common.perception.exposure import blindness
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouettes
+from common.perception.white import Chosen, looked_at
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
 
 _ROUND = 0.96  # part of an outline that must fit for a blob to be one ball
+_LEAST_TABLE = 0.1  # part of a picture that shows the table, at least, for it to tell the colour of the light
 
 Hue = Annotated[int, Field(ge=0, le=180)]
 Byte = Annotated[int, Field(ge=0, le=255)]
@@ -129,11 +131,13 @@ class Detector:
         """Prepare for balls of the surroundings' size.
 
         Args:
-            surroundings: radius of the balls, height of the table, container.
+            surroundings: radius of the balls, table, container.
             options: colour windows and sizes; they may change between pictures.
         """
         self.options = options or DetectorOptions()
         self.resting = Resting.of(surroundings)
+        self._around = surroundings
+        self._table: tuple[Pinhole, Chosen | None] | None = None  # where the last camera shows it
         self._masks = Masks()
         self._outlines: dict[Traced, Outline] = {}  # of the last picture: what is there again is not worked out again
         self._fits: dict[_Key, list[_Round]] = {}
@@ -143,18 +147,24 @@ class Detector:
         self.too_large = 0  # round blobs in it that look larger than a stack, but for those in the container
         self._last: tuple[Mask, Pinhole, DetectorOptions, list[Detection]] | None = None
 
-    def masks(self, picture: Picture) -> RedMasks:
-        """What is red in a bgr8 picture. The masks are not to be written to."""
+    def masks(self, picture: Picture, camera: Pinhole) -> RedMasks:
+        """What is red in a bgr8 picture. The masks are not to be written to.
+
+        The colour of the light is that of the table: beside it a camera at the side sees the floor, of another colour.
+        """
         o = self.options
         windows = (o.hsv_red_lo1, o.hsv_red_hi1), (o.hsv_red_lo2, o.hsv_red_hi2)
-        return self._masks.of(picture, Colours(windows, o.morph_kernel_px))
+        if self._table is None or self._table[0] is not camera:
+            table = shows_table(self._around, camera, looked_at(camera.height, camera.width))
+            self._table = camera, table if table.mean() >= _LEAST_TABLE else None
+        return self._masks.of(picture, Colours(windows, o.morph_kernel_px), self._table[1])
 
     def detect(self, picture: Picture, camera: Pinhole) -> list[Detection]:
         """Balls in a bgr8 picture (height, width, 3), nearest to the upper left corner first.
 
         A picture that is the last one again, as drawn ones without noise often are, is not looked at again.
         """
-        masks = self.masks(picture)
+        masks = self.masks(picture, camera)
         last = self._last
         if last and masks.closed is last[0] and camera is last[1] and self.options == last[2]:
             return list(last[3])
@@ -165,7 +175,7 @@ class Detector:
 
     def detect_in_depth(self, picture: Picture, depth: Depth, camera: Pinhole) -> list[Detection]:
         """The same by a picture with depth (height, width) [m]: balls are where they are, on the table or on others."""
-        fine, closed, narrow = self.masks(picture)
+        fine, closed, narrow = self.masks(picture, camera)
         centers = find_in_depth(fine, depth, camera, self.resting.radius)
         found = []
         if len(centers):
@@ -193,17 +203,19 @@ class Detector:
         small = small_blobs(closed, self.options.min_contour_area_px)
         # What shows of a ball below others in the container is small, too.
         self.too_small = sum(not self.resting.shows_container(camera, pixel) for pixel in small)
-        pixel_size = abs(float(camera.position[2]) - self.resting.plane) / camera.fx  # at the plane of the balls
+        # Of a ball straight below the camera. How much larger one looks that lies higher is a length, which hardly
+        # grows with the distance: what tells that from the side, too, is this, not how much a pixel is over there.
+        pixel_size = abs(float(camera.position[2]) - self.resting.plane) / camera.fx
         offset = self.options.outline_offset_px * pixel_size
         seen: list[_Seen] = []
         self.odd, self.too_large = self._thin(narrow, camera), 0
         alone, crowded, offsets = self._alone(blobs, camera, offset, pixel_size)
         seen += alone
-        # All outlines of a picture are off by as much: balls that stand alone say by how much.
         spread = 1.0 * pixel_size
-        if offsets:
-            offset, spread = float(np.median(offsets)), 0.2 * pixel_size
         for blob in crowded:  # balls that touch, hide each other or reach over the border
+            if offsets:  # all outlines of a picture are off by as many pixels: balls that stand alone say by how many
+                there = self._pixel_size(camera, blob.centroid)
+                offset, spread = float(np.median(offsets)) * there, 0.2 * there
             centers = separate(blob.outline, closed, camera, self.resting, offset)
             if len(centers):
                 fit = fit_spheres(blob.outline, centers, self.resting.radius, offset=offset, offset_std=spread)
@@ -222,10 +234,19 @@ class Detector:
         self.odd = self._on_table(camera, self.odd)
         return sorted(self._detections(seen, camera), key=lambda d: (d.pixel[1], d.pixel[0]))
 
+    def _pixel_size(self, camera: Pinhole, pixel: Array) -> float:
+        """How much one pixel is of a ball on the table that is seen at a pixel [m]: from the side more of one far away.
+
+        Above the horizon, where none is, it is that of one straight below.
+        """
+        center = np.append(camera.on_plane(pixel, self.resting.plane), self.resting.plane)
+        depth = float(camera.to_camera(center)[2])
+        return (depth if np.isfinite(depth) else abs(float(camera.position[2]) - self.resting.plane)) / camera.fx
+
     def _alone(
         self, blobs: list[Blob], camera: Pinhole, offset: float, pixel_size: float
     ) -> tuple[list[_Seen], list[Blob], list[float]]:
-        """Blobs that are one ball wholly in view, blobs that are not round, and the offsets of the former [m].
+        """Blobs that are one ball wholly in view, blobs that are not round, and the offsets of the former [px].
 
         What is round but as large as no ball looks where it can lie is left out: it is something else, or falling.
         """
@@ -258,28 +279,31 @@ class Detector:
         self._fits = fits
         alone: list[_Seen] = []
         offsets: list[float] = []
+        sizes: list[float] = []
         for blob, key in tried:
             if not (tries := fits[key]):
                 continue
             if min(one.close for one in tries) < _ROUND:
                 crowded.append(blob)
                 continue
+            there = self._pixel_size(camera, blob.centroid)
             best = min(tries, key=lambda one: abs(one.offset - offset))
             if best.offset - offset > FALLING:
                 self.too_large += not self.resting.shows_container(camera, blob.centroid)
                 continue
             if abs(best.offset - offset) > self.options.max_offset_px * pixel_size:
                 self.odd.append(self._odd(blob.centroid, camera, sized(best.offset, offset)))
-            elif best.oval > MOST_OVAL * pixel_size and not self.resting.shows_container(camera, blob.centroid):
+            elif best.oval > MOST_OVAL * there and not self.resting.shows_container(camera, blob.centroid):
                 self.odd.append(self._odd(blob.centroid, camera, FLAT))
             else:
                 alone.append(_Seen(best.center, blob.area, blob.border))
-                offsets.append(best.offset)
-        usual = float(np.median(offsets)) if offsets else offset
-        for k in np.flatnonzero(unlike(np.array(offsets), MOST_UNLIKE * pixel_size))[::-1].tolist():
+                offsets.append(best.offset / there)
+                sizes.append(there)
+        usual = float(np.median(offsets)) if offsets else 0.0
+        for k in np.flatnonzero(unlike(np.array(offsets), MOST_UNLIKE))[::-1].tolist():
             pixel = camera.project(alone[k].center + camera.position)
             if not self.resting.shows_container(camera, pixel):
-                self.odd.append(self._odd(pixel, camera, sized(offsets[k], usual)))
+                self.odd.append(self._odd(pixel, camera, sized(offsets[k] * sizes[k], usual * sizes[k])))
                 del alone[k], offsets[k]
         return alone, crowded, offsets
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.applications.pick_place.blobs import Mask
-from common.perception.white import green_gain, with_green
+from common.perception.white import Chosen, green_gain, with_green
 
 Picture = npt.NDArray[np.uint8]
 Window = tuple[tuple[int, int, int], tuple[int, int, int]]  # lower and upper end: hue, saturation, value
@@ -41,6 +41,7 @@ class _Known:
     picture: Picture
     colours: Colours
     gain: float  # of green, for the colour of the light
+    table: Chosen | None
     masks: RedMasks
 
 
@@ -51,17 +52,23 @@ class Masks:
         """Nothing was seen yet."""
         self._known: _Known | None = None
 
-    def of(self, picture: Picture, colours: Colours) -> RedMasks:
-        """What is red in a bgr8 picture. The masks are not to be written to."""
+    def of(self, picture: Picture, colours: Colours, table: Chosen | None = None) -> RedMasks:
+        """What is red in a bgr8 picture. The masks are not to be written to.
+
+        Args:
+            picture: the picture.
+            colours: what counts as red.
+            table: where it is shown, see `green_gain`: the very same array as long as it is there.
+        """
         known, part = self._known, None
         if known is not None and known.colours == colours and known.picture.shape == picture.shape:
             part = changed(known.picture, picture)
-            if part is None:
+            if part is None and known.table is table:
                 return known.masks
-        gain = green_gain(picture)
+        gain = green_gain(picture, table)
         if known is None or part is None or gain != known.gain or _share(part, picture) > _MOST:
             masks = _masks(with_green(picture, gain), colours)
-            self._known = _Known(picture.copy(), colours, gain, masks)
+            self._known = _Known(picture.copy(), colours, gain, table, masks)
             return masks
         reach = 4 * (colours.kernel_px // 2) + 2  # of erosion and dilation, twice: so far a pixel acts on the masks
         inner, outer = _grown(part, reach, picture), _grown(part, 2 * reach, picture)
@@ -72,7 +79,7 @@ class Masks:
         within = slice(offset[0], offset[0] + size[0]), slice(offset[1], offset[1] + size[1])
         for whole, fresh in zip(masks, _masks(with_green(picture[outer], gain), colours), strict=True):
             whole[inner] = fresh[within]
-        self._known = _Known(known.picture, colours, gain, masks)
+        self._known = _Known(known.picture, colours, gain, table, masks)
         return masks
 
 

@@ -80,7 +80,7 @@ def sized(offset: float, usual: float) -> str:
 
 
 def unlike(offsets: Array, most: float) -> npt.NDArray[np.bool_]:
-    """(n,) which outlines are further out or in than those of the others [m]; none where there are too few to tell."""
+    """(n,) which outlines are further out or in than those of the others [px]; none where there are too few to tell."""
     if len(offsets) < FEWEST:
         return np.zeros(len(offsets), bool)
     return np.asarray(np.abs(offsets - np.median(offsets)) > most)

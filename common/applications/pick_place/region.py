@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from common.applications.pick_place.resting import Resting
-from common.config import Fixture, Surroundings
+from common.applications.pick_place.resting import Resting, is_table
+from common.config import Surroundings
 from common.perception.occlusion import Hidden, Silhouettes
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
@@ -32,7 +32,7 @@ class Region:
         found = [
             (x, y, plane)
             for fixture in around.fixtures
-            if _is_table(fixture, around.table_height)
+            if is_table(fixture, around.table_height)
             for x in _steps(fixture.position[0], fixture.dimensions[0] / 2)
             for y in _steps(fixture.position[1], fixture.dimensions[1] / 2)
         ]
@@ -94,11 +94,6 @@ def looking_poses(
             found.append((share, q.tolist()))
     good = [q for share, q in found if share <= most]
     return good or [min(found)[1]] if found else []
-
-
-def _is_table(fixture: Fixture, height: float) -> bool:
-    top = fixture.position[2] + fixture.dimensions[2] / 2 if fixture.shape == "box" else None
-    return top is not None and abs(top - height) < 1e-3
 
 
 def _steps(middle: float, half: float) -> list[float]:

@@ -10,10 +10,27 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from common.config import Container, Surroundings
+from common.config import Container, Fixture, Surroundings
 from common.perception.pinhole import Pinhole
 
 Array = npt.NDArray[np.float64]
+
+
+def is_table(fixture: Fixture, height: float) -> bool:
+    """Whether the upper side of a fixture is a table at a height [m]."""
+    top = fixture.position[2] + fixture.dimensions[2] / 2 if fixture.shape == "box" else None
+    return top is not None and abs(top - height) < 1e-3
+
+
+def shows_table(around: Surroundings, camera: Pinhole, pixels: Array) -> npt.NDArray[np.bool_]:
+    """Through which pixels (..., 2) a table would be seen if nothing were before it: (...)."""
+    places = camera.on_plane(pixels, around.table_height)
+    shown = np.zeros(places.shape[:-1], bool)
+    for fixture in around.fixtures:
+        if is_table(fixture, around.table_height):
+            beside = np.abs(places - fixture.position[:2])  # nan above the horizon, and no table there
+            shown |= (beside <= np.array(fixture.dimensions[:2]) / 2).all(axis=-1)
+    return shown
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from common.perception.white import green_gain, with_green
+from common.perception.white import green_gain, looked_at, with_green
 from common.sim.lighting import tint
 
 TABLE, RED = (0.10, 0.35, 0.55), (0.10, 0.15, 1.0)  # blue, green, red
@@ -41,6 +41,16 @@ def test_green_is_raised_in_warm_light_so_far_that_a_table_is_not_red(light: flo
 def test_grey_and_dark_pictures_stay_as_they_are() -> None:
     assert green_gain(np.full((48, 64, 3), 128, np.uint8)) == 1.0
     assert green_gain(np.zeros((48, 64, 3), np.uint8)) == 1.0
+
+
+def test_light_is_that_of_the_part_of_a_picture_that_shows_the_table() -> None:
+    picture = table(2700)
+    picture[:120] = np.clip(128 * tint(2700), 0, 255)  # a grey floor
+    pixels = looked_at(240, 320)
+    shown = pixels[..., 1] >= 120
+    assert green_gain(picture, shown) == green_gain(picture[120:]) > green_gain(picture)
+    assert green_gain(picture, np.ones(pixels.shape[:2], bool)) == green_gain(picture)
+    assert green_gain(picture, np.zeros(pixels.shape[:2], bool)) == 1.0
 
 
 def test_in_warm_light_a_highlight_on_a_ball_stays_red_and_the_table_is_none() -> None:

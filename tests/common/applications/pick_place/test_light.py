@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from common.applications.pick_place.detector import Detector
-from common.config import Light, Scenery, Surroundings, load_cell
+from common.config import CameraConfig, Light, Scenery, Surroundings, load_cell
 from common.messages import Color, Header, JointState, Pose, Vector3, WorldObject, WorldObjects
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
@@ -20,6 +20,7 @@ CELL = load_cell("panda")
 AROUND = CELL.section(Surroundings)
 assert isinstance(AROUND, Surroundings)
 CAMERA = Pinhole.from_config(AROUND.camera)
+SIDE = CameraConfig(position=(1.15, 0.0, 0.85), rpy=(-2.4, 0.0, math.pi / 2))
 PLACES = [(0.40, -0.30, 0.03), (0.60, -0.10, 0.03), (0.25, 0.20, 0.03), (0.15, -0.15, 0.03), (0.62, 0.02, 0.03)]
 
 
@@ -29,8 +30,8 @@ def balls() -> list[WorldObject]:
             for k, (x, y, z) in enumerate(PLACES)]
 
 
-def errors(picture: np.ndarray) -> list[float]:
-    found = Detector(AROUND).detect(picture, CAMERA)
+def errors(picture: np.ndarray, camera: Pinhole = CAMERA) -> list[float]:
+    found = Detector(AROUND).detect(picture, camera)
     assert len(found) == len(PLACES), found
     return [min(math.dist(place[:2], one.position[:2]) for one in found) for place in PLACES]
 
@@ -50,6 +51,15 @@ def test_balls_are_found_to_3_mm_and_none_is_made_up(
     values = scene * tint(kelvin) * bright * fall  # a shadow across it, and light that fades along it
     noisy = values + np.sqrt(0.02 * values + 0.3) * rng.standard_normal(values.shape)
     assert max(errors(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))) < 0.003
+
+
+@pytest.mark.parametrize("bright", [1.0, 0.5])
+@pytest.mark.parametrize("kelvin", [2700, 3000, 3500])
+def test_the_floor_beside_a_table_does_not_tell_the_light_on_it(kelvin: float, bright: float) -> None:
+    camera = Pinhole.from_config(SIDE)
+    picture = Renderer(AROUND, camera=camera).see(balls()).colour
+    warm = np.clip(np.rint(picture * tint(kelvin) * bright), 0, 255).astype(np.uint8)
+    assert max(errors(warm, camera)) < 0.003
 
 
 @pytest.mark.slow

@@ -54,6 +54,19 @@ def test_a_picture_that_is_the_last_one_again_has_the_very_same_masks() -> None:
     assert masks.of(picture, Colours(WINDOWS, 9))[1] is not first[1]
 
 
+def test_where_the_table_is_seen_tells_what_is_red() -> None:
+    picture = np.full((96, 128, 3), (40, 65, 90), np.uint8)
+    picture[48:] = (5, 50, 230)  # a brown table in warm light
+    picture[10:40, 20:60] = RED
+    lower = np.zeros((12, 16), bool)
+    lower[6:] = True
+    masks, colours = Masks(), Colours(WINDOWS, 7)
+    assert masks.of(picture, colours, ~lower).closed[48:].any()
+    told = masks.of(picture, colours, lower)
+    assert told.closed[20, 40] and not told.closed[48:].any(), "of the same picture, too"
+    assert masks.of(picture.copy(), colours, lower) is told
+
+
 def test_masks_that_were_given_stay_as_they_are() -> None:
     rng = np.random.default_rng(2)
     picture, masks = scene(rng, 120, 90), Masks()

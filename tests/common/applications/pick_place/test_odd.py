@@ -178,6 +178,46 @@ def test_balls_that_touch_do_not_lie_on_each_other(eye: CameraConfig, others: bo
         assert len(detector.detect(picture, camera)) == len(touching) + len(beside) and detector.odd == []
 
 
+def painted(camera: Pinhole, places: list[tuple[float, float]], wider: list[float], higher: list[float]) -> np.ndarray:
+    """Balls whose outlines are so much further out than they should be [px], as light and noise have it."""
+    fine = 8
+    picture = np.full((camera.height * fine, camera.width * fine, 3), 40, np.uint8)
+    drawn = silhouettes(camera, np.array([(x, y, 0.03) for x, y in places]), 0.03, 64)
+    for outline, *more in zip(drawn, wider, higher, strict=True):
+        away = outline - outline.mean(axis=0)
+        moved = outline + away / np.abs(away).max(axis=0) * more
+        cv2.fillConvexPoly(picture, np.rint((moved + 0.5) * fine - 0.5).astype(np.int32), (25, 35, 200))
+    return cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+
+@pytest.mark.parametrize(("wider", "higher"), [
+    ([0.45] * 4, [-0.45] * 4), ([-0.45] * 4, [0.45] * 4), ([0.41, 0, 0, 0], [0.41, 0, 0, 0]),
+])
+def test_outline_of_a_ball_far_away_may_be_off_by_as_many_pixels_as_that_of_one_near(
+    wider: list[float], higher: list[float],
+) -> None:
+    camera, around = Pinhole.from_config(SIDE), AROUND.model_copy(update={"camera": SIDE})
+    places = [(0.10, -0.40), (0.10, 0.10), (0.20, -0.20), (0.60, -0.10)]
+    detector = Detector(around)
+    found = detector.detect(painted(camera, places, wider, higher), camera)
+    assert len(found) == len(places), detector.odd
+    assert all(min(math.dist(one.position[:2], place) for one in found) < 0.003 for place in places)
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("others", [True, False])
+@pytest.mark.parametrize("height", [0.079, 0.09])
+def test_ball_on_top_of_something_looks_too_large_from_the_side(
+    place: tuple[float, float], height: float, others: bool,
+) -> None:
+    camera, around = Pinhole.from_config(SIDE), AROUND.model_copy(update={"camera": SIDE})
+    beside = [ball(x, y) for x, y in OTHERS] if others else []
+    detector = Detector(around)
+    picture = Renderer(around, camera=camera).see([ball(*place, height), *beside]).colour
+    assert len(detector.detect(picture, camera)) == len(beside)
+    assert ["it lies higher" in one.reason for one in detector.odd] == [True]
+
+
 @pytest.mark.parametrize("places", [
     [(0.544, 0.265), (0.514, 0.21), (0.579, 0.216)], [(0.552, 0.273), (0.539, 0.214)],
 ])
