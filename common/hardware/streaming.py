@@ -105,6 +105,10 @@ class SetPointStream:
         if not np.isfinite(dq).all():
             self.ceased = f"the velocity of {self._limits.names[int(np.argmin(np.isfinite(dq)))]} is no finite number"
             return
+        gap = step > STALL  # nobody who makes them takes so long; who plays them may have been held up as long
+        if gap and np.any(np.abs(dq0) > REST):
+            self._cease(f"set-points ceased to come for {step * 1e3:.0f} ms")
+            return
         piece = Piece(step, *accelerations(step, q0, dq0, q, dq))
         if np.all(np.abs(dq0) <= REST) and np.all(q == q0):
             self._points.pop()  # rests: a later motion begins where the rest ends
@@ -112,7 +116,7 @@ class SetPointStream:
                 self._points.append(Point(before, q0, 0 * q0, ddq=0 * q0))
             piece = Piece(math.inf, 0 * q0, 0 * q0)
         elif newest.ddq is None:
-            newest.ddq = between(self._came, piece)
+            newest.ddq = 0 * q0 if gap else between(self._came, piece)  # in so long a time it has come to rest
         a0, a1 = piece.begins, piece.ends
         jerk = np.maximum(np.abs(a0 - self._came.ends), np.abs(a1 - a0)) / step
         self._came = piece

@@ -236,3 +236,24 @@ def test_what_is_older_than_what_came_before_is_left_out() -> None:
     for now in np.arange(0.0, 1.0, 2e-3):
         q, _ = stream.at(float(now))
     assert not stream.ceased and q[0] == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize("rests", [False, True])
+def test_set_points_after_a_gap_in_which_nothing_was_played_bring_the_arm_nowhere_else(rests: bool) -> None:
+    stream = SetPointStream(LIMITS, AHEAD, 1e-3)
+    stream.begin(0 * TWO, 0.0)
+    rows = []
+    for number in range(31):
+        stream.put(number * PERIOD, *wave(number * PERIOD))
+        rows += [stream.at(number * PERIOD + each * 1e-3)[0] for each in range(10)]
+    q, _ = wave(0.3)
+    if rests:  # all at once, which is how a program ends that was stopped
+        stream.put(0.31, q, 0 * TWO)
+    measured = rows[-1]
+    for number in range(30):  # the controller stood still for a second, and its clock with it
+        stream.put(1.3 + number * PERIOD, measured, 0 * TWO)
+    rows += [stream.at(0.31 + tick * 1e-3)[0] for tick in range(1200)]
+    assert bool(stream.ceased) != rests and "for 1000 ms" in (stream.ceased or "for 1000 ms")
+    assert np.min(rows) > -1e-6 and np.max(rows) < q.max() + 0.05
+    assert np.abs(np.diff(rows, axis=0)).max() / 1e-3 <= LIMITS.velocity[0]
+    assert np.abs(rows[-1] - rows[-50]).max() < 1e-3
