@@ -156,7 +156,7 @@ class Choice:
         self._given_up: list[GivenUp] = []
         self._judged_by: dict[str, Any] = {}  # values of the parameters
         self._expected = (0, 0.0)  # balls that will be in the container soon, and until when that is only expected
-        self._released: Spot | None = None  # above what the last of them was let go
+        self._tops: dict[Spot, float] = {}  # height [m] of the last that was let go above each column
 
     def next(self, view: PickPlaceView, origin: Sequence[float], under_way: Sequence[Pick]) -> Pick | None:
         """The nearest ball to `origin` (x, y) that can be taken, with its yaws; None when there is none now."""
@@ -196,16 +196,27 @@ class Choice:
 
         An arm that lets go wherever it comes first heaps up a pile that leans to its side.
         """
-        lie = [place_of(thing.pose) for thing in view.objects("contained")]
-        coming = [pick.over for pick in under_way]
-        if view.scene_stamp < self._expected[1]:
-            coming.insert(0, self._released)
-        for over in coming:
+        lie = self._lie(view)
+        for over in (pick.over for pick in under_way):
             if over is not None:
-                below = [z for x, y, z in lie if math.dist((x, y), over) < self.radius]
-                lie.append((*over, max(below, default=self.p.world.table_height - self.radius) + 2 * self.radius))
+                lie.append((*over, self._top(over, lie)))
         low = low_columns(self.container, lie, self.radius)
         return min(low, key=lambda column: math.dist(column, ball.position[:2]))
+
+    def _lie(self, view: PickPlaceView) -> list[Place]:
+        """What lies in the container, as it is seen and as it was let go, until that is seen to be empty.
+
+        What leans on others may look as if it lay on the floor, where it was let go above another one.
+        """
+        seen = [place_of(thing.pose) for thing in view.objects("contained")]
+        if not seen and view.scene_stamp >= self._expected[1]:
+            self._tops.clear()
+        return [*seen, *((*over, top) for over, top in self._tops.items())]
+
+    def _top(self, over: Spot, lie: Sequence[Place]) -> float:
+        """Height [m] of one more above those that lie there."""
+        below = [z for x, y, z in lie if math.dist((x, y), over) < self.radius]
+        return max(below, default=self.p.world.table_height - self.radius) + 2 * self.radius
 
     def once_more(self) -> bool:
         """Open again what no plan was found for, each once while the table stays as it is; whether there is any."""
@@ -235,7 +246,9 @@ class Choice:
 
     def released(self, pick: Pick, view: PickPlaceView) -> None:
         """A ball was let go above the container, where it will be seen when it has come to rest."""
-        self._expected, self._released = (self._contained(view) + 1, view.now + SETTLING), pick.over
+        if pick.over is not None:
+            self._tops[pick.over] = self._top(pick.over, self._lie(view))
+        self._expected = self._contained(view) + 1, view.now + SETTLING
         self._forget(pick.target)
 
     def missed(self, target: Target, view: PickPlaceView, problem: str) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 import pytest
 from hypothesis import given, settings
@@ -43,6 +44,20 @@ def test_planned_ahead_motions_start_where_the_one_before_ends() -> None:
     cell.until("DONE")
     plans = [r for r in cell.requests if isinstance(r, m.PlanRequest)]
     assert [bool(p.start) for p in plans[:4]] == [False, True, True, True]
+
+
+def test_what_leans_on_others_and_looks_as_if_it_lay_on_the_floor_is_not_heaped_upon(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fall(cell: CellDouble) -> None:
+        cell.fell.append((*cell.tcp[:2], 0.035))
+        cell.contained, cell.held = cell.contained + 1, ""
+
+    monkeypatch.setattr(CellDouble, "_fall", fall)
+    cell = CellDouble(SEVEN)
+    cell.until("DONE")
+    columns = Counter((x > 0.55, y > 0.25) for x, y, _ in cell.fell)
+    assert sorted(columns.values()) == [1, 2, 2, 2], columns
 
 
 def test_ball_that_fell_out_of_the_hand_and_is_not_seen_again_is_told_at_the_end() -> None:
