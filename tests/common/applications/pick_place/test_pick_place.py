@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 
 import pytest
 from hypothesis import given, settings
@@ -46,18 +45,19 @@ def test_planned_ahead_motions_start_where_the_one_before_ends() -> None:
     assert [bool(p.start) for p in plans[:4]] == [False, True, True, True]
 
 
-def test_what_leans_on_others_and_looks_as_if_it_lay_on_the_floor_is_not_heaped_upon(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def fall(cell: CellDouble) -> None:
-        cell.fell.append((*cell.tcp[:2], 0.035))
-        cell.contained, cell.held = cell.contained + 1, ""
-
-    monkeypatch.setattr(CellDouble, "_fall", fall)
-    cell = CellDouble(SEVEN)
-    cell.until("DONE")
-    columns = Counter((x > 0.55, y > 0.25) for x, y, _ in cell.fell)
-    assert sorted(columns.values()) == [1, 2, 2, 2], columns
+def test_nothing_is_let_go_above_what_leans_on_others_and_looks_as_if_it_lay_on_the_floor() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    choice = cell.task._choice
+    cell.fell = [(x, y, 0.035) for x in (0.526, 0.574) for y in (0.226, 0.274)]
+    cell.contained = len(cell.fell)
+    pick = choice.next(cell.view(), (0.4, -0.3), [])
+    assert pick is not None and pick.over is not None
+    choice.released(pick, cell.view())
+    cell.fell.append((*pick.over, 0.035))
+    for contained, same in ((5, False), (0, True)):  # then somebody empties the container
+        cell.now, cell.contained = cell.now + 10.0, contained
+        after = choice.next(cell.view(), (0.4, -0.3), [])
+        assert after is not None and (after.over == pick.over) == same
 
 
 def test_ball_that_fell_out_of_the_hand_and_is_not_seen_again_is_told_at_the_end() -> None:
