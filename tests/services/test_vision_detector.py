@@ -204,7 +204,7 @@ async def test_mask_shows_what_the_colour_windows_let_through_as_they_are_now_an
     rig.calibrate()
     tuned = config.model_copy()
     look = Detector.masks
-    monkeypatch.setattr(Detector, "masks", lambda self, pixels: asked.append(1) or look(self, pixels))
+    monkeypatch.setattr(Detector, "masks", lambda self, *given: asked.append(1) or look(self, *given))
     async with running_service(net, run, tuned, name="vision_detector"):
         asked.clear()  # what it rehearsed before it was ready
         rig.images.put(picture(stamp=1))

@@ -15,7 +15,8 @@ from common.errors import ConfigError
 from common.perception.depth_sources import CameraGone, Lens, Shot, maker_of
 
 PATIENCE = 1000  # [ms] without a frame after which the camera is gone
-REWIND = 10_000  # [ms] without one after which a recording is, which a busy machine begins again only after a while
+REWIND = 10_000  # [ms] without one in which a recording was begun again and again after which it is
+LOOK = 50  # [ms] without one after which a recording is asked whether it ended
 
 
 class Options(Parameters):
@@ -31,16 +32,16 @@ class Options(Parameters):
 class RealSense:
     """A camera whose pipeline runs."""
 
-    def __init__(self, rs: Any, pipeline: Any, profile: Any, align: str) -> None:
-        """Take a pipeline that was started.
+    def __init__(self, rs: Any, pipeline: Any, config: Any, profile: Any, align: str) -> None:
+        """Take a pipeline that was started with a config, which gave the profile.
 
         Raises:
             ConfigError: the lens of the picture that is kept as it is has distortion, or a recording is of colours
                 that are not read.
         """
-        self._rs, self._pipeline = rs, pipeline
+        self._rs, self._pipeline, self._config = rs, pipeline, config
         device = profile.get_device()
-        self._recorded = bool(device.is_playback())
+        self._playback: Any = device.as_playback() if device.is_playback() else None
         self._scale = float(device.first_depth_sensor().get_depth_scale())  # [m] of one step of z16
         stream = getattr(rs.stream, align)
         self._align = rs.align(stream)
@@ -58,7 +59,8 @@ class RealSense:
         """The next shot, depth and colour of the same instant."""
         while True:
             try:
-                frames = self._align.process(self._pipeline.wait_for_frames(REWIND if self._recorded else PATIENCE))
+                frames = self._align.process(
+                    self._pipeline.wait_for_frames(PATIENCE) if self._playback is None else self._played())
             except RuntimeError as error:  # unplugged, or it hangs
                 raise CameraGone(str(error)) from None
             depth, color = frames.get_depth_frame(), frames.get_color_frame()
@@ -71,9 +73,28 @@ class RealSense:
                 pixels = np.ascontiguousarray(pixels[:, :, ::-1])
             age = 0.0
             ours = color.get_frame_timestamp_domain() == self._rs.timestamp_domain.global_time  # of this machine
-            if ours and not self._recorded:
+            if ours and self._playback is None:
                 age = max(0.0, time.time() - color.get_timestamp() * 1e-3)  # [ms]
             return Shot(pixels, metres, age)
+
+    def _played(self) -> Any:
+        """The next frames of the recording, which begins again when it has ended.
+
+        The maker's own `repeat_playback` stands still for good after some of the ends (2.59.1, recordings of three
+        frames).
+
+        Raises:
+            RuntimeError: none came for `REWIND`, or it cannot be begun again.
+        """
+        until = time.monotonic() + REWIND * 1e-3
+        while time.monotonic() < until:
+            there, frames = self._pipeline.try_wait_for_frames(LOOK)
+            if there:
+                return frames
+            if self._playback.current_status() == self._rs.playback_status.stopped:
+                self._pipeline.stop()
+                self._playback = self._pipeline.start(self._config).get_device().as_playback()
+        raise RuntimeError(f"no frame of the recording for {REWIND * 1e-3:g} s")
 
     def close(self) -> None:
         """Stop it."""
@@ -92,7 +113,7 @@ def open_camera(options: Options, size: tuple[int, int], rate: float) -> RealSen
         what = options.file or f"{size[0]}x{size[1]} at {options.fps} Hz"
         raise CameraGone(f"{what}: {error}") from None
     try:
-        return RealSense(rs, pipeline, profile, options.align)
+        return RealSense(rs, pipeline, config, profile, options.align)
     except RuntimeError as error:  # a recording without one of the two
         pipeline.stop()
         raise CameraGone(f"{options.file}: {error}") from None
@@ -131,5 +152,5 @@ def _recording(rs: Any, options: Options) -> Any:
     if options.serial:
         raise ConfigError("options.serial", options.serial, f"is of a camera; there is a recording too: {options.file}")
     config = rs.config()
-    config.enable_device_from_file(str(file), repeat_playback=True)
+    config.enable_device_from_file(str(file), repeat_playback=False)  # see RealSense._played
     return config
