@@ -17,7 +17,7 @@ from common.errors import ConfigError, ZencellError
 R = TypeVar("R", bound=BaseModel)
 
 STATE_VARIABLE = "ZENCELL_STATE"  # folder for what is kept: what persons decided, how the simulated world stands
-STANDING_VARIABLE = "ZENCELL_STANDING"  # folder for the world alone; without both it is not kept
+STANDING_VARIABLE = "ZENCELL_STANDING"  # folder for what is kept until the cell's end alone, as how the world stands
 LARGEST = 1_000_000  # [bytes]
 ROOM = 128 * 1024  # [bytes] that each file takes: more than the largest record there can be
 
@@ -35,6 +35,12 @@ def lasting_folder(environ: Mapping[str, str] = os.environ) -> Path:
     except RuntimeError:
         told = "must name a folder to keep what persons decide in: this user has no home"
         raise ConfigError(STATE_VARIABLE, ..., told) from None
+
+
+def standing_folder(environ: Mapping[str, str] = os.environ) -> Path | None:
+    """The folder for what outlives a service, but not the cell; None where nobody has said one: then it is not kept."""
+    folder = environ.get(STANDING_VARIABLE) or environ.get(STATE_VARIABLE)
+    return Path(folder) if folder else None
 
 
 class Unreadable(ZencellError):

@@ -11,7 +11,8 @@ from common.kept_file import STATE_VARIABLE
 IMAGE = "zencell"
 ROUTER, ROUTER_PORT = "router", 7447
 VIEWER, VIEWER_PORT = "viewer", 8080
-KEEPERS = ("trajectory_executor", "scene_manager", "outline_scene")  # of what persons decided, and what is simulated
+# Of what persons decided, what is simulated, and what was done.
+KEEPERS = ("trajectory_executor", "scene_manager", "outline_scene", "smart_pick_place")
 CONFIG = "/app/config"
 DATA = "/data"
 # A container's port is published to the loopback of its host only.

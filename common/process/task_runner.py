@@ -7,9 +7,12 @@ import contextlib
 from collections.abc import Callable, Iterable
 from typing import Any, Generic, Protocol, TypeVar
 
+from pydantic import BaseModel
+
 from common import messages as m
 from common import topics
 from common.errors import Refused, RequestFailed
+from common.kept_file import KeptFile, Unreadable, standing_folder
 from common.process.orders import BY_THEMSELVES, GOAL_TIMEOUT, PERSON, Answered, Orders
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
@@ -79,7 +82,9 @@ async def run_task(
         return known
 
     watchdog = LivenessWatchdog(lambda: joints.received, lambda: config.joint_states_timeout)
-    runner = TaskRunner(bus, task, look, out, lambda: config.planning_time, watchdog)
+    memory = Memory(bus, task)
+    runner = TaskRunner(bus, task, look, out, lambda: config.planning_time, watchdog, memory)
+    await memory.begin()
     await bus.ready()
     await runner.run((*own.values(), scene, gripper, motion))
 
@@ -103,7 +108,7 @@ class TaskRunner(Generic[V]):
 
     def __init__(
         self, bus: Bus, task: Stepped[V], look: Callable[[], V], status: Writer[Any],
-        planning_time: Callable[[], float], watchdog: LivenessWatchdog | None = None,
+        planning_time: Callable[[], float], watchdog: LivenessWatchdog | None = None, memory: Memory | None = None,
     ) -> None:
         """Declare the requests of a task and the command that it serves.
 
@@ -114,13 +119,14 @@ class TaskRunner(Generic[V]):
             status: where the task's status goes.
             planning_time: that the task asks for now [s, wall].
             watchdog: holds the arm while those are missing that the task relies on.
+            memory: keeps what the task is to know when it is started again.
         """
         self._task, self._look, self._status, self._bus = task, look, status, bus
         self._woken = asyncio.Event()
         self._orders = Orders(bus, task, look, planning_time, self._note, self._woken.set)
         self._own, self._owner = bus.client(topics.MOTION_OWN), bus.reader(topics.MOTION_OWNER)
         self._owning: asyncio.Task[None] | None = None
-        self._watchdog = watchdog
+        self._watchdog, self._memory = watchdog, memory
         self._told: list[Command] = []
         self._before: m.TaskStatus | None = None
         bus.serve(topics.TASK_COMMAND, self._obey)
@@ -141,6 +147,8 @@ class TaskRunner(Generic[V]):
                 for command in [*told, *holds, *self._task.step(view)]:
                     self._orders.begin(group, command)
                 self._tell()
+                if self._memory is not None:
+                    self._memory.keep(group)
                 self._have_motion(group, view.motion if view else None)
 
     def _have_motion(self, group: asyncio.TaskGroup, motion: m.MotionStatus | None) -> None:
@@ -211,6 +219,51 @@ class TaskRunner(Generic[V]):
     async def _wake_on(self, reader: Reader[Any]) -> None:
         async for _ in reader:
             self._woken.set()
+
+
+class Memory:
+    """A file in which the memory of a task outlives it, where there is a folder for that."""
+
+    def __init__(self, bus: Bus, task: Task[Any]) -> None:
+        """Keep nothing yet."""
+        self._bus, self._task = bus, task
+        self._kept = task.memory
+        self._file: KeptFile[Any] | None = None
+        self._saving: asyncio.Task[None] | None = None
+
+    async def begin(self) -> None:
+        """Have the task remember what was kept, if it has a memory at all."""
+        folder = standing_folder()
+        if self._kept is None or folder is None:
+            return
+        await self._bus.owned()  # until then another one of this name may still write
+        if self._bus.declares_only:
+            return
+        self._file = KeptFile(folder / f"{self._bus.cell}.{self._bus.service}.json", type(self._kept))
+        try:
+            self._kept = self._file.read()
+            self._task.remember(self._kept)
+        except Unreadable as error:  # the next that is kept takes its place
+            self._bus.log.warning("what was done before is not known: %s", error)
+
+    def keep(self, group: asyncio.TaskGroup) -> None:
+        """Write down what has changed, beside everything else; what changes meanwhile has its turn after it."""
+        now = self._task.memory
+        if self._file is None or now is None or now is self._kept or (self._saving and not self._saving.done()):
+            return
+        self._kept = now
+        self._saving = group.create_task(self._save(self._file, now), name="memory")
+
+    async def _save(self, file: KeptFile[Any], memory: BaseModel) -> None:
+        def write() -> None:
+            file.path.parent.mkdir(parents=True, exist_ok=True)
+            file.save(memory)
+
+        try:
+            await asyncio.to_thread(write)
+        except OSError as error:
+            self._bus.log.warning("%s cannot be written (%s): a task that is started again will not know this",
+                                  file.path, error.strerror or error)
 
 
 def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owner: m.MotionOwner | None) -> None:

@@ -9,7 +9,7 @@ import math
 from collections import deque
 from typing import Generic, Literal, TypeVar
 
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from common import messages as m
 from common.config import GripperConfig, Parameters, RobotConfig, Run, Tunable
@@ -177,6 +177,15 @@ class Deciding(Generic[V]):
 
     def began_anew(self) -> None:
         """A person has started it once more after its end."""
+
+    @property
+    def memory(self) -> BaseModel | None:
+        """What cannot be seen or felt again and is to outlive a restart: replaced by another when it changes."""
+        return None
+
+    def remember(self, memory: BaseModel) -> None:
+        """Go on from the memory that the task had before it was started again."""
+        raise NotImplementedError
 
     def home(self, view: V) -> Move:
         """To the pose from which everything is seen, with whatever is held."""

@@ -1,13 +1,19 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Any
 
 from common import messages as m
 from common import topics
+from common.applications.pick_place.choice import LetGo, PickPlaceView
+from common.applications.pick_place.parameters import Config
+from common.applications.pick_place.task import PickPlace
 from common.applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common.clock import Clock
 from common.config import load_cell, service_config
+from common.kept_file import STANDING_VARIABLE
 from common.process.in_process import running_service
+from common.process.task_runner import run_task
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import smart_pick_place
@@ -82,6 +88,32 @@ async def test_status_is_a_state_that_a_late_reader_gets() -> None:
         late = await asyncio.wait_for(bus.reader(PICK_PLACE_STATUS).next(), 5)
         assert first.state == late.state == "IDLE"
         assert "waiting for" in late.message
+
+
+async def test_what_a_task_knows_of_what_it_let_go_outlives_it(monkeypatch, tmp_path, caplog) -> None:
+    monkeypatch.setenv(STANDING_VARIABLE, str(tmp_path))
+    tasks: list[PickPlace] = []
+
+    class Seen(PickPlace):
+        def __init__(self, *given: Any) -> None:
+            super().__init__(*given)
+            tasks.append(self)
+
+    async def run(bus: Bus, config: Config) -> None:
+        await run_task(bus, config, Seen, PICK_PLACE_STATUS, PickPlaceView, seen=VALIDATED_TARGETS)
+
+    kept, places = tmp_path / "test.smart_pick_place.json", [(0.5, 0.2, 0.095)]
+    async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
+        tasks[0].remember(LetGo(places=places))
+        async with asyncio.timeout(10):
+            while not kept.exists():  # noqa: ASYNC110  # nobody tells
+                await asyncio.sleep(0.01)
+    async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
+        assert tasks[1].memory == LetGo(places=places)
+    kept.write_text("{")
+    async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
+        assert tasks[2].memory == LetGo()
+    assert f"what was done before is not known: {kept} cannot be read: it is damaged" in caplog.text
 
 
 async def test_pause_is_answered_with_the_status() -> None:

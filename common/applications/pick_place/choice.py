@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from pydantic import BaseModel
+
 from common import messages as m
 from common.applications.pick_place.parameters import Config, HandShape
 from common.applications.pick_place.remembered import HIDDEN
@@ -79,6 +81,12 @@ class Pick(Cycle):
     def __post_init__(self) -> None:
         """Its subject is the target."""
         self.subject = self.target.id
+
+
+class LetGo(BaseModel):
+    """Where the last was let go above each column of the container: its centre [m] once it lies, world."""
+
+    places: list[Place] = []
 
 
 @dataclass
@@ -156,7 +164,7 @@ class Choice:
         self._given_up: list[GivenUp] = []
         self._judged_by: dict[str, Any] = {}  # values of the parameters
         self._expected = (0, 0.0)  # balls that will be in the container soon, and until when that is only expected
-        self._tops: dict[Spot, float] = {}  # height [m] of the last that was let go above each column
+        self.let_go = LetGo()
 
     def next(self, view: PickPlaceView, origin: Sequence[float], under_way: Sequence[Pick]) -> Pick | None:
         """The nearest ball to `origin` (x, y) that can be taken, with its yaws; None when there is none now."""
@@ -209,9 +217,9 @@ class Choice:
         What leans on others may look as if it lay on the floor, where it was let go above another one.
         """
         seen = [place_of(thing.pose) for thing in view.objects("contained")]
-        if not seen and view.scene_stamp >= self._expected[1]:
-            self._tops.clear()
-        return [*seen, *((*over, top) for over, top in self._tops.items())]
+        if not seen and self.let_go.places and view.scene_stamp >= self._expected[1] and not _hidden(view):
+            self.let_go = LetGo()
+        return [*seen, *self.let_go.places]
 
     def _top(self, over: Spot, lie: Sequence[Place]) -> float:
         """Height [m] of one more above those that lie there."""
@@ -247,7 +255,8 @@ class Choice:
     def released(self, pick: Pick, view: PickPlaceView) -> None:
         """A ball was let go above the container, where it will be seen when it has come to rest."""
         if pick.over is not None:
-            self._tops[pick.over] = self._top(pick.over, self._lie(view))
+            place = (*pick.over, self._top(pick.over, self._lie(view)))
+            self.let_go = LetGo(places=[*(other for other in self.let_go.places if other[:2] != pick.over), place])
         self._expected = self._contained(view) + 1, view.now + SETTLING
         self._forget(pick.target)
 
@@ -276,6 +285,11 @@ class Choice:
                         reason=g.reason)
             for g in self._given_up
         ]
+
+
+def _hidden(view: PickPlaceView) -> bool:
+    """Whether part of what the picture should show cannot be seen in it, the container perhaps."""
+    return view.seen is None or bool(view.seen.unseen)
 
 
 def same_place(a: Place, b: Place, radius: float) -> bool:

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import math
 
+from pydantic import BaseModel
+
 from common import messages as m
-from common.applications.pick_place.choice import Choice, Pick, PickPlaceView, Spot, Spots, Target, same_place
+from common.applications.pick_place.choice import Choice, LetGo, Pick, PickPlaceView, Spot, Spots, Target, same_place
 from common.applications.pick_place.looking import Looking
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.parameters import Config
@@ -202,6 +204,16 @@ class PickPlace(Task[PickPlaceView]):
         self._looking.found()
         self._hidden.reset()
         self._due = 0
+
+    @property
+    def memory(self) -> LetGo:
+        """Where balls were let go: what leans on others in the container may look as if it lay on its floor."""
+        return self._choice.let_go
+
+    def remember(self, memory: BaseModel) -> None:
+        """Go on from there."""
+        assert isinstance(memory, LetGo)
+        self._choice.let_go = memory
 
     def succeeded(self, stage: Stage, view: PickPlaceView) -> None:
         """A ball that was let go is done."""

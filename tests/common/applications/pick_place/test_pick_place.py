@@ -54,10 +54,13 @@ def test_nothing_is_let_go_above_what_leans_on_others_and_looks_as_if_it_lay_on_
     assert pick is not None and pick.over is not None
     choice.released(pick, cell.view())
     cell.fell.append((*pick.over, 0.035))
+    restarted = CellDouble([(0.40, -0.30)]).task
+    restarted.remember(type(cell.task.memory).model_validate_json(cell.task.memory.model_dump_json()))
     for contained, same in ((5, False), (0, True)):  # then somebody empties the container
         cell.now, cell.contained = cell.now + 10.0, contained
-        after = choice.next(cell.view(), (0.4, -0.3), [])
-        assert after is not None and (after.over == pick.over) == same
+        for one in (choice, restarted._choice):
+            after = one.next(cell.view(), (0.4, -0.3), [])
+            assert after is not None and (after.over == pick.over) == same
 
 
 def test_ball_that_fell_out_of_the_hand_and_is_not_seen_again_is_told_at_the_end() -> None:
