@@ -100,6 +100,7 @@ class Reader(Generic[M]):
         self._lock = threading.Lock()
         self._changed = asyncio.Event()
         self._doorbell = Doorbell(loop, self._wake)
+        self._awaited = False  # whether somebody waits for the next: the loop is not woken for who only looks at times
         self._queue: _Newest[M] | _NewestOfEach[M] | _InOrder[M] = (
             _InOrder(size) if topic.kind == "event" else _NewestOfEach() if topic.signed else _Newest())
         self._overflow_logged = 0
@@ -131,9 +132,13 @@ class Reader(Generic[M]):
                 self.overflow += lost
             else:
                 self.dropped += lost
-        self._doorbell.ring()
+            woken = self._awaited or (lost and self.topic.kind == "event")
+        if woken:
+            self._doorbell.ring()
 
     def _wake(self) -> None:
+        with self._lock:
+            self._awaited = False
         self._changed.set()
         if self.overflow > self._overflow_logged and not self._queue.reported:
             self._queue.reported = True
@@ -185,6 +190,7 @@ class Reader(Generic[M]):
                 self.dropped += lost
                 if arrived is None:
                     self._changed.clear()
+                    self._awaited = True
             if arrived is not None and arrived.message is not None:
                 if arrived.attachment is not None:
                     follow(arrived.attachment.trace)
