@@ -71,6 +71,32 @@ async def test_latest_does_not_consume(new_bus, until) -> None:
     assert reader.dropped == 0
 
 
+async def test_loop_is_woken_for_who_waits_and_not_for_who_looks_at_the_newest_at_times(new_bus, until) -> None:
+    sender, receiver = await new_bus("sender"), await new_bus("receiver")
+    reader, writer = receiver.reader(topics.CAMERA_IMAGE), sender.writer(topics.CAMERA_IMAGE)
+    await matched(writer, until)
+    rings, ring = [], reader._doorbell.ring
+
+    def rung() -> None:
+        rings.append(1)
+        ring()
+
+    reader._doorbell.ring = rung  # type: ignore[method-assign]
+    for number in (1, 2, 3):
+        writer.put(image(number))
+    await until(lambda: reader.received == 3)
+    assert not rings and reader.latest is not None and reader.latest.header.stamp == 3
+    assert (await next_of(reader)).header.stamp == 3
+    both = [asyncio.create_task(next_of(reader)) for _ in range(2)]
+    await asyncio.sleep(0)  # they wait
+    for number in (4, 5):
+        writer.put(image(number))
+        done, _ = await asyncio.wait(both, timeout=PATIENCE, return_when=asyncio.FIRST_COMPLETED)
+        both = [task for task in both if task not in done]
+        assert [task.result().header.stamp for task in done] == [number]
+    assert not both and rings
+
+
 async def test_stream_message_is_returned_once(new_bus, until) -> None:
     bus = await new_bus()
     reader, writer = bus.reader(topics.CAMERA_IMAGE), bus.writer(topics.CAMERA_IMAGE)
