@@ -26,6 +26,12 @@ def slot_positions(box: Container, radius: float, table_height: float) -> Array:
     ])
 
 
+def column_at(box: Container, place: tuple[float, float]) -> tuple[float, float]:
+    """(x, y) of the column of slots that is nearest to a place [m], world."""
+    d = box.slot_offset
+    return box.x + (d if place[0] > box.x else -d), box.y + (d if place[1] > box.y else -d)
+
+
 def low_columns(box: Container, places: Iterable[tuple[float, float, float]], same: float) -> list[tuple[float, float]]:
     """(x, y) of the columns of slots in which least lies, which may be all of them [m], world.
 
@@ -38,7 +44,7 @@ def low_columns(box: Container, places: Iterable[tuple[float, float, float]], sa
     heights = {(box.x + dx, box.y + dy): -np.inf for dx in (-d, d) for dy in (-d, d)}
     for x, y, z in places:
         if max(abs(x - box.x), abs(y - box.y)) <= box.half_side:
-            column = box.x + (d if x > box.x else -d), box.y + (d if y > box.y else -d)
+            column = column_at(box, (x, y))
             heights[column] = max(heights[column], z)
     least = min(heights.values())
     return [column for column, height in heights.items() if height == least or height - least < same]

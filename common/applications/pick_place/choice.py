@@ -17,7 +17,7 @@ from common.applications.pick_place.parameters import Config, HandShape
 from common.applications.pick_place.remembered import HIDDEN
 from common.config import Container
 from common.robot.transforms import matrix_to_rpy, pose_to_matrix
-from common.scene.slots import low_columns
+from common.scene.slots import column_at, low_columns
 from common.scene.workspace import yaw_candidates
 from common.tasks.engine import appeared
 from common.tasks.stages import Cycle, Place, View, place_of
@@ -196,11 +196,17 @@ class Choice:
                 clear = [] if flat is not None else grasp_yaws(
                     self.p.hand, ball.position, others, self.radius, self.container, yaw_candidates(FINE))
                 return Pick(target=ball, yaws=yaws, ranges=yaw_ranges(clear), again=again,
-                            over=self._over(ball, view, under_way))
+                            over=self._over(ball.position, view, under_way))
         return None
 
-    def _over(self, ball: Target, view: PickPlaceView, under_way: Sequence[Pick]) -> Spot:
-        """(x, y) in the container above which there is most room, of those the nearest to the ball [m].
+    def held(self, name: str, view: PickPlaceView) -> Pick:
+        """What is left of a pick whose object is in the hand: a restart or a failure has left nothing else of it."""
+        pick = Pick(target=Target(name, view.tool), over=self._over(view.tool, view, []))
+        pick.begun = True
+        return pick
+
+    def _over(self, place: Place, view: PickPlaceView, under_way: Sequence[Pick]) -> Spot:
+        """(x, y) in the container above which there is most room, of those the nearest to a place [m].
 
         An arm that lets go wherever it comes first heaps up a pile that leans to its side.
         """
@@ -209,7 +215,7 @@ class Choice:
             if over is not None:
                 lie.append((*over, self._top(over, lie)))
         low = low_columns(self.container, lie, self.radius)
-        return min(low, key=lambda column: math.dist(column, ball.position[:2]))
+        return min(low, key=lambda column: math.dist(column, place[:2]))
 
     def _lie(self, view: PickPlaceView) -> list[Place]:
         """What lies in the container, as it is seen and as it was let go, until that is seen to be empty.
@@ -254,9 +260,9 @@ class Choice:
 
     def released(self, pick: Pick, view: PickPlaceView) -> None:
         """A ball was let go above the container, where it will be seen when it has come to rest."""
-        if pick.over is not None:
-            place = (*pick.over, self._top(pick.over, self._lie(view)))
-            self.let_go = LetGo(places=[*(other for other in self.let_go.places if other[:2] != pick.over), place])
+        over = column_at(self.container, view.tool[:2])  # where there was no way to above another, anywhere
+        place = (*over, self._top(over, self._lie(view)))
+        self.let_go = LetGo(places=[*(other for other in self.let_go.places if other[:2] != over), place])
         self._expected = self._contained(view) + 1, view.now + SETTLING
         self._forget(pick.target)
 

@@ -10,7 +10,7 @@ import math
 from pydantic import BaseModel
 
 from common import messages as m
-from common.applications.pick_place.choice import Choice, LetGo, Pick, PickPlaceView, Spot, Spots, Target, same_place
+from common.applications.pick_place.choice import Choice, LetGo, Pick, PickPlaceView, Spot, Spots, same_place
 from common.applications.pick_place.looking import Looking
 from common.applications.pick_place.messages import PickPlaceStatus
 from common.applications.pick_place.parameters import Config
@@ -53,9 +53,7 @@ class PickPlace(Task[PickPlaceView]):
             self._let_go(view)
         elif view.holding:
             if view.attached:  # else the planning scene has not caught up yet
-                held = Pick(target=Target(view.attached, view.tool))
-                held.begun = True
-                self.row += self._rows.place_held(held, view.tool)
+                self.row += self._rows.place_held(self._choice.held(view.attached, view), view.tool)
         elif self._looks_elsewhere(view):
             self.row += [self.home(view), Look()]
         elif not self._queue_next(view):

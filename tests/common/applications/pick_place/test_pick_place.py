@@ -52,6 +52,7 @@ def test_nothing_is_let_go_above_what_leans_on_others_and_looks_as_if_it_lay_on_
     cell.contained = len(cell.fell)
     pick = choice.next(cell.view(), (0.4, -0.3), [])
     assert pick is not None and pick.over is not None
+    cell.tcp = (*pick.over, 0.225)
     choice.released(pick, cell.view())
     cell.fell.append((*pick.over, 0.035))
     restarted = CellDouble([(0.40, -0.30)]).task
@@ -61,6 +62,20 @@ def test_nothing_is_let_go_above_what_leans_on_others_and_looks_as_if_it_lay_on_
         for one in (choice, restarted._choice):
             after = one.next(cell.view(), (0.4, -0.3), [])
             assert after is not None and (after.over == pick.over) == same
+
+
+def test_what_a_task_finds_in_the_hand_as_it_is_started_again_is_let_go_where_there_is_most_room() -> None:
+    cell = CellDouble([(0.40, -0.30)])
+    cell.until("across")
+    again = CellDouble([])
+    again.held, again.gripper, again.tcp = cell.held, cell.gripper, cell.tcp
+    again.fell = [(x, y, 0.035) for x, y in ((0.526, 0.226), (0.526, 0.274), (0.574, 0.226))]
+    again.contained = len(again.fell)
+    again.until("across")
+    asked = next(r for r in again.requests if isinstance(r, m.PlanRequest) and r.stage == "across")
+    assert isinstance(asked.goal, m.PoseGoal)
+    place, tolerance = asked.goal.pose.position, asked.goal.position_tolerance
+    assert place.x - tolerance.x / 2 >= 0.55 and place.y - tolerance.y / 2 >= 0.25
 
 
 def test_ball_that_fell_out_of_the_hand_and_is_not_seen_again_is_told_at_the_end() -> None:
