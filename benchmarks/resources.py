@@ -24,7 +24,7 @@ from tests.harness import RunningCell, folder_for, until
 CELL = "panda"
 STARTS = 3
 SETTLED = 5.0  # [s] after the first motion the measuring begins
-SAMPLES, PERIOD = 20, 2.0  # looks at memory and processor, and [s] between them
+SAMPLES, PERIOD = 10, 2.0  # looks at memory and processor, and [s] between them
 SHOWN = 12  # largest parts of the environment
 TIMEOUT = 180.0  # [s] for one run
 
