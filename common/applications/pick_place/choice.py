@@ -223,7 +223,7 @@ class Choice:
         What leans on others may look as if it lay on the floor, where it was let go above another one.
         """
         seen = [place_of(thing.pose) for thing in view.objects("contained")]
-        if not seen and self.let_go.places and view.scene_stamp >= self._expected[1] and not _hidden(view):
+        if not seen and self.let_go.places and 0 < view.scene_stamp >= self._expected[1] and not _hidden(view):
             self.let_go = LetGo()
         return [*seen, *self.let_go.places]
 
