@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 from collections.abc import Callable, Iterable
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, cast
 
 from pydantic import BaseModel
 
@@ -30,6 +31,7 @@ LONGEST_STEP = LOOK_PERIOD  # [s] wall: time passes too
 WAITS = "the arm waits: "
 ENDED = ("DONE", "ERROR")
 NOT_ANSWERED = "trajectory_executor has not answered yet: until it does, this does not outlive the task"
+SAVE_AGAIN = 2.0  # [s] wall after a memory could not be written
 OWN_PERIOD = 0.2  # [s] wall between two times that the motion is asked for: what came of it is heard meanwhile
 SOMEBODY = ("", PERSON, *BY_THEMSELVES)  # whose holds are nobody's own
 
@@ -241,29 +243,52 @@ class Memory:
             return
         self._file = KeptFile(folder / f"{self._bus.cell}.{self._bus.service}.json", type(self._kept))
         try:
-            self._kept = self._file.read()
-            self._task.remember(self._kept)
+            kept = _read(self._file)
         except Unreadable as error:  # the next that is kept takes its place
             self._bus.log.warning("what was done before is not known: %s", error)
+            return
+        if kept is not None:
+            self._kept = kept
+            self._task.remember(kept)
 
     def keep(self, group: asyncio.TaskGroup) -> None:
         """Write down what has changed, beside everything else; what changes meanwhile has its turn after it."""
         now = self._task.memory
         if self._file is None or now is None or now is self._kept or (self._saving and not self._saving.done()):
             return
-        self._kept = now
-        self._saving = group.create_task(self._save(self._file, now), name="memory")
+        self._saving = group.create_task(self._save(self._file), name="memory")
 
-    async def _save(self, file: KeptFile[Any], memory: BaseModel) -> None:
-        def write() -> None:
-            file.path.parent.mkdir(parents=True, exist_ok=True)
-            file.save(memory)
+    async def _save(self, file: KeptFile[Any]) -> None:
+        """Write the newest, as often as it takes: until then a task that is started again knows what was before."""
+        told = False
+        while True:
+            memory = self._task.memory
+            assert memory is not None
+            try:
+                await asyncio.to_thread(_write, file, memory)
+            except OSError as error:
+                if not told:
+                    self._bus.log.warning("%s cannot be written (%s): until it can, a task that is started again does "
+                                          "not know what was done since", file.path, error.strerror or error)
+                told = True
+                await asyncio.sleep(SAVE_AGAIN)
+                continue
+            self._kept = memory
+            return
 
-        try:
-            await asyncio.to_thread(write)
-        except OSError as error:
-            self._bus.log.warning("%s cannot be written (%s): a task that is started again will not know this",
-                                  file.path, error.strerror or error)
+
+def _read(file: KeptFile[Any]) -> BaseModel | None:
+    """What is kept; None where nothing was yet.
+
+    Raises:
+        Unreadable: something else is there.
+    """
+    return cast(BaseModel, file.read()) if os.path.lexists(file.path) else None
+
+
+def _write(file: KeptFile[Any], memory: BaseModel) -> None:
+    file.path.parent.mkdir(parents=True, exist_ok=True)
+    file.save(memory)
 
 
 def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owner: m.MotionOwner | None) -> None:

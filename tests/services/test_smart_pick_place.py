@@ -12,6 +12,7 @@ from common.applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_T
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.kept_file import STANDING_VARIABLE
+from common.process import task_runner
 from common.process.in_process import running_service
 from common.process.task_runner import run_task
 from common.transport.bus import Bus
@@ -114,6 +115,38 @@ async def test_what_a_task_knows_of_what_it_let_go_outlives_it(monkeypatch, tmp_
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
         assert tasks[2].memory == LetGo()
     assert f"what was done before is not known: {kept} cannot be read: it is damaged" in caplog.text
+
+
+async def test_memory_that_a_task_begins_with_stays_where_none_was_kept_and_is_written_as_soon_as_it_can_be(
+    monkeypatch, tmp_path, caplog,
+) -> None:
+    in_the_way = tmp_path / "standing"
+    in_the_way.write_text("no folder")
+    monkeypatch.setenv(STANDING_VARIABLE, str(in_the_way / "cell"))
+    monkeypatch.setattr(task_runner, "SAVE_AGAIN", 0.01)
+    begun, later = LetGo(places=[(0.5, 0.2, 0.095)]), LetGo(places=[(0.5, 0.3, 0.035)])
+    tasks: list[PickPlace] = []
+
+    class Begun(PickPlace):
+        def __init__(self, *given: Any) -> None:
+            super().__init__(*given)
+            self.remember(begun)
+            tasks.append(self)
+
+    async def run(bus: Bus, config: Config) -> None:
+        await run_task(bus, config, Begun, PICK_PLACE_STATUS, PickPlaceView, seen=VALIDATED_TARGETS)
+
+    kept = in_the_way / "cell" / "test.smart_pick_place.json"
+    async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"), asyncio.timeout(10):
+        assert tasks[0].memory == begun
+        tasks[0].remember(later)
+        while "cannot be written" not in caplog.text:  # noqa: ASYNC110  # nobody tells
+            await asyncio.sleep(0.01)
+        in_the_way.unlink()
+        while not kept.exists():  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+    assert LetGo.model_validate_json(kept.read_text()) == later
+    assert caplog.text.count("cannot be written") == 1
 
 
 async def test_pause_is_answered_with_the_status() -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, FiniteFloat
 
 from common import messages as m
 from common.applications.pick_place.parameters import Config, HandShape
@@ -21,6 +21,7 @@ from common.scene.slots import column_at, low_columns
 from common.scene.workspace import yaw_candidates
 from common.tasks.engine import appeared
 from common.tasks.stages import Cycle, Place, View, place_of
+from common.tasks.watchdogs import Patience
 
 Spot = tuple[float, float]  # (x, y) [m]
 Spots = list[Spot]
@@ -29,6 +30,7 @@ FULL = "the container is full"
 FINE = 36  # yaws in half a turn at which it is looked whether the hand is clear
 TIPS = 0.012  # [m] by which finger tips reach below the middle of what they grip
 SAME_PLACE = 0.02  # [m] what is hidden and a track that is nearer are one object
+EMPTY_FOR = 0.5  # [s] a container in which nothing is seen for so long is empty
 SETTLING = 1.5  # [s] from letting go until the ball lies in the container and was seen there
 
 
@@ -86,7 +88,7 @@ class Pick(Cycle):
 class LetGo(BaseModel):
     """Where the last was let go above each column of the container: its centre [m] once it lies, world."""
 
-    places: list[Place] = []
+    places: list[tuple[FiniteFloat, FiniteFloat, FiniteFloat]] = []
 
 
 @dataclass
@@ -163,6 +165,7 @@ class Choice:
         self._misses: list[tuple[Place, int]] = []
         self._given_up: list[GivenUp] = []
         self._judged_by: dict[str, Any] = {}  # values of the parameters
+        self._empty = Patience()
         self._expected = (0, 0.0)  # balls that will be in the container soon, and until when that is only expected
         self.let_go = LetGo()
 
@@ -223,7 +226,8 @@ class Choice:
         What leans on others may look as if it lay on the floor, where it was let go above another one.
         """
         seen = [place_of(thing.pose) for thing in view.objects("contained")]
-        if not seen and self.let_go.places and 0 < view.scene_stamp >= self._expected[1] and not _hidden(view):
+        empty = not seen and 0 < view.scene_stamp >= self._expected[1] and not _hidden(view)
+        if self._empty.lasts(empty, view.scene_stamp) >= EMPTY_FOR and empty and self.let_go.places:
             self.let_go = LetGo()
         return [*seen, *self.let_go.places]
 
