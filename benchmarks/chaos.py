@@ -26,10 +26,11 @@ ASKED = ("cell", "speed", "balls", "rate", "set")  # what makes a run with a see
 BEFORE: dict[str, Any] = {"cell": USUAL, "set": []}  # of runs told of in a file that does not say
 MOST_OFF = 1.0  # [mm] from the true outline
 TIMEOUT = 300.0  # [s] for one run
+RECORDING = "run.mcap"
 
 
 async def run_once(seed: int, folder: Path, options: argparse.Namespace) -> dict[str, Any]:
-    """What became of the run with the faults of a seed; its log stays in the folder if it was not good."""
+    """What became of the run with the faults of a seed; its log and recording stay in the folder if it was not good."""
     began = time.monotonic()
     arguments = ["--speed", f"{options.speed:g}", "--chaos", str(seed), *WORLD[options.cell]]
     if options.cell == USUAL:
@@ -38,6 +39,8 @@ async def run_once(seed: int, folder: Path, options: argparse.Namespace) -> dict
         arguments += ["--chaos-rate", f"{options.rate:g}"]
     for setting in options.set:
         arguments += ["--set", setting]
+    if options.record:
+        arguments += ["--record", str(folder / RECORDING)]
     outcome: dict[str, Any] = {"seed": seed, **{name: getattr(options, name) for name in ASKED}}
     with RunningCell(folder, "run", options.cell, *arguments) as cell:
         try:
@@ -55,6 +58,7 @@ async def run_once(seed: int, folder: Path, options: argparse.Namespace) -> dict
     outcome["problems"] = problems(outcome)
     if not outcome["problems"]:
         (folder / LOG).unlink()
+        (folder / RECORDING).unlink(missing_ok=True)
     return outcome
 
 
@@ -154,6 +158,7 @@ def main() -> int:
     parser.add_argument("--balls", type=int, default=7)
     parser.add_argument("--rate", type=float, help="faults per minute of wall time")
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="as for `zencell run`")
+    parser.add_argument("--record", action="store_true", help="record each run, and keep that of a bad one")
     parser.add_argument("--file", help="JSON lines of what became of the runs; runs that are in there are not repeated")
     parser.add_argument("--again", action="store_true", help="repeat those that were not good")
     options = parser.parse_args()

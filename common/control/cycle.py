@@ -230,7 +230,9 @@ class ControlCycle:
         mark = (self._q.tobytes(), width, told, effort, self._world.version)
         if mark == self._kept:
             return None
-        if self._stood is None or self._stood[0] != self._world.version:
+        # Physics moves things between what it tells of: the hand and what it holds are to be kept as of one moment, or
+        # they are within each other when they are found again, and fly apart.
+        if self._felt is None or self._stood is None or self._stood[0] != self._world.version:
             self._stood = self._world.version, dict(self._world.standing())
         self._kept = mark
         return Standing.model_construct(  # which copies nothing: what is the same object need not be written anew

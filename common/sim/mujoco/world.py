@@ -36,6 +36,7 @@ TOLD = 0.05  # [s] between changes that are told of while something moves
 SLIPPERY = 0.5  # [s] fingers do not touch what a person lets slip, and not before they are clear of it
 QUIET = 1e-6  # [m] or of a quaternion: nothing has moved since the last look
 ASLEEP = 1e-3  # [m/s] or [rad/s]: velocities below are not kept over a restart
+DECIMALS = 6  # of [m] and of quaternions that are
 
 
 class PhysicsWorld(News):
@@ -64,6 +65,7 @@ class PhysicsWorld(News):
         self._watch = Watch(world)
         self._taken: set[str] = set()  # what "remove" was said of
         self._slippery: dict[str, float] = {}  # until when
+        self._stood: dict[str, StandingObject] = {}
         self._time: float | None = None
         self._told_at = -math.inf
         self._cell: CellModel | None = None
@@ -199,30 +201,34 @@ class PhysicsWorld(News):
     # --- over a restart ---
 
     def standing(self) -> dict[str, StandingObject]:
-        """Everything as it is and moves, for `restore`."""
+        """Everything as it is and moves, for `restore`; what is as it was at the last call is the very same object."""
         cell, data = self._built
         found = {}
         for name, body in self._paper.bodies.items():
             kept, at = body.standing(), cell.things[name]
             speeds = data.qvel[at.dof: at.dof + 6]
-            details = {**kept.details, "mass": self._masses.get(name, USUAL_MASS),
-                       "qpos": data.qpos[at.qpos: at.qpos + 7].tolist(),
+            details = {**kept.details, "mass": self._masses.get(name, USUAL_MASS), "slippery": name in self._slippery,
+                       "qpos": np.round(data.qpos[at.qpos: at.qpos + 7], DECIMALS).tolist(),
                        "qvel": speeds.tolist() if np.abs(speeds).max() > ASLEEP else [0.0] * 6}
-            found[name] = kept.model_copy(update={"details": details})
+            now, before = kept.model_copy(update={"details": details}), self._stood.get(name)
+            found[name] = now if before is None or before != now else before
+        self._stood = found
         return found
 
     def restore(self, objects: Mapping[str, StandingObject]) -> None:
-        """Put everything where it was, as fast as it was."""
+        """Put everything where it was, as fast as it was; what is held stands still, as the arm does that begins."""
         self._paper.restore(objects)
         self._masses = {name: float(kept.details.get("mass", USUAL_MASS)) for name, kept in objects.items()}
         self._taken = {name for name, body in self._paper.bodies.items() if body.state in ("held", "falling")}
+        self._slippery = {name: -math.inf for name, kept in objects.items() if kept.details.get("slippery")}
         self._build()
         cell, data = self._built
         for name, kept in objects.items():
             if name in cell.things and "qpos" in kept.details:
                 place = cell.things[name]
                 data.qpos[place.qpos: place.qpos + 7] = kept.details["qpos"]
-                data.qvel[place.dof: place.dof + 6] = kept.details["qvel"]
+                held = kept.details.get("state") == "held"
+                data.qvel[place.dof: place.dof + 6] = [0.0] * 6 if held else kept.details["qvel"]
             if name in cell.things and kept.details.get("state") == "elsewhere":
                 self._watch.on_floor(name)
         mujoco.mj_forward(cell.model, data)

@@ -19,8 +19,10 @@ from common.messages import (
     StopRequest,
     Vector3,
     WorldEdit,
+    WorldObjects,
 )
 from common.robot.transforms import tool_down
+from common.sim.interface import StandingObject
 from common.sim.kinematic import KinematicWorld
 from common.transport.codec import decode, encode
 
@@ -85,6 +87,28 @@ def test_what_stands_still_while_the_arm_moves_is_written_down_once(rig, rest_to
     rig.step()
     second = rig.cycle.standing()
     assert first.q != second.q and first.objects is second.objects and first.layout is second.layout
+
+
+def test_what_physics_moves_with_the_arm_is_written_down_as_of_the_same_moment(limits, rest_to_rest):
+    class Physics:
+        version, ids, layout, held = 1, [], {}, "ball"  # it tells of what moves now and then only
+
+        def standing(self):
+            return {"ball": StandingObject(pose=tuple(rig.joints[-1].position))}
+
+        def objects(self, header):
+            return WorldObjects(header=header)
+
+        def take_events(self):
+            return []
+
+    rig = Rig(limits, world=Physics())
+    rig.step()
+    rig.execute("a", rest_to_rest([0, 0], [0, 0.1]))
+    for _ in range(3):
+        rig.run(0.1)
+        kept = rig.cycle.standing()
+        assert kept.q == list(kept.objects["ball"].pose[:2]) and kept.q[1] > 0
 
 
 def test_first_cycle_tells_everything_and_then_only_the_joints(rig):

@@ -323,6 +323,54 @@ def test_what_a_person_lets_slip_on_the_table_is_not_flung_away_by_the_fingers_t
     assert rig.fingers.read(rig.now).holding, "and it can be taken again"
 
 
+def test_what_slips_over_a_restart_is_not_flung_away_by_the_fingers_that_are_within_it() -> None:
+    rig = Rig(BALL)
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    rig.grip(0.0)
+    rig.world.edit(WorldEdit(op="drop"), rig.now)
+    rig.wait(0.15)
+    kept, width = rig.world.standing(), rig.fingers.read(rig.now).width
+    assert width < 0.04, "the fingers are within the ball"
+    rig.begin(rig.set_point)
+    rig.world.restore({name: type(each).model_validate(each.model_dump()) for name, each in kept.items()})
+    assert isinstance(rig.fingers, PlacedGripper)
+    rig.fingers.place(width)
+    rig.grip(0.0, seconds=3.0)
+    assert math.dist(rig.place(), (0.45, 0.0, 0.03)) < 5e-3
+    assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3, "nor does it push the arm"
+    rig.move(rig.above(0.45, 0.0, 0.2))
+    rig.grip(0.08)
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    rig.grip(0.0)
+    assert rig.fingers.read(rig.now).holding, "and it can be taken again"
+
+
+def test_what_is_kept_of_a_world_is_of_the_moment_and_what_did_not_move_is_the_very_same() -> None:
+    rig = Rig(BALL, {**CUBE, "y": -0.2})
+    rig.wait(0.5)
+    rig.push("thing_1", 0.2)
+    for _ in range(10):  # more often than is told of anything that moves
+        before = rig.world.standing()
+        rig.wait(PERIOD)
+        after = rig.world.standing()
+        way = after["thing_1"].details["qpos"][0] - before["thing_1"].details["qpos"][0]
+        assert way > 0.1 * PERIOD and after["thing_2"] is before["thing_2"]
+
+
+def test_what_was_carried_over_a_restart_stands_still_with_the_arm() -> None:
+    rig = Rig(BALL)
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    rig.grip(0.0)
+    rig.move(rig.above(0.45, 0.0, 0.2))
+    rig.push("thing_1", 0.0, 1.0)
+    kept = rig.world.standing()
+    assert kept["thing_1"].details["qvel"][1] == 1.0
+    rig.begin(rig.set_point)
+    rig.world.restore(kept)
+    cell, data = rig.world._built
+    assert not data.qvel[cell.things["thing_1"].dof:][:6].any()
+
+
 def test_hold_up_of_the_process_is_no_leap_in_the_world() -> None:
     rig = Rig(BALL)
     rig.push("thing_1", 0.2)
