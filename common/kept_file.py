@@ -71,7 +71,7 @@ class KeptFile(Generic[R]):
     """
 
     def __init__(self, path: Path, model: type[R]) -> None:
-        """Use this file for records of a kind; it need not be there yet."""
+        """Use this file for records of a kind; neither it nor its folder need be there yet."""
         self.path, self._model = path, model
         self._new = path.with_name(f"{path.name}.new")
         self._last = path.with_name(f"{path.name}.last")  # second name of the old file while it is replaced
@@ -123,6 +123,7 @@ class KeptFile(Generic[R]):
         Raises:
             OSError: it could not be written.
         """
+        self.path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError):
             if not os.path.lexists(self._new):
                 self._last.replace(self._new)  # we were ended between the two

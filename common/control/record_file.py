@@ -25,7 +25,6 @@ class RecordFile(KeptFile[Record]):
             ConfigError: it cannot.
         """
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
             record, problem = self.load()
             if not problem:  # else it stays to be looked at
                 self.save(record)

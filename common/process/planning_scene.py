@@ -55,7 +55,7 @@ class SceneWriter:
             changed = self._added.edited(edit, perceived)
             if changed is not self._added:
                 try:
-                    await asyncio.to_thread(self._keep, self._file, changed)
+                    await asyncio.to_thread(self._file.save, changed)
                 except OSError as error:
                     raise Refused("not_kept", f"{self._file.path} cannot be written ({error.strerror or error}): it "
                                               "would not outlive a restart, and nothing was changed") from None
@@ -64,8 +64,3 @@ class SceneWriter:
                 self._bus.log.info("%s %s%s", "added" if edit.op == "add" else "removed", id_of(edit.id),
                                    edit.owner and f", by {edit.owner}")
             return SceneEditReply(id=id_of(edit.id), ids=self._added.ids)
-
-    @staticmethod
-    def _keep(file: KeptFile[AddedSolids], record: AddedSolids) -> None:
-        file.path.parent.mkdir(parents=True, exist_ok=True)
-        file.save(record)

@@ -265,7 +265,7 @@ class Memory:
             memory = self._task.memory
             assert memory is not None
             try:
-                await asyncio.to_thread(_write, file, memory)
+                await asyncio.to_thread(file.save, memory)
             except OSError as error:
                 if not told:
                     self._bus.log.warning("%s cannot be written (%s): until it can, a task that is started again does "
@@ -284,11 +284,6 @@ def _read(file: KeptFile[Any]) -> BaseModel | None:
         Unreadable: something else is there.
     """
     return cast(BaseModel, file.read()) if os.path.lexists(file.path) else None
-
-
-def _write(file: KeptFile[Any], memory: BaseModel) -> None:
-    file.path.parent.mkdir(parents=True, exist_ok=True)
-    file.save(memory)
 
 
 def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owner: m.MotionOwner | None) -> None:

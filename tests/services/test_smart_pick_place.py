@@ -3,6 +3,8 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
+import pytest
+
 from common import messages as m
 from common import topics
 from common.applications.pick_place.choice import LetGo, PickPlaceView
@@ -91,7 +93,8 @@ async def test_status_is_a_state_that_a_late_reader_gets() -> None:
         assert "waiting for" in late.message
 
 
-async def test_what_a_task_knows_of_what_it_let_go_outlives_it(monkeypatch, tmp_path, caplog) -> None:
+@pytest.mark.parametrize("damaged", ["{", '{"places": [[0.5, 0.2, NaN]]}', '{"places": 3}', "[]"])
+async def test_what_a_task_knows_of_what_it_let_go_outlives_it(damaged, monkeypatch, tmp_path, caplog) -> None:
     monkeypatch.setenv(STANDING_VARIABLE, str(tmp_path))
     tasks: list[PickPlace] = []
 
@@ -111,7 +114,7 @@ async def test_what_a_task_knows_of_what_it_let_go_outlives_it(monkeypatch, tmp_
                 await asyncio.sleep(0.01)
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
         assert tasks[1].memory == LetGo(places=places)
-    kept.write_text("{")
+    kept.write_text(damaged)
     async with running_service(LocalNetwork(), run, CONFIG, name="smart_pick_place"):
         assert tasks[2].memory == LetGo()
     assert f"what was done before is not known: {kept} cannot be read: it is damaged" in caplog.text

@@ -30,7 +30,7 @@ class ContourOptions(Parameters):
     )
     threshold: Tunable[int] = Field(127, ge=0, le=254, description="a pixel above this belongs to an object [0..255]")
     subpixel: Tunable[bool] = Field(
-        True, description="place each point of a contour where the channel passes half its step"
+        True, description="place each point of a contour where the channel passes half its step, and even out noise"
     )
     min_area: Tunable[float] = Field(0.0, ge=0, le=1e6, description="smaller contours are left out [px^2]")
 

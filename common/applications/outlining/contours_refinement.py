@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +15,9 @@ STEP = 0.25  # [px]
 LEVELS = 2.0  # from here on outwards it is that of the object, or of what is beside it [px]
 LEAST_CONTRAST = 20.0  # [0..255]
 NEIGHBOURS = 2  # points to each side from which the direction of the edge is found
+RUN = 6  # points to each side with which a point of a noisy contour is evened out
+LEAST_NOISE = 0.04  # [px] across the edge: contours with less are left as they are
+CORNER = 2.0  # times as far from a curve through both sides as from one through a single side: there is a corner
 
 
 def normals(points: npt.ArrayLike, *, hole: bool) -> Array:
@@ -44,7 +49,47 @@ def refine(channel: npt.NDArray[np.uint8], chain: npt.NDArray[np.int32], *, hole
     weights = np.full(len(along), STEP)
     weights[[0, -1]] = STEP / 2
     offset = np.where(clear, np.clip(share @ weights - REACH, -1.0, 1.5), 0.5)
-    return np.asarray(chain + offset[:, None] * out)
+    return evened(np.asarray(chain + offset[:, None] * out))
+
+
+def evened(points: Array) -> Array:
+    """The points of a closed contour (n, 2) [px] without the noise of the picture, which moved each by itself.
+
+    Each is taken to a parabola through its neighbours (Savitzky and Golay, "Smoothing and differentiation of data by
+    simplified least squares procedures", 1964); at a corner through those of one side, so that it stays sharp. A
+    contour that hardly has any noise stays as it is.
+    """
+    if len(points) < 4 * RUN + 1:
+        return points
+    found = [_parabolas(points, first) for first in (-RUN, -2 * RUN, 0)]  # about each point, before, and behind it
+    middle, before, behind = (off for _, off in found)
+    if np.median(middle) < LEAST_NOISE:
+        return points
+    corner = middle > np.maximum(CORNER * np.minimum(before, behind), LEAST_NOISE)
+    which = np.where(corner, np.where(before < behind, 1, 2), 0)
+    return np.asarray(np.choose(which[:, None], [on for on, _ in found]))
+
+
+def _parabolas(points: Array, first: int) -> tuple[Array, Array]:
+    """Where a parabola through a run of points has each of them (n, 2) [px], and how far off the run it is (n,) [px].
+
+    The run of a point begins with the one that comes `first` after it, or before it.
+    """
+    steps = np.arange(first, first + 2 * RUN + 1)
+    powers, solve = _fit(first)
+    runs = points[(np.arange(len(points)) + steps[:, None]) % len(points)]
+    terms = np.tensordot(solve, runs, axes=1)  # (3, n, 2)
+    off = np.tensordot(powers, terms, axes=1) - runs
+    along = terms[1] / np.maximum(np.linalg.norm(terms[1], axis=1, keepdims=True), 1e-9)
+    across = off[..., 0] * along[:, 1] - off[..., 1] * along[:, 0]  # the step from pixel to pixel is no noise
+    return terms[0], np.sqrt((across**2).mean(axis=0))
+
+
+@lru_cache
+def _fit(first: int) -> tuple[Array, Array]:
+    """Powers (m, 3) of the steps of a run, and what fits a parabola to its points (3, m)."""
+    powers = np.vander(np.arange(first, first + 2 * RUN + 1, dtype=float), 3, increasing=True)
+    return powers, np.linalg.pinv(powers)
 
 
 def _sample(channel: npt.NDArray[np.uint8], at: Array) -> Array:

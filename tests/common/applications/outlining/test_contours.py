@@ -16,7 +16,8 @@ from common.applications.outlining.contours_choice import (
 )
 from common.applications.outlining.contours_drawing import CHOSEN, annotate_contours
 from common.applications.outlining.contours_following import Following
-from common.applications.outlining.contours_refinement import normals
+from common.applications.outlining.contours_refinement import RUN, evened, normals, refine
+from common.applications.outlining.duplicates import simplified
 from common.applications.outlining.messages import Contours, OutlineSelect
 from common.errors import DecodeError
 from common.messages import Color, Header
@@ -125,6 +126,47 @@ def test_refined_points_lie_on_a_straight_edge_whatever_its_direction(edge, angl
     off = (np.array(contour.pixels) - 32) @ across - edge
     on_edge = (np.abs(along) < 15) & (off > -3)
     assert on_edge.sum() > 10 and np.abs(off[on_edge]).max() < 0.2 and abs(off[on_edge].mean()) < 0.12
+
+
+TURNED = np.radians(17)
+BOX = np.array([(-60, -40), (60, -40), (60, 40), (-60, 40)]) @ [
+    (np.cos(TURNED), np.sin(TURNED)), (-np.sin(TURNED), np.cos(TURNED))] + 150.0
+TURNS = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+DISC = 150.3 + 70 * np.column_stack([np.cos(TURNS), np.sin(TURNS)])
+
+
+def outlined(shape, noise):
+    """The contour of a shape (n, 2) [px] in a picture with so much noise [0..255], and how far off each point is."""
+    large = np.zeros((2400, 2400), np.uint8)  # 8 to a pixel
+    cv2.fillPoly(large, [np.rint((shape + 0.5) * 8 - 0.5).astype(np.int32)], 255)
+    channel = cv2.GaussianBlur(cv2.resize(large, (300, 300), interpolation=cv2.INTER_AREA).astype(float), (0, 0), 0.6)
+    channel += np.random.default_rng(0).normal(0, noise, channel.shape)
+    points = found_in(np.clip(channel, 0, 255).astype(np.uint8))
+    sides = np.roll(shape, -1, axis=0) - shape
+    along = ((points[:, None] - shape) * sides).sum(-1) / (sides**2).sum(-1)
+    return points, np.linalg.norm(points[:, None] - shape - np.clip(along, 0, 1)[..., None] * sides, axis=-1).min(1)
+
+
+def found_in(channel):
+    chains, _ = cv2.findContours((channel > 127).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return refine(channel, max(chains, key=len).reshape(-1, 2), hole=False)
+
+
+@pytest.mark.parametrize(("shape", "turns"), [(BOX, 40), (DISC, 75)])
+def test_noise_of_the_picture_is_evened_out_and_corners_stay_sharp(shape, turns, monkeypatch):
+    clean, _ = outlined(shape, 0.0)
+    even, off = outlined(shape, 12.0)
+    assert off.mean() < 0.06 and off.max() < 0.45
+    assert len(simplified(even, 0.15)) < turns, "an outline that zigzags is not followed at an even speed"
+    monkeypatch.setattr("common.applications.outlining.contours_refinement.LEAST_NOISE", np.inf)
+    rough, off_rough = outlined(shape, 12.0)
+    assert off.mean() < 0.75 * off_rough.mean() and len(simplified(rough, 0.15)) > turns
+    assert np.array_equal(outlined(shape, 0.0)[0], clean), "what has no noise is left as it is"
+
+
+def test_contour_that_is_too_short_to_be_evened_out_stays_as_it_is():
+    few = np.random.default_rng(0).normal(0, 5, (4 * RUN, 2))
+    assert evened(few) is few
 
 
 def test_normals_point_out_of_the_object_at_its_edge_and_into_a_hole():
