@@ -122,7 +122,7 @@ def fit_spheres(
 
 
 def fit_each(
-    outlines: Sequence[Outline],
+    outlines: Sequence[Outline] | tuple[Outline, Chosen],
     centers: Array,
     radius: float,
     *,
@@ -131,10 +131,10 @@ def fit_each(
     close: float,
     hold_offset: bool = False,
 ) -> tuple[Array, Array, Array]:
-    """Fit many spheres in one go, each to an outline of its own and with an offset of its own.
+    """Fit many spheres in one go, each to points of its own and with an offset of its own.
 
     Args:
-        outlines: one or more points each.
+        outlines: one or more points each; or one outline, and which of its points (n, k) each is fitted to.
         centers: (k, 3) first guesses relative to the optical centre [m]; heights are kept.
         radius: of all spheres [m].
         offset: of the outlines, to start from [m].
@@ -145,29 +145,44 @@ def fit_each(
     Returns:
         (k, 3) centres [m], (k,) offsets [m], (k,) the part of each outline that is close.
     """
-    rays, inward = (np.concatenate([getattr(o, name) for o in outlines]) for name in ("rays", "inward"))
-    sizes = np.array([len(o) for o in outlines])
-    starts, owner = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
+    if isinstance(outlines, tuple):
+        owner, which = np.nonzero(outlines[1].T)
+        rays, inward = outlines[0].rays[which].T, outlines[0].inward[which].T
+        sizes = np.count_nonzero(outlines[1], axis=0)
+    else:
+        rays, inward = (np.concatenate([getattr(o, name) for o in outlines]).T for name in ("rays", "inward"))
+        sizes = np.array([len(o) for o in outlines])
+        owner = np.repeat(np.arange(len(sizes)), sizes)
+    (rx, ry, rz), (ix, iy, iz) = (np.ascontiguousarray(each) for each in (rays, inward))
+    starts = np.cumsum(sizes) - sizes
     c, delta = centers.astype(float), np.full(len(sizes), offset)
     free = 2 if hold_offset else 3
 
-    def compare() -> tuple[Array, Array]:
-        mine = c[owner]
-        along = np.einsum("ij,ij->i", rays, mine)
-        distance = np.sqrt(np.maximum(np.einsum("ij,ij->i", mine, mine) - along**2, 1e-18))
-        facing = np.einsum("ij,ij->i", inward, mine) > _FACING * distance
-        away: Array = (mine[:, :2] - along[:, None] * rays[:, :2]) / distance[:, None]
-        return np.where(facing, distance - radius - delta[owner], np.inf), away
+    def compare() -> tuple[Array, Array, Array]:
+        """How far points are beyond their silhouette [m], and how their distance changes with its x and y."""
+        x, y, z = c.T[:, owner]
+        along = rx * x + ry * y + rz * z
+        distance = np.sqrt(np.maximum(x * x + y * y + z * z - along * along, 1e-18))
+        facing = ix * x + iy * y + iz * z > _FACING * distance
+        beyond = np.where(facing, distance - radius - delta[owner], np.inf)
+        return beyond, (x - along * rx) / distance, (y - along * ry) / distance
 
     for gate in gates:
-        beyond, away = compare()
+        beyond, by_x, by_y = compare()
         near = np.abs(beyond) < gate
-        J = np.column_stack([away, np.full(len(away), -1.0), np.where(near, beyond, 0.0)]) * near[:, None]
-        products = np.add.reduceat(J[:, :, None] * J[:, None, :], starts)
-        step = np.linalg.solve(products[:, :free, :free] + 1e-3 * np.eye(free), -products[:, :free, 3:])[..., 0]
+        x, y, off = by_x * near, by_y * near, np.where(near, beyond, 0.0)
+        products = [x * x, x * y, y * y, x * off, y * off]
+        if not hold_offset:
+            products += [-x, -y, near.astype(float), -off]
+        sums = np.add.reduceat(np.array(products), starts, axis=1)
+        H, g = np.empty((len(sizes), free, free)), np.empty((len(sizes), free, 1))
+        H[:, 0, 0], H[:, 0, 1], H[:, 1, 0], H[:, 1, 1], g[:, 0, 0], g[:, 1, 0] = sums[[0, 1, 1, 2, 3, 4]]
+        if not hold_offset:
+            H[:, 0, 2], H[:, 2, 0], H[:, 1, 2], H[:, 2, 1], H[:, 2, 2], g[:, 2, 0] = sums[[5, 5, 6, 6, 7, 8]]
+        step = np.linalg.solve(H + 1e-3 * np.eye(free), -g)[..., 0]
         length = np.hypot(step[:, 0], step[:, 1])
         c[:, :2] += step[:, :2] * np.minimum(1.0, 0.5 * radius / np.maximum(length, 1e-12))[:, None]
         if not hold_offset:
             delta += step[:, 2]
-    beyond, _ = compare()
+    beyond, _, _ = compare()
     return c, delta, np.add.reduceat((np.abs(beyond) < close).astype(float), starts) / sizes

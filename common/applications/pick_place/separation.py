@@ -132,7 +132,7 @@ def _refined(
     if not len(enough):
         return []
     centers, _, _ = fit_each(
-        [outline.take(near[:, k]) for k in enough], first[enough], resting.radius, offset=offset,
+        (outline, near[:, enough]), first[enough], resting.radius, offset=offset,
         gates=(8e-3, 6e-3, 4e-3, 3e-3), close=_NEAR, hold_offset=True,
     )
     points = near_points(outline, centers, radius, _NEAR)
