@@ -44,6 +44,13 @@ class Outline:
         return Outline(self.pixels[which], self.rays[which], self.inward[which])
 
 
+def all_of(outlines: Sequence[Outline]) -> tuple[Outline, npt.NDArray[np.intp]]:
+    """The points of one or more outlines as one, and the index of the outline that each is of (n,)."""
+    pixels, rays, inward = (np.concatenate([getattr(each, name) for each in outlines])
+                            for name in ("pixels", "rays", "inward"))
+    return Outline(pixels, rays, inward), np.repeat(np.arange(len(outlines)), [len(each) for each in outlines])
+
+
 @dataclass(frozen=True)
 class Blob:
     """One connected region.

@@ -15,6 +15,7 @@ from common.applications.pick_place.blobs import (
     Mask,
     Outline,
     Traced,
+    all_of,
     find_blobs,
     long_ones,
     middles,
@@ -270,8 +271,9 @@ class Detector:
         fitted = [(blob.outline, key, start) for blob, key in tried for start in starts.get(key, ())]
         if fitted:
             found = fit_each(
-                [outline for outline, _, _ in fitted], np.array([start for _, _, start in fitted]), self.resting.radius,
-                offset=offset, gates=(self.resting.radius, 4 * pixel_size, 3 * pixel_size), close=1.3 * pixel_size,
+                *all_of([outline for outline, _, _ in fitted]), np.array([start for _, _, start in fitted]),
+                self.resting.radius, offset=offset, close=1.3 * pixel_size,
+                gates=(self.resting.radius, 4 * pixel_size, 3 * pixel_size),
             )
             for (outline, key, _), center, off, close in zip(fitted, *found, strict=True):
                 longer = oval(outline, center, camera) if close >= _ROUND else 0.0

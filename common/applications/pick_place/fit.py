@@ -6,7 +6,6 @@ segmented outline lies a little inside or outside of the true one, by as much fo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,7 +121,8 @@ def fit_spheres(
 
 
 def fit_each(
-    outlines: Sequence[Outline] | tuple[Outline, Chosen],
+    outline: Outline,
+    owner: Index,
     centers: Array,
     radius: float,
     *,
@@ -134,27 +134,21 @@ def fit_each(
     """Fit many spheres in one go, each to points of its own and with an offset of its own.
 
     Args:
-        outlines: one or more points each; or one outline, and which of its points (n, k) each is fitted to.
+        outline: the points of all.
+        owner: (n,) index of the sphere that each point is fitted to, in ascending order, with one or more for each.
         centers: (k, 3) first guesses relative to the optical centre [m]; heights are kept.
         radius: of all spheres [m].
-        offset: of the outlines, to start from [m].
+        offset: of the outline, to start from [m].
         hold_offset: find the places only.
         gates: how far off a point may be in each step [m].
         close: how far off a point may be in the end [m].
 
     Returns:
-        (k, 3) centres [m], (k,) offsets [m], (k,) the part of each outline that is close.
+        (k, 3) centres [m], (k,) offsets [m], (k,) the part of the points of each that is close.
     """
-    if isinstance(outlines, tuple):
-        owner, which = np.nonzero(outlines[1].T)
-        rays, inward = outlines[0].rays[which].T, outlines[0].inward[which].T
-        sizes = np.count_nonzero(outlines[1], axis=0)
-    else:
-        rays, inward = (np.concatenate([getattr(o, name) for o in outlines]).T for name in ("rays", "inward"))
-        sizes = np.array([len(o) for o in outlines])
-        owner = np.repeat(np.arange(len(sizes)), sizes)
-    (rx, ry, rz), (ix, iy, iz) = (np.ascontiguousarray(each) for each in (rays, inward))
+    sizes = np.bincount(owner, minlength=len(centers))
     starts = np.cumsum(sizes) - sizes
+    (rx, ry, rz), (ix, iy, iz) = (np.ascontiguousarray(each.T) for each in (outline.rays, outline.inward))
     c, delta = centers.astype(float), np.full(len(sizes), offset)
     free = 2 if hold_offset else 3
 

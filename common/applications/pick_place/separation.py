@@ -131,8 +131,9 @@ def _refined(
     enough = np.flatnonzero(np.count_nonzero(near, axis=0) >= 6)
     if not len(enough):
         return []
+    owner, which = np.nonzero(near[:, enough].T)
     centers, _, _ = fit_each(
-        (outline, near[:, enough]), first[enough], resting.radius, offset=offset,
+        outline.take(which), owner, first[enough], resting.radius, offset=offset,
         gates=(8e-3, 6e-3, 4e-3, 3e-3), close=_NEAR, hold_offset=True,
     )
     points = near_points(outline, centers, radius, _NEAR)

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.applications.pick_place.blobs import Outline
+from common.applications.pick_place.blobs import Outline, all_of
 from common.applications.pick_place.fit import fit_each, fit_spheres, near_points
 from common.config import CameraConfig
 from common.perception.pinhole import Pinhole
@@ -36,7 +36,8 @@ def test_each_sphere_and_the_offset_of_its_outline_are_found_from_a_guess_nearby
     centers = np.array([center for center, _, _ in spheres])
     starts = centers + [step for _, step, _ in spheres] - camera.position
     outlines = [outline_of(center, R + offset) for center, _, offset in spheres]
-    found, offsets, close = fit_each(outlines, starts, R, offset=0.0, gates=(0.02, 0.01, 0.005, 0.003), close=1e-4)
+    gates = (0.02, 0.01, 0.005, 0.003)
+    found, offsets, close = fit_each(*all_of(outlines), starts, R, offset=0.0, gates=gates, close=1e-4)
     np.testing.assert_allclose(found + camera.position, centers, atol=2e-5)
     np.testing.assert_allclose(offsets, [offset for _, _, offset in spheres], atol=2e-5)
     assert (close == 1).all()
@@ -47,7 +48,7 @@ def test_a_part_of_the_outline_is_enough_when_its_offset_is_known(center, step, 
     outline = outline_of(center, R - 0.001, (first + np.arange(length)) % 120)
     start = np.array([center]) + step - camera.position
     gates = (0.02, 0.02, 0.01, 0.01, 0.005, 0.005)
-    found, offsets, _ = fit_each([outline], start, R, offset=-0.001, gates=gates, close=1e-3, hold_offset=True)
+    found, offsets, _ = fit_each(*all_of([outline]), start, R, offset=-0.001, gates=gates, close=1e-3, hold_offset=True)
     np.testing.assert_allclose(found[0] + camera.position, center, atol=2e-5)
     assert offsets[0] == -0.001
 
@@ -95,6 +96,7 @@ def test_nothing_to_fit_leaves_the_guess():
     fit = fit_spheres(outline_of((0.4, 0.0, 0.03), part=slice(0, 0)), guess, R, offset=-0.001, offset_std=1e-3)
     np.testing.assert_allclose(fit.centers, guess)
     assert fit.offset == pytest.approx(-0.001)
-    elsewhere, _, close = fit_each([outline_of((0.6, 0.2, 0.03))], guess, R, offset=0.0, gates=(0.01,), close=0.001)
+    points = all_of([outline_of((0.6, 0.2, 0.03))])
+    elsewhere, _, close = fit_each(*points, guess, R, offset=0.0, gates=(0.01,), close=0.001)
     np.testing.assert_allclose(elsewhere, guess, atol=1e-9)
     assert close[0] == 0
