@@ -16,8 +16,12 @@ LEVELS = 2.0  # from here on outwards it is that of the object, or of what is be
 LEAST_CONTRAST = 20.0  # [0..255]
 NEIGHBOURS = 2  # points to each side from which the direction of the edge is found
 RUN = 6  # points to each side with which a point of a noisy contour is evened out
-LEAST_NOISE = 0.04  # [px] across the edge: contours with less are left as they are
-CORNER = 2.0  # times as far from a curve through both sides as from one through a single side: there is a corner
+SHORTEST = 8 * RUN + 1  # contours with fewer points are left as they are
+LEAST_NOISE = 0.02  # [px] across the edge, likewise
+CALMEST = 80  # percentile of the changes from pixel to pixel beside an edge that are taken for noise
+ON_EDGE = 1.4  # [px] by which points move for such a change that is as large as the step itself, measured
+FITS = 1.4  # times the noise, so far from the points may be what is put through them: else there is some detail
+FARTHEST = 3.0  # times the noise, so far a point is moved at most
 
 
 def normals(points: npt.ArrayLike, *, hole: bool) -> Array:
@@ -49,25 +53,36 @@ def refine(channel: npt.NDArray[np.uint8], chain: npt.NDArray[np.int32], *, hole
     weights = np.full(len(along), STEP)
     weights[[0, -1]] = STEP / 2
     offset = np.where(clear, np.clip(share @ weights - REACH, -1.0, 1.5), 0.5)
-    return evened(np.asarray(chain + offset[:, None] * out))
+    points = np.asarray(chain + offset[:, None] * out)
+    return evened(points, _noise(profile, along, contrast)) if clear.any() else points
 
 
-def evened(points: Array) -> Array:
-    """The points of a closed contour (n, 2) [px] without the noise of the picture, which moved each by itself.
+def _noise(profile: Array, along: Array, contrast: Array) -> float:
+    """By how much the noise of the picture moves points to and fro (standard deviation) [px].
+
+    It is everywhere: where only one side of the edge changes from pixel to pixel, some detail does.
+    """
+    inner, outer = profile[:, along <= -LEVELS], profile[:, along >= LEVELS]
+    changes = min(float(np.percentile(np.abs(side[:, 0] - side[:, -1]), CALMEST)) for side in (inner, outer))
+    return ON_EDGE * changes / float(np.median(np.maximum(contrast, LEAST_CONTRAST)))
+
+
+def evened(points: Array, noise: float) -> Array:
+    """The points of a closed contour (n, 2) [px] without the noise [px] that moves each by itself.
 
     Each is taken to a parabola through its neighbours (Savitzky and Golay, "Smoothing and differentiation of data by
-    simplified least squares procedures", 1964); at a corner through those of one side, so that it stays sharp. A
-    contour that hardly has any noise stays as it is.
+    simplified least squares procedures", 1964); at a corner through those of one side, so that it stays sharp. Where
+    neither goes along the points as well as their noise allows, there is some detail, and they stay where they are.
     """
-    if len(points) < 4 * RUN + 1:
+    if noise < LEAST_NOISE or len(points) < SHORTEST:
         return points
     found = [_parabolas(points, first) for first in (-RUN, -2 * RUN, 0)]  # about each point, before, and behind it
     middle, before, behind = (off for _, off in found)
-    if np.median(middle) < LEAST_NOISE:
-        return points
-    corner = middle > np.maximum(CORNER * np.minimum(before, behind), LEAST_NOISE)
-    which = np.where(corner, np.where(before < behind, 1, 2), 0)
-    return np.asarray(np.choose(which[:, None], [on for on, _ in found]))
+    which = np.where(middle <= FITS * noise, 0, np.where(before < behind, 1, 2))
+    even = np.choose(which[:, None], [on for on, _ in found])
+    good = np.choose(which, [middle, before, behind]) <= FITS * noise
+    good &= np.linalg.norm(even - points, axis=1) <= FARTHEST * noise
+    return np.where(good[:, None], even, points)
 
 
 def _parabolas(points: Array, first: int) -> tuple[Array, Array]:

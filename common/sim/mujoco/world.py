@@ -36,7 +36,6 @@ TOLD = 0.05  # [s] between changes that are told of while something moves
 SLIPPERY = 0.5  # [s] fingers do not touch what a person lets slip, and not before they are clear of it
 QUIET = 1e-6  # [m] or of a quaternion: nothing has moved since the last look
 ASLEEP = 1e-3  # [m/s] or [rad/s]: velocities below are not kept over a restart
-DECIMALS = 6  # of [m] and of quaternions that are
 
 
 class PhysicsWorld(News):
@@ -65,7 +64,6 @@ class PhysicsWorld(News):
         self._watch = Watch(world)
         self._taken: set[str] = set()  # what "remove" was said of
         self._slippery: dict[str, float] = {}  # until when
-        self._stood: dict[str, StandingObject] = {}
         self._time: float | None = None
         self._told_at = -math.inf
         self._cell: CellModel | None = None
@@ -201,18 +199,16 @@ class PhysicsWorld(News):
     # --- over a restart ---
 
     def standing(self) -> dict[str, StandingObject]:
-        """Everything as it is and moves, for `restore`; what is as it was at the last call is the very same object."""
+        """Everything as it is and moves at this moment, for `restore`."""
         cell, data = self._built
         found = {}
         for name, body in self._paper.bodies.items():
             kept, at = body.standing(), cell.things[name]
             speeds = data.qvel[at.dof: at.dof + 6]
             details = {**kept.details, "mass": self._masses.get(name, USUAL_MASS), "slippery": name in self._slippery,
-                       "qpos": np.round(data.qpos[at.qpos: at.qpos + 7], DECIMALS).tolist(),
+                       "qpos": data.qpos[at.qpos: at.qpos + 7].tolist(),
                        "qvel": speeds.tolist() if np.abs(speeds).max() > ASLEEP else [0.0] * 6}
-            now, before = kept.model_copy(update={"details": details}), self._stood.get(name)
-            found[name] = now if before is None or before != now else before
-        self._stood = found
+            found[name] = kept.model_copy(update={"details": details})
         return found
 
     def restore(self, objects: Mapping[str, StandingObject]) -> None:

@@ -345,16 +345,14 @@ def test_what_slips_over_a_restart_is_not_flung_away_by_the_fingers_that_are_wit
     assert rig.fingers.read(rig.now).holding, "and it can be taken again"
 
 
-def test_what_is_kept_of_a_world_is_of_the_moment_and_what_did_not_move_is_the_very_same() -> None:
-    rig = Rig(BALL, {**CUBE, "y": -0.2})
+def test_what_is_kept_of_a_world_is_of_the_moment() -> None:
+    rig = Rig(BALL)
     rig.wait(0.5)
     rig.push("thing_1", 0.2)
     for _ in range(10):  # more often than is told of anything that moves
-        before = rig.world.standing()
+        before = rig.world.standing()["thing_1"].details["qpos"][0]
         rig.wait(PERIOD)
-        after = rig.world.standing()
-        way = after["thing_1"].details["qpos"][0] - before["thing_1"].details["qpos"][0]
-        assert way > 0.1 * PERIOD and after["thing_2"] is before["thing_2"]
+        assert rig.world.standing()["thing_1"].details["qpos"][0] - before > 0.1 * PERIOD
 
 
 def test_what_was_carried_over_a_restart_stands_still_with_the_arm() -> None:
