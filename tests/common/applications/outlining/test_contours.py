@@ -163,7 +163,7 @@ def test_noise_of_the_picture_is_evened_out_and_corners_stay_sharp(shape, turns,
     even, off = outlined(shape, 12.0)
     assert off.mean() < 0.08 and off.max() < 0.6
     assert len(simplified(even, 0.2)) < turns, "an outline that zigzags is not followed at an even speed"
-    monkeypatch.setattr("common.applications.outlining.contours_refinement.LEAST_NOISE", np.inf)
+    monkeypatch.setattr("common.applications.outlining.contours_refinement.SHORTEST", np.inf)
     rough, off_rough = outlined(shape, 12.0)
     assert off.mean() < 0.7 * off_rough.mean() and len(simplified(rough, 0.2)) > turns
 
@@ -172,14 +172,14 @@ def test_noise_of_the_picture_is_evened_out_and_corners_stay_sharp(shape, turns,
 def test_without_noise_a_contour_stays_as_it_is_and_with_it_details_do(shape, monkeypatch):
     clean, _ = outlined(shape, 0.0)
     _, off = outlined(shape, 12.0)
-    monkeypatch.setattr("common.applications.outlining.contours_refinement.LEAST_NOISE", np.inf)
+    monkeypatch.setattr("common.applications.outlining.contours_refinement.SHORTEST", np.inf)
     assert np.array_equal(outlined(shape, 0.0)[0], clean)
     assert off.mean() < 1.1 * outlined(shape, 12.0)[1].mean()
 
 
 def test_contour_that_is_too_short_to_be_evened_out_stays_as_it_is():
     few = np.random.default_rng(0).normal(0, 5, (SHORTEST - 1, 2))
-    assert evened(few, 1.0) is few
+    assert evened(few) is few
 
 
 def test_normals_point_out_of_the_object_at_its_edge_and_into_a_hole():
