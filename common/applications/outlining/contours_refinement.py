@@ -18,8 +18,7 @@ NEIGHBOURS = 2  # points to each side from which the direction of the edge is fo
 RUN = 6  # points to each side with which a point of a noisy contour is evened out
 SHORTEST = 80  # contours with fewer points are left as they are
 NOISE = 0.05, 0.14  # [px] likewise those with less, and with more, which is detail; measured, see `evened`
-FITS = 1.4  # times the noise, so far from the points may be what is put through them: else there is some detail
-FARTHEST = 3.0  # times the noise, so far a point is moved at most
+FITS = 1.7  # times the noise, so far from the points may be what is put through them: else there is some detail
 
 
 def normals(points: npt.ArrayLike, *, hole: bool) -> Array:
@@ -75,7 +74,6 @@ def evened(points: Array) -> Array:
     which = np.where(middle <= FITS * noise, 0, np.where(before < behind, 1, 2))
     even = np.choose(which[:, None], [on for on, _ in found])
     good = np.choose(which, [middle, before, behind]) <= FITS * noise
-    good &= np.linalg.norm(even - points, axis=1) <= FARTHEST * noise
     return np.where(good[:, None], even, points)
 
 
