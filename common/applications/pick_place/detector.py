@@ -55,6 +55,8 @@ Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
 
 _ROUND = 0.96  # part of an outline that must fit for a blob to be one ball
+_BRIGHT = 60  # [0..255] of green from which on it tells a colour together with blue, also where red is clipped
+_WARMEST = 0.25  # part of the blue, compared with green, that is left in light of 2700 K
 _LEAST_TABLE = 0.1  # part of a picture that shows the table, at least, for it to tell the colour of the light
 
 Hue = Annotated[int, Field(ge=0, le=180)]
@@ -169,7 +171,7 @@ class Detector:
         last = self._last
         if last and masks.closed is last[0] and camera is last[1] and self.options == last[2]:
             return list(last[3])
-        found = self._look_at(masks, camera)
+        found = [one for one in self._look_at(masks, camera) if not self._is_floor(one, picture, camera)]
         self.blind = "" if found else blindness(picture)
         self._last = (masks.closed, camera, self.options.model_copy(), found)
         return list(found)
@@ -337,6 +339,22 @@ class Detector:
         if offsets[upper] - usual <= MOST_UNLIKE * pixel_size:
             return []
         return [sized(float(offsets[k]), usual) if k == upper else BELOW for k in range(len(offsets))]
+
+    def _is_floor(self, seen: Detection, picture: Picture, camera: Pinhole) -> bool:
+        """Whether what was found in the container has its colour: overexposed in warm light an orange one is red.
+
+        Green and blue are not clipped then: balls have more blue than that, whatever the light.
+        """
+        blue_of_ball, blue_of_container = (b / max(g, 1e-3) for _, g, b in (
+            self._around.ball_color, self.resting.container.color))
+        least = _WARMEST * blue_of_ball
+        if blue_of_container > least / 2 or not self.resting.shows_container(camera, seen.pixel):
+            return False
+        inner = np.concatenate([seen.pixel + part * (seen.outline - seen.pixel) for part in (0.3, 0.6)])
+        u, v = np.clip(np.rint(inner).astype(int), 0, (camera.width - 1, camera.height - 1)).T
+        blue, green = picture[v, u, :2].astype(float).T
+        bright = green >= _BRIGHT
+        return bool(bright.mean() > 0.5 and np.median(blue[bright] / green[bright]) < least / 2)
 
     def _thin(self, narrow: Mask, camera: Pinhole) -> list[Odd]:
         """What is long and thin."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from common.applications.pick_place.detector import Detector
 from common.config import CameraConfig, Light, Scenery, Surroundings, load_cell
 from common.messages import Color, Header, JointState, Pose, Vector3, WorldObject, WorldObjects
 from common.perception.pinhole import Pinhole
+from common.perception.sphere import silhouettes
 from common.robot.model import RobotModel
 from common.sim.camera import CameraParameters, SimulatedCamera
 from common.sim.lighting import tint
@@ -78,3 +80,19 @@ def test_balls_are_found_in_drawn_light_and_shadow(number: int) -> None:
     sensor = CameraParameters(auto_exposure=True, full_well=10_000)
     eye = SimulatedCamera(AROUND, lit, CELL.robot, sensor, rng, plain=True)
     assert max(errors(eye.shoot(WorldObjects(objects=balls()), joints, 0).colour)) < 0.003
+
+
+@pytest.mark.parametrize(("color", "count"), [
+    ((0, 85, 255), 0), ((14, 85, 255), 1), ((0, 40, 170), 1),  # the floor's; a ball's as bright; one in the shadow
+])
+def test_overexposed_in_warm_light_the_floor_of_an_orange_container_is_no_ball(
+    color: tuple[int, int, int], count: int,
+) -> None:
+    box = AROUND.container
+    picture = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
+    for place in ((box.x, box.y, 0.035), PLACES[0]):
+        outline = silhouettes(CAMERA, np.array([place]), AROUND.ball_radius, 32)[0]
+        cv2.fillConvexPoly(picture, np.rint(outline).astype(np.int32), color)
+    found = Detector(AROUND).detect(picture, CAMERA)
+    inside = [one for one in found if math.dist(one.position[:2], (box.x, box.y)) < box.half_side]
+    assert len(inside) == count and len(found) == count + 1, "elsewhere it is what it looks like"
