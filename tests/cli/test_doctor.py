@@ -313,6 +313,8 @@ def test_stopped_service_of_a_cell_is_found_until_the_cell_is_gone(zencell: Call
     command.until("zenoh --mode client")
     middle = command.children()["middle"]
     middle.suspend()
+    while middle.status() != psutil.STATUS_STOPPED:  # only its parent is told when that is so, up to 5 ms later
+        time.sleep(0.001)
     (found,) = (f for f in leftovers.processes() if f"middle ({middle.pid})" in f.what)
     not_well(found, "stopped (SIGSTOP)", "kill -CONT", str(middle.pid))
     command.process.kill()
