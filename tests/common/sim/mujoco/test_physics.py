@@ -308,19 +308,23 @@ def test_what_a_person_lets_slip_falls_out_of_the_fingers(meanwhile: WorldEdit |
     assert rig.place()[2] == pytest.approx(0.03, abs=2e-3) and not rig.fingers.read(rig.now).holding
 
 
+def lies_there_and_can_be_taken_again(rig: Rig) -> None:
+    assert math.dist(rig.place(), (0.45, 0.0, 0.03)) < 5e-3
+    assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3, "nor does it push the arm"
+    rig.move(rig.above(0.45, 0.0, 0.2))
+    rig.grip(0.08)
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    rig.grip(0.0)
+    assert rig.fingers.read(rig.now).holding, "and it can be taken again"
+
+
 def test_what_a_person_lets_slip_on_the_table_is_not_flung_away_by_the_fingers_that_close_through_it() -> None:
     rig = Rig(BALL)
     rig.move(rig.above(0.45, 0.0, 0.03))
     rig.grip(0.0)
     rig.world.edit(WorldEdit(op="drop"), rig.now)
     rig.wait(3.0)
-    assert math.dist(rig.place(), (0.45, 0.0, 0.03)) < 5e-3
-    assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3, "nor pushes it the arm"
-    rig.move(rig.above(0.45, 0.0, 0.2))
-    rig.grip(0.08)
-    rig.move(rig.above(0.45, 0.0, 0.03))
-    rig.grip(0.0)
-    assert rig.fingers.read(rig.now).holding, "and it can be taken again"
+    lies_there_and_can_be_taken_again(rig)
 
 
 def test_what_slips_over_a_restart_is_not_flung_away_by_the_fingers_that_are_within_it() -> None:
@@ -336,13 +340,7 @@ def test_what_slips_over_a_restart_is_not_flung_away_by_the_fingers_that_are_wit
     assert isinstance(rig.fingers, PlacedGripper)
     rig.fingers.place(width)
     rig.grip(0.0, seconds=3.0)
-    assert math.dist(rig.place(), (0.45, 0.0, 0.03)) < 5e-3
-    assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3, "nor does it push the arm"
-    rig.move(rig.above(0.45, 0.0, 0.2))
-    rig.grip(0.08)
-    rig.move(rig.above(0.45, 0.0, 0.03))
-    rig.grip(0.0)
-    assert rig.fingers.read(rig.now).holding, "and it can be taken again"
+    lies_there_and_can_be_taken_again(rig)
 
 
 def test_what_is_kept_of_a_world_is_of_the_moment() -> None:
