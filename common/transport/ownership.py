@@ -113,6 +113,8 @@ class Ownership:
         self._lock = threading.Lock()
         # Of each key of ours, as far as they have shown up since; when, or None once that was judged.
         self._others: dict[str, dict[Owner, float | None]] = {}
+        # They gave way before they were judged: by their clock they had met us for long enough, by ours not quite.
+        self._gone: deque[Owner] = deque(maxlen=MOST_OTHERS)
         self._bell = Doorbell(loop, self._look)
         self._next_look: asyncio.TimerHandle | None = None
         self._told: deque[tuple[float, str]] = deque(maxlen=64)  # when, of whom by process
@@ -193,7 +195,8 @@ class Ownership:
         with self._lock:
             others = self._others.setdefault(other.key, {})
             if not there:
-                others.pop(other, None)
+                if others.pop(other, None) is not None and not other.asks:
+                    self._gone.append(other)
             elif other not in others:
                 others[other] = self._loop.time()
                 if len(others) > MOST_OTHERS:  # who was there first matters most
@@ -203,9 +206,10 @@ class Ownership:
     def _look(self) -> None:
         """Judge whoever has owned a key of ours for long enough; look again when the next one has."""
         now = self._loop.time()
-        due: list[Owner] = []
         later: list[float] = []
         with self._lock:
+            due = [other for other in self._gone if (mine := self._mine.get(other.key)) and mine.was_before(other)]
+            self._gone.clear()
             for others in self._others.values():
                 for other, since in others.items():
                     if since is not None and since + MEET <= now:

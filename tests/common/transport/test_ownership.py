@@ -16,8 +16,10 @@ from common.messages import Header, PlanningScene, TaskCommand, TaskStatus
 from common.transport import ownership
 from common.transport.bus import Bus
 from common.transport.codec import decode
+from common.transport.keys import owns_key
 from common.transport.local import LocalNetwork
 from common.transport.ownership import Owner, Ownership, process_name, who_owns
+from common.transport.session import Declared
 
 NewBus = Callable[..., Awaitable[Bus]]
 
@@ -186,13 +188,14 @@ class Split:
         self.stood.append(asyncio.create_task(bus.run(run())))
         await bus.ready_event.wait()
 
-    def join(self) -> None:
-        """Show to each side the tokens of the other."""
+    def join(self) -> list[Declared]:
+        """Show to each side the tokens of the other; returns what the first side is shown."""
         tokens = [list(net.tokens) for net in self.nets]
+        shown: list[list[Declared]] = []
         for net, theirs in zip(self.nets, reversed(tokens), strict=True):
             session = net.session()
-            for entry in theirs:
-                session.token(entry.key)
+            shown.append([session.token(entry.key) for entry in theirs])
+        return shown[0]
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -207,6 +210,33 @@ async def test_split_network_that_is_whole_again_leaves_the_one_that_was_there_f
     with pytest.raises(ConfigError, match=r"services\.arm: another arm .* was there first: this one ends"):
         await asyncio.wait_for(split.stood[1], 20)
     assert not split.stood[0].done() and caplog.text.count("gives way: this one was there first") == 1
+    split.stood[0].cancel()
+
+
+async def test_first_tells_of_a_second_that_ended_before_the_first_had_met_it_for_long_enough(
+    caplog: pytest.LogCaptureFixture
+) -> None:
+    split = Split()
+    for side in range(2):
+        await split.start(side)
+    for token in split.join():
+        token.undeclare()
+    for _ in range(4):
+        await asyncio.sleep(0)
+    assert caplog.text.count("gives way: this one was there first") == 1
+    for stood in split.stood:
+        stood.cancel()
+
+
+async def test_who_asks_and_goes_soon_is_told_of_by_nobody(caplog: pytest.LogCaptureFixture) -> None:
+    split = Split()
+    await split.start(0)
+    session = split.nets[0].session()
+    for process in (process_name("asks"), process_name("before", since=7)):
+        session.token(owns_key("test", topics.JOINT_STATES.key, topics.JOINT_STATES.key, "arm", process)).undeclare()
+    for _ in range(4):
+        await asyncio.sleep(0)
+    assert "first" not in caplog.text and not split.stood[0].done()
     split.stood[0].cancel()
 
 
