@@ -360,6 +360,12 @@ def processes_of(domain: int) -> dict[str, psutil.Process]:
     return found
 
 
+def freeze(child: subprocess.Popen[Any]) -> None:
+    """Stop a child; returns when all of its threads stand, up to 5 ms later: until then it may still answer."""
+    child.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, child.pid, os.WSTOPPED | os.WNOWAIT)
+
+
 async def until(reader: Reader[M], wanted: Callable[[M], bool], timeout: float = 60.0) -> M:
     """The first message from now on, or the newest there is, that is wanted.
 

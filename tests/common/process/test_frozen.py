@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from common.process.health import end_if_frozen, stopped_service
+from tests.harness import freeze
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc, as in a container")
 
@@ -28,11 +29,6 @@ def service() -> Iterator[subprocess.Popen[bytes]]:
     started.stdout.close()
 
 
-def stop(process: subprocess.Popen[bytes]) -> None:
-    process.send_signal(signal.SIGSTOP)
-    os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOWAIT)
-
-
 def test_service_that_runs_is_left_alone(service: subprocess.Popen[bytes]) -> None:
     assert stopped_service(os.getpid()) is None
     assert not end_if_frozen(os.getpid())
@@ -40,7 +36,7 @@ def test_service_that_runs_is_left_alone(service: subprocess.Popen[bytes]) -> No
 
 
 def test_stopped_service_is_killed(service: subprocess.Popen[bytes]) -> None:
-    stop(service)
+    freeze(service)
     waited: list[float] = []
     assert end_if_frozen(os.getpid(), waited.append)
     assert service.wait(10) == -signal.SIGKILL
@@ -48,7 +44,7 @@ def test_stopped_service_is_killed(service: subprocess.Popen[bytes]) -> None:
 
 
 def test_service_that_goes_on_in_time_is_left_alone(service: subprocess.Popen[bytes]) -> None:
-    stop(service)
+    freeze(service)
     waited: list[float] = []
 
     def wait(seconds: float) -> None:
@@ -63,7 +59,7 @@ def test_service_that_goes_on_in_time_is_left_alone(service: subprocess.Popen[by
 
 
 def test_stopped_process_that_somebody_else_started_is_left_alone(service: subprocess.Popen[bytes]) -> None:
-    stop(service)
+    freeze(service)
     assert stopped_service(parent=service.pid) is None
     assert stopped_service(os.getpid()) == service.pid
 
@@ -71,7 +67,7 @@ def test_stopped_process_that_somebody_else_started_is_left_alone(service: subpr
 def test_stopped_program_that_is_no_service_is_left_alone() -> None:
     program = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     try:
-        stop(program)
+        freeze(program)
         assert stopped_service(os.getpid()) is None
     finally:
         program.kill()

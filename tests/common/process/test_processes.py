@@ -23,7 +23,7 @@ from common.transport.bus import Bus, Client
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of, port_of
 from tests.common.process.toy import Config
-from tests.harness import wait_router
+from tests.harness import freeze, wait_router
 
 PATIENCE = 20.0  # only ever waited for by a test that fails
 CELL = str(Path(__file__).with_name("toy_cell.yaml"))
@@ -127,7 +127,7 @@ async def test_frozen_responder_is_a_time_out_then_lost_then_gone_and_serves_aga
 ) -> None:
     toy = stage.toy()
     client = await available(bus)
-    toy.send_signal(signal.SIGSTOP)
+    freeze(toy)
     with pytest.raises(RequestTimeout):
         await client.call(START, timeout=0.2)
     with pytest.raises(RequestLost):  # its lease runs out while we wait
@@ -159,7 +159,7 @@ async def test_router_frozen_in_the_middle_loses_the_request(stage: Stage, bus: 
     client = await available(bus)
     waiting = asyncio.create_task(client.call(HOLD, timeout=PATIENCE))
     await stage.said(toy, "holding")
-    stage.the_router.send_signal(signal.SIGSTOP)
+    freeze(stage.the_router)
     with pytest.raises(RequestTimeout):
         await client.call(START, timeout=0.1)
     with pytest.raises(RequestLost):
@@ -215,7 +215,7 @@ async def reach(stage: Stage, state: str) -> list[subprocess.Popen[bytes]]:
         for toy in toys:
             await stage.said(toy, "the router is lost")
     if state == "router frozen":
-        router.send_signal(signal.SIGSTOP)
+        freeze(router)
     return toys
 
 
