@@ -82,11 +82,20 @@ class KeptFile(Generic[R]):
         Raises:
             Unreadable: there is something else.
         """
+        kept = self.find()
+        return self._model() if kept is None else kept
+
+    def find(self) -> R | None:
+        """The record; None when nothing was kept yet.
+
+        Raises:
+            Unreadable: there is something else.
+        """
         try:
             return self._model.model_validate_json(self._text())
         except FileNotFoundError as error:
             if not self.path.is_symlink():
-                return self._model()
+                return None
             why = f"it is a link to nothing ({error.strerror})"
         except OSError as error:
             why = error.strerror or str(error)

@@ -6,12 +6,12 @@ import math
 
 from common.config import World
 from common.messages import WorldObject, WorldObjects
+from common.sim.kinematic import GRAVITY
 from common.sim.layout import wholly_in_picture
 from common.sim.mujoco.contact import ROLLING
 
 CLEARANCE = 0.12  # [m] from the container's edge: what falls between its wall and this may be hidden by it
 FALLS_STRAIGHT = "kinematic"  # the world in which what is let go has no speed
-GRAVITY = 9.81  # [m/s^2]
 RECENT = 0.1  # [s] between what is compared to find how fast the hand goes
 FARTHER = (0.0, 1.0, 1.5)  # as far as it rolls by what was known, and half as far again: the hand may go on speeding up
 

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 from collections.abc import Callable, Iterable
-from typing import Any, Generic, Protocol, TypeVar, cast
-
-from pydantic import BaseModel
+from typing import Any, Generic, Protocol, TypeVar
 
 from common import messages as m
 from common import topics
 from common.errors import Refused, RequestFailed
-from common.kept_file import KeptFile, Unreadable, standing_folder
 from common.process.orders import BY_THEMSELVES, GOAL_TIMEOUT, PERSON, Answered, Orders
+from common.process.task_memory import Memory
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.sources import monotonic, new_id
@@ -31,7 +28,6 @@ LONGEST_STEP = LOOK_PERIOD  # [s] wall: time passes too
 WAITS = "the arm waits: "
 ENDED = ("DONE", "ERROR")
 NOT_ANSWERED = "trajectory_executor has not answered yet: until it does, this does not outlive the task"
-SAVE_AGAIN = 2.0  # [s] wall after a memory could not be written
 OWN_PERIOD = 0.2  # [s] wall between two times that the motion is asked for: what came of it is heard meanwhile
 SOMEBODY = ("", PERSON, *BY_THEMSELVES)  # whose holds are nobody's own
 
@@ -221,69 +217,6 @@ class TaskRunner(Generic[V]):
     async def _wake_on(self, reader: Reader[Any]) -> None:
         async for _ in reader:
             self._woken.set()
-
-
-class Memory:
-    """A file in which the memory of a task outlives it, where there is a folder for that."""
-
-    def __init__(self, bus: Bus, task: Task[Any]) -> None:
-        """Keep nothing yet."""
-        self._bus, self._task = bus, task
-        self._kept = task.memory
-        self._file: KeptFile[Any] | None = None
-        self._saving: asyncio.Task[None] | None = None
-
-    async def begin(self) -> None:
-        """Have the task remember what was kept, if it has a memory at all."""
-        folder = standing_folder()
-        if self._kept is None or folder is None:
-            return
-        await self._bus.owned()  # until then another one of this name may still write
-        if self._bus.declares_only:
-            return
-        self._file = KeptFile(folder / f"{self._bus.cell}.{self._bus.service}.json", type(self._kept))
-        try:
-            kept = _read(self._file)
-        except Unreadable as error:  # the next that is kept takes its place
-            self._bus.log.warning("what was done before is not known: %s", error)
-            return
-        if kept is not None:
-            self._kept = kept
-            self._task.remember(kept)
-
-    def keep(self, group: asyncio.TaskGroup) -> None:
-        """Write down what has changed, beside everything else; what changes meanwhile has its turn after it."""
-        now = self._task.memory
-        if self._file is None or now is None or now is self._kept or (self._saving and not self._saving.done()):
-            return
-        self._saving = group.create_task(self._save(self._file), name="memory")
-
-    async def _save(self, file: KeptFile[Any]) -> None:
-        """Write the newest, as often as it takes: until then a task that is started again knows what was before."""
-        told = False
-        while True:
-            memory = self._task.memory
-            assert memory is not None
-            try:
-                await asyncio.to_thread(file.save, memory)
-            except OSError as error:
-                if not told:
-                    self._bus.log.warning("%s cannot be written (%s): until it can, a task that is started again does "
-                                          "not know what was done since", file.path, error.strerror or error)
-                told = True
-                await asyncio.sleep(SAVE_AGAIN)
-                continue
-            self._kept = memory
-            return
-
-
-def _read(file: KeptFile[Any]) -> BaseModel | None:
-    """What is kept; None where nothing was yet.
-
-    Raises:
-        Unreadable: something else is there.
-    """
-    return cast(BaseModel, file.read()) if os.path.lexists(file.path) else None
 
 
 def _require_allowed(command: m.TaskCommand, motion: m.MotionStatus | None, owner: m.MotionOwner | None) -> None:

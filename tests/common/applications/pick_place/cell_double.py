@@ -12,6 +12,7 @@ from common.applications.pick_place.task import PickPlace
 from common.config import Surroundings, load_cell
 
 CELL = load_cell("panda")
+SEVEN = [tuple(spot) for spot in CELL.world.spots[:7]]
 MOTION, FINGERS, LEAD = 0.45, 0.25, 0.1  # [s] that each takes, and by which those begin before the arm stands
 
 
@@ -45,6 +46,11 @@ class CellDouble:
         self._waiting: m.GripperCommand | None = None  # for the arm
         self._fingers: tuple[m.GripperCommand, float] | None = None  # what they were told, and when they have done it
         self._goals: dict[str, m.Pose] = {}
+
+    def restart(self) -> None:
+        """The task ends, and another one begins."""
+        self.task = CellDouble([]).task
+        self.task.prefix = f"again{self.now:.1f}"
 
     def view(self) -> PickPlaceView:
         if self.camera_on:
