@@ -19,6 +19,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from common.errors import ConfigError
+from common.mesh_files import parts_of
 from common.robot.description import find_description
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
@@ -161,16 +162,11 @@ def _coloured(shape: Shape) -> list[tuple[Rgb, trimesh.Trimesh]]:
     """The triangles of a shape by colour; that of the URDF counts more than that of the file."""
     if shape.path is None:
         return [(shape.color or _PLAIN, _merged(shape.primitive))]
-    try:
-        scene = trimesh.load_scene(shape.path)
-    except (ValueError, OSError, NotImplementedError) as error:
-        raise ConfigError("robot.urdf", str(shape.path), f"is a mesh that cannot be read: {error}") from None
     meshes = []
-    for mesh in scene.dump():
-        if isinstance(mesh, trimesh.Trimesh):
-            color = shape.color or _own_color(mesh) or _PLAIN
-            mesh.vertices = mesh.vertices * np.array(shape.scale)
-            meshes.append((color, _merged(mesh)))
+    for mesh in parts_of("robot.urdf", shape.path):
+        color = shape.color or _own_color(mesh) or _PLAIN
+        mesh.vertices = mesh.vertices * np.array(shape.scale)
+        meshes.append((color, _merged(mesh)))
     return meshes
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from common.config import ObjectConfig
 from common.config.objects import Shape
 from common.errors import ConfigError
+from common.mesh_files import triangles_of
 from common.messages import Color, Pose, Vector3, WorldObject
 from common.planning.prism import convex_hull
 from common.robot.transforms import matrix_to_pose, pose_to_matrix, rpy_to_matrix, transform
@@ -209,17 +210,12 @@ def load_mesh(name: str, path: Path, scale: float) -> Array:
     """Triangles (n, 3, 3) [m] of a file, scaled.
 
     Raises:
-        ConfigError: it cannot be read, has no triangles, or too many.
+        ConfigError: it cannot be read, or has too many triangles.
     """
-    import trimesh  # takes a third of a second, and few worlds have meshes
-
-    try:
-        triangles = scale * np.array(trimesh.load_mesh(str(path), process=False).triangles, dtype=np.float64)
-    except (OSError, ValueError, AttributeError, IndexError, KeyError, NotImplementedError) as error:
-        raise ConfigError(f"world.objects.{name}.mesh", str(path), f"cannot be read: {error}") from None
-    if not 0 < len(triangles) <= MOST_TRIANGLES:
+    triangles = scale * triangles_of(f"world.objects.{name}.mesh", path)
+    if len(triangles) > MOST_TRIANGLES:
         raise ConfigError(f"world.objects.{name}.mesh", str(path),
-                          f"has {len(triangles)} triangles; 1 to {MOST_TRIANGLES} can be simulated: simplify it")
+                          f"has {len(triangles)} triangles; at most {MOST_TRIANGLES} can be simulated: simplify it")
     return triangles
 
 

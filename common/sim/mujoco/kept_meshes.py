@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import ConfigError
+from common.mesh_files import triangles_of
 from common.robot.model import RobotModel
 
 CACHE_VARIABLE = "ZENCELL_CACHE"  # folder for what can be made again; else zencell in that of the user
@@ -39,13 +39,7 @@ def hull_points(path: Path) -> NDArray[np.float64]:
         ConfigError: it cannot be read.
     """
     def read() -> Arrays:
-        import trimesh
-
-        try:
-            mesh = trimesh.load_mesh(str(path), process=False)
-            return {"points": np.unique(np.asarray(mesh.triangles, dtype=float).reshape(-1, 3), axis=0)}
-        except (OSError, ValueError, AttributeError, IndexError, KeyError, NotImplementedError) as error:
-            raise ConfigError("robot.urdf", str(path), f"is a mesh that cannot be read: {error}") from None
+        return {"points": np.unique(triangles_of("robot.urdf", path).reshape(-1, 3), axis=0)}
 
     return kept("hull", [path.read_bytes()], read)["points"]
 

@@ -244,7 +244,7 @@ def test_a_mesh_beside_the_file_of_the_world_is_gripped_carried_dropped_and_coun
 
 def test_a_mesh_that_is_not_there_is_named(wedge: Path) -> None:
     (wedge.parent / "wedge.stl").unlink()
-    with pytest.raises(ConfigError, match=r"world\.objects\.wedge\.mesh: .*wedge\.stl' cannot be read"):
+    with pytest.raises(ConfigError, match=r"world\.objects\.wedge\.mesh: .*wedge\.stl' is a mesh that cannot be read"):
         KinematicWorld(load_cell("panda", world=str(wedge)).world)
 
 
