@@ -6,7 +6,7 @@ It also watches the motion that runs, and holds the arm while the newest scene h
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from functools import partial
@@ -63,7 +63,7 @@ class Config(Parameters):
                                                     "least one; none with points")
 
 
-Planner = Callable[..., PlanResponse]  # of request, scene, joints, cancel, points and width
+Planner = Callable[..., Awaitable[PlanResponse]]  # of request, scene, joints, width and what makes obstacles of points
 
 
 async def run(bus: Bus, config: Config, helpers: Sequence[Helper] = ()) -> None:
@@ -88,7 +88,7 @@ async def run(bus: Bus, config: Config, helpers: Sequence[Helper] = ()) -> None:
             see = None if eyes is None else eyes.look(scene, request.stage or request.id)
             width = None if state is None else measured_width(config.robot.gripper, state.name, state.position)
             joints = None if current is None else current.tolist()
-            return await _plan(planner, request, scene, joints, width, see), scene, width
+            return await planner(request, scene, joints, width, see), scene, width
 
     async def handle(request: PlanRequest) -> PlanResponse:
         try:
@@ -112,8 +112,8 @@ async def run(bus: Bus, config: Config, helpers: Sequence[Helper] = ()) -> None:
         helper.close()
     for helper in helpers[:config.helpers if config.points is None else 0]:
         helper.set_up(config.robot, config.motion, config.pipeline, seed=config.run.seed)
-        crew.join(partial(_of_helper, helper))
-    crew.join(loaded[0].plan)
+        crew.join(partial(_by_helper, helper))
+    crew.join(partial(_plan, loaded[0]))
     if eyes is not None:
         await asyncio.to_thread(eyes.load, loaded[0])
     if watcher is not None:
@@ -140,12 +140,12 @@ def _load(config: Config) -> PlanningPipeline:
     return pipeline
 
 
-def _of_helper(
-    helper: Helper, request: PlanRequest, scene: PlanningScene, current: list[float] | None, cancel: Cancel,
-    points: Sequence[PointObstacle], width: float | None,
+async def _by_helper(
+    helper: Helper, request: PlanRequest, scene: PlanningScene, current: list[float] | None, width: float | None,
+    see: Callable[[], list[PointObstacle]] | None,
 ) -> PlanResponse:
-    assert not points
-    return helper.plan(request, scene, current, cancel, width)
+    assert see is None
+    return await helper.plan(request, scene, current, width)
 
 
 class Crew:
@@ -297,7 +297,7 @@ def _readers(
 
 
 async def _plan(
-    planner: Planner,
+    pipeline: PlanningPipeline,
     request: PlanRequest,
     scene: PlanningScene,
     current: list[float] | None,
@@ -310,7 +310,7 @@ async def _plan(
     def plan() -> PlanResponse:
         come_last()
         points = [] if see is None else see()
-        return planner(request, scene, current, cancel, points, width)
+        return pipeline.plan(request, scene, current, cancel, points, width)
 
     planning = asyncio.create_task(asyncio.to_thread(plan))
     try:
@@ -318,7 +318,7 @@ async def _plan(
     except asyncio.CancelledError:
         cancel.set()
         await asyncio.wait({planning})
-        planning.exception()  # of a helper that was ended together with us: no news
+        planning.exception()  # which is no news then
         raise
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import math
-import threading
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -132,23 +131,22 @@ class Problem:
 class Cancel:
     """A flag that another thread may set; planners look at it and at the time that is left."""
 
-    def __init__(self) -> None:
-        self._event = threading.Event()
-        self.word = ctypes.c_int(0)  # not 0 once set: compiled code looks here
+    def __init__(self, word: ctypes.c_int | None = None) -> None:
+        """Not set; `word` is not 0 once it is, and compiled code looks there. It may lie in memory that is shared."""
+        self.word = ctypes.c_int(0) if word is None else word
 
     def set(self) -> None:
         """Ask the planner to give up."""
-        self._event.set()
         self.word.value = 1
 
     @property
     def is_set(self) -> bool:
         """Whether somebody asked."""
-        return self._event.is_set()
+        return self.word.value != 0
 
     def reason(self, problem: Problem) -> str:
         """Why planning must end now: cancelled, timeout, or nothing."""
-        if self._event.is_set():
+        if self.is_set:
             return "cancelled"
         return "timeout" if problem.seconds_left <= 0 else ""
 

@@ -164,12 +164,12 @@ class HelperDouble:
     def set_up(self, robot, motion, pipeline, *, seed):
         self.pipeline = PlanningPipeline(RobotModel.load(robot), motion, pipeline, seed=seed)
 
-    def plan(self, request, scene, current, cancel, width):
+    async def plan(self, request, scene, current, width):
         self.asked.append(request.id)
         if self.lost:
             raise HelperLost("the second planner has ended")
-        self.together.wait(20)
-        return self.pipeline.plan(request, scene, current, cancel, (), width)
+        await asyncio.to_thread(self.together.wait, 20)
+        return self.pipeline.plan(request, scene, current, None, (), width)
 
     def close(self):
         self.closed = True

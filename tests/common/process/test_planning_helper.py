@@ -11,12 +11,11 @@ import psutil
 ROOT = Path(__file__).resolve().parents[3]
 
 BEGIN = """
-import json, os, signal, sys, threading, time
+import asyncio, json, os, signal, sys, time
 from common.config import load_cell
 from common.messages import CollisionObject, Header, JointGoal, PlanningScene, PlanRequest, Pose, Vector3
 from common.process.planning_helper import Helper, HelperLost
 from common.planning.pipeline import PlanningPipeline
-from common.planning.problem import Cancel
 from common.robot.model import RobotModel
 
 cell = load_cell("panda", ["pipeline.planners=[{name: ompl, options: {algorithm: AORRTC, improving_time: 60}}]"]
@@ -30,8 +29,23 @@ scene = PlanningScene(header=Header(frame_id="world"), objects=[wall])
 down = RobotModel.load(cell.robot).named("home") + [0.0, 0.5, 0, 0.1, 0, 0, 0]
 left, right = [0.6, *down.tolist()[1:]], [-0.6, *down.tolist()[1:]]
 
+runner = asyncio.Runner()
+
 def asked(id, seconds=20.0):
     return PlanRequest(id=id, start=left, goal=JointGoal(positions=right), planning_time=seconds)
+
+def plan(*request):
+    return runner.run(helper.plan(*request))
+
+def given_up(after):
+    async def give_up():
+        task = asyncio.create_task(helper.plan(asked("a", 300.0), scene, None))
+        await asyncio.sleep(after)
+        task.cancel()
+        began = time.monotonic()
+        await asyncio.wait({task})
+        return task.cancelled(), time.monotonic() - began
+    return runner.run(give_up())
 """
 
 
@@ -47,8 +61,8 @@ def test_helper_plans_as_the_pipeline_itself_does_also_on_the_next_scene() -> No
     answers, own = told("""
 own = PlanningPipeline(RobotModel.load(cell.robot), *setup[1:], seed=3)
 empty = PlanningScene(header=Header(frame_id="world"))
-for plan in (helper.plan, own.plan):
-    answers = [plan(asked(name), where, None, Cancel()) for name, where in (("a", scene), ("b", scene), ("c", empty))]
+for asks in (plan, own.plan):
+    answers = [asks(asked(name), where, None) for name, where in (("a", scene), ("b", scene), ("c", empty))]
     print(json.dumps([[p.positions for p in each.trajectory.points] for each in answers]))
 """)
     assert answers == own
@@ -56,18 +70,13 @@ for plan in (helper.plan, own.plan):
 
 
 def test_helper_gives_up_when_it_is_told_to_and_is_there_for_the_next_request() -> None:
-    first, seconds, second = told("""
-cancel = Cancel()
-threading.Timer(2.0, cancel.set).start()
-began = time.monotonic()
-print(json.dumps(helper.plan(asked("a", 300.0), scene, None, cancel).error))
-print(json.dumps(time.monotonic() - began))
-cancel = Cancel()
-cancel.set()
-print(json.dumps(helper.plan(asked("b", 300.0), scene, None, cancel).error))
+    loading, planning, answer = told("""
+for after in (0.0, 2.0):
+    print(json.dumps(given_up(after)))
+print(json.dumps(plan(asked("b", 0.5), scene, None).ok))
 """, "long")
-    assert first == second == "cancelled"
-    assert isinstance(seconds, float) and seconds < 30
+    assert isinstance(loading, list) and loading[0] and answer is True
+    assert isinstance(planning, list) and planning[0] and planning[1] < 5.0
 
 
 def test_helper_that_was_killed_is_said_to_be_lost() -> None:
@@ -76,7 +85,7 @@ import multiprocessing
 process, = multiprocessing.active_children()
 os.kill(process.pid, signal.SIGKILL)
 try:
-    helper.plan(asked("a"), scene, None, Cancel())
+    plan(asked("a"), scene, None)
 except HelperLost as lost:
     print(json.dumps(str(lost)))
 """) == ["the second planner has ended"]
@@ -86,9 +95,11 @@ def test_helper_ends_with_its_parent_however_that_ends() -> None:
     pids = told("""
 import multiprocessing
 print(json.dumps(multiprocessing.active_children()[0].pid), flush=True)
-threading.Thread(target=helper.plan, args=(asked("a", 300.0), scene, None, Cancel()), daemon=True).start()
-time.sleep(0.5)
-os._exit(0)
+async def leave():
+    planning = asyncio.create_task(helper.plan(asked("a", 300.0), scene, None))
+    await asyncio.sleep(0.5)
+    os._exit(0)
+runner.run(leave())
 """, "long")
     assert isinstance(pids[0], int)
     with contextlib.suppress(psutil.NoSuchProcess):
@@ -119,7 +130,7 @@ common.process.planning_helper.PATIENCE = 0.1
 scene = scene.model_copy(update={"header": Header.model_construct(frame_id="x" * 10_000_000)})
 os.kill(helper._process.pid, signal.SIGSTOP)
 try:
-    helper.plan(asked("a", 0.1), scene, None, Cancel())
+    plan(asked("a", 0.1), scene, None)
 except HelperLost as lost:
     print(json.dumps([str(lost), helper._process.exitcode]))
 """) == [["the second planner has ended", -9]]
@@ -129,14 +140,13 @@ def test_helper_that_is_stopped_is_ended_when_giving_up_is_told_to_it() -> None:
     assert told("""
 import common.process.planning_helper
 common.process.planning_helper.PATIENCE = 0.1
-cancel = Cancel()
-cancel.set()
 os.kill(helper._process.pid, signal.SIGSTOP)
+print(json.dumps(given_up(0.0)[0]))
 try:
-    helper.plan(asked("a", 300.0), scene, None, cancel)
+    plan(asked("b"), scene, None)
 except HelperLost as lost:
     print(json.dumps(str(lost)))
-""") == ["the second planner has ended"]
+""") == [True, "the second planner has ended"]
 
 
 def test_helper_that_is_let_go_of_leaves_no_process_behind() -> None:
@@ -155,5 +165,5 @@ def test_helper_finds_a_planner_that_lies_where_only_its_parent_looks_by_now(tmp
 sys.path.append(sys.argv[1])
 cell = load_cell("panda", ["pipeline.planners=[{name: of_a_person.planner}]"])
 helper.set_up(cell.robot, cell.motion, cell.pipeline, seed=3)
-print(json.dumps(helper.plan(asked("a"), scene, None, Cancel()).planner))
+print(json.dumps(plan(asked("a"), scene, None).planner))
 """, str(tmp_path)) == ["planner"]
