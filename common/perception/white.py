@@ -50,6 +50,17 @@ def green_gain(picture: Picture, table: Chosen | None = None) -> float:
     return math.exp(STEP * round(missing / STEP))
 
 
+def blue_share(picture: Picture, table: Chosen) -> float:
+    """The blue of what a bgr8 picture (height, width, 3) shows of a table, compared with its green; 0 where it is dark.
+
+    `table` is as that of `green_gain`.
+    """
+    few = picture[::STRIDE, ::STRIDE]
+    pixels = few[table].astype(np.float32)
+    pixels = pixels[pixels[:, 1] > DIM]
+    return float(np.median(pixels[:, 0] / pixels[:, 1])) if len(pixels) else 0.0
+
+
 def with_green(picture: Picture, gain: float) -> Picture:
     """The picture with its green so much stronger; itself for a gain of 1."""
     if gain == 1.0:

@@ -42,14 +42,14 @@ from common.applications.pick_place.odd import (
     sized,
     unlike,
 )
-from common.applications.pick_place.resting import Resting, shows_table
+from common.applications.pick_place.resting import Resting, is_table, shows_table
 from common.applications.pick_place.separation import separate
 from common.config import CameraConfig, Parameters, Surroundings, Tunable
 from common.perception.depth import Depth
 from common.perception.exposure import blindness
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouettes
-from common.perception.white import Chosen, looked_at
+from common.perception.white import Chosen, blue_share, looked_at
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
@@ -57,6 +57,9 @@ Picture = npt.NDArray[np.uint8]
 _ROUND = 0.96  # part of an outline that must fit for a blob to be one ball
 _BRIGHT = 60  # [0..255] of green from which on it tells a colour together with blue, also where red is clipped
 _WARMEST = 0.25  # part of the blue, compared with green, that is left in light of 2700 K
+_LEAST_BLUE = 0.15  # of it in light in which balls still show some: that of 2400 K has less
+_LEAST_GREEN = 0.05  # of a ball's colour: what is given for less is no measure of its blue
+_TURNS_RED = 0.25, 0.9  # green of a container, compared with red, of which it looks red when that is clipped
 _LEAST_TABLE = 0.1  # part of a picture that shows the table, at least, for it to tell the colour of the light
 
 Hue = Annotated[int, Field(ge=0, le=180)]
@@ -193,7 +196,7 @@ class Detector:
             for middle, contour in middles(closed, self.options.min_contour_area_px)
             if not any(cv2.pointPolygonTest(contour, one.pixel, False) >= 0 for one in found)
         ] + self._thin(narrow, camera))
-        self.blind, self.too_small = "" if found else blindness(picture), 0
+        self.blind, self.too_small, self._last = "" if found else blindness(picture), 0, None
         return sorted(found, key=lambda d: (d.pixel[1], d.pixel[0]))
 
     def _look_at(self, masks: RedMasks, camera: Pinhole) -> list[Detection]:
@@ -343,18 +346,36 @@ class Detector:
     def _is_floor(self, seen: Detection, picture: Picture, camera: Pinhole) -> bool:
         """Whether what was found in the container has its colour: overexposed in warm light an orange one is red.
 
-        Green and blue are not clipped then: balls have more blue than that, whatever the light.
+        Green and blue are not clipped then: balls have more blue than that, in any light that leaves some.
         """
-        blue_of_ball, blue_of_container = (b / max(g, 1e-3) for _, g, b in (
-            self._around.ball_color, self.resting.container.color))
-        least = _WARMEST * blue_of_ball
-        if blue_of_container > least / 2 or not self.resting.shows_container(camera, seen.pixel):
+        least = self._blue_of_balls
+        if least is None or not self.resting.shows_container(camera, seen.pixel):
             return False
         inner = np.concatenate([seen.pixel + part * (seen.outline - seen.pixel) for part in (0.3, 0.6)])
         u, v = np.clip(np.rint(inner).astype(int), 0, (camera.width - 1, camera.height - 1)).T
         blue, green = picture[v, u, :2].astype(float).T
         bright = green >= _BRIGHT
-        return bool(bright.mean() > 0.5 and np.median(blue[bright] / green[bright]) < least / 2)
+        return bool(bright.mean() > 0.5 and np.median(blue[bright] / green[bright]) < least
+                    and self._blue_of_light(picture) >= _LEAST_BLUE)
+
+    def _blue_of_light(self, picture: Picture) -> float:
+        """The blue of the light, compared with its green, as the table shows it: 1 in daylight, 0 where none tells."""
+        table = next((fixture for fixture in self._around.fixtures
+                      if is_table(fixture, self._around.table_height)), None)
+        if table is None or self._table is None or self._table[1] is None or min(table.color[1:]) <= 0:
+            return 0.0
+        return blue_share(picture, self._table[1]) * table.color[1] / table.color[2]
+
+    @property
+    def _blue_of_balls(self) -> float | None:
+        """The blue, compared with green, that is at least to be seen of balls in warm light.
+
+        None where the container never looks like one: it is neither orange nor brown, or has as much blue.
+        """
+        red, green, blue = self.resting.container.color
+        _, green_of_ball, blue_of_ball = self._around.ball_color
+        least = 0.5 * _WARMEST * min(1.0, blue_of_ball / max(green_of_ball, _LEAST_GREEN))
+        return least if _TURNS_RED[0] <= green / max(red, 1e-3) <= _TURNS_RED[1] and blue <= least * green else None
 
     def _thin(self, narrow: Mask, camera: Pinhole) -> list[Odd]:
         """What is long and thin."""

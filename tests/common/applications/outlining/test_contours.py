@@ -16,8 +16,9 @@ from common.applications.outlining.contours_choice import (
 )
 from common.applications.outlining.contours_drawing import CHOSEN, annotate_contours
 from common.applications.outlining.contours_following import Following
-from common.applications.outlining.contours_refinement import SHORTEST, evened, normals, refine
+from common.applications.outlining.contours_refinement import normals, refine
 from common.applications.outlining.duplicates import simplified
+from common.applications.outlining.evening import SHORTEST, evened
 from common.applications.outlining.messages import Contours, OutlineSelect
 from common.errors import DecodeError
 from common.messages import Color, Header
@@ -138,10 +139,14 @@ def box(width, height):
     return corners @ [(np.cos(TURNED), np.sin(TURNED)), (-np.sin(TURNED), np.cos(TURNED))] + 150.0
 
 
-def wheel(radius, teeth=0):
-    """A circle (720, 2) [px], with waves for teeth."""
-    r = radius + 1.5 * np.sin(teeth * TURNS)
+def wheel(radius, teeth=0, high=1.5, wave=np.sin):
+    """A circle (720, 2) [px], with waves for teeth, or teeth of another form."""
+    r = radius + high * wave(teeth * TURNS)
     return 150.3 + r[:, None] * np.column_stack([np.cos(TURNS), np.sin(TURNS)])
+
+
+def square(turned):
+    return np.sign(np.sin(turned))
 
 
 def outlined(shape, noise):
@@ -163,16 +168,18 @@ def test_noise_of_the_picture_is_evened_out_and_corners_stay_sharp(shape, turns,
     even, off = outlined(shape, 12.0)
     assert off.mean() < 0.08 and off.max() < 0.6
     assert len(simplified(even, 0.2)) < turns, "an outline that zigzags is not followed at an even speed"
-    monkeypatch.setattr("common.applications.outlining.contours_refinement.SHORTEST", np.inf)
+    monkeypatch.setattr("common.applications.outlining.evening.SHORTEST", np.inf)
     rough, off_rough = outlined(shape, 12.0)
     assert off.mean() < 0.7 * off_rough.mean() and len(simplified(rough, 0.2)) > turns
 
 
-@pytest.mark.parametrize("shape", [box(120, 80), box(14, 14), box(20, 12), wheel(70), wheel(60, 40), wheel(60, 24)])
+@pytest.mark.parametrize("shape", [box(120, 80), box(14, 14), box(20, 12), wheel(70), wheel(60, 40), wheel(60, 24),
+                                   wheel(60, 20, 1.0), wheel(60, 25, 0.3),
+                                   wheel(70, 24, 0.5, square), wheel(70, 16, 0.3, square)])
 def test_without_noise_a_contour_stays_as_it_is_and_with_it_details_do(shape, monkeypatch):
     clean, _ = outlined(shape, 0.0)
     _, off = outlined(shape, 12.0)
-    monkeypatch.setattr("common.applications.outlining.contours_refinement.SHORTEST", np.inf)
+    monkeypatch.setattr("common.applications.outlining.evening.SHORTEST", np.inf)
     assert np.array_equal(outlined(shape, 0.0)[0], clean)
     assert off.mean() < 1.1 * outlined(shape, 12.0)[1].mean()
 

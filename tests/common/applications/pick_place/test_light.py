@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -26,10 +27,10 @@ SIDE = CameraConfig(position=(1.15, 0.0, 0.85), rpy=(-2.4, 0.0, math.pi / 2))
 PLACES = [(0.40, -0.30, 0.03), (0.60, -0.10, 0.03), (0.25, 0.20, 0.03), (0.15, -0.15, 0.03), (0.62, 0.02, 0.03)]
 
 
-def balls() -> list[WorldObject]:
+def balls(places: Sequence[tuple[float, float, float]] = PLACES) -> list[WorldObject]:
     return [WorldObject(id=f"ball_{k}", shape="sphere", pose=Pose(position=Vector3(x=x, y=y, z=z)),
                         size=Vector3(x=0.06, y=0.06, z=0.06), color=Color(r=1.0, g=0.15, b=0.1))
-            for k, (x, y, z) in enumerate(PLACES)]
+            for k, (x, y, z) in enumerate(places)]
 
 
 def errors(picture: np.ndarray, camera: Pinhole = CAMERA) -> list[float]:
@@ -96,3 +97,28 @@ def test_overexposed_in_warm_light_the_floor_of_an_orange_container_is_no_ball(
     found = Detector(AROUND).detect(picture, CAMERA)
     inside = [one for one in found if math.dist(one.position[:2], (box.x, box.y)) < box.half_side]
     assert len(inside) == count and len(found) == count + 1, "elsewhere it is what it looks like"
+
+
+@pytest.mark.parametrize(("color", "light"), [
+    ((1.0, 0.6, 0.0), 1700), ((1.0, 0.6, 0.0), 2000), ((1.0, 0.6, 0.0), 2200), ((1.0, 0.6, 0.0), 2700),
+    ((0.0, 0.0, 0.0), 2000), ((0.0, 0.8, 0.0), 2000), ((1.0, 0.9, 0.0), 2000), ((0.0, 0.0, 0.0), 2700),
+])
+def test_balls_in_a_container_are_found_however_warm_and_bright_the_light_is(
+    color: tuple[float, float, float], light: int,
+) -> None:
+    box = AROUND.container.model_copy(update={"color": color})
+    around = AROUND.model_copy(update={"container": box, "containers": {"box": box}})
+    inside = balls([(box.x - 0.04, box.y - 0.04, 0.035), (box.x + 0.04, box.y + 0.04, 0.035)])
+    picture = Renderer(around, camera=CAMERA).see(inside).colour
+    warm = np.clip(np.rint(picture * tint(light) * 3.0), 0, 255).astype(np.uint8)
+    assert len(Detector(around).detect(warm, CAMERA)) == 2
+
+
+@pytest.mark.parametrize("color", [(1.0, 0.0, 0.1), (1.0, 0.01, 0.1), (0.8, 0.0, 0.2), (1.0, 0.15, 0.1)])
+def test_however_little_green_balls_are_said_to_have_those_in_the_container_are_found(
+    color: tuple[float, float, float],
+) -> None:
+    around, box = AROUND.model_copy(update={"ball_color": color}), AROUND.container
+    picture = Renderer(AROUND, camera=CAMERA).see(balls([(box.x, box.y, 0.035)])).colour
+    bright = np.clip(np.rint(picture * 2.0), 0, 255).astype(np.uint8)
+    assert len(Detector(around).detect(bright, CAMERA)) == 1
