@@ -88,9 +88,10 @@ class Helper:
 
     def close(self) -> None:
         """End the process, whatever it does."""
-        if self._streams is not None:
-            self._streams[1].close()
-        self._socket.close()
+        if self._streams is None:
+            self._socket.close()
+        else:
+            self._streams[1].transport.abort()
         self._process.kill()
         self._process.join()
 

@@ -11,6 +11,7 @@ from common.transport.bus import Bus
 
 SAVE_AGAIN = 2.0  # [s] wall after a memory could not be written
 
+
 class Memory:
     """A file in which the memory of a task outlives it, where there is a folder for that."""
 
