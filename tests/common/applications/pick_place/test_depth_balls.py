@@ -91,6 +91,17 @@ def test_balls_on_a_large_red_cloth_are_found_and_no_more_is_tried_than_it_takes
     assert len(found) == len(places) and len(tries) < 40
 
 
+def test_what_is_odd_without_depth_is_told_again_after_a_look_with_it() -> None:
+    view = Renderer(AROUND, camera=CAMERA).see([thing(at) for at in PYRAMID])
+    detector = Detector(AROUND)
+    detector.detect(view.colour, CAMERA)
+    without = detector.odd
+    detector.detect_in_depth(view.colour, view.depth_within(0.1, 2.0), CAMERA)
+    assert without and not detector.odd
+    detector.detect(view.colour, CAMERA)
+    assert detector.odd == without
+
+
 def test_nothing_red_gives_nothing() -> None:
     detector, found = look([])
     assert len(found) == 0 and detector.odd == [] and detector.blind == ""
