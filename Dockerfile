@@ -33,6 +33,13 @@ COPY common common
 COPY --from=kernel /src/common/planning/kernel/*.so common/planning/kernel/
 COPY services services
 COPY cli cli
+COPY applications applications
+COPY page page
+COPY drivers drivers
+COPY recording recording
+COPY tools tools
+COPY lab lab
+COPY security security
 COPY zencell zencell
 COPY examples examples
 COPY config config

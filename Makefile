@@ -22,7 +22,7 @@ $(STAMP): pyproject.toml constraints.txt $(KERNEL) $(wildcard $(VENV)/.extras)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev$(addprefix $(COMMA),$(EXTRAS))]'
 	@touch $@
 
-# A test host of tests/common/hardware/test_franka.py and tests/cells/test_real_arms.py; its numpy is not ours. Nothing else needs it.
+# A test host of tests/drivers/test_franka.py and tests/cells/test_real_arms.py; its numpy is not ours. Nothing else needs it.
 franka-sim: .venv-franka-sim/.up-to-date
 .venv-franka-sim/.up-to-date:
 	$(PYTHON) -m venv .venv-franka-sim

@@ -13,7 +13,8 @@ from setuptools import setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_py import build_py
 
-FOLDERS = ("common", "services", "cli", "config")
+FOLDERS = ("common", "services", "cli", "config", "applications", "page", "drivers", "recording", "tools", "lab",
+           "security")
 KERNEL = Path("common", "planning", "kernel")
 
 

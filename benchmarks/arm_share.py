@@ -18,11 +18,11 @@ from typing import Any
 import msgpack
 from mcap.reader import make_reader
 
+from applications.pick_place.recheck import Recheck, Recording
 from common.application import find_application
-from common.applications.pick_place.recheck import Recheck, Recording
 from common.config import load_cell
-from common.reporting.fold import Fold
 from common.transport.codec import decode
+from recording.report.fold import Fold
 
 ENDS = ("succeeded", "aborted", "cancelled")
 KINDS = {"motion/status": "arm", "gripper/state": "fingers"}

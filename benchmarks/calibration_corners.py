@@ -15,14 +15,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.perception import calibration_board
-from common.perception.calibration import CollectingOptions, calibrate_intrinsics
-from common.perception.calibration_board import Sighting
-from common.perception.calibration_corners import refine
-from common.perception.calibration_file import CameraFile
-from common.perception.calibration_pose import calibrate_pose
+from common.perception.camera_file import CameraFile
 from common.robot.transforms import invert, rpy_to_matrix, transform
-from tests.common.perception.rendered_boards import BOARD, Lens, many_poses, render
+from tests.tools.calibration.rendered_boards import BOARD, Lens, many_poses, render
+from tools.calibration import board as calibration_board
+from tools.calibration.board import Sighting
+from tools.calibration.calibration import CollectingOptions, calibrate_intrinsics
+from tools.calibration.camera_pose import calibrate_pose
+from tools.calibration.corners import refine
 
 Array = npt.NDArray[np.float64]
 Placed = tuple[Array, npt.NDArray[np.bool_]]

@@ -17,12 +17,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from applications.pick_place.recheck import Contact, Recheck, Recording
 from common.application import find_application
-from common.applications.pick_place.recheck import Contact, Recheck, Recording
 from common.config import load_cell
-from common.reporting.fold import Fold
 from common.transport.bus import Bus
 from common.transport.codec import decode
+from recording.report.fold import Fold
 from tests.harness import RunningCell, beside, folder_for
 
 CELL = "panda"

@@ -17,7 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from common.chaos.plan import LABELS
+from lab.chaos.plan import LABELS
 from tests.harness import LOG, SUMMARY, RunningCell, folder_for
 
 USUAL = "panda"

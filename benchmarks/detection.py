@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.applications.pick_place.detector import Detector
+from applications.pick_place.detector import Detector
 from common.config import Surroundings, load_cell
 from common.messages import Color, Pose, Vector3, WorldObject
 from common.perception.pinhole import Pinhole

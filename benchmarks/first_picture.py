@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import psutil
 
-from tests.viewer.conftest import ARGUMENTS, NAMES
+from tests.page.browser.conftest import ARGUMENTS, NAMES
 
 if TYPE_CHECKING:
     from playwright.async_api import Browser

@@ -31,7 +31,7 @@ from common.messages.basics import SMALL, Message
 from common.topics import Topic
 from common.transport.bus import Bus
 from common.transport.codec import decode
-from common.virtual.simulation import Simulation
+from lab.simulation import Simulation
 from tests.gaps import Gaps, Side
 from tests.harness import RunningCell, beside, until
 from tests.mutations import Mutations, models

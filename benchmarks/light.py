@@ -18,8 +18,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from applications.pick_place.detector import Detector, DetectorOptions
 from benchmarks.detection import objects
-from common.applications.pick_place.detector import Detector, DetectorOptions
 from common.config import Cell, Light, Scenery, Surroundings, load_cell
 from common.messages import Header, JointState, WorldObjects
 from common.perception.occlusion import Silhouettes
@@ -27,7 +27,7 @@ from common.perception.sphere import silhouettes as outlines
 from common.robot.model import RobotModel
 from common.sim.camera import CameraParameters, SimulatedCamera
 from common.sim.lens import Lens
-from common.sim.mujoco.gl import chosen_gl
+from drivers.mujoco.gl import chosen_gl
 
 DISTORTION = [0.08, -0.15, 0.001, -0.001]
 SIDE = {"position": (1.15, 0.0, 0.85), "rpy": (-2.4, 0.0, 1.5708)}  # of docs/detection.md

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.applications.outlining.contours import ContourOptions, find_contours, is_hole
-from common.applications.outlining.duplicates import simplified, without_duplicates
-from common.applications.outlining.top_face import TopFaceOptions, top_face
+from applications.outlining.contours import ContourOptions, find_contours, is_hole
+from applications.outlining.duplicates import simplified, without_duplicates
+from applications.outlining.top_face import TopFaceOptions, top_face
 from common.config import Surroundings, World, check, config_root, load_robot, read_yaml
 from common.messages import Header, JointState, WorldObject
 from common.perception.pinhole import Pinhole

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from applications.outlining.figures import distances
+from applications.outlining.messages import OutlinePoints, OutlineStatus
+from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_STATUS
 from common import topics
-from common.applications.outlining.figures import distances
-from common.applications.outlining.messages import OutlinePoints, OutlineStatus
-from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_STATUS
 from common.config import Cell, Surroundings, load_cell
 from common.messages import (
     CollisionObject,

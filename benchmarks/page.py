@@ -26,8 +26,8 @@ import psutil
 from benchmarks.first_picture import chromium, openings
 from common import topics
 from common.messages import SupervisorStatus
-from tests.common.viewer.browser_double import BrowserDouble, opened
 from tests.harness import RunningCell, until
+from tests.page.browser_double import BrowserDouble, opened
 
 SETTLE = 5.0  # [s] after the cell is up, for meshes to be read
 MEASURE = 15.0  # [s]

@@ -21,8 +21,8 @@ from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.sim.interface import load_world
-from common.sim.mujoco.contact import TIMESTEP
-from common.sim.mujoco.world import PhysicsWorld
+from drivers.mujoco.contact import TIMESTEP
+from drivers.mujoco.world import PhysicsWorld
 from tests.simulated.visited import SimulatedCell
 
 Array = NDArray[np.float64]

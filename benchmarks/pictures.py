@@ -22,9 +22,9 @@ from common.robot.model import RobotModel
 from common.sim.depth_sensor import DepthSensorParameters, measured_depth
 from common.sim.interface import load_world
 from common.sim.lighting import REFERENCE
-from common.sim.mujoco.gl import chosen_gl
-from common.sim.mujoco.rendering import PhysicsRenderer
 from common.sim.sensor import Sensor, SensorParameters
+from drivers.mujoco.gl import chosen_gl
+from drivers.mujoco.rendering import PhysicsRenderer
 
 EVEN = Scenery(lights={"above": Light(shadow=False)})
 

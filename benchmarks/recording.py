@@ -15,12 +15,12 @@ from pathlib import Path
 
 import psutil
 
+from applications.outlining.topics import CONTOURS
+from applications.pick_place.topics import DETECTED_OBJECTS
 from common import topics
-from common.applications.outlining.topics import CONTOURS
-from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.messages import SupervisorStatus
-from common.recording.reading import Recording
-from common.recording.summary import Summary, summarise
+from recording.reading import Recording
+from recording.summary import Summary, summarise
 from tests.harness import RunningCell, command_line, environment, folder_for, until
 
 CELLS = {"panda": DETECTED_OBJECTS, "ur5": CONTOURS}

@@ -32,9 +32,9 @@ from statistics import median
 
 import psutil
 
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
 from common.application import all_topics
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.errors import RequestFailed
 from common.messages import WorldEdit
 from common.transport.bus import Bus

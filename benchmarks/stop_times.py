@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from applications.outlining.topics import OUTLINE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
-from common.applications.outlining.topics import OUTLINE_STATUS
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.config import load_cell
 from common.messages import JointState, TaskCommand, TaskStatus, WorldEdit
 from common.robot.model import RobotModel

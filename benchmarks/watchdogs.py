@@ -14,9 +14,9 @@ from pathlib import Path
 
 import psutil
 
+from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
-from common.applications.pick_place.messages import PickPlaceStatus
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import MotionStatus, ServiceStatus, SupervisorStatus
 from common.transport.bus import Bus
 from tests.harness import RunningCell, until

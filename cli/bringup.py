@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from cli import options, verbs
-from common.operation.operation import Operation
+from cli.operation.operation import Operation
 from common.supervision.share import Share
 
 Speed = Annotated[str, typer.Option("--speed", metavar="X", help="cell time per wall time, 0.1 to 10")]
@@ -59,8 +59,8 @@ def _operation(
     until_ended: bool,
 ) -> Operation:
     """What is asked for with the options of `run` and `up`, which are these."""
-    from common.security.requiring import choose
     from common.supervision.interrupts import end_with_stdin
+    from security.requiring import choose
 
     choose(secure)
     operation = Operation(
@@ -85,8 +85,8 @@ def _per_minute(seed: str | None, rate: str | None) -> float:
     Raises:
         ConfigError: the rate cannot be used.
     """
-    from common.chaos.plan import MOST_PER_MINUTE, PER_MINUTE
     from common.errors import ConfigError
+    from lab.chaos.plan import MOST_PER_MINUTE, PER_MINUTE
 
     per_minute = PER_MINUTE if rate is None else options.number("--chaos-rate", rate)
     if not 0 < per_minute <= MOST_PER_MINUTE:

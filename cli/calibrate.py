@@ -14,7 +14,7 @@ from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 
 if TYPE_CHECKING:
-    from common.perception.calibration_board import Board
+    from tools.calibration.board import Board
 
 app = Verbs("Calibrate a real camera with a ChArUco board.")
 
@@ -65,10 +65,10 @@ def intrinsics(
 ) -> None:
     """Find focal lengths, centre and distortion from views of the board all over the picture, tilted to each side."""
     from common.config import check
-    from common.perception.calibration import CollectingOptions, ViewCollector, calibrate_intrinsics
-    from common.perception.calibration_record import camera_of
-    from common.perception.calibration_telling import intrinsics_told
     from common.perception.sources import pictures
+    from tools.calibration.calibration import CollectingOptions, ViewCollector, calibrate_intrinsics
+    from tools.calibration.formatting import intrinsics_told
+    from tools.calibration.record import camera_of
 
     least = options.whole("--views", views, 3) or 3
     settings = check(CollectingOptions, {"least_views": least, "most_views": max(60, least),
@@ -121,11 +121,11 @@ def pose(
 
     Several places, far apart in the picture, make it much more precise: give a SOURCE and a --board-position for each.
     """
-    from common.perception.calibration_file import CameraFile
-    from common.perception.calibration_pose import calibrate_pose, sightings_in
-    from common.perception.calibration_record import with_pose
-    from common.perception.calibration_telling import pose_told
+    from common.perception.camera_file import CameraFile
     from common.robot.transforms import rpy_to_matrix, transform
+    from tools.calibration.camera_pose import calibrate_pose, sightings_in
+    from tools.calibration.formatting import pose_told
+    from tools.calibration.record import with_pose
 
     rotations = board_rpy or ["0,0,0"]
     if len(board_position) != len(sources):
@@ -161,12 +161,12 @@ def hand_eye(
     """Find where a camera is that sits on the hand, or beside an arm that holds the board."""
     from typing import get_args
 
-    from common.perception.calibration import CalibrationFailed
-    from common.perception.calibration_file import CameraFile
-    from common.perception.calibration_hand_eye import LEAST_VIEWS, Mount, calibrate_hand_eye
-    from common.perception.calibration_record import with_hand_eye
-    from common.perception.calibration_telling import hand_eye_told
-    from common.perception.hand_eye_views import load_views
+    from common.perception.camera_file import CameraFile
+    from tools.calibration.calibration import CalibrationFailed
+    from tools.calibration.formatting import hand_eye_told
+    from tools.calibration.hand_eye import LEAST_VIEWS, Mount, calibrate_hand_eye
+    from tools.calibration.record import with_hand_eye
+    from tools.calibration.views import load_views
 
     if mount not in get_args(Mount):
         raise UnknownName("--camera", mount, get_args(Mount))
@@ -196,10 +196,10 @@ def collect(
 
     Bring it there by hand, by jogging or by a script of yours; nothing is moved from here.
     """
-    from common.client.views import collect_views
     from common.config import load_robot
-    from common.perception.hand_eye_views import ViewCollector
     from common.robot.model import RobotModel
+    from tools.calibration.collecting import collect_views
+    from tools.calibration.views import ViewCollector
 
     model = RobotModel.load(load_robot(robot))
     board, wanted = board_of(squares, square, marker, dictionary), options.whole("--views", views, 1) or 1
@@ -218,7 +218,7 @@ def board_of(squares: str, square: str, marker: str, dictionary: str) -> Board:
     from typing import get_args
 
     from common.config import check
-    from common.perception import calibration_board as b
+    from tools.calibration import board as b
 
     columns, rows = _two("--squares", squares, "7x5")
     if dictionary not in get_args(b.Dictionary):

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from cli import options
-from common.completing import offers
+from cli.completing import offers
 from common.errors import UnknownName
 from common.terminal import echo
 

@@ -22,8 +22,8 @@ def check(
 
     Nothing is started and nothing moves. Exit 0 without errors, also with warnings.
     """
-    from common.checking.services import examine
     from common.config import load_cell
+    from tools.check.services import examine
 
     loaded = load_cell(cell, tuple(overrides or ()), world=world, seed=options.whole("--seed", seed, 0))
     errors = warnings = 0

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import options
+from cli.completing import offers
 from cli.place import UP, Place, Verbs
-from common.completing import offers
 from common.errors import ConfigError, UnknownName
 from common.terminal import echo
 

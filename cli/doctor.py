@@ -15,8 +15,8 @@ def doctor(
     domain: options.Domain = None, connect: options.Connect = None, as_json: options.Json = False
 ) -> None:
     """Check this machine and say what to do about what is not well; exit 1 if something fails."""
-    from common.doctor.examining import examine
     from common.transport.endpoint import endpoint_of
+    from tools.doctor.examining import examine
 
     endpoint = endpoint_of(domain, connect)
     failed = False

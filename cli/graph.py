@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli import options
+from cli.completing import offers
 from cli.place import Place
-from common.completing import offers
 from common.errors import ConfigError
 from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.config import Cell
-    from common.graph.drawing import Graph
-    from common.graph.wired import Wired
+    from common.supervision.wired import Wired
+    from tools.graph.drawing import Graph
 
 FORMATS = (".svg", ".dot", ".mmd")
 
@@ -38,8 +38,8 @@ def graph(
 ) -> None:
     """Draw services and topics of a cell, up or not; while it is up, what is not alive is dashed."""
     from common.config import load_cell
-    from common.graph.drawing import graph_of, names
-    from common.viewer.access import VIEWER
+    from page.access import VIEWER
+    from tools.graph.drawing import graph_of, names
 
     path = Path(output).expanduser() if output else None
     write = _writer_of(path)
@@ -57,8 +57,8 @@ def graph(
 
 
 def _writer_of(path: Path | None) -> Callable[[Graph], str]:
-    from common.graph.drawing import dot, mermaid
-    from common.graph.svg import svg
+    from tools.graph.drawing import dot, mermaid
+    from tools.graph.svg import svg
 
     writers = dict(zip(FORMATS, (svg, dot, mermaid), strict=True))
     if path is None:
@@ -70,7 +70,7 @@ def _writer_of(path: Path | None) -> Callable[[Graph], str]:
 
 def _wired_services(cell: Cell) -> list[Wired]:
     """The services of a cell in start order; one that cannot be wired is drawn without its keys."""
-    from common.graph.wired import Unwired, Wired, wired
+    from common.supervision.wired import Unwired, Wired, wired
 
     found = []
     for entry in cell.services.values():

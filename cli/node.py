@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from cli import options
+from cli.completing import offers
 from cli.place import Place, Verbs
-from common.completing import offers
 from common.terminal import echo
 
 app = Verbs("Services: who is ready, and what each has to do with.")
@@ -50,7 +50,7 @@ def info(
 ) -> None:
     """Show what a service reads, writes, serves and calls, its parameters, and how it is while a cell is up."""
     from common.client.service import described, find, lines, parameters_of
-    from common.graph.wired import wired
+    from common.supervision.wired import wired
 
     cells = Place(domain=domain, connect=connect).look()
     loaded, entry = find(service, cell, cells)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from common.completing import offers
+from cli.completing import offers
 from common.errors import ConfigError
 
 MOST_PER_SECOND = 1000.0  # messages or lines

@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from cli import options
+from cli.completing import offers
 from cli.place import UP, Place, Verbs
-from common.completing import offers
 from common.terminal import echo
 
 app = Verbs("Parameters of running services: what there is, and changing it.")

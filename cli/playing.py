@@ -15,7 +15,7 @@ from common.errors import ConfigError
 from common.terminal import echo, rewrite
 
 if TYPE_CHECKING:
-    from common.client.player import Player
+    from recording.player import Player
 
 MOST_RATE = 1000.0
 
@@ -48,11 +48,11 @@ def play_(
 
     On a terminal space pauses, right steps one message, down one picture, left goes back 5 s, q quits.
     """
-    from common.client.playing import play, played_of, renaming
-    from common.recording.reading import Recording
-    from common.recording.selection import Selection
     from common.remapping import is_cell
     from common.transport.credentials import refuse_to_publish
+    from recording.playing import play, played_of, renaming
+    from recording.reading import Recording
+    from recording.selection import Selection
 
     refuse_to_publish("play")
     selection = Selection.of([*(keys or ()), *(topics or ())], None, exclude)
@@ -71,7 +71,7 @@ def play_(
             raise ConfigError("--loop", ..., f"needs a recording with a length, which {file} has not")
 
         def make() -> Player:
-            from common.client.player import Player
+            from recording.player import Player
 
             return Player(recording, selection.wants, renamed, rate=speed, offset=offset, loop=loop,
                           paused=start_paused, stamp_now=stamp_now)

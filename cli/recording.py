@@ -12,11 +12,11 @@ from typing import Annotated
 import typer
 
 from cli import options
+from cli.completing import offers
 from cli.place import UP, Place
-from common.completing import offers
 from common.errors import ConfigError
-from common.recording.telling import contents, in_bytes, require_new
 from common.terminal import echo, rewrite
+from recording.telling import contents, in_bytes, require_new
 
 LEAST_FILE = 1.0  # [MB] of a recording that is split
 
@@ -42,11 +42,11 @@ def record_(
     own: Annotated[str, typer.Option("--own", hidden=True, help="under a supervisor: what is in the cell's file")] = "",
 ) -> None:
     """Record what travels in a cell, all keys if none are given, until Ctrl-C."""
-    from common.client.recorder import Asked, record, record_gated, require_published
     from common.config import load_cell
-    from common.recording.own import Own
-    from common.recording.selection import Selection
     from common.transport.credentials import identity_of_listener
+    from recording.own import Own
+    from recording.recorder import Asked, record, record_gated, require_published
+    from recording.selection import Selection
 
     beside, cell = Own.read(own) if own else Own(), at.cell
     if cell is not None and cell.endswith((".yaml", ".yml")):
@@ -80,8 +80,8 @@ def _positive(option: str, text: str | None) -> float | None:
 
 def info(file: File, as_json: options.Json = False) -> None:
     """Show what is in a recording: each topic with its type, count, rate and size, how long it is, what was lost."""
-    from common.recording.reading import Recording
-    from common.recording.summary import summarise
+    from recording.reading import Recording
+    from recording.summary import summarise
 
     with Recording(Path(file)) as recording:
         summary = summarise(recording)
@@ -99,7 +99,7 @@ def recover(
     ] = None,
 ) -> None:
     """Make a whole file of a recording that was cut by a kill or a full disk."""
-    from common.recording.recovery import recover as recover_file
+    from recording.recovery import recover as recover_file
 
     source = Path(file)
     target = Path(output) if output else source.with_name(f"{source.stem}_recovered.mcap")

@@ -24,9 +24,9 @@ def report(
     ] = None,
 ) -> None:
     """Write one page about a recorded run: timeline, plans, latency, joints, what was seen, and what went wrong."""
-    from common.recording.reading import Recording
-    from common.recording.sample import RecordingError
-    from common.reporting.recorded import cut, page_of
+    from recording.reading import Recording
+    from recording.report.recorded import cut, page_of
+    from recording.sample import RecordingError
 
     path = Path(file)
     page_path = Path(output).expanduser() if output else path.with_suffix(".html")

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 import typer
 
 from cli import options, robot_new
+from cli.completing import offers
 from cli.place import UP, Place, Verbs
-from common.completing import offers
 from common.errors import ConfigError
 from common.terminal import echo
 

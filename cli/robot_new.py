@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from common.completing import offers
+from cli.completing import offers
 from common.errors import ConfigError
 from common.terminal import echo
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
-    from common.setup.proposal import Proposal
+    from tools.robot_setup.proposal import Proposal
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")
 
@@ -41,11 +41,11 @@ def new(
     """Write a robot file for an arm from its URDF: what it says, what is measured on it, and guesses marked as such."""
     from common.config import names_of
     from common.robot.merging import read_urdf
-    from common.setup.cell_like import layout_of, write_cell
-    from common.setup.meshes import folders_of_meshes
-    from common.setup.proposal import draft, finish
-    from common.setup.tree import find_wrists, read_tree
-    from common.setup.writing import robot_file
+    from tools.robot_setup.cell_like import layout_of, write_cell
+    from tools.robot_setup.meshes import folders_of_meshes
+    from tools.robot_setup.proposal import draft, finish
+    from tools.robot_setup.tree import find_wrists, read_tree
+    from tools.robot_setup.writing import robot_file
 
     sources = {"urdf": urdf, "--gripper": gripper}
     urdf, gripper = (_described(each, out, force) for each in (urdf, gripper))
@@ -102,8 +102,8 @@ def check(
     from common.config import load_robot
     from common.planning.robot_geometry import RobotGeometry
     from common.robot.model import RobotModel
-    from common.setup.hand import complaints
-    from common.setup.home import hits
+    from tools.robot_setup.hand import complaints
+    from tools.robot_setup.home import hits
 
     robot = RobotModel.load(load_robot(name))
     wrong = complaints(robot)
@@ -148,7 +148,7 @@ def _described(urdf: str, out: str, force: bool) -> str:
     """The URDF, made of a xacro file where it is one."""
     if not urdf.endswith(".xacro"):
         return urdf
-    from common.setup.xacro import urdf_of_xacro
+    from tools.robot_setup.xacro import urdf_of_xacro
 
     return urdf_of_xacro(urdf, Path(out).expanduser().parent if out else Path(), overwrite=force)
 

@@ -23,8 +23,6 @@ def config(
     secure: options.Secure = None,
 ) -> None:
     """Print the router's configuration as JSON5, for zenohd or the image eclipse/zenoh."""
-    from common.security.checking import require_valid
-    from common.security.requiring import choose
     from common.supervision.launch import Launch
     from common.transport.credentials import ROUTER_NAME, credentials_of, read_access, secure_folder
     from common.transport.endpoint import (
@@ -34,6 +32,8 @@ def config(
         parse_domain,
         router_settings,
     )
+    from security.checking import require_valid
+    from security.requiring import choose
 
     choose(secure)
     given = os.environ.get(DOMAIN_VARIABLE, DEFAULT_DOMAIN) if domain is None else domain

@@ -35,10 +35,10 @@ def init(
 ) -> None:
     """Make an authority, a certificate for each process, and the router's rules of who may do what."""
     from common.config import load_cell, names_of
-    from common.security.folder import authority_files, make
-    from common.security.rights import rights_in
     from common.transport.credentials import ACCESS
-    from common.viewer.access import VIEWER
+    from page.access import VIEWER
+    from security.folder import authority_files, make
+    from security.rights import rights_in
 
     valid = options.whole("--days", days, 1)
     assert valid is not None
@@ -64,8 +64,8 @@ def renew_(
     The router takes what is new within seconds and has everybody connect anew, each with what is new of his own.
     """
     from common.errors import ConfigError
-    from common.security.folder import authority_files, renew
-    from common.security.folder import forget as forget_others
+    from security.folder import authority_files, renew
+    from security.folder import forget as forget_others
 
     valid, place = options.whole("--days", days, 1), Path(folder)
     assert valid is not None
@@ -87,8 +87,8 @@ def renew_(
 def show(folder: Folder, as_json: options.Json = False) -> None:
     """Show who may do what, as the router enforces it, and until when each certificate is valid."""
     from common.errors import ConfigError
-    from common.security.checking import allowances, certificate_in
     from common.transport.credentials import ROUTER_NAME, read_access
+    from security.checking import allowances, certificate_in
 
     place = Path(folder)
     allowed = allowances(read_access(place))
@@ -122,10 +122,10 @@ def check(
     """Say whether the certificates are valid, and the rules those that the cells' services need now."""
     from common.config import load_cell, names_of
     from common.errors import ConfigError
-    from common.security.checking import require_current, require_valid
-    from common.security.requiring import renewal
-    from common.security.rights import rights_in
     from common.transport.credentials import OPERATOR, RECORDER, ROUTER_NAME, common_name, read_access
+    from security.checking import require_current, require_valid
+    from security.requiring import renewal
+    from security.rights import rights_in
 
     if only and len(cells or ()) != 1:
         raise ConfigError("--only", ",".join(only), "needs the one cell that they are services of: --cell CELL")

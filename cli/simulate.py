@@ -43,9 +43,9 @@ def simulate(
     from common.config import load_cell
     from common.errors import ConfigError
     from common.process.environment import usable_cores
-    from common.virtual.doubles import settings_of, with_doubles
-    from common.virtual.telling import seeds_of
-    from common.virtual.watched_arm import with_watched_arm
+    from lab.doubles import settings_of, with_doubles
+    from lab.telling import seeds_of
+    from lab.watched_arm import with_watched_arm
 
     if seeds is not None and seed is not None:
         raise ConfigError("--seed", seed, "does not go with --seeds")
@@ -69,11 +69,11 @@ def simulate(
 
 def _single(cell: Cell, seed: int, faults: bool, file: str | None, limit: float) -> int:
     """Run one seed and tell of all that happened; the exit code."""
-    from common.recording.own import Own
-    from common.recording.telling import about, require_new
-    from common.virtual.simulation import Simulation
-    from common.virtual.telling import told
-    from common.virtual.trace import Trace
+    from lab.simulation import Simulation
+    from lab.telling import told
+    from lab.trace import Trace
+    from recording.own import Own
+    from recording.telling import about, require_new
 
     trace = None
     if file is not None:
@@ -97,8 +97,8 @@ def _campaign(cell: Cell, seeds: Sequence[int], faults: bool, jobs: int, limit: 
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from common.virtual.campaign import Tally, run_seeds
-    from common.virtual.telling import reason, table
+    from lab.campaign import Tally, run_seeds
+    from lab.telling import reason, table
 
     tally, interrupted = Tally(), False
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

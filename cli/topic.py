@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli import options, publishing
+from cli.completing import offers
 from cli.place import UP, Place, Verbs
 from common import terminal
-from common.completing import offers
 
 if TYPE_CHECKING:
     from common.client.keys import Known

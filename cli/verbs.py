@@ -47,8 +47,8 @@ class CommandShell:
         seed: str | None, domain: str | None, connect: str | None,
     ) -> T:
         """What a visit to a cell returns: to one that is up, or one that is brought up for it without its task."""
+        from cli.operation.operation import Operation
         from common.config import load_cell
-        from common.operation.operation import Operation
         from common.supervision.launch import place_of, require_free_port
         from common.transport.endpoint import endpoint_of
         from common.transport.router import PortInUse

@@ -1,6 +1,6 @@
 """Applications: what a cell is for. The platform names none; it finds them.
 
-An application is a package of common/applications, or a dotted module of a person's own, which may be a single file.
+An application is a package of applications, or a dotted module of a person's own, which may be a single file.
 What it brings lies in modules of these names within the package, or else in the file itself:
 
     topics    its keys as `Topic` and `Request`, with their messages; and, by these names, the ones that all look for:
@@ -17,10 +17,10 @@ What it brings lies in modules of these names within the package, or else in the
     truth     (optional) `wrong_in(WorldObjects) -> str`: what is wrong with where things really are when the task says
               DONE, in words; empty when nothing is. For the evaluation of a simulated run only
     page      (optional) labels and layers of the operator's page
-    recording (optional) how its messages are written for other tools, as common/recording/foxglove.py says
+    recording (optional) how its messages are written for other tools, as recording/foxglove.py says
     verbs     (optional) verbs of the command line, as common/verbs.py says
     checks    (optional) what `zencell check` finds beside its own, as generators of findings: `quick(cell)`, from the
-                files alone, and `reach(cell, arm)`, with an arm of common/checking/arm.py
+                files alone, and `reach(cell, arm)`, with an arm of tools/check/arm.py
     reach     (optional) for `zencell robot new --cell`:
                 fitted(RobotModel, tree of a cell file) -> that tree with a world in reach of the robot
     double    (optional) a service, with `Config` and `run`, that stands for its perception in `simulate --doubles`:
@@ -35,7 +35,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import pkgutil
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -46,24 +45,25 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
 
 from common.errors import ConfigError, UnknownName
+from common.plugins import find_plugin, plugin_names
 
 if TYPE_CHECKING:  # they take longer to load than a person at the command line wants to wait
     from common.messages import Message, TaskStatus, WorldObjects
     from common.topics import AnyTopic, Request, Topic
 
-PACKAGE = "common.applications"
+GROUP = "zencell.applications"
 
 
 @dataclass(frozen=True)
 class Application:
-    """An application by its name in common/applications, or by that of its own dotted module."""
+    """An application by its name in applications, or by that of its own dotted module."""
 
     name: str
 
     @property
     def module(self) -> ModuleType:
         """The package, or the single file."""
-        return importlib.import_module(self.name if "." in self.name else f"{PACKAGE}.{self.name}")
+        return find_plugin(GROUP, self.name, field="application", noun="application")
 
     def part(self, name: str) -> ModuleType | None:
         """The module of that name within the package, or None; a single file is all parts of itself."""
@@ -132,7 +132,7 @@ class Application:
 
 def application_names() -> list[str]:
     """Applications that come with the project."""
-    return sorted(found.name for found in pkgutil.iter_modules(importlib.import_module(PACKAGE).__path__))
+    return plugin_names(GROUP)
 
 
 def applications() -> Iterator[Application]:
@@ -151,10 +151,7 @@ def find_application(name: str) -> Application:
         raise UnknownName("application", name, application_names())
     found = Application(name)
     look_where_one_stands()
-    try:
-        _ = found.module
-    except ImportError as error:
-        raise ConfigError("application", name, f"cannot be imported: {error}") from None
+    _ = found.module
     return found
 
 

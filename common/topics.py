@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import InitVar, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 from common import messages as m
-from common.moved import moved_to_applications
 
 Kind = Literal["stream", "event", "state", "request"]
 PublishedKind = Literal["stream", "event", "state"]
@@ -158,7 +157,3 @@ _OF_EACH: dict[str, Topic[Any] | Request[Any, Any]] = {
 def platform_topics() -> dict[str, AnyTopic]:
     """Every topic of this file by key, in its order."""
     return {value.key: value for value in globals().values() if isinstance(value, Topic | Request)}
-
-
-if not TYPE_CHECKING:  # which would take any name for one that is there
-    __getattr__ = moved_to_applications(__name__, "topics")

@@ -6,7 +6,6 @@ from typing import Any
 
 import yaml
 
-from common.viewer.access import TOKEN_VARIABLE
 from deploy.containers import (
     CONFIG,
     DATA,
@@ -19,6 +18,7 @@ from deploy.containers import (
     containers_of,
     router,
 )
+from page.access import TOKEN_VARIABLE
 
 HEAD = """\
 # Made by `make deploy` from config/cells: change those, not this file.
@@ -64,7 +64,7 @@ DEV_HEAD = """\
 #   docker compose -f compose.yaml -f compose.dev.yaml up --build
 services:
 """
-SOURCE = ("common", "services", "cli")
+SOURCE = ("common", "services", "cli", "applications", "page", "drivers", "recording", "tools", "lab", "security")
 
 
 def compose_dev() -> str:
@@ -79,7 +79,8 @@ def compose_dev() -> str:
             "image": f"{IMAGE}-dev",
             "build": {"context": ".", "target": "dev"},
             "volumes": [f"./{folder}:/app/{folder}:ro" for folder in SOURCE],
-            "command": ["watchfiles", "--filter", "deploy.watched.concerns", started, "/app/common", "/app/services"],
+            "command": ["watchfiles", "--filter", "deploy.watched.concerns", started,
+                        *(f"/app/{folder}" for folder in SOURCE)],
         }))
     return DEV_HEAD + "\n".join(blocks)
 

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from common.transport.credentials import ACCESS, AUTHORITY, OPERATOR, ROUTER_NAME, common_name
-from common.viewer.access import ROLES, token_file
 from deploy.compose import lines_of
 from deploy.containers import IMAGE, ROUTER, ROUTER_PORT, cells, containers_of
+from page.access import ROLES, token_file
 
 HEAD = """\
 # Made by `make deploy`. Laid over compose.yaml; what it mounts is made by

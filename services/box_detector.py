@@ -8,8 +8,8 @@ from collections import deque
 
 import cv2
 
+from applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common import topics
-from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common.config import Surroundings
 from common.messages import Color, Header, Image, Marker, MarkerArray, Pose, Quaternion, Vector3
 from common.perception.boxes import BoxDetector, BoxOptions, SeenBox, outlined

@@ -11,7 +11,7 @@ from common import topics
 from common.config import Surroundings, Tunable
 from common.errors import ConfigError
 from common.messages import CameraInfo
-from common.perception.calibration_file import CameraFile, Rectifier, require_size
+from common.perception.camera_file import CameraFile, Rectifier, require_size
 from common.perception.image import array_to_image
 from common.perception.sources import Source, open_source
 from common.process.pace import Pace

@@ -7,13 +7,13 @@ import asyncio
 import cv2
 from pydantic import Field
 
+from applications.outlining.contours import ContourOptions, Picture, find_contours
+from applications.outlining.contours_choice import NoSuchContour, parse_choice
+from applications.outlining.contours_drawing import annotate_contours
+from applications.outlining.contours_following import Following
+from applications.outlining.messages import Contour, Contours, OutlineSelect, OutlineSelection
+from applications.outlining.topics import CONTOUR_IMAGE, CONTOURS, OUTLINE_SELECT
 from common import topics
-from common.applications.outlining.contours import ContourOptions, Picture, find_contours
-from common.applications.outlining.contours_choice import NoSuchContour, parse_choice
-from common.applications.outlining.contours_drawing import annotate_contours
-from common.applications.outlining.contours_following import Following
-from common.applications.outlining.messages import Contour, Contours, OutlineSelect, OutlineSelection
-from common.applications.outlining.topics import CONTOUR_IMAGE, CONTOURS, OUTLINE_SELECT
 from common.errors import ConfigError, Refused
 from common.messages import Image
 from common.perception.image import array_to_image

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from common.applications.outlining.legs import OutlineView
-from common.applications.outlining.task import Config, Outline
-from common.applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
+from applications.outlining.legs import OutlineView
+from applications.outlining.task import Config, Outline
+from applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
 from common.process.service import main
 from common.process.task_runner import run_task
 from common.transport.bus import Bus

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, ValidationError
 
-from common.applications.outlining.duplicates import simplified, without_duplicates
-from common.applications.outlining.messages import OutlinePoints
-from common.applications.outlining.stage_files import StageFileError, read_coordinates
-from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS
+from applications.outlining.duplicates import simplified, without_duplicates
+from applications.outlining.messages import OutlinePoints
+from applications.outlining.stage_files import StageFileError, read_coordinates
+from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS
 from common.config import Parameters, Tunable
 from common.errors import ConfigError
 from common.messages import Pose, Vector3

@@ -15,7 +15,6 @@ from typing import Any, Literal
 from pydantic import Field
 
 from common import topics
-from common.checking.arm import require_free_home
 from common.config import Motion, Parameters, Pipeline, RobotConfig, Run, Surroundings
 from common.errors import Refused, RemoteError, RequestFailed
 from common.messages import (
@@ -41,6 +40,7 @@ from common.robot.finger_joints import measured_width
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 from common.transport.reader import Reader
+from tools.check.arm import require_free_home
 
 HOLDER: Literal["scene_monitor"] = "scene_monitor"
 REQUEST_TIMEOUT = 0.2  # [s] wall; it is asked again after that

@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 
+from applications.outlining.messages import Contours
+from applications.outlining.perceived_solids import perceived_solids
+from applications.outlining.scene import planning_scene, require_apart
+from applications.outlining.topics import CONTOURS
 from common import topics
-from common.applications.outlining.messages import Contours
-from common.applications.outlining.perceived_solids import perceived_solids
-from common.applications.outlining.scene import planning_scene, require_apart
-from common.applications.outlining.topics import CONTOURS
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Image, PlanningScene
 from common.perception.depth import DepthError, check_depth, depth_of

@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 from collections import OrderedDict
 
+from applications.outlining.contours import is_hole
+from applications.outlining.messages import MOST_POINTS, Contours, OutlinePoints
+from applications.outlining.top_face import TopFace, TopFaceOptions, top_face
+from applications.outlining.topics import CONTOUR_POINTS, CONTOURS
 from common import topics
-from common.applications.outlining.contours import is_hole
-from common.applications.outlining.messages import MOST_POINTS, Contours, OutlinePoints
-from common.applications.outlining.top_face import TopFace, TopFaceOptions, top_face
-from common.applications.outlining.topics import CONTOUR_POINTS, CONTOURS
 from common.config import Surroundings
 from common.errors import ZencellError
 from common.messages import Header, Image, Pose, Vector3

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from applications.pick_place.perceived import PerceivedScene
+from applications.pick_place.tracks import SceneParameters
+from applications.pick_place.views import Seen, Views, ViewsParameters
 from common import topics
-from common.applications.pick_place.perceived import PerceivedScene
-from common.applications.pick_place.tracks import SceneParameters
-from common.applications.pick_place.views import Seen, Views, ViewsParameters
 from common.config import RobotConfig, Surroundings
 from common.errors import ConfigError
 from common.perception.intake import LeftOut, Unusable

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from common.applications.pick_place.choice import PickPlaceView
-from common.applications.pick_place.parameters import Config
-from common.applications.pick_place.task import PickPlace
-from common.applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_TARGETS
+from applications.pick_place.choice import PickPlaceView
+from applications.pick_place.parameters import Config
+from applications.pick_place.task import PickPlace
+from applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common.process.service import main
 from common.process.task_runner import run_task
 from common.transport.bus import Bus

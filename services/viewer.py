@@ -14,20 +14,20 @@ from common.config import Members, Parameters, RobotConfig, Run, Surroundings
 from common.process.service import main
 from common.transport.bus import Bus
 from common.transport.credentials import secure_folder
-from common.viewer.access import address_of, tokens_in
-from common.viewer.console import Console
-from common.viewer.doors import Doors
-from common.viewer.feeds import Feeds, Latest, Periods, Topics
-from common.viewer.guard import close_server, make_server
-from common.viewer.layers import Layers, find_layers
-from common.viewer.layout import load_layout
-from common.viewer.line import Line
-from common.viewer.page import Page
-from common.viewer.recorded import folder_of
+from page.access import address_of, tokens_in
+from page.console import Console
+from page.doors import Doors
+from page.feeds import Feeds, Latest, Periods, Topics
+from page.guard import close_server, make_server
+from page.layers import Layers, find_layers
+from page.layout import load_layout
+from page.line import Line
+from page.page import Page
+from page.recorded import folder_of
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
-    from common.viewer.scene import Scene
+    from page.scene import Scene
 
 IDLE_PERIOD = 0.1  # [s] wall: without a browser
 START_PATIENCE = 15.0  # [s] wall: for the other services to be ready
@@ -66,8 +66,8 @@ def load(
     """The scene with its meshes, the robot and the names of the planners; takes seconds."""
     from common.planning.planners import planner_names
     from common.robot.model import RobotModel
-    from common.viewer.scene import Scene
-    from common.viewer.viser_inside import client_files
+    from page.scene import Scene
+    from page.viser_inside import client_files
 
     client_files()  # kept from now on
     robot = RobotModel.load(config.robot)

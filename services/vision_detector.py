@@ -11,12 +11,12 @@ from functools import lru_cache
 import cv2
 from pydantic import Field
 
+from applications.pick_place.annotation import annotate
+from applications.pick_place.detector import Detection, Detector, DetectorOptions, rehearse
+from applications.pick_place.odd import Odd
+from applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
+from applications.pick_place.tracks import Place
 from common import topics
-from common.applications.pick_place.annotation import annotate
-from common.applications.pick_place.detector import Detection, Detector, DetectorOptions, rehearse
-from common.applications.pick_place.odd import Odd
-from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
-from common.applications.pick_place.tracks import Place
 from common.config import Surroundings
 from common.config.basics import Rgb
 from common.messages import Color, Header, Image, Marker, MarkerArray, Pose, Vector3

@@ -8,15 +8,15 @@ from contextlib import suppress
 
 from pydantic import Field
 
-from common.applications.pick_place.region import MOST_HIDDEN, Region
-from common.applications.pick_place.remembered import HIDDEN, Remembered
-from common.applications.pick_place.topics import (
+from applications.pick_place.region import MOST_HIDDEN, Region
+from applications.pick_place.remembered import HIDDEN, Remembered
+from applications.pick_place.topics import (
     REJECTED_TARGETS,
     VALIDATED_TARGETS,
     WORKSPACE_MARKERS,
 )
-from common.applications.pick_place.validation import Validation
-from common.applications.pick_place.views import Seen, Views, ViewsParameters
+from applications.pick_place.validation import Validation
+from applications.pick_place.views import Seen, Views, ViewsParameters
 from common.config import Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
 from common.messages.geometry import MOST_POSES

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from common import topics
-from common.recording.stamps import stamp_of
 from common.transport.bus import Bus
 from common.transport.codec import decode_attachment
 from common.transport.session import RawSample
+from recording.stamps import stamp_of
 
 GAP = 0.05  # [s] between two joint states
 LOOK = 0.01  # [s] between two looks at what the executor spends

@@ -29,16 +29,16 @@ from common.messages import CameraInfo, Image, Pose, Vector3, WorldObject, World
 from common.planning.planners import load_planner
 from common.process.in_process import running_service
 from common.process.wiring import wiring
-from common.recording.reading import Recording
 from common.robot.model import RobotModel
 from common.tasks.stages import View
 from common.topics import CAMERA_IMAGE, CAMERA_INFO, GRIPPER_STATE, SCENE_OBJECTS
 from common.transport.codec import decode
 from common.transport.local import LocalNetwork
-from common.viewer.guard import close_server, make_server
+from page.guard import close_server, make_server
+from recording.reading import Recording
 from tests import pages
-from tests.common.viewer.scene_cell import Stage
 from tests.harness import ask, free_domain
+from tests.page.scene_cell import Stage
 from tests.simulated.visited import no_processes
 
 ROOT = Path(__file__).resolve().parent.parent

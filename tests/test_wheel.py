@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ("common", "services", "cli", "zencell")
+FOLDERS = ("common", "services", "cli", "zencell", "applications", "page", "drivers", "recording", "tools", "lab",
+           "security")
 KERNEL = Path("common", "planning", "kernel")
 DOMAIN = 110
 
@@ -68,7 +69,7 @@ services: {mine.task: }
 # What the doctor says of the kernel, and who plans around a wall.
 PLAN = """
 import zencell
-from common.doctor.software import kernel
+from tools.doctor.software import kernel
 from common.config import load_cell
 from common.messages import CollisionObject, Header, JointGoal, PlanningScene, PlanRequest, Pose, Vector3
 from common.planning.pipeline import PlanningPipeline

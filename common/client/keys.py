@@ -63,7 +63,7 @@ async def _live(cell: str | None, domain: str | None, connect: str | None) -> li
 
 
 def _of_files(cell: str | None) -> list[Found]:
-    from common.graph.wired import Unwired, wired
+    from common.supervision.wired import Unwired, wired
 
     found: list[Found] = []
     for name in [cell] if cell else names_of("cells"):

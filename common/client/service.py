@@ -12,8 +12,8 @@ from common.client.joining import Presence, joined
 from common.config import Cell, ServiceEntry, load_cell, names_of, service_names
 from common.config.tunables import describe
 from common.errors import RequestFailed, UnknownName
-from common.graph.wired import Wired
 from common.messages import Parameter, ParameterRequest, ServiceStatus
+from common.supervision.wired import Wired
 from common.transport.keys import ROUTER
 
 ASK_TIMEOUT = 2.0  # [s]

@@ -58,7 +58,7 @@ class Cell(Section):
     watchdogs: Watchdogs = Watchdogs()
     services: dict[str, ServiceEntry]
     task: str = Field(description="the service that runs the task and ends in DONE")
-    application: str = Field(description="what the cell is for: a name of common/applications, or a dotted module")
+    application: str = Field(description="what the cell is for: a name of applications, or a dotted module")
 
     @property
     def name(self) -> str:

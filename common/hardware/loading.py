@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from collections.abc import Callable
 from typing import Any, Protocol, cast
 
 from common.config import Parameters, RobotConfig, check
 from common.errors import ConfigError, UnknownName
 from common.hardware.interface import Hardware, Limits, Vector
+from common.plugins import find_plugin, plugin_names
 
-PACKAGE = "common.hardware"
+GROUP = "zencell.hardware"
 WORLDS = ("mujoco",)  # simulators that are looked for here
 STANDS_IN = "mock"  # for the arm of a simulated world, where that has one
 
 
 def backend_names() -> list[str]:
-    """Backends that come with the project: the modules of this folder that create one."""
-    folder = importlib.import_module(PACKAGE).__path__
-    names = [found.name for found in pkgutil.iter_modules(folder)]
-    return sorted(name for name in names if hasattr(importlib.import_module(f"{PACKAGE}.{name}"), "create"))
+    """Return the plain names of all backends."""
+    return [name for name in plugin_names(GROUP, "create") if name not in WORLDS]
 
 
 class Backend(Protocol):
@@ -44,12 +41,9 @@ def find_backend(robot: RobotConfig) -> Backend:
     if name in WORLDS:
         raise ConfigError("robot.hardware.backend", name, "is a simulated world with an arm in it: leave the "
                           f"backend at {STANDS_IN} and say world.simulator: {name} in the cell")
-    if "." not in name and name not in backend_names():
-        raise UnknownName("hardware backend", name, backend_names())
-    try:
-        module = importlib.import_module(name if "." in name else f"{PACKAGE}.{name}")
-    except ImportError as error:
-        raise ConfigError("robot.hardware.backend", name, f"cannot be imported: {error}") from None
+    if "." not in name and name not in (choices := backend_names()):
+        raise UnknownName("hardware backend", name, choices)
+    module = find_plugin(GROUP, name, field="robot.hardware.backend", noun="hardware backend", marker="create")
     missing = [part for part in ("Options", "create", "simulated") if not hasattr(module, part)]
     if missing:
         raise ConfigError("robot.hardware.backend", name, f"is no backend: it has no {', '.join(missing)}")

@@ -59,7 +59,3 @@ from common.messages.robot import JointState, JointTrajectory, JointTrajectoryPo
 from common.messages.scene import AttachedObject, CollisionObject, PlanningScene, SceneEdit, SceneEditReply
 from common.messages.task import PlanFigure, TaskCommand, TaskStatus
 from common.messages.world import SceneUpdate, WorldEdit, WorldEditReply, WorldObject, WorldObjects
-from common.moved import moved_to_applications
-
-if not TYPE_CHECKING:  # which would take any name for one that is there
-    __getattr__ = moved_to_applications(__name__, "messages")

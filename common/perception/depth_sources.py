@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from common.config import Parameters, check
 from common.errors import ConfigError, ZencellError
+from common.plugins import find_plugin, plugin_names
 
-DRIVERS = ("realsense", "oak")  # modules of common/perception/depth_drivers
-PACKAGE = "common.perception.depth_drivers"
+GROUP = "zencell.cameras"
 
 Picture = npt.NDArray[np.uint8]
 Depth = npt.NDArray[np.float32]
@@ -91,12 +91,9 @@ def find_driver(name: str, given: dict[str, Any], field: str) -> tuple[Driver, P
     Raises:
         ConfigError: no such module, or not one that opens cameras; or an option that does not fit.
     """
-    if "." not in name and name not in DRIVERS:
-        raise ConfigError(field, name, f"must be one of {', '.join(DRIVERS)}, or the dotted name of a module of yours")
-    try:
-        module = importlib.import_module(name if "." in name else f"{PACKAGE}.{name}")
-    except ImportError as error:
-        raise ConfigError(field, name, f"cannot be imported: {error}") from None
+    if "." not in name and name not in (choices := plugin_names(GROUP, "open_camera")):
+        raise ConfigError(field, name, f"must be one of {', '.join(choices)}, or the dotted name of a module of yours")
+    module = find_plugin(GROUP, name, field=field, noun="camera driver", marker="open_camera")
     missing = [part for part in ("Options", "open_camera") if not hasattr(module, part)]
     if missing:
         raise ConfigError(field, name, f"opens no cameras: it has no {', '.join(missing)}")

@@ -17,7 +17,6 @@ in the process of each camera, from `scene_objects` and `joint_states`; a module
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
@@ -27,9 +26,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from common.config import GripperConfig, ObjectConfig, Parameters, Scenery, Surroundings, Tunable, World
-from common.errors import ConfigError, UnknownName
+from common.errors import ConfigError
 from common.hardware.interface import Hardware, Limits
 from common.messages import Header, JointState, SceneUpdate, WorldEdit, WorldObject, WorldObjects
+from common.plugins import find_plugin
 
 if TYPE_CHECKING:
     from common.perception.pinhole import Pinhole
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
 
-PACKAGE = "common.sim"
-SIMULATORS = ("kinematic", "mujoco")
+GROUP = "zencell.worlds"
+KINEMATIC = "kinematic"  # the default; it draws for worlds that draw nothing themselves
 
 
 class StandingObject(BaseModel):
@@ -174,7 +174,7 @@ def require_simulator(name: str) -> None:
         UnknownName: no such simulator; lists the choices.
         ConfigError: a module that cannot be imported, or something that is not installed.
     """
-    if name != SIMULATORS[0]:
+    if name != KINEMATIC:
         require = getattr(_module(name), "require", None)
         if require is not None:
             require()
@@ -227,15 +227,10 @@ def load_renderer(
     """
     module = _module(scenery.simulator)
     if not hasattr(module, "renderer"):
-        module = _module(SIMULATORS[0])
+        module = _module(KINEMATIC)
     made: Renderer = module.renderer(around, scenery, robot, plain=plain, camera=camera, arm=arm)
     return made
 
 
 def _module(name: str) -> ModuleType:
-    if "." not in name and name not in SIMULATORS:
-        raise UnknownName("simulator", name, SIMULATORS)
-    try:
-        return importlib.import_module(name if "." in name else f"{PACKAGE}.{name}")
-    except ImportError as error:
-        raise ConfigError("world.simulator", name, f"cannot be imported: {error}") from None
+    return find_plugin(GROUP, name, field="world.simulator", noun="simulator", marker="renderer")

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from common.config import CameraConfig
 from common.errors import ConfigError
-from common.perception.calibration_file import CameraFile, Rectifier
+from common.perception.camera_file import CameraFile, Rectifier
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]

@@ -21,7 +21,7 @@ import msgpack
 from pydantic import BaseModel, ConfigDict
 
 from common.kept_file import Unreadable, open_regular, standing_folder
-from common.sim.interface import SIMULATORS, StandingObject
+from common.sim.interface import KINEMATIC, StandingObject
 
 SLOT = 4 * 1024 * 1024  # [bytes] for each of the two newest states
 CLOSE_SECONDS = 0.3
@@ -36,7 +36,7 @@ class Standing(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    simulator: str = SIMULATORS[0]
+    simulator: str = KINEMATIC
     layout: dict[str, tuple[float, ...]]
     q: list[float]
     width: float | None = None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from applications.pick_place.topics import DETECTION_IMAGE
 from common import messages as m
-from common.applications.pick_place.topics import DETECTION_IMAGE
 from common.process.service import main
 from common.process.task_runner import run_task
 from common.tasks.handling import Handling, HandlingConfig, HandlingStatus

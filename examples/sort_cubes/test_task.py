@@ -13,7 +13,7 @@ from common.config import load_cell
 from common.messages import TaskCommand, TaskStatus
 from common.transport.bus import Bus
 from common.transport.reader import Reader
-from common.virtual.simulation import Simulation
+from lab.simulation import Simulation
 
 CELL = str(Path(__file__).with_name("cell.yaml"))
 

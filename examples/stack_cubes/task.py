@@ -6,8 +6,8 @@ import math
 
 from pydantic import Field
 
+from applications.pick_place.topics import DETECTION_IMAGE
 from common import messages as m
-from common.applications.pick_place.topics import DETECTION_IMAGE
 from common.config import Tunable
 from common.process.service import main
 from common.process.task_runner import run_task

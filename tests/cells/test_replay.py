@@ -12,7 +12,7 @@ from typing import Any
 import msgpack
 import pytest
 
-from common.applications.pick_place.topics import DETECTED_OBJECTS
+from applications.pick_place.topics import DETECTED_OBJECTS
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
 from tests.harness import RunningCell, command_line, environment, free_domain, until

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import ServiceCounters, TaskCommand
 from common.transport.bus import Bus
 from tests.cells.losses import Losses

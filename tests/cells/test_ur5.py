@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
+from applications.outlining import stage_files
+from applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
 from common import topics
-from common.applications.outlining import stage_files
-from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
 from common.config import load_cell
 from common.messages import SupervisorStatus
 from tests.harness import RunningCell, command_line, environment, free_domain, until

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cli.main import app
-from common.operation.operation import Operation
+from cli.operation.operation import Operation
 from tests.harness import ask, command_line, environment
 
 RECORDING = str(Path(__file__).parents[1] / "data" / "panda_first_release.mcap")

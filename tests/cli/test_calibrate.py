@@ -10,7 +10,7 @@ import yaml
 
 from cli.main import app
 from common.robot.transforms import invert, rpy_to_matrix, transform
-from tests.common.perception.rendered_boards import BOARD, Lens, many_poses, render
+from tests.tools.calibration.rendered_boards import BOARD, Lens, many_poses, render
 
 LENS = Lens()
 T_WORLD_CAMERA = transform(rpy_to_matrix(np.pi - 0.06, 0.04, -np.pi / 2 + 0.1), (0.42, -0.01, 0.80))

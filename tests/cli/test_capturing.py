@@ -10,20 +10,20 @@ import pytest
 
 from common import messages as m
 from common import topics
-from common.client.capturing import Capture
 from common.clock import Clock
 from common.config import load_cell
-from common.recording.decoding import schema_of
-from common.recording.files import SplitWriter
-from common.recording.own import Own
-from common.recording.reading import Recording
-from common.recording.sample import Sample
-from common.recording.selection import Selection
-from common.recording.sink import Sink
 from common.transport.bus import Bus
 from common.transport.codec import encode
 from common.transport.local import LocalNetwork
 from common.transport.session import RawSample
+from recording.capturing import Capture
+from recording.decoding import schema_of
+from recording.files import SplitWriter
+from recording.own import Own
+from recording.reading import Recording
+from recording.sample import Sample
+from recording.selection import Selection
+from recording.sink import Sink
 
 TWO_CAMERAS = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")
 RENAMED = {"camera/*": "left/camera/*"}

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from common.checking.cell import quick, refused, thorough
-from common.checking.finding import Finding
-from common.checking.services import wiring
-from common.checking.wiring import Keys, check_wiring
 from common.config import Cell, load_cell, names_of
 from common.errors import ConfigError
 from tests.harness import ask
+from tools.check.cell import quick, refused, thorough
+from tools.check.finding import Finding
+from tools.check.services import wiring
+from tools.check.wiring import Keys, check_wiring
 
 ONE = "world.count=1"
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from cli import completion
+from cli.completing import offers
 from common.application import all_topics
-from common.completing import offers
 from common.config import load_cell, service_config, service_names
 from common.planning.planners import planner_names
 from common.topics import Topic

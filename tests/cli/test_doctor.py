@@ -14,14 +14,14 @@ import psutil
 import pytest
 
 from cli.main import app
-from common.doctor import configuration, leftovers, machine, network, software
-from common.doctor.examining import examine
-from common.doctor.finding import Finding
-from common.doctor.leftovers import Seen
 from common.errors import DecodeError
 from common.process import environment
 from common.transport.local import LocalNetwork
 from tests.harness import Zencell
+from tools.doctor import configuration, leftovers, machine, network, software
+from tools.doctor.examining import examine
+from tools.doctor.finding import Finding
+from tools.doctor.leftovers import Seen
 
 Disk = namedtuple("Disk", "total used free")
 NOWHERE = "tcp/127.0.0.1:1"
@@ -57,7 +57,7 @@ def test_this_machine_is_examined_and_what_is_not_well_has_a_remedy() -> None:
 def test_exit_code_is_1_when_something_fails(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    looks = "common.doctor.examining.examine"
+    looks = "tools.doctor.examining.examine"
     monkeypatch.setattr(looks, lambda endpoint: iter([Finding("fail", "the roof", "mend it")]))
     assert app.execute(["doctor"]) == 1
     assert capsys.readouterr().out == "fail  the roof: mend it\n"

@@ -12,16 +12,16 @@ from pathlib import Path
 
 import pytest
 
+from applications.outlining.topics import OUTLINE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from cli.main import app
 from common.application import message_class
-from common.applications.outlining.topics import OUTLINE_STATUS
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import TaskStatus
-from common.recording.reading import Recording
 from common.topics import Topic
 from common.transport.codec import decode
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of
+from recording.reading import Recording
 from tests.harness import command_line, environment
 
 DATA = Path(__file__).resolve().parent.parent / "data"

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from cli.main import app
-from common.graph.drawing import OUTSIDE, Graph, dot, edges, graph_of, mermaid
-from common.graph.svg import svg
-from common.graph.wired import Wired
+from common.supervision.wired import Wired
+from tools.graph.drawing import OUTSIDE, Graph, dot, edges, graph_of, mermaid
+from tools.graph.svg import svg
 
 SERVICES = [
     Wired("planner", "Plans.", writes=["display_trajectory"], serves=["motion/plan"], reads=["joint_states"]),

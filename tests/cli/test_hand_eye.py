@@ -9,13 +9,13 @@ import yaml
 
 from cli.main import app
 from common.config import load_cell
-from common.perception.calibration_file import CameraFile
-from common.perception.hand_eye_views import ViewCollector
+from common.perception.camera_file import CameraFile
 from common.robot.model import RobotModel
 from common.robot.transforms import invert, rpy_to_matrix, transform
 from tests.cli.conftest import CELL, make_folder
-from tests.common.perception.rendered_boards import BOARD, Lens, facing, render
 from tests.harness import place_of
+from tests.tools.calibration.rendered_boards import BOARD, Lens, facing, render
+from tools.calibration.views import ViewCollector
 
 LENS = Lens()
 ROBOT = RobotModel.load(load_cell("panda").robot)

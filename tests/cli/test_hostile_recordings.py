@@ -16,9 +16,9 @@ from mcap.writer import MCAP0_MAGIC
 
 from cli.main import app
 from common.messages import Header, Image, JointState, LogLine
-from common.recording.names import file_names
-from common.recording.writing import RUN, RecordingWriter
-from tests.common.recording.samples import joints, packed, status
+from recording.names import file_names
+from recording.writing import RUN, RecordingWriter
+from tests.recording.samples import joints, packed, status
 
 STEERING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]")
 EVIL = "\x1b]0;owned\x07\x9b2J[/x]<script>alert(1)</script>\u202e"
@@ -30,10 +30,9 @@ VERBS = ("info", "play", "report", "export", "recover")
 @pytest.fixture(autouse=True)
 def warm() -> None:
     """What the verbs import is no part of what a recording costs."""
-    import common.recording.foxglove
-    import common.recording.recovery
-    import common.recording.summary
-    import common.reporting.page  # noqa: F401
+    import recording.foxglove
+    import recording.recovery
+    import recording.report.page  # noqa: F401
 
 
 def verb(name: str, path: Path) -> list[str]:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from cli.completing import offers
 from common.application import find_application
-from common.completing import offers
 from common.config import load_cell
 from common.supervision.launch import Launch
 from tests.harness import ask, environment

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from applications.outlining import stage_files
 from cli.main import app
-from common.applications.outlining import stage_files
 
 
 @pytest.fixture

@@ -10,17 +10,17 @@ from pathlib import Path
 import msgpack
 import pytest
 
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
-from common.client.player import Player
 from common.messages import Header, Image
-from common.recording.reading import Recording
-from common.recording.sample import Sample
-from common.recording.stamps import stamp_of
-from common.recording.writing import RUN, RecordingWriter
 from common.transport.local import LocalNetwork
 from common.transport.session import RawSample
-from tests.common.recording.samples import START, STEP, joints, packed, status, write
+from recording.player import Player
+from recording.reading import Recording
+from recording.sample import Sample
+from recording.stamps import stamp_of
+from recording.writing import RUN, RecordingWriter
+from tests.recording.samples import START, STEP, joints, packed, status, write
 
 
 def image(number: int) -> Sample:

@@ -15,13 +15,13 @@ from pathlib import Path
 import pytest
 
 from common.client.keyboard import names_of
-from common.recording.reading import Recording
-from common.recording.sink import Figures
-from common.recording.summary import summarise
-from common.recording.telling import in_bytes, outcome, progress
+from recording.reading import Recording
+from recording.sink import Figures
+from recording.summary import summarise
+from recording.telling import in_bytes, outcome, progress
 from tests.cli.conftest import CELL, make_folder
-from tests.common.recording.samples import joints, status, write
 from tests.harness import PATIENCE, Place, Zencell, ask, command_line, environment, free_domain, place_of
+from tests.recording.samples import joints, status, write
 
 Start = Callable[..., Zencell]
 

@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
+from applications.outlining.messages import OutlinePoints, OutlineStatus
+from applications.pick_place.messages import PickPlaceStatus
 from cli.main import app
 from common import messages as m
-from common.applications.outlining.messages import OutlinePoints, OutlineStatus
-from common.applications.pick_place.messages import PickPlaceStatus
-from common.recording.sample import Sample
-from common.recording.writing import RUN, RecordingWriter
-from common.reporting import film as filming
 from common.transport.codec import encode
+from recording.report import film as filming
+from recording.sample import Sample
+from recording.writing import RUN, RecordingWriter
 
 BEGIN = 1_700_000_000_000_000_000  # [ns]
 ARM = [f"panda_joint{k}" for k in range(1, 8)]
@@ -232,7 +232,7 @@ def test_an_outline_is_compared_with_what_was_traced(tmp_path):
 def test_an_application_of_ones_own_is_told_of_in_its_own_words(tmp_path, monkeypatch):
     (tmp_path / "own_words").mkdir()
     (tmp_path / "own_words" / "polish.py").write_text(
-        "from common import messages as m\nfrom common.reporting import application\n"
+        "from common import messages as m\nfrom recording.report import application\n"
         "from common.topics import Topic\n\n"
         "class PolishStatus(m.TaskStatus):\n    pass\n\n"
         'STATUS = Topic("polish_status", PolishStatus, "state", "how smooth it is")\n\n'

@@ -14,10 +14,10 @@ import yaml
 
 from common.config import RobotConfig, check, load_cell, read_robot
 from common.robot.model import RobotModel
-from common.setup.fingers import tool_complaints
-from common.virtual.simulation import Simulation
+from lab.simulation import Simulation
 from tests.harness import ask
 from tests.small_arms import nodding, scara
+from tools.robot_setup.fingers import tool_complaints
 
 URDF = Path(__file__).parents[1] / "data" / "side_arm.urdf"
 NO_ARM = '<robot name="post"><link name="a"/><link name="b"/><joint name="j" type="fixed">' \

@@ -7,10 +7,10 @@ import threading
 import pytest
 from rich.console import Console
 
+from cli.operation.live import MOST_LINES, LiveScreen, render
+from cli.operation.screen import Content
+from cli.operation.screens import JsonScreen, PlainScreen, ScreenHandler, open_screen
 from common.messages import ServiceStatus
-from common.operation.live import MOST_LINES, LiveScreen, render
-from common.operation.screen import Content
-from common.operation.screens import JsonScreen, PlainScreen, ScreenHandler, open_screen
 
 CONTENT = Content(
     [ServiceStatus(name="router", state="ready", pid=12), ServiceStatus(name="vision", state="restarting", restarts=2)],

@@ -10,8 +10,8 @@ import pytest
 from common.config import Cell, load_cell
 from common.errors import ConfigError
 from common.transport.credentials import SECURE_VARIABLE
-from common.viewer.access import FIRST_PORT, TOKEN_VARIABLE
-from common.viewer.serving import page_of
+from page.access import FIRST_PORT, TOKEN_VARIABLE
+from page.serving import page_of
 from tests.harness import Zencell, ask
 
 OPTIONS = (("--viewer-port", "9000"), ("--viewer-host", "0.0.0.0"))
@@ -61,8 +61,8 @@ def test_page_is_on_this_machine_alone_unless_asked_for_more(cell: Cell) -> None
 
 
 def test_next_free_port_is_taken_when_none_was_named(cell: Cell, monkeypatch: pytest.MonkeyPatch, taken: int) -> None:
-    monkeypatch.setattr("common.viewer.access.FIRST_PORT", taken)
-    monkeypatch.setattr("common.viewer.access.LAST_PORT", taken + 50)
+    monkeypatch.setattr("page.access.FIRST_PORT", taken)
+    monkeypatch.setattr("page.access.LAST_PORT", taken + 50)
     page = page_of(cell, None, None)
     assert page is not None and taken < int(page.address.rpartition(":")[2]) <= taken + 50
 
@@ -77,8 +77,8 @@ def test_two_cells_that_come_up_at_the_same_time_have_pages_of_their_own(cell: C
 
 
 def test_no_free_port_is_said(cell: Cell, monkeypatch: pytest.MonkeyPatch, taken: int) -> None:
-    monkeypatch.setattr("common.viewer.access.FIRST_PORT", taken)
-    monkeypatch.setattr("common.viewer.access.LAST_PORT", taken)
+    monkeypatch.setattr("page.access.FIRST_PORT", taken)
+    monkeypatch.setattr("page.access.LAST_PORT", taken)
     with pytest.raises(ConfigError, match=f"--viewer-port: ports {taken} to {taken} are all in use"):
         page_of(cell, None, None)
 
@@ -133,7 +133,7 @@ VIEWER = '''"""Says the fingerprint of the token that it was given, and serves n
 import asyncio, hashlib, os
 from common.config import Parameters
 from common.process.service import main
-from common.viewer.access import TOKEN_VARIABLE
+from page.access import TOKEN_VARIABLE
 
 class Config(Parameters):
     """Where."""

@@ -35,7 +35,7 @@ from common.messages import (
 )
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
-from common.virtual.simulation import Simulation
+from lab.simulation import Simulation
 
 pytestmark = pytest.mark.timeout(600)
 

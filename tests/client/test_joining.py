@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from common.applications.pick_place.messages import PickPlaceStatus
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
+from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common.client import joining
 from common.client.cell import Cell
 from common.client.hearing import NothingHeard

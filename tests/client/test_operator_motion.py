@@ -8,10 +8,10 @@ from typing import Any, cast
 
 import pytest
 
+from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import messages as m
 from common import topics
-from common.applications.pick_place.messages import PickPlaceStatus
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.client.arm import Arm
 from common.client.hearing import Ear
 from common.client.operator_motion import MotionFailed, OperatorMotion

@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from cli.operation.live import render
+from cli.operation.screen import Content
+from cli.operation.screens import PlainScreen
 from common.client.tables import services_table, topics_table
 from common.client.watching import ServiceRow, TopicRow
 from common.messages import ServiceStatus
-from common.operation.live import render
-from common.operation.screen import Content
-from common.operation.screens import PlainScreen
 from common.process.log import log_to_stderr
 from common.terminal import echo, printable
-from common.viewer import markup
+from page import markup
 
 ROOT = Path(__file__).parents[2]
 EVIL = "a\x1b]0;owned\x07\r\x9b2J\u202eb\u2028\x7f\ud800[/x][red]\nERROR router: forged"
@@ -76,5 +76,6 @@ def test_a_line_of_the_log_cannot_be_forged(capsys: pytest.CaptureFixture[str]) 
 
 
 def test_everything_that_is_shown_goes_through_here() -> None:
-    files = [path for folder in ("cli", "common", "services") for path in (ROOT / folder).rglob("*.py")]
+    product = ("cli", "common", "services", "page", "recording", "tools", "lab", "security", "drivers", "applications")
+    files = [path for folder in product for path in (ROOT / folder).rglob("*.py")]
     assert [p.name for p in files if re.search(r"\b(typer|click)\.s?echo\(", p.read_text())] == ["terminal.py"]

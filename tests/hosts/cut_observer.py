@@ -8,8 +8,8 @@ import sys
 import time
 from typing import Any
 
+from applications.pick_place.topics import VALIDATED_TARGETS
 from common import topics
-from common.applications.pick_place.topics import VALIDATED_TARGETS
 from common.transport.bus import Bus
 from common.transport.connect import connect
 from common.transport.endpoint import endpoint_of

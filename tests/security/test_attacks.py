@@ -21,19 +21,19 @@ import psutil
 import pytest
 import zenoh
 
+from applications.pick_place.topics import DETECTED_OBJECTS
 from common import messages as m
 from common import topics
-from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.errors import NoRouter
-from common.recording.reading import Recording
-from common.security.certificates import Authority
 from common.topics import of_service
 from common.transport.codec import DEFAULT_LIMIT, decode, decode_attachment, encode
 from common.transport.connect import connect
 from common.transport.credentials import ROUTER_NAME, Credentials, credentials_of
 from common.transport.endpoint import MOST_BYTES, MOST_BYTES_BESIDES, client_config, router_config
 from common.transport.session import RawSample
-from common.viewer.access import ROLES, tokens_in
+from page.access import ROLES, tokens_in
+from recording.reading import Recording
+from security.certificates import Authority
 from tests.harness import RunningCell, command_line, environment, until
 from tests.security.holders import REFUSED, Heard, Holder
 from zencell.blocking import Cell

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from common.security.certificates import Authority
+from security.certificates import Authority
 from tests.harness import ROOT
 
 BIN = Path(sys.executable).parent

@@ -12,15 +12,15 @@ import pytest
 import zenoh
 
 from cli.main import app
-from common.doctor.certificates import certificates as findings
-from common.security.access import Rights, access_control
-from common.security.certificates import Authority
-from common.security.checking import certificate_in, require_valid
 from common.transport.credentials import Credentials, credentials_of
 from common.transport.expiry import EndWatch, end_of, warning_of
 from common.transport.router import Router, tend
+from security.access import Rights, access_control
+from security.certificates import Authority
+from security.checking import certificate_in, require_valid
 from tests.security.holders import REFUSED, Holder
 from tests.security.test_routers import free_port
+from tools.doctor.certificates import certificates as findings
 
 NAMES = ("router", "operator", "panda.camera")
 PATIENCE = 20.0  # [s] only ever waited for by a test that fails

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from common.security.certificates import Authority
 from common.supervision.launch import Launch, free_endpoints
 from common.transport.credentials import credentials_of
 from common.transport.endpoint import LINKS, NEAR_MS, near_of
 from common.transport.router import Router
 from common.transport.zenoh_session import ZenohSession, open_zenoh
+from security.certificates import Authority
 from tests.common.transport.conftest import until
 from tests.security.holders import REFUSED, Holder
 from tests.security.test_routers import free_port

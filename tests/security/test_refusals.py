@@ -12,11 +12,11 @@ import pytest
 from cli.main import app
 from common.config import load_cell
 from common.errors import ConfigError
-from common.security.certificates import Authority
-from common.security.requiring import require_secured
 from common.supervision.launch import Launch
 from common.supervision.share import Share
 from common.transport.credentials import ACCESS, ROUTER_NAME
+from security.certificates import Authority
+from security.requiring import require_secured
 from tests.harness import free_domain
 
 CELL = load_cell("panda")

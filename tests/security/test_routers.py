@@ -14,11 +14,11 @@ import zenoh
 
 from cli.main import app
 from common.errors import ConfigError
-from common.security.access import Rights, access_control
-from common.security.certificates import Authority
 from common.transport.credentials import ACCESS, ROUTER_NAME, credentials_of, read_access
 from common.transport.endpoint import MOST_BYTES_BESIDES, port_of, router_config
 from common.transport.router import open_router
+from security.access import Rights, access_control
+from security.certificates import Authority
 from tests.harness import ROOT, environment, free_domain
 from tests.security.holders import REFUSED, Holder
 

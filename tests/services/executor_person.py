@@ -7,8 +7,8 @@ from contextlib import asynccontextmanager
 import numpy as np
 import ruckig
 
+from applications.pick_place.topics import SCENE_BALLS
 from common import topics
-from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.messages import (

@@ -12,12 +12,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from applications.outlining.contours import ContourOptions, find_contours
+from applications.outlining.messages import Contours, OutlinePoints
+from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_STATUS
+from applications.pick_place.topics import DETECTED_OBJECTS, VALIDATED_TARGETS
 from common import messages as m
 from common import topics
-from common.applications.outlining.contours import ContourOptions, find_contours
-from common.applications.outlining.messages import Contours, OutlinePoints
-from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_STATUS
-from common.applications.pick_place.topics import DETECTED_OBJECTS, VALIDATED_TARGETS
 from common.clock import Clock
 from common.config import Parameters, load_cell, service_config
 from common.config.tunables import tunable_sections

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
+from applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common import messages as m
 from common import topics
-from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common.clock import Clock
 from common.config import CameraConfig
 from common.perception.boxes import BoxKind, SeenBox

@@ -7,16 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
+from applications.pick_place.topics import DETECTED_OBJECTS
 from cli.main import app
 from common import topics
-from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.config import load_cell, service_config
 from common.perception.image import image_to_array
 from common.process.in_process import running_service
 from common.robot.transforms import invert, rpy_to_matrix, transform
 from common.transport.local import LocalNetwork
 from services import camera_opencv, robot_state_publisher, vision_detector
-from tests.common.perception.rendered_boards import BOARD, Lens, many_poses, render, through
+from tests.tools.calibration.rendered_boards import BOARD, Lens, many_poses, render, through
 
 LENS = Lens()
 T_WORLD_CAMERA = transform(rpy_to_matrix(np.pi - 0.05, 0.04, -np.pi / 2 + 0.08), (0.41, -0.02, 0.82))

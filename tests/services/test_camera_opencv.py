@@ -10,7 +10,7 @@ from common import topics
 from common.config import Surroundings
 from common.errors import ConfigError
 from common.perception import sources
-from common.perception.calibration_file import CameraFile, Rectifier
+from common.perception.camera_file import CameraFile, Rectifier
 from common.perception.image import image_to_array
 from common.perception.sources import Video, open_source
 from common.process.in_process import running_service

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import asyncio
 
+from applications.outlining.messages import OutlinePoints
+from applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
 from common import messages as m
 from common import topics
-from common.applications.outlining.messages import OutlinePoints
-from common.applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import Refused

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from common.applications.outlining.messages import OutlinePoints
-from common.applications.outlining.stage_files import write_points
-from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS
+from applications.outlining.messages import OutlinePoints
+from applications.outlining.stage_files import write_points
+from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS
 from common.errors import ConfigError
 from common.process.in_process import running_service
 from common.transport.local import LocalNetwork

@@ -20,8 +20,8 @@ from common.sources import drawn_from
 from common.transport import ownership
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
-from common.virtual.loop import VirtualLoop
-from common.virtual.watched_arm import shown_to, with_watched_arm
+from lab.loop import VirtualLoop
+from lab.watched_arm import shown_to, with_watched_arm
 from services import trajectory_executor
 from services.trajectory_executor import Config
 from tests.common.control.test_limiter import assert_within

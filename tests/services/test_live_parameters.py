@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from applications.outlining.messages import OutlinePoints
+from applications.pick_place.topics import REJECTED_TARGETS, WORKSPACE_MARKERS
 from common import topics
-from common.applications.outlining.messages import OutlinePoints
-from common.applications.pick_place.topics import REJECTED_TARGETS, WORKSPACE_MARKERS
 from common.config import Parameters, World
 from common.config.tunables import apply, checked, leaves, tunable_sections
 from common.messages import Inhibit, PlanRequest, StopRequest
 from common.robot.transforms import tool_down
 from common.sim.interface import GraspTolerances
 from common.sim.kinematic import KinematicWorld
-from tests.common.applications.outlining.outline_double import OutlineDouble
-from tests.common.applications.pick_place.cell_double import CellDouble
+from tests.applications.outlining.outline_double import OutlineDouble
+from tests.applications.pick_place.cell_double import CellDouble
 from tests.services.service_turns import CELLS, SCENARIOS, Running, config_of
 from tests.services.watched_reading import Watch
 

@@ -5,8 +5,8 @@ from functools import partial
 
 import pytest
 
+from applications.pick_place.topics import SCENE_BALLS
 from common import topics
-from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.errors import Refused, RemoteError

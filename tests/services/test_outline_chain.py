@@ -6,10 +6,10 @@ from contextlib import AsyncExitStack
 import numpy as np
 import pytest
 
+from applications.outlining.messages import OutlineSelect
+from applications.outlining.top_face import TopFace
+from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
 from common import topics
-from common.applications.outlining.messages import OutlineSelect
-from common.applications.outlining.top_face import TopFace
-from common.applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
 from common.config import (
     CameraConfig,
     ObjectConfig,

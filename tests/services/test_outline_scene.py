@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from applications.outlining.contours import ContourOptions, find_contours
+from applications.outlining.messages import Contour, Contours
+from applications.outlining.topics import CONTOURS
 from common import messages as m
 from common import topics
-from common.applications.outlining.contours import ContourOptions, find_contours
-from common.applications.outlining.messages import Contour, Contours
-from common.applications.outlining.topics import CONTOURS
 from common.clock import Clock
 from common.config import Surroundings, load_cell, service_config
 from common.perception.image import array_to_image

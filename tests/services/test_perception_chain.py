@@ -5,8 +5,8 @@ from contextlib import AsyncExitStack
 
 import numpy as np
 
+from applications.pick_place.topics import REJECTED_TARGETS, VALIDATED_TARGETS
 from common import topics
-from common.applications.pick_place.topics import REJECTED_TARGETS, VALIDATED_TARGETS
 from common.clock import Clock
 from common.config import Run, Surroundings, load_cell, service_config
 from common.messages import Header, TFMessage, TransformStamped

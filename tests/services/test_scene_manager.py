@@ -3,9 +3,9 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
+from applications.pick_place.topics import DETECTED_OBJECTS
 from common import messages as m
 from common import topics
-from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.perception.pinhole import Pinhole

@@ -5,12 +5,12 @@ from typing import Any
 
 import pytest
 
+from applications.pick_place.choice import LetGo, PickPlaceView
+from applications.pick_place.parameters import Config
+from applications.pick_place.task import PickPlace
+from applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common import messages as m
 from common import topics
-from common.applications.pick_place.choice import LetGo, PickPlaceView
-from common.applications.pick_place.parameters import Config
-from common.applications.pick_place.task import PickPlace
-from common.applications.pick_place.topics import PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common.clock import Clock
 from common.config import load_cell, service_config
 from common.kept_file import STANDING_VARIABLE

@@ -8,8 +8,8 @@ import msgpack
 import numpy as np
 import pytest
 
+from applications.pick_place.topics import SCENE_BALLS
 from common import topics
-from common.applications.pick_place.topics import SCENE_BALLS
 from common.clock import Clock
 from common.control.cycle import ControlCycle
 from common.errors import ConfigError, UnknownName

@@ -4,9 +4,9 @@ import logging
 import numpy as np
 import pytest
 
+from applications.pick_place.detector import Detector
+from applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common import topics
-from common.applications.pick_place.detector import Detector
-from common.applications.pick_place.topics import DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK
 from common.config import Surroundings, check
 from common.errors import ConfigError
 from common.messages import Header, Image, TFMessage, TransformStamped

@@ -6,9 +6,9 @@ import importlib
 
 import pytest
 
+from applications.pick_place.topics import SCENE_BALLS
 from common import topics
 from common.application import all_topics
-from common.applications.pick_place.topics import SCENE_BALLS
 from common.config import Surroundings, World, load_cell, service_config
 from common.errors import ConfigError
 from common.process.wiring import Wiring, owned_in, require_one_owner, wiring

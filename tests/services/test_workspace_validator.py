@@ -4,13 +4,13 @@ import logging
 import numpy as np
 import pytest
 
-from common import topics
-from common.applications.pick_place.topics import (
+from applications.pick_place.topics import (
     DETECTED_OBJECTS,
     REJECTED_TARGETS,
     VALIDATED_TARGETS,
     WORKSPACE_MARKERS,
 )
+from common import topics
 from common.config import Grasp, Surroundings, load_cell
 from common.messages import Header, Marker, MarkerArray, Pose, TFMessage, TransformStamped, Vector3
 from common.perception.pinhole import Pinhole

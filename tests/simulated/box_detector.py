@@ -7,8 +7,8 @@ import math
 import cv2
 import numpy as np
 
+from applications.pick_place.topics import DETECTED_OBJECTS
 from common import topics
-from common.applications.pick_place.topics import DETECTED_OBJECTS
 from common.config import Parameters, Surroundings
 from common.messages import Color, Header, Marker, MarkerArray, Pose, Quaternion, Vector3
 from common.perception.image import image_to_array

@@ -8,8 +8,8 @@ import contextlib
 import sys
 from unittest.mock import patch
 
+from applications.pick_place.perceived import PerceivedScene
 from common import topics
-from common.applications.pick_place.perceived import PerceivedScene
 from common.config import load_cell
 from common.control.controller import TrajectoryController
 from common.control.goals import GoalMemory
@@ -20,9 +20,9 @@ from common.control.record_file import RecordFile
 from common.sources import host_ns, wall_ns
 from common.transport import requests
 from common.transport.reader import Newness
-from common.virtual import process
-from common.virtual.doubles import settings_of, with_doubles
-from common.virtual.simulation import Simulation
+from lab import process
+from lab.doubles import settings_of, with_doubles
+from lab.simulation import Simulation
 from services import smart_pick_place, trajectory_executor
 
 CELL = ("panda", ["world.count=1"])  # the faults come early: a short run sees as many of them

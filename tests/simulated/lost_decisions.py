@@ -11,8 +11,8 @@ from common.config import load_cell
 from common.control.inhibits import Inhibits, Record
 from common.control.record_file import RecordFile
 from common.transport.ownership import Ownership
-from common.virtual.doubles import settings_of, with_doubles
-from common.virtual.simulation import Simulation
+from lab.doubles import settings_of, with_doubles
+from lab.simulation import Simulation
 from services import trajectory_executor
 
 

@@ -7,11 +7,11 @@ from typing import get_args
 import pytest
 
 from common import topics
-from common.chaos.agent import Chaos
-from common.chaos.plan import Fault, Form
 from common.config import Cell, load_cell
 from common.process.wiring import owned_in, wiring_of
 from common.transport.bus import Bus
+from lab.chaos.agent import Chaos
+from lab.chaos.plan import Fault, Form
 from tests.harness import beside
 from tests.simulated.visited import SimulatedCell
 

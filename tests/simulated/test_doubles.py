@@ -10,9 +10,9 @@ from common.config import Cell, load_cell
 from common.errors import ConfigError
 from common.messages import StopRequest, TaskCommand
 from common.transport.bus import Bus
-from common.virtual.doubles import settings_of, with_doubles
-from common.virtual.faults import LAST, make_plan
-from common.virtual.simulation import Outcome, Simulation
+from lab.doubles import settings_of, with_doubles
+from lab.faults import LAST, make_plan
+from lab.simulation import Outcome, Simulation
 from tests.harness import until
 from tests.simulated.known_bugs import BUGS
 from tests.simulated.lost_decisions import DECISIONS, found_in

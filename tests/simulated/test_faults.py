@@ -6,10 +6,10 @@ import pytest
 
 from common.config import load_cell
 from common.errors import ConfigError
-from common.virtual.campaign import run_seeds
-from common.virtual.faults import SKEW, SPEEDS, make_plan
-from common.virtual.simulation import LIMIT, Outcome, Simulation
-from common.virtual.watched_arm import with_watched_arm
+from lab.campaign import run_seeds
+from lab.faults import SKEW, SPEEDS, make_plan
+from lab.simulation import LIMIT, Outcome, Simulation
+from lab.watched_arm import with_watched_arm
 from tests.simulated.known_bugs import BUGS, RARE, found_within
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
@@ -55,7 +55,7 @@ def test_run_of_a_campaign_is_repeated_by_its_seed():
 
 @pytest.mark.slow
 def test_campaign_goes_on_after_a_process_has_had_its_seeds(monkeypatch):
-    monkeypatch.setattr("common.virtual.campaign.SEEDS_A_PROCESS", 1)
+    monkeypatch.setattr("lab.campaign.SEEDS_A_PROCESS", 1)
     outcomes = [*run_seeds(PANDA, [1, 2, 3], False, 1, 1.0)]  # none ends within that time
     assert [outcome.seed for outcome in outcomes] == [1, 2, 3]
 

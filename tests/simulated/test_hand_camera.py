@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from applications.pick_place.topics import DETECTED_OBJECTS, PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common import topics
-from common.applications.pick_place.topics import DETECTED_OBJECTS, PICK_PLACE_STATUS, VALIDATED_TARGETS
 from common.config import load_cell
 from common.messages import WorldEdit
 from common.transport.bus import Bus
-from common.virtual.simulation import Simulation
+from lab.simulation import Simulation
 from tests.simulated.visited import SimulatedCell
 
 DATA = Path(__file__).parents[1] / "data"

@@ -6,9 +6,9 @@ import asyncio
 
 import pytest
 
+from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
-from common.applications.pick_place.messages import PickPlaceStatus
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.errors import RemoteError
 from common.messages import JointGoal, ParameterRequest, StopRequest, TaskCommand

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from applications.outlining import stage_files
+from applications.outlining.contours_choice import parse_choice
+from applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT
+from applications.outlining.verbs import before_run
 from common import topics
-from common.applications.outlining import stage_files
-from common.applications.outlining.contours_choice import parse_choice
-from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT
-from common.applications.outlining.verbs import before_run
 from common.messages import TaskCommand
 from common.transport.bus import Bus
 from tests.harness import until

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from applications.outlining.topics import OUTLINE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
-from common.applications.outlining.topics import OUTLINE_STATUS
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.messages import JointGoal, JointState, MotionStatus, TaskCommand
 from common.transport.bus import Bus, Reader

@@ -10,15 +10,15 @@ from typing import Any, Literal
 import msgpack
 import pytest
 
-from common.applications.outlining.topics import CONTOURS
-from common.applications.pick_place.topics import DETECTED_OBJECTS
+from applications.outlining.topics import CONTOURS
+from applications.pick_place.topics import DETECTED_OBJECTS
 from common.config import load_cell, service_config
 from common.process.in_process import running_service
-from common.recording.reading import Recording
-from common.recording.sample import encoding_of
 from common.topics import Topic
 from common.transport.local import LocalNetwork
 from common.transport.writer import RawWriter
+from recording.reading import Recording
+from recording.sample import encoding_of
 from tests.simulated.visited import SimulatedCell
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy

@@ -13,12 +13,12 @@ from common.config import load_cell, service_config
 from common.errors import ConfigError
 from common.process.in_process import running_service
 from common.process.wiring import owned_in, require_one_owner, wiring_of
-from common.recording.own import Own
-from common.recording.reading import Recording
 from common.transport import ownership
 from common.transport.local import LocalNetwork
-from common.virtual.simulation import Simulation
-from common.virtual.trace import Trace
+from lab.simulation import Simulation
+from lab.trace import Trace
+from recording.own import Own
+from recording.reading import Recording
 from services import camera_simulator
 
 CELL = str(Path(__file__).parents[1] / "data" / "two_cameras.yaml")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.messages import MotionStatus
 from common.transport.bus import Bus
 from tests.harness import until

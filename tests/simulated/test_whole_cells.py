@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from common.config import load_cell
-from common.virtual.simulation import Simulation
+from lab.simulation import Simulation
 from tests.simulated.visited import SimulatedCell
 
 pytestmark = pytest.mark.timeout(600)  # some seconds of work, on a machine that may be busy
@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 DIGEST = """
 import sys
 from common.config import load_cell
-from common.virtual.simulation import Simulation
+from lab.simulation import Simulation
 print(Simulation(load_cell(sys.argv[1], sys.argv[3:]), int(sys.argv[2]), digest=True).run().digest)
 """
 

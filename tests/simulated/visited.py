@@ -14,18 +14,18 @@ from unittest.mock import patch
 
 import typer
 
+from cli.operation.operation import Operation
 from common import topics
 from common.application import find_application
 from common.config import Cell, load_cell
 from common.messages import TaskCommand
-from common.operation.operation import Operation
-from common.recording.own import Own
-from common.reporting.fold import Fold
-from common.reporting.summary import describe
-from common.supervision.collector import Collector
 from common.transport.bus import Bus
-from common.virtual.simulation import Outcome, Simulation
-from common.virtual.trace import Trace
+from lab.simulation import Outcome, Simulation
+from lab.trace import Trace
+from recording.own import Own
+from recording.report.collector import Collector
+from recording.report.fold import Fold
+from recording.report.summary import describe
 from tests.harness import beside
 
 Visit = Callable[["SimulatedCell", Bus], Coroutine[Any, Any, None]]

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from common.config import Parameters, check
-from common.errors import ConfigError, UnknownName
+from common.errors import ConfigError
 from common.planning.problem import Cancel, Problem, Result
+from common.plugins import find_plugin, plugin_names
 
 Plan = Callable[[Problem, Any, Cancel], Result]
 
 
 def planner_names() -> list[str]:
     """Planners that come with the project."""
-    return sorted(module.name for module in pkgutil.iter_modules(__path__))
+    return plugin_names("zencell.planners")
 
 
 def load_planner(name: str, options: Mapping[str, Any]) -> tuple[Plan, Parameters]:
@@ -30,13 +29,7 @@ def load_planner(name: str, options: Mapping[str, Any]) -> tuple[Plan, Parameter
         UnknownName: with the choices.
         ConfigError: a module that is no planner, or an option that does not fit.
     """
-    if "." not in name and name not in planner_names():
-        raise UnknownName("planner", name, planner_names())
-    path = name if "." in name else f"{__name__}.{name}"
-    try:
-        module = importlib.import_module(path)
-    except ModuleNotFoundError as error:
-        raise ConfigError("pipeline.planners", name, f"cannot be imported: {error}") from None
+    module = find_plugin("zencell.planners", name, field="pipeline.planners", noun="planner")
     plan, model = getattr(module, "plan", None), getattr(module, "Options", None)
     if not callable(plan) or not (isinstance(model, type) and issubclass(model, Parameters)):
         raise ConfigError("pipeline.planners", name, "must have plan() and Options(Parameters)")

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from common.applications.pick_place.topics import scene_balls
+from applications.pick_place.topics import scene_balls
 from common.config import Fixture, GripperConfig, World
 from common.control.cycle import ControlCycle
 from common.errors import ConfigError, Refused

@@ -10,8 +10,8 @@ from common.control.controller import PERIOD, TrajectoryController
 from common.control.limiter import SLACK
 from common.hardware.interface import Limits
 from common.hardware.streaming import SetPointStream
-from common.hardware.ur import Smoothing
 from common.messages import JointTrajectory, JointTrajectoryPoint
+from drivers.ur import Smoothing
 
 DOF = 6
 LIMITS = Limits(  # those of an arm whose jerk is what binds it

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from common.hardware.interface import Limits
 from common.hardware.lag import LagHardware
 from common.messages import JointTrajectory, JointTrajectoryPoint
-from tests.common.hardware.rig import START, STEP, T0, Rig
+from tests.drivers.rig import START, STEP, T0, Rig
 
 LIMITS = Limits(("shoulder", "elbow"), -3 * np.ones(2), 3 * np.ones(2), 2 * np.ones(2), np.array([10.0, 5.0]))
 

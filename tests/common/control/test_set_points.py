@@ -15,7 +15,7 @@ from common.planning.path import blended_path
 from common.planning.retiming import limited_jerk, parametrise
 from tests.common.control.test_holding import LIMITS, winding
 from tests.common.control.test_limiter import assert_within
-from tests.common.hardware.rig import START, STEP, Rig
+from tests.drivers.rig import START, STEP, Rig
 
 HARD = replace(LIMITS, deceleration=2 * LIMITS.acceleration)
 

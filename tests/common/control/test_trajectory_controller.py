@@ -14,7 +14,7 @@ from common.control.trajectory import Trajectory
 from common.hardware.lag import LagHardware
 from common.hardware.mock import MockHardware
 from common.messages import Header, Inhibit, MotionStatus
-from tests.common.hardware.rig import START, STEP, T0, Rig
+from tests.drivers.rig import START, STEP, T0, Rig
 from tests.harness import ROOT
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from common.hardware.interface import Limits
 from common.messages import JointTrajectory, JointTrajectoryPoint
-from tests.common.hardware.rig import Rig
+from tests.drivers.rig import Rig
 
 Make = Callable[..., JointTrajectory]
 

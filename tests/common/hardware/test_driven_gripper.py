@@ -12,8 +12,8 @@ from common.errors import ConfigError
 from common.hardware.driven_gripper import DrivenGripper
 from common.hardware.interface import HardwareFault, Limits
 from common.hardware.loading import load_hardware
-from common.hardware.robotiq import MODELS, Robotiq
 from common.messages import GripperCommand, GripperState
+from drivers.robotiq import MODELS, Robotiq
 from tests.doubles.robotiq import RobotiqHost
 
 TIMEOUT = 20.0
@@ -67,7 +67,7 @@ class Driven:
 
 @pytest.fixture
 def driven(host: RobotiqHost) -> Iterator[Driven]:
-    gripper = DrivenGripper("common.hardware.robotiq", options(host), CONFIG, name="a 2f85")
+    gripper = DrivenGripper("drivers.robotiq", options(host), CONFIG, name="a 2f85")
     yield Driven(gripper)
     gripper.close()
 
@@ -96,7 +96,7 @@ def test_what_is_between_them_is_held_with_the_effort_that_was_asked_for_and_let
 
 def test_gripper_that_is_not_activated_or_has_a_fault_is_never_moved_and_says_so(host: RobotiqHost) -> None:
     host.gripper.registers["STA"] = 0
-    driven = Driven(DrivenGripper("common.hardware.robotiq", options(host), CONFIG, name="a 2f85"))
+    driven = Driven(DrivenGripper("drivers.robotiq", options(host), CONFIG, name="a 2f85"))
     driven.until(lambda _: "a 2f85: the gripper is not activated (state 0)" in driven.problem)
     with pytest.raises(HardwareFault, match="not activated"):
         driven.gripper.command(0.0, time.monotonic(), 20.0)
@@ -111,7 +111,7 @@ def test_gripper_that_is_not_activated_or_has_a_fault_is_never_moved_and_says_so
 @pytest.mark.slow
 def test_gripper_that_goes_away_is_a_fault_and_is_found_again() -> None:
     with RobotiqHost() as host:
-        driven = Driven(DrivenGripper("common.hardware.robotiq", options(host), CONFIG, name="a 2f85"))
+        driven = Driven(DrivenGripper("drivers.robotiq", options(host), CONFIG, name="a 2f85"))
         assert driven.told("first", 0.02).state == "succeeded"
     driven.until(lambda _: "the gripper's program is gone" in driven.problem)
     driven.until(lambda _: "refused" in driven.problem)

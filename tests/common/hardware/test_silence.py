@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from common.hardware.ur import LATEST, LOOK, Silence
+from drivers.ur import LATEST, LOOK, Silence
 
 
 def test_silence_grows_with_the_time_that_was_listened_and_ends_with_a_word() -> None:

@@ -5,7 +5,7 @@ from common.messages import Header
 from common.perception.depth import DepthError, Rays, check_depth, depth_of, point_cloud
 from common.perception.image import array_to_image
 from common.perception.intake import Unusable, colour_picture
-from tests.common.applications.outlining.outline_scenes import seen_world
+from tests.applications.outlining.outline_scenes import seen_world
 
 HEADER = Header(frame_id="camera")
 

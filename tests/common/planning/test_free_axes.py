@@ -18,8 +18,8 @@ from common.planning.problem import Region
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, tool_down
 from common.scene.workspace import WorkspaceBounds, reach_reason
-from common.setup.proposal import draft
 from tests.small_arms import nodding, scara
+from tools.robot_setup.proposal import draft
 
 CELL = load_cell("panda")
 ANYWHERE = WorkspaceBounds(min_radius=0.1, max_radius=2.0)

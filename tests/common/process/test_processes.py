@@ -14,8 +14,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.errors import NoResponder, NoRouter, RemoteError, RequestLost, RequestTimeout, ZencellError
 from common.messages import TaskCommand
 from common.process.service import add_options, prepare

@@ -8,10 +8,10 @@ from contextlib import asynccontextmanager
 from itertools import pairwise
 from typing import Any
 
+from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import messages as m
 from common import topics
-from common.applications.pick_place.messages import PickPlaceStatus
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.clock import Clock
 from common.errors import Refused
 from common.process.in_process import running_service

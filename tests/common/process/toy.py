@@ -4,9 +4,9 @@ import asyncio
 import time
 from typing import Literal
 
+from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
-from common.applications.pick_place.messages import PickPlaceStatus
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.config import Parameters
 from common.errors import ConfigError, Refused
 from common.messages import TaskCommand, TaskStatus

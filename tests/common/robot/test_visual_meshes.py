@@ -18,7 +18,7 @@ from common.config import RobotConfig
 from common.errors import ConfigError
 from common.robot.model import RobotModel
 from common.robot.visual_meshes import _groups, _parts, _piece, coarse, collision_pieces, visual_pieces
-from tests.common.viewer.scene_cell import pieces_of, robot_of
+from tests.page.scene_cell import pieces_of, robot_of
 
 URDF = """<robot name="post">
   <material name="blue"><color rgba="0 0 1 1"/></material>

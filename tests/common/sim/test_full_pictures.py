@@ -8,7 +8,7 @@ from common.robot.model import RobotModel
 from common.sim.objects import world_object
 from common.sim.rendering import ARM, Renderer, disturbed_depth
 from common.sim.robot_shapes import robot_shapes, triangles
-from tests.common.applications.outlining.outline_scenes import seen_world, world
+from tests.applications.outlining.outline_scenes import seen_world, world
 
 AROUND = Surroundings.model_validate({f: getattr(world("w5"), f) for f in Surroundings.model_fields})
 OBJECTS = [world_object(o) for o in world("w5").objects]

@@ -11,7 +11,7 @@ from common.sim import ray_caster
 from common.sim.objects import object_mesh, world_object
 from common.sim.ray_caster import NEAREST, Mesh, cast, empty_view
 from common.sim.solids import fixture_mesh
-from tests.common.applications.outlining.outline_scenes import WORLDS, seen_world, world
+from tests.applications.outlining.outline_scenes import WORLDS, seen_world, world
 
 GREY = (178 / 255,) * 3
 CAMERA = Pinhole(80.0, 80.0, 32.0, 24.0, 64, 48, transform(rpy_to_matrix(-math.pi, 0, math.pi / 2), (0.5, 0, 2.0)))

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from common.applications.pick_place.topics import scene_balls
+from applications.pick_place.topics import scene_balls
 from common.config import Fixture, World
 from common.errors import ConfigError, Refused
 from common.messages import Header, Vector3, WorldEdit

@@ -15,13 +15,13 @@ from common.client.tables import render
 from common.client.watching import View
 from common.config import load_cell
 from common.messages import Notice, SupervisorStatus
-from common.security.certificates import Authority
 from common.supervision import operation
 from common.supervision.launch import Launch
 from common.supervision.liveness_watchdog import Elsewhere
 from common.transport.local import LocalNetwork
-from common.viewer.guard import close_server, make_server
-from common.viewer.health import HealthPanel
+from page.guard import close_server, make_server
+from page.health import HealthPanel
+from security.certificates import Authority
 
 FAR = Notice(urgent=True, message="the certificate of panda.camera ends", host="camera")
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from common import messages as m
 from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
-from tests.common.applications.outlining.outline_double import OutlineDouble
-from tests.common.applications.pick_place.cell_double import CellDouble
+from tests.applications.outlining.outline_double import OutlineDouble
+from tests.applications.pick_place.cell_double import CellDouble
 
 ACTIVE, IDLE = m.MotionStatus(id="a", state="active"), m.MotionStatus()
 PLANNER, EXECUTOR = "motion_planner", "trajectory_executor"

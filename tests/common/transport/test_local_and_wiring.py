@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
+from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import topics
-from common.applications.pick_place.messages import PickPlaceStatus
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.errors import NoResponder
 from common.messages import Image, LogLine, TaskCommand, TaskStatus
 from common.process.in_process import running_service

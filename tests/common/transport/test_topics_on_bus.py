@@ -11,9 +11,9 @@ from contextlib import suppress
 import msgpack
 import pytest
 
+from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PICK_PLACE_STATUS, REJECTED_TARGETS
 from common import topics
-from common.applications.pick_place.messages import PickPlaceStatus
-from common.applications.pick_place.topics import PICK_PLACE_STATUS, REJECTED_TARGETS
 from common.messages import Image, LogLine, Rejections, TFMessage
 from common.process.log import BusLog
 from common.transport.bus import Bus, Reader, Writer

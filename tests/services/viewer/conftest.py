@@ -11,13 +11,13 @@ from typing import Any, ClassVar
 
 import pytest
 
-from common import messages as m
-from common import topics
-from common.applications.outlining.messages import (
+from applications.outlining.messages import (
     OutlineSelect,
     OutlineSelection,
 )
-from common.applications.outlining.topics import OUTLINE_SELECT
+from applications.outlining.topics import OUTLINE_SELECT
+from common import messages as m
+from common import topics
 from common.clock import Clock
 from common.config import Cell, load_cell, service_config
 from common.errors import Refused
@@ -25,7 +25,7 @@ from common.process.in_process import running_service
 from common.transport.bus import Bus
 from common.transport.local import LocalNetwork
 from services import viewer
-from tests.common.viewer.browser_double import PATIENCE, BrowserDouble, opened
+from tests.page.browser_double import PATIENCE, BrowserDouble, opened
 
 TOKEN = "a-token-that-is-long-enough"
 MIN_AREA = "services.vision_detector.min_area"
@@ -63,7 +63,7 @@ class SceneDouble:
 
 @pytest.fixture(autouse=True)
 def scenes(monkeypatch: pytest.MonkeyPatch) -> list[SceneDouble]:
-    monkeypatch.setattr("common.viewer.scene.Scene", SceneDouble)
+    monkeypatch.setattr("page.scene.Scene", SceneDouble)
     monkeypatch.setattr(viewer, "START_PATIENCE", 0.0)
     monkeypatch.setattr(SceneDouble, "made", [])
     return SceneDouble.made

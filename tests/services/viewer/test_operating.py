@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
+from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PICK_PLACE_STATUS
 from common import messages as m
 from common import topics
-from common.applications.pick_place.messages import PickPlaceStatus
-from common.applications.pick_place.topics import PICK_PLACE_STATUS
 from common.errors import Refused
 from common.transport.reader import Reader
-from tests.common.viewer.browser_double import PATIENCE, BrowserDouble, opened
+from tests.page.browser_double import PATIENCE, BrowserDouble, opened
 from tests.services.viewer.conftest import TOKEN, Played, SceneDouble, page_of, until
 
 

@@ -13,30 +13,30 @@ import yaml
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
-from common import messages as m
-from common import topics
-from common.application import find_application
-from common.applications.outlining.messages import (
+from applications.outlining.messages import (
     Contour,
     Contours,
     OutlinePoints,
     OutlineSelect,
     OutlineStatus,
 )
-from common.applications.outlining.page import choose
-from common.applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
-from common.applications.pick_place.messages import PickPlaceStatus
-from common.applications.pick_place.topics import (
+from applications.outlining.page import choose
+from applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
+from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import (
     DETECTED_OBJECTS,
     DETECTION_IMAGE,
     PICK_PLACE_STATUS,
     REJECTED_TARGETS,
     WORKSPACE_MARKERS,
 )
+from common import messages as m
+from common import topics
+from common.application import find_application
 from common.config import Members, load_cell
-from common.viewer.layout import Layout
+from page.layout import Layout
 from services import viewer
-from tests.common.viewer.browser_double import PATIENCE, BrowserDouble, opened
+from tests.page.browser_double import PATIENCE, BrowserDouble, opened
 from tests.services.viewer.conftest import MIN_AREA, TOKEN, Played, SceneDouble, page_of, until
 
 
@@ -215,7 +215,7 @@ async def test_rejection_that_came_before_the_scene_is_shown_in_it(
         assert go.wait(PATIENCE)
         return SceneDouble(*arguments, **options)
 
-    monkeypatch.setattr("common.viewer.scene.Scene", slow)
+    monkeypatch.setattr("page.scene.Scene", slow)
     async with page_of("panda") as played, opened(played.port) as page:
         rejected = m.Rejections(header=m.Header(), rejected=[m.Rejection(position=m.Vector3(x=1.0), reason="too far")])
         played.bus.writer(REJECTED_TARGETS).put(rejected)

@@ -1,0 +1,66 @@
+"""A double of perception, for simulations: says what stands there and its outline, and needs no picture."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from applications.outlining.messages import OutlinePoints
+from applications.outlining.perceived_solids import PerceivedSolid
+from applications.outlining.scene import planning_scene
+from applications.outlining.topics import CONTOUR_PATH
+from common import topics
+from common.config import Parameters, RobotConfig, Surroundings, Tunable
+from common.messages import Header, Pose, Vector3, WorldObject
+from common.process.pace import Pace
+from common.process.planning_scene import SceneWriter
+from common.scene.home import HomeWatch
+from common.transport.bus import Bus
+
+REPLACES = ("depth_camera", "contour_detector", "pixel_to_world", "duplicate_remover", "outline_scene")
+SETTINGS = ("motion.velocity_scaling=0.6", "motion.acceleration_scaling=1.0")
+WORLD = "world"
+
+
+class Config(Parameters):
+    """How often is looked, and how much is told."""
+
+    robot: RobotConfig
+    world: Surroundings
+    rate: Tunable[float] = Field(2.0, gt=0, le=30, description="looks per second of cell time [Hz]")
+    points: Tunable[int] = Field(3, ge=2, le=1000, description="of an outline")
+
+
+def perceived(index: int, thing: WorldObject) -> PerceivedSolid:
+    """A solid that stands upright, as it would be perceived."""
+    return PerceivedSolid(index, thing.id, np.array(thing.outline), thing.base, thing.height, thing.color, False)
+
+
+def path(solid: PerceivedSolid, points: int, header: Header) -> OutlinePoints:
+    """The outline of its top face in so many points at most."""
+    step = max(1, len(solid.outline) // points)
+    top = solid.base + solid.height
+    poses = [Pose(position=Vector3(x=x, y=y, z=top)) for x, y in solid.outline[::step].tolist()]
+    return OutlinePoints(header=header, poses=poses, object=solid.label)
+
+
+async def run(bus: Bus, config: Config) -> None:
+    """While the arm is at home, tell of all that stands there, and of the first one's outline."""
+    truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.JOINT_STATES)
+    paths, out = bus.writer(CONTOUR_PATH), SceneWriter(bus)
+    home = HomeWatch(config.robot.named_poses["home"])
+    await out.begin(planning_scene(config.world, [], 0))
+    await bus.ready()
+    pace = Pace(bus, lambda: bus.clock.wall_rate(config.rate, 30.0))
+    while True:
+        objects, state, stamp = truth.latest, joints.latest, bus.header().stamp
+        if state is not None:
+            at = dict(zip(state.name, state.position, strict=True))
+            if all(name in at for name in config.robot.joints):
+                home.note([at[name] for name in config.robot.joints], state.header.stamp)
+        if objects is not None and home.covers(stamp):
+            solids = [perceived(index, thing) for index, thing in enumerate(objects.objects) if thing.outline]
+            out.put(planning_scene(config.world, solids, stamp))
+            header = Header(stamp=stamp, frame_id=WORLD)
+            paths.put(path(solids[0], config.points, header) if solids else OutlinePoints(header=header))
+        await pace.wait()

@@ -1,0 +1,235 @@
+"""Outlining on the operator's page: its words, the objects to choose from, as buttons and in the scene, the outline."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from applications.outlining.contours_choice import middle_of
+from applications.outlining.messages import Contour, OutlineSelect, OutlineSelection, OutlineStatus
+from applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT, OUTLINE_STATUS
+from common import topics
+from common.config import Fixture
+from common.messages import CollisionObject, MotionStatus, TaskStatus
+from common.perception.pinhole import CameraError, Pinhole
+from common.terminal import printable
+from common.topics import Topic
+from page.layers import Layer
+from page.nodes import FLAT, add_line, points_of, rgb_of
+
+if TYPE_CHECKING:
+    import viser
+
+    from page.console import Console
+
+Array = NDArray[np.float64]
+
+STATES = {"SELECTING": "Waiting for a choice", "PLANNING": "Planning", "APPROACHING": "Approaching",
+          "TRACING": "Tracing", "RETREATING": "Retreating"}
+LATENCY = "Picture to path"
+REQUESTS = (OUTLINE_SELECT,)
+
+LARGEST = "Largest"
+OUTLINE = (255, 140, 40)
+CHOSEN = (255, 255, 255)
+_ENDED = ("IDLE", "DONE", "ERROR")
+_PATH_TIMEOUT = 5.0  # [s] wall: from choosing an object until its path is known
+_LIFTED = 0.002  # [m] lines lie this far above the faces, so as to be seen
+_POINTS = 200  # of a contour
+_MOST = 100  # contours, the largest: to draw as many as noise has would keep the page from whoever presses STOP
+_PIN = 0.006  # radius of what is clicked [m]
+
+_newest: WeakKeyDictionary[Console, OutlineSelection] = WeakKeyDictionary()  # what was chosen last on a page
+
+
+def counters(status: TaskStatus, rejected: int) -> dict[str, object]:
+    """The figures of the task by their names."""
+    if not isinstance(status, OutlineStatus):
+        return {}
+    return {"points": status.points, "outline [mm]": f"{1e3 * status.length_m:.0f}",
+            "planned": f"{100 * status.fraction:.0f} %", "failures": status.failures}
+
+
+def progress(status: TaskStatus, motion: MotionStatus | None) -> float:
+    """How far the motion under way is."""
+    return motion.progress if motion is not None and motion.state == "active" else 0.0
+
+
+def choice_of(contour: Contour) -> OutlineSelect:
+    """The choice of what is seen here, however later pictures count."""
+    return OutlineSelect(rule="index", index=contour.index, at=middle_of(contour))
+
+
+async def choose(console: Console, choice: OutlineSelect) -> None:
+    """Have an object outlined: it is chosen, and the task starts once its path is known. Tells which it is.
+
+    Whoever stops or holds the arm until then has the last word, and of several choices the last one counts.
+    """
+    console.tell("")
+    heard, stops = console.heard, console.stops
+    chosen = _newest[console] = await console.ask(OUTLINE_SELECT, choice)
+    status = console.latest(OUTLINE_STATUS)
+    if status is not None and (not status.started or status.state in _ENDED):  # else it traces what is chosen by itself
+        try:
+            async with asyncio.timeout(_PATH_TIMEOUT):
+                while (path := console.latest(CONTOUR_PATH)) is None or path.object != chosen.label:  # noqa: ASYNC110
+                    await asyncio.sleep(0.02)  # others read the messages themselves
+        except TimeoutError:
+            pass  # the task tells what is wrong with the object
+        if _newest[console] is not chosen:  # that one starts the task, if anything
+            return
+        if console.stops > stops or (console.heard or 0) > (heard or 0):
+            console.tell(f"{chosen.label} is chosen, but not traced: the arm was stopped or held meanwhile", "busy")
+            return
+        await console.command("start", heard=heard)
+    console.tell(f"{chosen.label} is chosen", "good")
+
+
+class Controls:
+    """A button for each object of the picture, the chosen one marked."""
+
+    TOPICS = (CONTOURS,)
+    PERIOD = 0.5  # [s]
+
+    def __init__(self, gui: viser.GuiApi, console: Console) -> None:
+        """Lay the buttons out where the GUI stands."""
+        self._console = console
+        self._offered: dict[str, Contour] = {}
+        self._buttons = gui.add_button_group("Outline", (LARGEST,), hint="choose an object: it is traced")
+        console.on_choice(self._buttons, self._choose)
+
+    def show(self, topic: Topic[Any], message: Any) -> None:
+        """Offer the objects of a picture."""
+        self._offered = {contour.label: contour for contour in message.contours}
+        marked = (f"{'● ' if c.index == message.selected else ''}{c.label}" for c in message.contours)
+        options = (*marked, LARGEST)
+        if options != self._buttons.options:
+            self._buttons.options = options
+
+    async def _choose(self, chosen: str) -> None:
+        contour = self._offered.get(chosen.removeprefix("● "))
+        await choose(self._console, choice_of(contour) if contour is not None else OutlineSelect(rule="auto"))
+
+
+class Outline(Layer):
+    """The outline of the chosen object as a closed line."""
+
+    LABEL = "Outline"
+    LEGEND = (("outline that is traced", OUTLINE),)
+    TOPICS = (CONTOUR_PATH,)
+
+    def build(self) -> None:
+        """Start without one."""
+        self.node: viser.LineSegmentsHandle | None = None
+        self._points: Array = np.empty((0, 3))
+
+    def show(self, topic: Topic[Any], message: Any) -> None:
+        """Show this outline; one without points clears it."""
+        points = points_of(message.poses)
+        if np.array_equal(points, self._points):
+            return
+        self._points = points
+        if self.node is not None:
+            self.node.remove()
+            self.node = None
+        if len(points) > 1:
+            above = points + np.array([0.0, 0.0, 2 * _LIFTED])  # the line of its contour, too
+            self.node = add_line(self.scene, f"{self.root}/line", above, OUTLINE, 4.0, closed=True)
+
+
+class ContourChoice(Layer):
+    """The contours of the picture, laid on what they are the contours of, each with a pin to click and its label."""
+
+    NAME = "contours"
+    LABEL = "Contours to choose from"
+    LEGEND = (("contour that is chosen", CHOSEN),)
+    TOPICS = (CONTOURS, topics.DEPTH_CAMERA_INFO, topics.PLANNING_SCENE, topics.TF_STATIC)
+    PERIOD = 0.5
+
+    def build(self) -> None:
+        """Start without any."""
+        self._shown: object = None
+        self.nodes: list[viser.LineSegmentsHandle | viser.LabelHandle | viser.IcosphereHandle] = []
+
+    def show(self, topic: Topic[Any], message: Any) -> None:
+        """Show the newest contours, as their camera sees them, on the objects that have their labels."""
+        m, info = self.stage.latest(CONTOURS), self.stage.latest(topics.DEPTH_CAMERA_INFO)
+        if m is None or info is None:
+            return
+        try:
+            camera = Pinhole.from_info(info, self.stage.transforms.pose(info.header.frame_id))
+        except CameraError:  # a distorted camera: pixels are not where a pinhole would see them
+            return
+        scene = self.stage.latest(topics.PLANNING_SCENE)
+        tops = {thing.id: _top(thing) for thing in scene.objects} if scene else {}
+        largest = sorted(m.contours, key=lambda c: (c.index != m.selected, -c.area))[:_MOST]
+        heights = [tops.get(c.label) or self._support(c, camera) for c in largest]
+        what = (largest, m.selected, m.width, heights, camera.T_world_optical.tolist(), camera.fx, camera.cx)
+        if what == self._shown:
+            return
+        self._shown = what
+        for node in self.nodes:
+            node.remove()
+        self.nodes = []
+        for contour, height in zip(largest, heights, strict=True):
+            self._add(contour, height + _LIFTED, camera, chosen=contour.index == m.selected)
+
+    def _add(self, contour: Contour, height: float, camera: Pinhole, *, chosen: bool) -> None:
+        pixels = np.array(contour.pixels)
+        some = pixels[np.unique(np.linspace(0, len(pixels) - 1, _POINTS).round().astype(int))]
+        at = camera.on_plane(some, height)
+        points = np.column_stack([at, np.full(len(at), height)])
+        if not np.isfinite(points).all():  # the camera does not look down at it
+            return
+        name, color = f"{self.root}/{contour.index}", CHOSEN if chosen else rgb_of(contour.color)
+        line = add_line(self.scene, f"{name}_line", points, color, 2.0, closed=True)
+        x, y = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
+        pin = self.scene.add_icosphere(f"{name}_pin", _PIN, color, position=(x, y, height + 2 * _PIN), **FLAT)
+        console, choice = self.stage.console, choice_of(contour)
+
+        @pin.on_click
+        async def _(_event: object) -> None:
+            console.put(lambda: choose(console, choice))
+
+        label = self.scene.add_label(
+            f"{name}_label", printable(f"{contour.index}: {contour.label}"), position=(x, y, height + 4 * _PIN),
+            anchor="bottom-center", font_screen_scale=0.8,
+        )
+        self.nodes += [line, pin, label]
+
+    def _support(self, contour: Contour, camera: Pinhole) -> float:
+        """Height [m] of the highest flat fixture that the contour lies on, else of the table."""
+        middle = np.array(contour.pixels).mean(axis=0)
+        fixtures = self.stage.around.fixtures
+        for height, fixture in sorted(((fixture_top(f), f) for f in fixtures), key=lambda pair: -pair[0]):
+            x, y = camera.on_plane(middle, height)
+            if _carries(fixture, float(x), float(y)):
+                return height
+        return self.stage.around.table_height
+
+
+def fixture_top(fixture: Fixture) -> float:
+    """Height [m] of the top of an upright fixture."""
+    sizes = fixture.dimensions
+    half = {"box": sizes[-1] / 2, "cylinder": sizes[-1] / 2, "sphere": sizes[0]}[fixture.shape]
+    return fixture.position[2] + half
+
+
+def _carries(fixture: Fixture, x: float, y: float) -> bool:
+    if fixture.shape == "sphere" or any(fixture.rpy[:2]):
+        return False
+    dx, dy = x - fixture.position[0], y - fixture.position[1]
+    if fixture.shape == "cylinder":
+        return bool(np.hypot(dx, dy) <= fixture.dimensions[0])
+    c, s = np.cos(fixture.rpy[2]), np.sin(fixture.rpy[2])
+    return bool(abs(c * dx + s * dy) <= fixture.dimensions[0] / 2 and abs(c * dy - s * dx) <= fixture.dimensions[1] / 2)
+
+
+def _top(thing: CollisionObject) -> float:
+    """Height [m] of the top of an upright object."""
+    sizes = thing.dimensions
+    return thing.pose.position.z + (sizes[0] if thing.shape == "sphere" else sizes[-1] / 2)

@@ -1,0 +1,252 @@
+"""The outline task decides: the chosen contour is traced once, and the arm goes home.
+
+Everything from the approach to the way home is planned before the arm moves, because once it is over the objects the
+camera sees the arm. What goes wrong ends in ERROR with one line, the arm at rest, at home where it can be brought.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from pydantic import Field, ValidationError
+
+from applications.outlining.legs import NEAR, Legs, OutlineView, TracingParameters, closed, length, same_place
+from applications.outlining.messages import OutlinePoints, OutlineStatus
+from common import messages as m
+from common.config import Tunable
+from common.tasks.deciding import TaskConfig
+from common.tasks.engine import Task
+from common.tasks.stages import Cycle, Grip, Look, Move, Place, Stage, place_of
+
+AT_HOME = 0.01  # [rad] from it
+MOST_FORGOTTEN = 5  # motions in a row, each by a controller that was started again
+SHUT = 0.002  # [m] fingers this close together count as closed
+
+
+class Config(TracingParameters, TaskConfig):
+    """How the task behaves; times are cell time unless they say wall."""
+
+    planning_time: Tunable[float] = Field(10.0, gt=0, le=600, description="wall time for one plan [s]")
+    overtime: Tunable[float] = Field(
+        30.0, gt=0, le=3600, description="a motion that takes so much longer is stopped [s]"
+    )
+    frame_timeout: Tunable[float] = Field(
+        3.0, ge=0.1, le=60, description="a contour from an older picture starts no motion [s, wall time]"
+    )
+    selection_timeout: Tunable[float] = Field(
+        10.0, ge=0, le=3600, description="wait for a usable contour while pictures come, before giving up; 0: for "
+                                         "ever [s, wall time]"
+    )
+    picture_timeout: Tunable[float] = Field(
+        60.0, ge=0, le=3600, description="wait for pictures while none comes, before giving up; longer than a camera "
+                                         "or detector takes to be started again; 0: for ever [s, wall time]"
+    )
+
+
+class Outline(Task[OutlineView]):
+    """Traces a contour. After a stop the arm goes home and outlines anew: half an outline is no outline."""
+
+    p: Config
+    status: OutlineStatus
+
+    def __init__(self, config: Config, status: OutlineStatus, prefix: str, speed: float = 1.0) -> None:
+        """Start from nothing known: see `Task`."""
+        super().__init__(config, status, prefix, speed)
+        self.status.standoff = config.standoff
+        self._legs = Legs(config, self.gripper)
+        self._home = config.robot.named_poses["home"]
+        self._cycle = Cycle()
+        self._traced = False
+        self._returned = False  # home was reached and not left since
+        self._error = ""  # what went wrong, while the arm is brought home
+        self._forgotten = 0  # motions since the last that ended well
+        self._up: Move | None = None  # the first motion of the way home from anywhere
+        self._excused: tuple[str, str] | None = None  # contact from which the arm has to be freed
+        self._path: OutlinePoints | None = None  # for which the motions were made
+        self._named: dict[str, Place] = {}  # where what stood when they were made, as it was called then
+
+    # --- what to do next -------------------------------------------------------------------------------------
+
+    def decide(self, view: OutlineView) -> None:
+        """Go home first, end, or look for a contour and plan around it."""
+        if self.status.state == "DONE":
+            return
+        if not self._is_home(view):
+            self._recover(view)
+        elif self._error:
+            self._give_up(self._error)
+        elif self._traced:
+            self.end("DONE")
+        else:
+            self._select(view)
+
+    def _select(self, view: OutlineView) -> None:
+        """Take the chosen contour once the planning scene holds its object; give up after a while without one."""
+        self.status.state, self.status.stage = "SELECTING", ""
+        path = view.path
+        if path is not None and min(view.stamps) < self.look_after:
+            path = None
+        solid = view.solid()
+        unseen = "no contour came from the camera" if path is None else self.unseen(view)
+        if path is not None and len(path.poses) > 1 and solid is not None and not unseen:
+            self._take(path, solid, view)
+            return
+        if path is None or unseen:
+            problem = unseen
+        elif not path.poses:
+            problem = path.message or "no object is chosen"
+        elif len(path.poses) < 2:  # noqa: PLR2004 - a point has no outline
+            problem = f"the contour of {path.object} is a single point"
+        else:
+            problem = f"the planning scene does not hold {path.object or 'the object'} around which the contour goes"
+        self.status.message = problem
+        # Waiting for a person or for pictures is by the clock on the wall, also in a fast cell.
+        limit = self.p.picture_timeout if unseen else self.p.selection_timeout
+        waited = self.patience.lasts(bool(unseen), view.now)
+        if 0 < limit * self.speed < waited:
+            self.fail(problem, view)
+
+    def _take(self, path: OutlinePoints, solid: str, view: OutlineView) -> None:
+        """Make the motions for a contour that goes round a solid of the planning scene."""
+        assert view.gripper is not None
+        points, cycle = closed(path), Cycle(path.object)
+        try:
+            motions = self._legs.outline(points, solid, cycle)
+        except ValidationError:  # a path may be all that a message of it can hold
+            self.fail(f"the contour of {path.object} has too many points, or lies too far away", view)
+            return
+        status = self.status
+        status.state, status.message, status.subject = "PLANNING", "", path.object
+        status.points, status.length_m, status.fraction, status.closed = len(path.poses), length(points), 0.0, False
+        status.invalid_depth, status.standoff = path.invalid_depth, self.p.standoff
+        self._cycle = cycle
+        self._path, self._named = path, _places(view)
+        if view.gripper.width > SHUT:
+            self.row.append(Grip("close", "PLANNING", self._cycle, width=0.0))
+        self.row += [*motions, Look()]
+        self.patience.reset()
+
+    def _is_home(self, view: OutlineView) -> bool:
+        assert view.q is not None
+        return self._returned or max(abs(a - b) for a, b in zip(view.q, self._home, strict=True)) < AT_HOME
+
+    # --- what happened ---------------------------------------------------------------------------------------
+
+    def began_anew(self) -> None:
+        """Forget the outline of before."""
+        self.status.closed = self._traced = False
+
+    def note(self, view: OutlineView) -> None:
+        """Whoever moves the arm, it is no longer at home."""
+        if self.running is None and view.motion is not None and view.motion.state == "active":
+            self._returned = False
+
+    def planned(self, move: Move, response: m.PlanResponse) -> None:
+        """How much of the contour can be traced is told also when it is too little."""
+        if move.name == "trace":
+            self.status.fraction = response.fraction
+
+    def may_begin(self, stage: Stage, view: OutlineView) -> bool:
+        """Without a fresh picture nothing begins, nor where it shows the contour elsewhere than was planned."""
+        if isinstance(stage, Move) and stage.fresh and self.unseen(view):
+            self.clear()
+            self.patience.reset()
+            return False
+        if isinstance(stage, Move) and stage.fresh and self._path and not same_place(self._path, view.path):
+            self.displaced(stage, view, f"{self.status.subject or 'the contour'} is not where it was")
+            return False
+        if isinstance(stage, Move):
+            self._returned = False
+        return True
+
+    def succeeded(self, stage: Stage, view: OutlineView) -> None:
+        """Take note of what a stage has done."""
+        self._forgotten = 0
+        if stage.name == "trace":
+            self._traced, self.status.closed = True, self.status.fraction >= 1
+        elif stage.name == "home":
+            self._returned, self._excused = True, None
+
+    def forgotten(self, stage: Stage, view: OutlineView) -> None:
+        """Decide anew, from home: the controller was started again, and what it was asked for was no mistake."""
+        self.displaced(stage, view, f"{stage.name} was forgotten by the controller")
+
+    def displaced(self, stage: Stage, view: OutlineView, problem: str) -> None:
+        """Decide anew, from home: nor is it one where the controller was started again before it could answer."""
+        self._forgotten += 1
+        if self._forgotten > MOST_FORGOTTEN:
+            self.fail(problem, view)
+            return
+        self.clear()
+        self.patience.reset()
+        self.status.failures += 1
+        self._returned, self.status.message = False, problem
+
+    def obstructed(self, stage: Stage, view: OutlineView, problem: str) -> None:
+        """Decide anew, from home: half an outline is none, and from home it is seen what is in the way."""
+        self.displaced(stage, view, problem)
+
+    # --- failure ---------------------------------------------------------------------------------------------
+
+    def plan_failed(self, move: Move, response: m.PlanResponse, view: OutlineView) -> None:
+        """End, or leave out what cannot be on the way home: the arm may stand as high as it reaches."""
+        if move is self._up and response.colliding and self._excused is None:
+            self._excused = response.colliding  # free the arm from what it stands against
+            self._recover(view)
+        elif move is self._up:
+            self.clear()
+            self.row += [self._legs.home(self._cycle), Look()]
+        elif not self._error and self._is_new(response.colliding or (), view):
+            self.displaced(move, view, response.message)
+        elif not self._error:
+            subject = self.status.subject
+            self.fail(f"{subject}: {response.message}" if subject else response.message, view)
+        else:
+            self._give_up(f"{self._error}; the arm stays where it is: {response.message}")
+
+    def _is_new(self, names: Sequence[str], view: OutlineView) -> bool:
+        """Whether one of these was not there when the motions were made, or something else was called so."""
+        now, before = _places(view), self._named
+        return any(name in now and (name not in before or math.dist(now[name], before[name]) > NEAR) for name in names)
+
+    def fail(self, message: str, view: OutlineView, *, go_home: bool = True) -> None:
+        """End in ERROR, by way of home when the arm is somewhere else."""
+        self.clear()
+        self.status.failures += 1
+        first, self._error = self._error, self._error or message
+        self.status.message = self._error
+        self.patience.reset()
+        if self.running is not None:  # the fingers are still closing: they may finish
+            return
+        if first:
+            self._give_up(f"{first}; the arm stays where it is: {message}")
+        elif self._is_home(view):
+            self._give_up(message)
+        else:
+            self._recover(view)
+
+    def _recover(self, view: OutlineView) -> None:
+        """Up and home, from wherever the arm is."""
+        self.clear()
+        up = self._up = self.retreat(view, self._excused, self.p.approach_clearance)
+        up.state, up.cycle, up.whole = "RETREATING", self._cycle, True
+        self.row += [up, self._legs.home(self._cycle), Look()]
+
+    def _give_up(self, message: str) -> None:
+        self._error, self._excused = "", None
+        self.end("ERROR", message)
+
+    # --- what its motions need -------------------------------------------------------------------------------
+
+    def obstacles(self, move: Move, view: OutlineView) -> list[tuple[float, float]]:
+        """Nothing: what stands around is seen from home only."""
+        return []
+
+    def time_limit(self, stage: Stage) -> float:
+        """A stage that takes longer is stopped [s]."""
+        return self.p.overtime + (stage.seconds if isinstance(stage, Move) else 0.0)
+
+
+def _places(view: OutlineView) -> dict[str, Place]:
+    return {thing.id: place_of(thing.pose) for thing in view.scene.objects} if view.scene is not None else {}

@@ -1,0 +1,431 @@
+"""Find balls of known size and colour in a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
+
+from applications.pick_place.blobs import (
+    Blob,
+    Mask,
+    Outline,
+    Traced,
+    all_of,
+    find_blobs,
+    long_ones,
+    middles,
+    small_blobs,
+)
+from applications.pick_place.depth_balls import find_in_depth
+from applications.pick_place.fit import Fit, fit_each, fit_spheres
+from applications.pick_place.masks import Colours, Masks, RedMasks
+from applications.pick_place.odd import (
+    BELOW,
+    BLURRED,
+    COVERED,
+    EXPLAINED,
+    FALLING,
+    FLAT,
+    LONG,
+    MOST_OVAL,
+    MOST_UNLIKE,
+    NOT_ROUND,
+    THIN,
+    Odd,
+    covered,
+    oval,
+    sized,
+    unlike,
+)
+from applications.pick_place.resting import Resting, is_table, shows_table
+from applications.pick_place.separation import separate
+from common.config import CameraConfig, Parameters, Surroundings, Tunable
+from common.perception.depth import Depth
+from common.perception.exposure import blindness
+from common.perception.pinhole import Pinhole
+from common.perception.sphere import ray_distances, silhouettes
+from common.perception.white import Chosen, blue_share, looked_at
+
+Array = npt.NDArray[np.float64]
+Picture = npt.NDArray[np.uint8]
+
+_ROUND = 0.96  # part of an outline that must fit for a blob to be one ball
+_BRIGHT = 60  # [0..255] of green from which on it tells a colour together with blue, also where red is clipped
+_WARMEST = 0.25  # part of the blue, compared with green, that is left in light of 2700 K
+_LEAST_BLUE = 0.15  # of it in light in which balls still show some: that of 2400 K has less
+_LEAST_GREEN = 0.05  # of a ball's colour: what is given for less is no measure of its blue
+_TURNS_RED = 0.25, 0.9  # green of a container, compared with red, of which it looks red when that is clipped
+_LEAST_TABLE = 0.1  # part of a picture that shows the table, at least, for it to tell the colour of the light
+
+Hue = Annotated[int, Field(ge=0, le=180)]
+Byte = Annotated[int, Field(ge=0, le=255)]
+Hsv = tuple[Hue, Byte, Byte]
+_Key = tuple[Traced, tuple[float, float], float]  # of a blob: its outline, its centre [px], the offset expected [m]
+
+
+class DetectorOptions(Parameters):
+    """How red is told from the rest. HSV as OpenCV has it: hue 0 to 180, saturation and value 0 to 255."""
+
+    hsv_red_lo1: Tunable[Hsv] = Field((0, 120, 8), description="lower end of the first window: hue, saturation, value")
+    hsv_red_hi1: Tunable[Hsv] = Field((10, 255, 255), description="upper end of the first window")
+    hsv_red_lo2: Tunable[Hsv] = Field(
+        (160, 120, 8), description="lower end of the second window: red goes round the hue axis"
+    )
+    hsv_red_hi2: Tunable[Hsv] = Field((180, 255, 255), description="upper end of the second window")
+    morph_kernel_px: Tunable[int] = Field(7, ge=1, le=51, description="ellipse for opening, then closing [px]")
+    min_contour_area_px: Tunable[float] = Field(400.0, gt=0, le=1e7, description="smaller blobs are ignored [px^2]")
+    outline_offset_px: Tunable[float] = Field(
+        -1.0, ge=-10, le=10, description="where the outline is expected, outside of the silhouette [px]"
+    )
+    max_offset_px: Tunable[float] = Field(
+        1.5, gt=0, le=20, description="an outline that is further from where it is expected is not that of a ball [px]"
+    )
+
+    @model_validator(mode="after")
+    def _windows_are_not_empty(self) -> DetectorOptions:
+        for low, high in (("hsv_red_lo1", "hsv_red_hi1"), ("hsv_red_lo2", "hsv_red_hi2")):
+            for name, a, b in zip("hsv", getattr(self, low), getattr(self, high), strict=True):
+                if a > b:
+                    raise ValueError(f"{low} {name} = {a} is above {high} {name} = {b}")
+        return self
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A ball that was seen.
+
+    Attributes:
+        position: (3,) where the ray of its centre meets the plane of the centres of balls on the table [m], world.
+        pixel: (u, v) where its centre is seen [px].
+        area: of the blob that it is part of, divided by the balls in it [px^2].
+        partial: reaches over the border of the picture.
+        outline: (n, 2) its fitted silhouette [px].
+    """
+
+    position: tuple[float, float, float]
+    pixel: tuple[float, float]
+    area: float
+    partial: bool
+    outline: Array
+
+
+@dataclass(frozen=True)
+class _Seen:
+    center: Array  # (3,) relative to the optical centre [m]
+    area: float  # [px^2]
+    border: Array  # (m, 2) pixels of its blob at the border of the picture
+
+
+class _Round(NamedTuple):
+    """How well one sphere fits a blob: where it is relative to the optical centre [m], off by so much [m]."""
+
+    center: Array
+    offset: float
+    close: float  # part of the outline that fits
+    oval: float  # by which it is longer one way [m]
+
+
+class Detector:
+    """Finds balls: the same picture always gives the same detections."""
+
+    def __init__(self, surroundings: Surroundings, options: DetectorOptions | None = None) -> None:
+        """Prepare for balls of the surroundings' size.
+
+        Args:
+            surroundings: radius of the balls, table, container.
+            options: colour windows and sizes; they may change between pictures.
+        """
+        self.options = options or DetectorOptions()
+        self.resting = Resting.of(surroundings)
+        self._around = surroundings
+        self._table: tuple[Pinhole, Chosen | None] | None = None  # where the last camera shows it
+        self._masks = Masks()
+        self._outlines: dict[Traced, Outline] = {}  # of the last picture: what is there again is not worked out again
+        self._fits: dict[_Key, list[_Round]] = {}
+        self.blind = ""  # why the last picture tells nothing
+        self.odd: list[Odd] = []  # what is red in the last picture and no ball on the table
+        self.too_small = 0  # blobs in the last picture that were not looked at, but for those in the container
+        self.too_large = 0  # round blobs in it that look larger than a stack, but for those in the container
+        self._last: tuple[Mask, Pinhole, DetectorOptions, list[Detection]] | None = None
+
+    def masks(self, picture: Picture, camera: Pinhole) -> RedMasks:
+        """What is red in a bgr8 picture. The masks are not to be written to.
+
+        The colour of the light is that of the table: beside it a camera at the side sees the floor, of another colour.
+        """
+        o = self.options
+        windows = (o.hsv_red_lo1, o.hsv_red_hi1), (o.hsv_red_lo2, o.hsv_red_hi2)
+        if self._table is None or self._table[0] is not camera:
+            table = shows_table(self._around, camera, looked_at(camera.height, camera.width))
+            self._table = camera, table if table.mean() >= _LEAST_TABLE else None
+        return self._masks.of(picture, Colours(windows, o.morph_kernel_px), self._table[1])
+
+    def detect(self, picture: Picture, camera: Pinhole) -> list[Detection]:
+        """Balls in a bgr8 picture (height, width, 3), nearest to the upper left corner first.
+
+        A picture that is the last one again, as drawn ones without noise often are, is not looked at again.
+        """
+        masks = self.masks(picture, camera)
+        last = self._last
+        if last and masks.closed is last[0] and camera is last[1] and self.options == last[2]:
+            return list(last[3])
+        found = [one for one in self._look_at(masks, camera) if not self._is_floor(one, picture, camera)]
+        self.blind = "" if found else blindness(picture)
+        self._last = (masks.closed, camera, self.options.model_copy(), found)
+        return list(found)
+
+    def detect_in_depth(self, picture: Picture, depth: Depth, camera: Pinhole) -> list[Detection]:
+        """The same by a picture with depth (height, width) [m]: balls are where they are, on the table or on others."""
+        fine, closed, narrow = self.masks(picture, camera)
+        centers = find_in_depth(fine, depth, camera, self.resting.radius)
+        found = []
+        if len(centers):
+            pixels, outlines = camera.project(centers), silhouettes(camera, centers, self.resting.radius, 32)
+            inside = np.asarray(camera.in_picture(outlines).all(axis=1))
+            area = cv2.countNonZero(fine) / len(centers)
+            for center, pixel, outline, whole in zip(centers.tolist(), pixels.tolist(), outlines, inside, strict=True):
+                place, seen = (center[0], center[1], center[2]), (pixel[0], pixel[1])
+                found.append(Detection(place, seen, area, not whole, outline))
+        self.odd = self._on_table(camera, [
+            self._odd(np.array(middle), camera, NOT_ROUND)
+            for middle, contour in middles(closed, self.options.min_contour_area_px)
+            if not any(cv2.pointPolygonTest(contour, one.pixel, False) >= 0 for one in found)
+        ] + self._thin(narrow, camera))
+        self.blind, self.too_small, self._last = "" if found else blindness(picture), 0, None
+        return sorted(found, key=lambda d: (d.pixel[1], d.pixel[0]))
+
+    def _look_at(self, masks: RedMasks, camera: Pinhole) -> list[Detection]:
+        fine, closed, narrow = masks
+        if self._last is None or camera is not self._last[1]:
+            self._outlines.clear()
+            self._fits.clear()
+        blobs = find_blobs(closed, fine, camera, self.options.min_contour_area_px, self._outlines)
+        self._outlines = {blob.traced: blob.outline for blob in blobs}
+        small = small_blobs(closed, self.options.min_contour_area_px)
+        # What shows of a ball below others in the container is small, too.
+        self.too_small = sum(not self.resting.shows_container(camera, pixel) for pixel in small)
+        # Of a ball straight below the camera. How much larger one looks that lies higher is a length, which hardly
+        # grows with the distance: what tells that from the side, too, is this, not how much a pixel is over there.
+        pixel_size = abs(float(camera.position[2]) - self.resting.plane) / camera.fx
+        offset = self.options.outline_offset_px * pixel_size
+        seen: list[_Seen] = []
+        self.odd, self.too_large = self._thin(narrow, camera), 0
+        alone, crowded, offsets = self._alone(blobs, camera, offset, pixel_size)
+        seen += alone
+        spread = 1.0 * pixel_size
+        for blob in crowded:  # balls that touch, hide each other or reach over the border
+            if offsets:  # all outlines of a picture are off by as many pixels: balls that stand alone say by how many
+                there = self._pixel_size(camera, blob.centroid)
+                offset, spread = float(np.median(offsets)) * there, 0.2 * there
+            centers = separate(blob.outline, closed, camera, self.resting, offset)
+            if len(centers):
+                fit = fit_spheres(blob.outline, centers, self.resting.radius, offset=offset, offset_std=spread)
+                if not self._is_explained(blob, fit.owner, camera):
+                    self.odd += [self._odd(camera.project(center + camera.position), camera, NOT_ROUND)
+                                 for center in fit.centers]
+                    continue
+                reasons = self._higher(blob, fit, camera, fine, offset if offsets else None, pixel_size)
+                if reasons:
+                    self.odd += [self._odd(camera.project(center + camera.position), camera, reason)
+                                 for center, reason in zip(fit.centers, reasons, strict=True)]
+                    continue
+                seen += [_Seen(center, blob.area / len(centers), blob.border) for center in fit.centers]
+            elif not len(blob.border):
+                self.odd.append(self._odd(blob.centroid, camera, NOT_ROUND))
+        self.odd = self._on_table(camera, self.odd)
+        return sorted(self._detections(seen, camera), key=lambda d: (d.pixel[1], d.pixel[0]))
+
+    def _pixel_size(self, camera: Pinhole, pixel: Array) -> float:
+        """How much one pixel is of a ball on the table that is seen at a pixel [m]: from the side more of one far away.
+
+        Above the horizon, where none is, it is that of one straight below.
+        """
+        center = np.append(camera.on_plane(pixel, self.resting.plane), self.resting.plane)
+        depth = float(camera.to_camera(center)[2])
+        return (depth if np.isfinite(depth) else abs(float(camera.position[2]) - self.resting.plane)) / camera.fx
+
+    def _alone(
+        self, blobs: list[Blob], camera: Pinhole, offset: float, pixel_size: float
+    ) -> tuple[list[_Seen], list[Blob], list[float]]:
+        """Blobs that are one ball wholly in view, blobs that are not round, and the offsets of the former [px].
+
+        What is round but as large as no ball looks where it can lie is left out: it is something else, or falling.
+        """
+        crowded: list[Blob] = []
+        tried: list[tuple[Blob, _Key]] = []
+        starts: dict[_Key, list[Array]] = {}  # of what was not in the last picture
+        fits: dict[_Key, list[_Round]] = {}
+        for blob in blobs:
+            center = camera.on_plane(blob.centroid, self.resting.plane)
+            if len(blob.border) or len(blob.outline) < 12 or not np.isfinite(center).all():
+                crowded.append(blob)
+                continue
+            key = blob.traced, (float(blob.centroid[0]), float(blob.centroid[1])), offset
+            if key in self._fits:
+                fits[key] = self._fits[key]
+            else:
+                ray = np.append(center, self.resting.plane) - camera.position
+                heights = self.resting.heights(camera, blob.centroid)
+                starts[key], fits[key] = [ray * ((z - camera.position[2]) / ray[2]) for z in heights], []
+            tried.append((blob, key))
+        fitted = [(blob.outline, key, start) for blob, key in tried for start in starts.get(key, ())]
+        if fitted:
+            found = fit_each(
+                *all_of([outline for outline, _, _ in fitted]), np.array([start for _, _, start in fitted]),
+                self.resting.radius, offset=offset, close=1.3 * pixel_size,
+                gates=(self.resting.radius, 4 * pixel_size, 3 * pixel_size),
+            )
+            for (outline, key, _), center, off, close in zip(fitted, *found, strict=True):
+                longer = oval(outline, center, camera) if close >= _ROUND else 0.0
+                fits[key].append(_Round(center, float(off), float(close), longer))
+        self._fits = fits
+        alone: list[_Seen] = []
+        offsets: list[float] = []
+        sizes: list[float] = []
+        for blob, key in tried:
+            if not (tries := fits[key]):
+                continue
+            if min(one.close for one in tries) < _ROUND:
+                crowded.append(blob)
+                continue
+            there = self._pixel_size(camera, blob.centroid)
+            best = min(tries, key=lambda one: abs(one.offset - offset))
+            if best.offset - offset > FALLING:
+                self.too_large += not self.resting.shows_container(camera, blob.centroid)
+                continue
+            if abs(best.offset - offset) > self.options.max_offset_px * pixel_size:
+                self.odd.append(self._odd(blob.centroid, camera, sized(best.offset, offset)))
+            elif best.oval > MOST_OVAL * there and not self.resting.shows_container(camera, blob.centroid):
+                self.odd.append(self._odd(blob.centroid, camera, FLAT))
+            else:
+                alone.append(_Seen(best.center, blob.area, blob.border))
+                offsets.append(best.offset / there)
+                sizes.append(there)
+        usual = float(np.median(offsets)) if offsets else 0.0
+        for k in np.flatnonzero(unlike(np.array(offsets), MOST_UNLIKE))[::-1].tolist():
+            pixel = camera.project(alone[k].center + camera.position)
+            if not self.resting.shows_container(camera, pixel):
+                self.odd.append(self._odd(pixel, camera, sized(offsets[k] * sizes[k], usual * sizes[k])))
+                del alone[k], offsets[k]
+        return alone, crowded, offsets
+
+    def _is_explained(self, blob: Blob, owner: npt.NDArray[np.intp], camera: Pinhole) -> bool:
+        """Whether a blob is nothing but its balls, as far as its outline shows; one in the container may be."""
+        if self.resting.shows_container(camera, blob.centroid):
+            return True
+        return float(np.mean(owner >= 0)) >= EXPLAINED
+
+    def _higher(
+        self, blob: Blob, fit: Fit, camera: Pinhole, fine: Mask, usual: float | None, pixel_size: float
+    ) -> list[str]:
+        """Why the balls of a blob are not to be taken: one lies on others. Empty if none does.
+
+        `usual` is the offset of balls that stand alone [m]; without any, that of the ball that looks smallest is.
+        """
+        if len(blob.border) or self.resting.shows_container(camera, blob.centroid):
+            return []
+        reach = self.resting.radius + max(0.0, fit.offset + BLURRED * pixel_size)
+        if covered(fit.centers, reach, fine, camera):
+            return [COVERED] * len(fit.centers)
+        distance, _ = ray_distances(blob.outline.rays, fit.centers)
+        own = [distance[fit.owner == k, k] for k in range(len(fit.centers))]
+        offsets = np.array([np.mean(one) - self.resting.radius if len(one) else np.nan for one in own])
+        if np.isnan(offsets).all():
+            return []
+        usual = float(np.nanmin(offsets)) if usual is None else usual
+        upper = int(np.nanargmax(offsets))
+        if offsets[upper] - usual <= MOST_UNLIKE * pixel_size:
+            return []
+        return [sized(float(offsets[k]), usual) if k == upper else BELOW for k in range(len(offsets))]
+
+    def _is_floor(self, seen: Detection, picture: Picture, camera: Pinhole) -> bool:
+        """Whether what was found in the container has its colour: overexposed in warm light an orange one is red.
+
+        Green and blue are not clipped then: balls have more blue than that, in any light that leaves some.
+        """
+        least = self._blue_of_balls
+        if least is None or not self.resting.shows_container(camera, seen.pixel):
+            return False
+        inner = np.concatenate([seen.pixel + part * (seen.outline - seen.pixel) for part in (0.3, 0.6)])
+        u, v = np.clip(np.rint(inner).astype(int), 0, (camera.width - 1, camera.height - 1)).T
+        blue, green = picture[v, u, :2].astype(float).T
+        bright = green >= _BRIGHT
+        return bool(bright.mean() > 0.5 and np.median(blue[bright] / green[bright]) < least
+                    and self._blue_of_light(picture) >= _LEAST_BLUE)
+
+    def _blue_of_light(self, picture: Picture) -> float:
+        """The blue of the light, compared with its green, as the table shows it: 1 in daylight, 0 where none tells."""
+        table = next((fixture for fixture in self._around.fixtures
+                      if is_table(fixture, self._around.table_height)), None)
+        if table is None or self._table is None or self._table[1] is None or min(table.color[1:]) <= 0:
+            return 0.0
+        return blue_share(picture, self._table[1]) * table.color[1] / table.color[2]
+
+    @property
+    def _blue_of_balls(self) -> float | None:
+        """The blue, compared with green, that is at least to be seen of balls in warm light.
+
+        None where the container never looks like one: it is neither orange nor brown, or has as much blue.
+        """
+        red, green, blue = self.resting.container.color
+        _, green_of_ball, blue_of_ball = self._around.ball_color
+        least = 0.5 * _WARMEST * min(1.0, blue_of_ball / max(green_of_ball, _LEAST_GREEN))
+        return least if _TURNS_RED[0] <= green / max(red, 1e-3) <= _TURNS_RED[1] and blue <= least * green else None
+
+    def _thin(self, narrow: Mask, camera: Pinhole) -> list[Odd]:
+        """What is long and thin."""
+        least = LONG * 2 * self.resting.radius
+        return [self._odd(np.array(pixel), camera, THIN)
+                for pixel in long_ones(narrow, camera, self.resting.table_height, least)]
+
+    def _on_table(self, camera: Pinhole, odd: list[Odd]) -> list[Odd]:
+        """Those that are not in the container, nor above the horizon, where no ray meets the table."""
+        return [one for one in odd
+                if np.isfinite(one.position).all() and not self.resting.shows_container(camera, one.pixel)]
+
+    def _odd(self, pixel: Array, camera: Pinhole, reason: str) -> Odd:
+        return Odd.at(camera, pixel, self.resting.plane, reason)
+
+    def _detections(self, seen: list[_Seen], camera: Pinhole) -> list[Detection]:
+        if not seen:
+            return []
+        centers = np.array([one.center for one in seen]) + camera.position
+        pixels = camera.project(centers)
+        places = camera.on_plane(pixels, self.resting.plane)
+        outlines = silhouettes(camera, centers, self.resting.radius, 32)
+        inside = np.asarray(camera.in_picture(outlines).all(axis=1))
+        return [
+            Detection(
+                position=(float(places[k, 0]), float(places[k, 1]), self.resting.plane),
+                pixel=(float(pixels[k, 0]), float(pixels[k, 1])),
+                area=one.area,
+                partial=not inside[k] or self._cut(one, camera),
+                outline=outlines[k],
+            )
+            for k, one in enumerate(seen)
+            if np.isfinite(places[k]).all() and np.isfinite(outlines[k]).all()
+        ]
+
+    def _cut(self, seen: _Seen, camera: Pinhole) -> bool:
+        """Whether the picture's border cuts through the ball: its blob touches it there."""
+        if not len(seen.border):
+            return False
+        distance, _ = ray_distances(camera.directions(seen.border), seen.center[None])
+        return bool((distance < self.resting.radius).any())
+
+
+def rehearse(surroundings: Surroundings, options: DetectorOptions) -> None:
+    """Look at a made-up picture: what is set up when it is first used does not hold up the first real one."""
+    radius, plane = surroundings.ball_radius, Resting.of(surroundings).plane
+    camera = Pinhole.from_config(CameraConfig(position=(0, 0, plane + 25 * radius), rpy=(np.pi, 0, 0)))
+    picture = np.full((camera.height, camera.width, 3), 128, np.uint8)
+    detector = Detector(surroundings, options)
+    places = np.array([(0, 0, plane)]) + radius * np.array([(0, 0, 0), (4, 0, 0), (4, 2, 0)])
+    for outline in silhouettes(camera, places, radius, 32):
+        cv2.fillConvexPoly(picture, np.rint(outline).astype(np.int32), (0, 0, 255))
+    detector.detect(picture, camera)

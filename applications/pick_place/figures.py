@@ -1,0 +1,47 @@
+"""What is said of a run of pick and place: how many were placed, and what the detector saw on the table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from applications.pick_place.topics import DETECTED_OBJECTS, SCENE_BALLS, VALIDATED_TARGETS
+from common.messages import MarkerArray, PoseArray
+from common.topics import Topic
+from recording.report import application
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from recording.report.gathering import Gathering
+
+
+class Figures(application.Figures):
+    """Those of every run, and what was detected and offered as a target."""
+
+    COUNTED = "placed"
+    STATE_COLORS: ClassVar = {"GRASPING": "#2f7ed8", "PLACING": "#17a398", "HOMING": "#8d6cc2"}
+    TRUTH = SCENE_BALLS
+
+    def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
+        """Detections and targets, where they are to be shown."""
+        self._detections: dict[tuple[int, int], int] = {}  # how often, by place
+        self._targets: dict[tuple[int, int], int] = {}
+        if not self.pictured:
+            return {}
+        return {DETECTED_OBJECTS: self._on_detections, VALIDATED_TARGETS: self._on_targets}
+
+    def _on_detections(self, _time: float, found: MarkerArray) -> None:
+        from recording.report.gathering import count_places
+
+        count_places(self._detections, (marker.pose for marker in found.markers))
+
+    def _on_targets(self, _time: float, targets: PoseArray) -> None:
+        from recording.report.gathering import count_places
+
+        count_places(self._targets, targets.poses)
+
+    def picture(self, run: Gathering, tool: npt.NDArray[np.float64]) -> application.Section | None:
+        """The table from above, with what was detected there."""
+        return application.seen_from_above(run, tool, {"detections": self._detections, "targets": self._targets})

@@ -1,0 +1,114 @@
+"""Pick and place on the operator's page: its words, the targets, what was rejected, and how far the arm reaches."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from applications.pick_place.topics import (
+    DETECTED_OBJECTS,
+    REJECTED_TARGETS,
+    VALIDATED_TARGETS,
+    WORKSPACE_MARKERS,
+)
+from common.messages import TaskStatus
+from common.topics import Topic
+from page.labels import Labels
+from page.layers import Layer
+from page.nodes import FLAT, Markers, points_of, ring
+from page.rejections import Place, RejectedPlaces
+
+if TYPE_CHECKING:
+    import viser
+
+STATES = {"GRASPING": "Taking", "PLACING": "Placing"}
+LATENCY = "Picture to targets"
+
+TARGET = (70, 220, 110)
+REJECTED = (255, 90, 200)
+_WIDER = 1.35  # than what lies there, a ring is
+_STILL = 1e-3  # [m] detections tremble by less
+
+
+def counters(status: TaskStatus, rejected: int) -> dict[str, object]:
+    """The figures of the task by their names."""
+    return {"placed": status.done, "targets": status.total, "rejected": rejected, "retries": status.retries,
+            "failures": status.failures}
+
+
+class Targets(Layer):
+    """A ring about each target."""
+
+    LABEL = "Targets"
+    LEGEND = (("target", TARGET),)
+    TOPICS = (VALIDATED_TARGETS,)
+
+    def build(self) -> None:
+        """Start without any."""
+        self._ring = ring(_WIDER * self.stage.around.ball_radius)
+        # A mesh each: their shader is that of everything else, and a browser without a graphics card needs a moment
+        # for one of their own.
+        self.nodes: list[viser.MeshHandle] = []
+
+    def show(self, topic: Topic[Any], message: Any) -> None:
+        """Show these targets and no others."""
+        at = points_of(message.poses)
+        while len(self.nodes) > len(at):
+            self.nodes.pop().remove()
+        for node, place in zip(self.nodes, at, strict=False):
+            if np.abs(node.position - place).max() >= _STILL:
+                node.position = place
+        for place in at[len(self.nodes) :]:
+            self.nodes.append(self.scene.add_mesh_simple(
+                f"{self.root}/{len(self.nodes)}", *self._ring, color=TARGET, position=place, **FLAT))
+
+
+class Rejected(Layer):
+    """A ring and the reason at each place from which something was rejected, until nothing is there any more."""
+
+    LABEL = "Rejected, with the reason"
+    LEGEND = (("rejected", REJECTED),)
+    TOPICS = (REJECTED_TARGETS, VALIDATED_TARGETS, DETECTED_OBJECTS)
+    PERIOD = 0.5
+
+    def build(self) -> None:
+        """Start without any."""
+        self._ring = ring(_WIDER * self.stage.around.ball_radius)
+        self.rejected = RejectedPlaces()
+        self.nodes: dict[Place, tuple[str, viser.MeshHandle]] = {}  # with the name of the label
+        self._count = 0
+        self.labels = Labels(self.scene, self.root, scale=0.75)
+
+    def show(self, topic: Topic[Any], message: Any) -> None:
+        """Add rejections; forget those where a target is, or where nothing has been detected for a while."""
+        self.rejected.hear(message)
+        for place in [place for place in self.nodes if place not in self.rejected.places]:
+            self.nodes.pop(place)[1].remove()
+        for place in self.rejected.places:
+            if place not in self.nodes:
+                self._count += 1
+                self.nodes[place] = str(self._count), self.scene.add_mesh_simple(
+                    f"{self.root}/{self._count}_ring", *self._ring, color=REJECTED, position=place.at, **FLAT)
+        self.labels.show({name: (place.reason, np.array(place.at)) for place, (name, _) in self.nodes.items()},
+                         self.stage.view())
+
+    @property
+    def reasons(self) -> list[str]:
+        """The reasons that are shown, oldest first."""
+        return [place.reason for place in self.rejected.places]
+
+
+class Workspace(Layer):
+    """The reachable shell and the excluded column."""
+
+    LABEL = "Workspace"
+    TOPICS = (WORKSPACE_MARKERS,)
+
+    def build(self) -> None:
+        """Start without them."""
+        self.markers = Markers(self.scene, self.root)
+
+    def show(self, topic: Topic[Any], message: Any) -> None:
+        """Show these shapes and no others."""
+        self.markers.show(message)

@@ -1,0 +1,202 @@
+"""Tell how many balls a blob is made of, and about where they are.
+
+Each point of the outline votes for the centre of a sphere that it could belong to: known radius, one way in. Votes of
+one ball meet, also when others hide or touch parts of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from applications.pick_place.blobs import Mask, Outline
+from applications.pick_place.fit import fit_each, near_points
+from applications.pick_place.resting import Resting
+from common.perception.pinhole import Pinhole
+from common.perception.sphere import ray_distances, silhouettes
+
+Array = npt.NDArray[np.float64]
+Chosen = npt.NDArray[np.bool_]
+
+_CELL = 0.003  # of the grid in which votes are counted [m]
+_LEAST_VOTES = 0.06  # at a peak, as part of the votes of a whole outline
+_LEAST_SUPPORT = 0.14  # part of a whole outline that a ball must show
+_NEAR = 2.0e-3  # a point this near to a silhouette belongs to it [m]
+_HIDDEN = 0.05  # part of a whole outline that shows of a ball though another one is before it, at most
+_COVERED = 0.85  # part of a ball's silhouette that must be red
+_MOST_GOING_ON = 0.45  # part of the surroundings of a ball that may be red for no known reason
+_MOST_CANDIDATES = 40
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    center: Array  # (3,) relative to the optical centre [m]
+    points: Chosen  # of the outline that belong to it
+    support: int  # how many these are
+    whole: float  # points that its whole outline has
+
+
+def separate(outline: Outline, mask: Mask, camera: Pinhole, resting: Resting, offset: float) -> Array:
+    """First guesses of the balls in a blob: (k, 3) centres relative to the optical centre [m].
+
+    Args:
+        outline: of the blob.
+        mask: red pixels of the whole picture.
+        camera: the camera.
+        resting: radius and possible heights of the balls.
+        offset: expected offset of the outline from the silhouettes [m].
+    """
+    if len(outline) < 8:
+        return np.empty((0, 3))
+    places = _peaks(_votes(outline, camera, resting, offset), camera, resting)
+    candidates = _refined(places, outline, camera, resting, offset)
+    if not candidates:
+        return np.empty((0, 3))
+    red = _are_red(np.array([c.center for c in candidates]), mask, camera, resting.radius)
+    candidates = [candidate for candidate, good in zip(candidates, red, strict=True) if good]
+    chosen: list[_Candidate] = []
+    free = np.ones(len(outline), bool)
+    while candidates:
+        gains = [np.count_nonzero(c.points & free) / c.whole for c in candidates]
+        best = int(np.argmax(gains))
+        if gains[best] < _LEAST_SUPPORT:
+            break
+        candidate = candidates.pop(best)
+        if not _clashes(candidate, chosen, outline, resting.radius):
+            chosen.append(candidate)
+            free &= ~candidate.points
+    centers = np.array([c.center for c in chosen]).reshape(-1, 3)
+    kept: Array = centers[_end(centers, mask, camera, resting.radius)]
+    return kept
+
+
+def _votes(outline: Outline, camera: Pinhole, resting: Resting, offset: float) -> Array:
+    """(n, 2) where each point puts the centre, on the plane of the balls on the table [m], world."""
+    drop = resting.plane - camera.position[2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.abs(drop / outline.rays[:, 2])
+    sine = np.clip((resting.radius + offset) / distance, 0, 0.9)[:, None]
+    toward = np.sqrt(1 - sine**2) * outline.rays + sine * outline.inward
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = drop / toward[:, 2]
+    votes = camera.position[:2] + t[:, None] * toward[:, :2]
+    good = np.isfinite(votes).all(axis=1) & (t > 0) & (np.abs(votes - camera.position[:2]).max(axis=1) < 20)
+    kept: Array = votes[good]
+    return kept
+
+
+def _peaks(votes: Array, camera: Pinhole, resting: Resting) -> Array:
+    """(m, 2) places at which many votes meet, the most voted for first [m], world."""
+    if not len(votes):
+        return np.empty((0, 2))
+    low = votes.min(axis=0) - 3 * _CELL
+    cells = np.floor((votes - low) / _CELL).astype(np.int64)
+    shape = cells.max(axis=0) + 4
+    if shape.prod() > 4_000_000:
+        return np.empty((0, 2))
+    counts = np.bincount(np.ravel_multi_index((cells[:, 0], cells[:, 1]), shape), minlength=int(shape.prod()))
+    smooth = cv2.GaussianBlur(counts.reshape(shape).astype(np.float32), (7, 7), 1.2)
+    # A cell that holds all votes of a spread of one cell keeps about a tenth of them after smoothing.
+    least = 0.1 * _LEAST_VOTES * _whole_outline(camera, resting.radius, -float(resting.plane - camera.position[2]))
+    highest = cv2.dilate(smooth, np.ones((5, 5), np.uint8))
+    rows, columns = np.nonzero((smooth >= highest) & (smooth > least))
+    order = np.argsort(-smooth[rows, columns], kind="stable")[:_MOST_CANDIDATES]
+    peaks: Array = low + (np.column_stack([rows, columns])[order] + 0.5) * _CELL
+    return peaks
+
+
+def _whole_outline(camera: Pinhole, radius: float, distance: float) -> float:
+    """Points that the contour of a whole ball at a distance has: a circle takes 4 sqrt(2) steps for each radius."""
+    return 5.66 * radius / max(distance, radius) * (camera.fx + camera.fy) / 2
+
+
+def _refined(
+    places: Array, outline: Outline, camera: Pinhole, resting: Resting, offset: float
+) -> list[_Candidate]:
+    """Candidates near places (k, 2), each at the height that fits best; places that few points support give none."""
+    radius = resting.radius + offset
+    starts, place_of = [], []
+    for index, place in enumerate(places):
+        ray = np.array([place[0], place[1], resting.plane]) - camera.position
+        for z in resting.heights(camera, camera.project(ray + camera.position)):
+            starts.append(ray * ((z - camera.position[2]) / ray[2]))
+            place_of.append(index)
+    if not starts:
+        return []
+    first = np.array(starts)
+    near = near_points(outline, first, radius, 0.35 * resting.radius)
+    enough = np.flatnonzero(np.count_nonzero(near, axis=0) >= 6)
+    if not len(enough):
+        return []
+    owner, which = np.nonzero(near[:, enough].T)
+    centers, _, _ = fit_each(
+        outline.take(which), owner, first[enough], resting.radius, offset=offset,
+        gates=(8e-3, 6e-3, 4e-3, 3e-3), close=_NEAR, hold_offset=True,
+    )
+    points = near_points(outline, centers, radius, _NEAR)
+    support = np.count_nonzero(points, axis=0)
+    best: dict[int, _Candidate] = {}
+    for k, center in enumerate(centers):
+        place = place_of[enough[k]]
+        whole = _whole_outline(camera, resting.radius, float(np.linalg.norm(center)))
+        if support[k] < _LEAST_SUPPORT * whole or not resting.can_lie(center + camera.position):
+            continue
+        if place not in best or support[k] > 1.05 * best[place].support:
+            best[place] = _Candidate(center, points[:, k], int(support[k]), whole)
+    return list(best.values())
+
+
+def _clashes(candidate: _Candidate, chosen: list[_Candidate], outline: Outline, radius: float) -> bool:
+    """Whether a candidate is one of the chosen again, inside of one, or would hide what is seen of one, or one of it.
+
+    Solid balls on a table are apart.
+    """
+    for other in chosen:
+        distance = float(np.linalg.norm(candidate.center - other.center))
+        same_layer = abs(candidate.center[2] - other.center[2]) < 0.5 * radius
+        if distance < (1.6 if same_layer else 0.5) * radius:
+            return True
+        lower, upper = sorted((candidate, other), key=lambda one: float(one.center[2]))
+        if not same_layer and _is_before(upper, lower, outline, radius):
+            return True
+    return False
+
+
+def _is_before(upper: _Candidate, lower: _Candidate, outline: Outline, radius: float) -> bool:
+    """Whether one would hide edges that are seen of the other."""
+    distance, _ = ray_distances(outline.rays[lower.points], upper.center[None])
+    return bool(np.count_nonzero(distance < radius - 2 * _NEAR) > _HIDDEN * lower.whole)
+
+
+def _red_at(pixels: Array, mask: Mask, camera: Pinhole) -> tuple[Chosen, Chosen]:
+    """Which pixels are in the picture, and which of all are red in it; in the shape of the pixels, without (u, v)."""
+    nearest = np.rint(np.where(np.isfinite(pixels), pixels, -1.0)).astype(int)
+    seen = np.asarray(camera.in_picture(nearest))
+    u, v = (np.where(seen, nearest[..., axis], 0) for axis in (0, 1))
+    return seen, seen & (mask[v, u] > 0)
+
+
+def _are_red(centers: Array, mask: Mask, camera: Pinhole, radius: float) -> Chosen:
+    """(k,) whether what balls there would cover of the picture is red."""
+    places = centers + camera.position
+    outlines, middles = silhouettes(camera, places, 0.82 * radius, 16), camera.project(places)[:, None]
+    rings = [middles + part * (outlines - middles) for part in (0.25, 0.55, 0.8, 1.0)]
+    seen, red = _red_at(np.concatenate(rings, axis=1), mask, camera)
+    visible = np.count_nonzero(seen, axis=1)
+    good: Chosen = (visible > 0) & (np.count_nonzero(red, axis=1) >= _COVERED * visible)
+    return good
+
+
+def _end(centers: Array, mask: Mask, camera: Pinhole, radius: float) -> Chosen:
+    """(k,) whether balls end where they should: what is red around them is other balls. Larger things go on and on."""
+    rings = silhouettes(camera, centers + camera.position, 1.15 * radius, 32)
+    _, red = _red_at(rings, mask, camera)
+    distance, _ = ray_distances(camera.directions(rings.reshape(-1, 2)), centers)
+    inside = (distance < 1.05 * radius).reshape(*rings.shape[:2], len(centers))
+    inside[np.arange(len(centers)), :, np.arange(len(centers))] = False  # itself explains nothing
+    going_on = red & ~inside.any(axis=2)
+    good: Chosen = np.count_nonzero(going_on, axis=1) <= _MOST_GOING_ON * rings.shape[1]
+    return good

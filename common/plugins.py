@@ -1,0 +1,72 @@
+"""Find plug-ins by name: modules of this project, dotted modules of the user's own, entry points of installed packages.
+
+A package adds a plug-in by an entry point of one of the groups below, for example in its pyproject.toml:
+
+    [project.entry-points."zencell.planners"]
+    my_planner = "my_package.my_planner"
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import pkgutil
+from collections.abc import Iterator
+from importlib.metadata import entry_points
+from types import ModuleType
+
+from common.errors import ConfigError, UnknownName
+
+# Packages of this project whose modules are plug-ins of a group. They are names, not imports: common/ depends on none.
+PACKAGES = {
+    "zencell.applications": ("applications",),
+    "zencell.planners": ("common.planning.planners",),
+    "zencell.hardware": ("common.hardware", "drivers"),
+    "zencell.cameras": ("drivers",),
+    "zencell.worlds": ("common.sim", "drivers"),
+    "zencell.page": ("page.layers",),
+    "zencell.verbs": (),
+}
+
+
+def find_plugin(group: str, name: str, *, field: str, noun: str, marker: str = "") -> ModuleType:
+    """Return the module of a plug-in.
+
+    Args:
+        group: an entry point group, a key of `PACKAGES`.
+        name: a plain name, or the dotted name of a module.
+        field: the configuration field that holds the name, for errors.
+        noun: what the plug-in is, for errors.
+        marker: an attribute that a module of `PACKAGES` must have to count as a plug-in of this group.
+
+    Raises:
+        UnknownName: no plug-in has that plain name; lists the choices.
+        ConfigError: the module cannot be imported.
+    """
+    try:
+        if "." in name:
+            return importlib.import_module(name)
+        for path in _paths(group, name):
+            module = importlib.import_module(path)
+            if hasattr(module, marker or "__name__"):
+                return module
+    except ImportError as error:
+        raise ConfigError(field, name, f"cannot be imported: {error}") from None
+    raise UnknownName(noun, name, plugin_names(group, marker))
+
+
+def plugin_names(group: str, marker: str = "") -> list[str]:
+    """Return the plain names of all plug-ins of a group, sorted."""
+    names = {entry.name for entry in entry_points(group=group)}
+    for package in PACKAGES[group]:
+        for found in pkgutil.iter_modules(importlib.import_module(package).__path__):
+            if not marker or hasattr(importlib.import_module(f"{package}.{found.name}"), marker):
+                names.add(found.name)
+    return sorted(names)
+
+
+def _paths(group: str, name: str) -> Iterator[str]:
+    for package in PACKAGES[group]:
+        if importlib.util.find_spec(f"{package}.{name}") is not None:
+            yield f"{package}.{name}"
+    yield from (entry.value for entry in entry_points(group=group, name=name))

@@ -1,0 +1,178 @@
+"""The robot in a model: the bodies, joints, masses and shapes of its URDF, and couplings of its fingers."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import ConfigError
+from common.robot.description import find_description
+from common.robot.finger_joints import finger_factors
+from common.robot.merging import WORLD
+from common.robot.model import RobotModel
+from common.robot.transforms import matrix_to_quaternion, rpy_to_matrix, transform
+from drivers.mujoco.contact import COLLIDES, ROBOT, SOLIMP, SOLREF, grips, only_seen, touches
+from drivers.mujoco.kept_meshes import hull_points, visual_arrays
+
+if TYPE_CHECKING:
+    from common.robot.visual_meshes import Piece
+
+Array = NDArray[np.float64]
+
+DENSITY = 1500.0  # [kg/m^3] of a link that says no mass: a case of metal with air in it
+ARMATURE = 0.1  # [kg m^2 or kg] of motor and gear at an arm's joint
+FINGER_ARMATURE = 0.05  # [kg] at the width of the fingers
+_HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+_JOINTS = {"revolute": _HINGE, "continuous": _HINGE, "prismatic": _SLIDE}
+_TRIANGLES = 25_000  # of all that is seen of a robot
+
+
+def add_robot(spec: mujoco.MjSpec, robot: RobotModel, visuals: bool) -> None:
+    """Put the robot into a model, its base where the robot file says; a body for each link, of its name.
+
+    Raises:
+        ConfigError: a joint or shape of the URDF that cannot be simulated, or a mesh that cannot be read.
+    """
+    root = ET.fromstring(robot.urdf)
+    links = {str(link.get("name")): link for link in root.findall("link")}
+    joints = defaultdict(list)
+    for joint in root.findall("joint"):
+        joints[_link(joint, "parent")].append(joint)
+    seen: defaultdict[str, list[Piece]] = defaultdict(list)
+    for piece in visual_arrays(robot, _TRIANGLES) if visuals else ():
+        seen[piece.link].append(piece)
+    grippers = robot.config.gripper.links if robot.config.gripper else []
+
+    def add(parent: Any, joint: ET.Element) -> None:
+        name = _link(joint, "child")
+        body = parent.add_body(name=name, gravcomp=1.0)  # arms hold themselves
+        _place(body, joint.find("origin"))
+        _add_joint(body, joint, robot)
+        _add_inertia(body, links[name])
+        for index, shape in enumerate(links[name].findall("collision")):
+            geom = _shape(spec, body, shape, f"{name}.{index}", robot)
+            touches(geom, ROBOT, group=COLLIDES).density = DENSITY
+            if name in grippers:
+                grips(geom)
+        for index, piece in enumerate(seen[name]):
+            mesh = spec.add_mesh(name=f"{name}.seen.{index}")
+            mesh.uservert, mesh.userface = piece.vertices.ravel(), piece.faces.ravel()
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            rgba = [*(part / 255 for part in piece.color), 1.0]
+            only_seen(body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, rgba=rgba))
+        for following in joints[name]:
+            add(body, following)
+
+    for joint in joints[WORLD]:
+        add(spec.worldbody, joint)
+    _couple(spec, root, robot)
+
+
+def _link(joint: ET.Element, which: str) -> str:
+    found = joint.find(which)
+    return "" if found is None else str(found.get("link"))
+
+
+def _numbers(element: ET.Element | None, name: str, usual: str) -> list[float]:
+    return [float(value) for value in (element.get(name, usual) if element is not None else usual).split()]
+
+
+def pose_of_origin(origin: ET.Element | None) -> Array:
+    """(4, 4) that an <origin> describes."""
+    x, y, z = _numbers(origin, "xyz", "0 0 0")
+    return transform(rpy_to_matrix(*_numbers(origin, "rpy", "0 0 0")), (x, y, z))
+
+
+def wxyz(rotation: Array) -> list[float]:
+    """Quaternion w, x, y, z, as MuJoCo has it, of a (3, 3) rotation."""
+    x, y, z, w = matrix_to_quaternion(rotation)
+    return [w, x, y, z]
+
+
+def _place(what: Any, origin: ET.Element | None) -> None:
+    T = pose_of_origin(origin)
+    what.pos, what.quat = T[:3, 3], wxyz(T[:3, :3])
+
+
+def _add_joint(body: Any, joint: ET.Element, robot: RobotModel) -> None:
+    kind, name = str(joint.get("type")), str(joint.get("name"))
+    if kind == "fixed":
+        return
+    if kind not in _JOINTS:
+        raise ConfigError("robot.urdf", name, f"is a {kind} joint, which is not simulated; choices: fixed, "
+                                              f"{', '.join(_JOINTS)}")
+    limit, dynamics = joint.find("limit"), joint.find("dynamics")
+    made = body.add_joint(name=name, type=_JOINTS[kind], axis=_numbers(joint.find("axis"), "xyz", "1 0 0"))
+    low, high = (float(limit.get(end, 0.0)) if limit is not None else 0.0 for end in ("lower", "upper"))
+    if low < high and kind != "continuous":  # one without any room is no joint of the arm, and held where it is
+        made.range, made.limited = [low, high], True
+    made.damping = [float(dynamics.get("damping", 0.0)) if dynamics is not None else 0.0, 0.0, 0.0]
+    made.frictionloss = float(dynamics.get("friction", 0.0)) if dynamics is not None else 0.0
+    made.armature = ARMATURE if name in robot.joint_names else 1e-4  # of fingers it depends on their linkage
+
+
+def _add_inertia(body: Any, link: ET.Element) -> None:
+    inertial = link.find("inertial")
+    mass, inertia = (inertial.find(part) if inertial is not None else None for part in ("mass", "inertia"))
+    if inertial is None or mass is None or inertia is None or float(mass.get("value", 0)) <= 0:
+        return
+    T = pose_of_origin(inertial.find("origin"))
+    xx, yy, zz, xy, xz, yz = (float(inertia.get(f"i{axes}", 0)) for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
+    about = T[:3, :3] @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ T[:3, :3].T
+    smallest = np.linalg.eigvalsh(about)[0]
+    if smallest < 1e-7:  # descriptions have inertias that no body has
+        about = about + (1e-7 - smallest) * np.eye(3)
+    body.explicitinertial, body.mass, body.ipos = True, float(mass.get("value", 0)), T[:3, 3]
+    body.fullinertia = [about[0, 0], about[1, 1], about[2, 2], about[0, 1], about[0, 2], about[1, 2]]
+
+
+def _shape(spec: mujoco.MjSpec, body: Any, shape: ET.Element, name: str, robot: RobotModel) -> Any:
+    geometry = shape.find("geometry/*")
+    tag = geometry.tag if geometry is not None else "nothing"
+    geom = body.add_geom(name=name)
+    _place(geom, shape.find("origin"))
+    kinds = mujoco.mjtGeom
+    if geometry is None or tag not in ("box", "cylinder", "capsule", "sphere", "mesh"):
+        raise ConfigError("robot.urdf", tag, "is no collision shape; choices: box, capsule, cylinder, mesh, sphere")
+    if tag == "mesh":
+        path = find_description("robot.urdf", str(geometry.get("filename")), robot.config.package_dirs)
+        points = hull_points(path) * _numbers(geometry, "scale", "1 1 1")
+        mesh = spec.add_mesh(name=name)
+        mesh.uservert = points.ravel()
+        geom.type, geom.meshname = kinds.mjGEOM_MESH, name
+    elif tag == "box":
+        geom.type, geom.size = kinds.mjGEOM_BOX, [side / 2 for side in _numbers(geometry, "size", "")]
+    elif tag == "sphere":
+        geom.type, geom.size = kinds.mjGEOM_SPHERE, [float(geometry.get("radius", "nan")), 0.0, 0.0]
+    else:
+        geom.type = kinds.mjGEOM_CYLINDER if tag == "cylinder" else kinds.mjGEOM_CAPSULE
+        geom.size = [float(geometry.get("radius", "nan")), float(geometry.get("length", "nan")) / 2, 0.0]
+    return geom
+
+
+def _couple(spec: mujoco.MjSpec, root: ET.Element, robot: RobotModel) -> None:
+    """Have fingers follow the driven one, what is a mimic its joint, and hold what nothing drives."""
+    gripper = robot.config.gripper
+    follows: dict[str, tuple[str, float, float]] = {}
+    if gripper is not None and gripper.joints:
+        driven, *others = gripper.joints
+        for name, factor in zip(others, finger_factors(gripper)[1:], strict=True):
+            follows[name] = driven, factor, 0.0
+    moved = {*robot.joint_names, *follows, *(gripper.joints[:1] if gripper else [])}
+    for joint in root.findall("joint"):
+        name, mimic = str(joint.get("name")), joint.find("mimic")
+        if joint.get("type") == "fixed" or name in moved:
+            continue
+        if mimic is not None:
+            factor, offset = float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
+            follows[name] = str(mimic.get("joint")), factor, offset
+        else:
+            follows[name] = "", 0.0, robot.config.locked_joints.get(name, 0.0)
+    for name, (other, factor, offset) in follows.items():
+        spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT, name=f"{name} follows",
+                          name1=name, name2=other, data=[offset, factor] + [0.0] * 10, solref=SOLREF, solimp=SOLIMP)

@@ -1,0 +1,196 @@
+"""Recordings for Foxglove: MCAP with JSON messages of its own schemas, where it has one for what was recorded.
+
+An application says in its part `recording` which of its own messages are one of these: `FOXGLOVE`, a list as KINDS is.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from common.application import applications
+from common.errors import ZencellError
+from common.messages import (
+    CameraInfo,
+    Image,
+    JointState,
+    LogLine,
+    MarkerArray,
+    Message,
+    PlanningScene,
+    PointCloud2,
+    Pose,
+    PoseArray,
+    TFMessage,
+    WorldObjects,
+)
+from common.perception.image import image_to_array
+from recording.decoding import Decoder, schema_of
+from recording.foxglove_scene import of_markers, of_scene, of_world, time_of
+from recording.foxglove_schemas import SCHEMAS
+from recording.reading import Recording, Wanted
+from recording.writing import AppendedFile, NotMade, WritingFailed
+
+JPEG_QUALITY = 90
+LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "critical": 5}
+FLOAT32, UINT8 = 7, 1
+CANNOT_BE_CONVERTED = (ZencellError, ArithmeticError, ValueError, LookupError, TypeError, cv2.error)
+CHUNK_BYTES = 1024 * 1024
+
+
+def export(recording: Recording, target: Path, wants: Wanted, decoder: Decoder) -> int:
+    """Number of messages that were written to a new file, which is whole or not there.
+
+    Colour pictures become JPEG. What Foxglove has no schema for is written as JSON of its own.
+
+    Raises:
+        RecordingError: the target is there already or cannot be written, or the recording is damaged.
+    """
+    file = AppendedFile(target)
+    try:
+        return _written(recording, file, wants, decoder)
+    except BaseException as error:
+        target.unlink(missing_ok=True)
+        if isinstance(error, WritingFailed):
+            raise NotMade(target, error.why) from None
+        raise
+    finally:
+        file.close()
+
+
+def _written(recording: Recording, file: AppendedFile, wants: Wanted, decoder: Decoder) -> int:
+    count = 0
+    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+    writer.start()
+    schemas: dict[str, int] = {}
+    channels: dict[str, int] = {}
+    for sample in recording.samples(wants):
+        message = decoder.message(sample)
+        if message is None:
+            continue
+        try:
+            name, value = convert(message)
+        except CANNOT_BE_CONVERTED:
+            decoder.skipped[sample.topic] += 1
+            continue
+        if name not in schemas:
+            text = json.dumps(SCHEMAS[name]).encode() if name in SCHEMAS else sample.schema or schema_of(name)
+            schemas[name] = writer.register_schema(name, "jsonschema", text)
+        if sample.key not in channels:
+            channels[sample.key] = writer.register_channel(sample.key, "json", schemas[name])
+        data = json.dumps(value, separators=(",", ":")).encode()
+        writer.add_message(channels[sample.key], sample.log_time, data, sample.publish_time, sample.sequence)
+        count += 1
+    writer.finish()  # type: ignore[no-untyped-call]
+    return count
+
+
+def convert(message: Message) -> tuple[str, dict[str, Any]]:
+    """Name of the schema, and the message as a JSON object of it."""
+    if isinstance(message, Image):
+        return image(message)
+    for kind, name, make in _kinds():
+        if isinstance(message, kind):
+            return name, make(message)
+    return type(message).__name__, message.model_dump(mode="json")
+
+
+@cache
+def _kinds() -> list[Kind]:
+    """Those of applications first: their messages derive from what any message may be."""
+    own = [kind for found in applications() for kind in found.find("recording", "FOXGLOVE") or ()]
+    return [*own, *KINDS]
+
+
+def image(message: Image) -> tuple[str, dict[str, Any]]:
+    """A picture: JPEG of colours, depth as it is."""
+    header = {"timestamp": time_of(message.header.stamp), "frame_id": message.header.frame_id}
+    if message.encoding not in ("bgr8", "rgb8", "mono8"):
+        return "foxglove.RawImage", {
+            **header, "width": message.width, "height": message.height, "encoding": message.encoding,
+            "step": message.step or len(message.data) // message.height, "data": _base64(message.data),
+        }
+    pixels = image_to_array(message)
+    if message.encoding == "rgb8":
+        pixels = np.ascontiguousarray(pixels[:, :, ::-1])
+    _, packed = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return "foxglove.CompressedImage", {**header, "data": _base64(packed.tobytes()), "format": "jpeg"}
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+def _calibration(message: CameraInfo) -> dict[str, Any]:
+    k = message.k
+    return {
+        "timestamp": time_of(message.header.stamp), "frame_id": message.header.frame_id, "width": message.width,
+        "height": message.height, "distortion_model": message.distortion_model, "D": message.d, "K": k,
+        "R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "P": [*k[0:3], 0, *k[3:6], 0, *k[6:9], 0],
+    }
+
+
+def _transforms(message: TFMessage) -> dict[str, Any]:
+    return {"transforms": [
+        {
+            "timestamp": time_of(t.header.stamp), "parent_frame_id": t.header.frame_id,
+            "child_frame_id": t.child_frame_id, "translation": t.transform.position.model_dump(),
+            "rotation": t.transform.orientation.model_dump(),
+        }
+        for t in message.transforms
+    ]}
+
+
+def _poses(message: PoseArray) -> dict[str, Any]:
+    return {
+        "timestamp": time_of(message.header.stamp), "frame_id": message.header.frame_id,
+        "poses": [pose.model_dump() for pose in message.poses],
+    }
+
+
+def _joints(message: JointState) -> dict[str, Any]:
+    columns = {"position": message.position, "velocity": message.velocity, "effort": message.effort}
+    return {"timestamp": time_of(message.header.stamp), "joints": [
+        {"name": name, **{field: values[i] for field, values in columns.items() if values}}
+        for i, name in enumerate(message.name)
+    ]}
+
+
+def _log(message: LogLine) -> dict[str, Any]:
+    return {
+        "timestamp": time_of(message.header.stamp), "level": LEVELS[message.level], "message": message.message,
+        "name": message.service, "file": "", "line": 0,
+    }
+
+
+def _cloud(message: PointCloud2) -> dict[str, Any]:
+    # The packed colour is 0x00RRGGBB, little-endian: blue comes first.
+    fields = [(name, 4 * i, FLOAT32) for i, name in enumerate("xyz")]
+    fields += [(name, 12 + i, UINT8) for i, name in enumerate(("blue", "green", "red"))]
+    return {
+        "timestamp": time_of(message.header.stamp), "frame_id": message.header.frame_id, "pose": Pose().model_dump(),
+        "point_stride": message.point_step, "data": _base64(message.data),
+        "fields": [{"name": name, "offset": offset, "type": kind} for name, offset, kind in fields],
+    }
+
+
+Kind = tuple[type[Message], str, Callable[[Any], dict[str, Any]]]  # message, schema, how it is made one
+KINDS: list[Kind] = [
+    (CameraInfo, "foxglove.CameraCalibration", _calibration),
+    (TFMessage, "foxglove.FrameTransforms", _transforms),
+    (PoseArray, "foxglove.PosesInFrame", _poses),
+    (MarkerArray, "foxglove.SceneUpdate", of_markers),
+    (PlanningScene, "foxglove.SceneUpdate", of_scene),
+    (WorldObjects, "foxglove.SceneUpdate", of_world),
+    (JointState, "foxglove.JointStates", _joints),
+    (LogLine, "foxglove.Log", _log),
+    (PointCloud2, "foxglove.PointCloud", _cloud),
+]

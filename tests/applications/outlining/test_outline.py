@@ -1,0 +1,453 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from applications.outlining.messages import OutlinePoints
+from applications.outlining.task import MOST_FORGOTTEN
+from common import messages as m
+from common.robot.transforms import pose_to_matrix, rpy_to_matrix
+from tests.applications.outlining.outline_double import (
+    AWAY,
+    HOME,
+    ROBOT,
+    SQUARE,
+    TOP,
+    OutlineDouble,
+    outline_of,
+    prism,
+)
+
+WHOLE = ["approach", "descend", "trace", "retreat", "home"]
+
+
+def test_chosen_contour_is_traced_and_the_arm_goes_home() -> None:
+    cell = OutlineDouble()
+    cell.until("DONE")
+    assert cell.moves() == WHOLE
+    assert cell.q == HOME
+    status = cell.status
+    assert (status.object, status.points, status.fraction, status.closed) == ("Object_1", 4, 1.0, True)
+    assert math.isclose(status.length_m, 0.4)
+    assert (status.invalid_depth, status.failures, status.message) == (2, 0, "")
+    assert len(status.plans) == 5
+
+
+def test_nothing_moves_before_everything_is_planned_and_the_fingers_are_closed() -> None:
+    cell = OutlineDouble()
+    cell.until("APPROACHING")
+    assert [r.stage for r in cell.plans()] == WHOLE
+    assert cell.gripper.width == 0.0
+    kinds = [type(r) for r in cell.requests]
+    assert kinds.index(m.GripperCommand) < kinds.index(m.ExecuteRequest)
+
+
+def test_fingers_that_are_closed_are_left_alone() -> None:
+    cell = OutlineDouble()
+    cell.gripper = m.GripperState(width=0.0)
+    cell.until("DONE")
+    assert not [r for r in cell.requests if isinstance(r, m.GripperCommand)]
+
+
+def test_path_is_closed_and_keeps_tool_standoff_and_speed() -> None:
+    cell = OutlineDouble(standoff=0.005, tool_speed=0.03, step=0.002)
+    cell.until("DONE")
+    goal = next(r.goal for r in cell.plans() if r.stage == "trace")
+    assert isinstance(goal, m.PathGoal)
+    assert (goal.tool_speed, goal.step, goal.min_fraction) == (0.03, 0.002, 0.99)
+    assert [(p.position.x, p.position.y) for p in goal.waypoints] == [*SQUARE, SQUARE[0]]
+    for pose in goal.waypoints:
+        assert math.isclose(pose.position.z, TOP + 0.005)
+        assert abs(pose_to_matrix(pose)[:3, :3] - rpy_to_matrix(0, -math.pi, -math.pi)).max() < 1e-9
+    assert cell.status.standoff == 0.005
+
+
+@pytest.mark.parametrize("path", [
+    outline_of(5000 * SQUARE, 0), outline_of(SQUARE, 0).model_copy(update={
+        "poses": [m.Pose(position=m.Vector3(x=0.5, z=1e7))] * 4})], ids=["too long to be closed", "too far away"])
+def test_path_along_which_no_motion_can_be_asked_for_is_an_error_of_the_task(path: OutlinePoints) -> None:
+    cell = OutlineDouble()
+    cell.path = path.model_copy(update={"given": True})
+    cell.until("ERROR")
+    assert cell.moves() == [] and "Object_1 has too many points, or lies too far away" in cell.status.message
+
+
+def test_each_motion_is_planned_from_where_the_one_before_ends() -> None:
+    cell = OutlineDouble()
+    cell.until("DONE")
+    assert [r.start for r in cell.plans()] == [[], AWAY, AWAY, AWAY, AWAY]
+
+
+def test_only_finger_tips_may_touch_and_only_what_is_traced() -> None:
+    cell = OutlineDouble()
+    cell.until("DONE")
+    assert ROBOT.gripper is not None
+    touching = [(link, "Object_1") for link in ROBOT.gripper.links]
+    allowed = {r.stage: r.allowed_collisions for r in cell.plans()}
+    assert allowed == {"approach": [], "descend": touching, "trace": touching, "retreat": touching, "home": []}
+
+
+def test_inner_edge_of_a_hole_is_traced_touching_the_solid_around_it() -> None:
+    cell = OutlineDouble()
+    cell.objects = [prism("Object_0", 0.5, 0.0, 0.08), prism("Object_2", 0.5, 0.3, 0.02)]
+    cell.until("DONE")
+    trace = next(r for r in cell.plans() if r.stage == "trace")
+    assert {name for _, name in trace.allowed_collisions} == {"Object_0"}
+
+
+def test_path_that_was_given_need_not_go_round_anything() -> None:
+    cell = OutlineDouble()
+    assert cell.path is not None
+    away = outline_of([(0.5, -0.3), (0.52, -0.3), (0.5, -0.28)], 0, "a.json")
+    cell.path = away.model_copy(update={"given": True})
+    cell.until("DONE")
+    assert [r.allowed_collisions for r in cell.plans()] == [[]] * 5
+    near = OutlineDouble()
+    near.path = outline_of([(0.5, 0.05), (0.5, 0.1), (0.45, 0.05)], 0, "a.json").model_copy(update={"given": True})
+    near.until("DONE")
+    assert {name for r in near.plans() for _, name in r.allowed_collisions} == {"Object_1"}
+
+
+@pytest.mark.parametrize("stage", ["approach", "descend", "trace", "retreat", "home"])
+def test_way_that_can_not_be_planned_ends_in_error_before_the_arm_moves(stage: str) -> None:
+    cell = OutlineDouble()
+    cell.unplannable = lambda r: "no_ik" if r.stage == stage else ""
+    cell.until("ERROR")
+    assert cell.moves() == []
+    assert cell.status.message == f"Object_1: {stage}: no_ik"
+    assert cell.status.failures == 1
+    if stage == "trace":
+        assert cell.status.fraction == 0.5
+
+
+def test_object_that_got_another_name_while_motions_were_planned_is_traced_under_that_name() -> None:
+    double = OutlineDouble()
+
+    def collides(request: m.PlanRequest) -> str:
+        if request.stage != "descend" or double.objects[0].id != "Object_1":
+            return ""
+        assert double.path is not None
+        double.objects[0] = double.objects[0].model_copy(update={"id": "Object_7"})
+        double.path = double.path.model_copy(update={"object": "Object_7"})
+        double.colliding = ("tip", "Object_7")
+        return "collision"
+
+    double.unplannable = collides
+    double.until("DONE", "ERROR")
+    assert (double.status.state, double.status.subject, double.status.failures) == ("DONE", "Object_7", 1)
+
+
+def test_objects_that_changed_their_names_while_motions_were_planned_are_told_apart_by_where_they_are() -> None:
+    double = OutlineDouble()
+
+    def collides(request: m.PlanRequest) -> str:
+        if request.stage != "descend" or double.objects[0].id != "Object_1":
+            return ""
+        assert double.path is not None
+        double.objects = [prism("Object_2", 0.5, 0.0, 0.05), prism("Object_1", 0.5, 0.3, 0.02)]
+        double.path = double.path.model_copy(update={"object": "Object_2"})
+        double.colliding = ("tip", "Object_2")
+        return "collision"
+
+    double.unplannable = collides
+    double.until("DONE", "ERROR")
+    assert (double.status.state, double.status.subject, double.status.failures) == ("DONE", "Object_2", 1)
+
+
+def moved(double: OutlineDouble, dy: float) -> None:
+    """The object stands elsewhere from now on."""
+    double.objects[0] = prism("Object_1", 0.5, dy, 0.05)
+    double.path = outline_of([(x, y + dy) for x, y in SQUARE], double.stamp)
+
+
+def test_object_that_was_moved_while_its_motions_were_planned_is_traced_where_it_is() -> None:
+    double = OutlineDouble()
+    double.unplannable = lambda request: (request.stage == "home" and moved(double, -0.2)) or ""
+    double.until("DONE", "ERROR")
+    trace = [r.goal for r in double.plans() if r.stage == "trace"][-1]
+    assert isinstance(trace, m.PathGoal) and double.moves() == WHOLE
+    assert [p.position.y for p in trace.waypoints[:4]] == [y - 0.2 for _, y in SQUARE]
+    assert double.status.state == "DONE" and double.status.failures == 1
+
+
+def test_object_that_was_taken_away_while_its_motions_were_planned_is_not_traced_in_the_air() -> None:
+    double = OutlineDouble()
+
+    def taken(request: m.PlanRequest) -> str:
+        if request.stage == "home":
+            gone = {"poses": [], "message": "Object_1 is not seen any more", "object": ""}
+            double.path = outline_of([], double.stamp).model_copy(update=gone)
+        return ""
+
+    double.unplannable = taken
+    double.until("DONE", "ERROR")
+    assert (double.status.state, double.moves()) == ("ERROR", [])
+    assert double.status.message == "Object_1 is not seen any more"
+
+
+def test_object_that_never_stands_still_ends_in_error_before_the_arm_moves() -> None:
+    double, places = OutlineDouble(), iter(range(1, 100))
+    double.unplannable = lambda request: (request.stage == "home" and moved(double, 0.02 * next(places))) or ""
+    double.until("DONE", "ERROR")
+    assert (double.status.state, double.moves()) == ("ERROR", [])
+    assert "Object_1 is not where it was" in double.status.message
+
+
+def test_motion_that_fails_brings_the_arm_home_and_ends_in_error() -> None:
+    cell = OutlineDouble()
+    cell.abort = "trace"
+    cell.until("ERROR")
+    assert cell.moves() == ["approach", "descend", "trace", "retreat", "home"]
+    assert cell.q == HOME
+    assert cell.status.message == "trace aborted: path tolerance"
+    assert not cell.status.closed
+
+
+@pytest.mark.parametrize("stage", WHOLE)
+def test_outline_is_traced_whole_although_the_controller_was_started_again(stage: str) -> None:
+    cell = OutlineDouble()
+    cell.until(stage)
+    cell.step()
+    cell.restart_controller()
+    cell.until("DONE")
+    traced = stage in ("retreat", "home")
+    before = WHOLE[: WHOLE.index(stage) + 1]
+    assert cell.moves() == [*before, "retreat", "home", *([] if traced else WHOLE)]
+    assert cell.status.closed and cell.status.failures == 1 and cell.status.message == ""
+    assert cell.q == HOME
+
+
+@pytest.mark.parametrize("stage", WHOLE)
+def test_outline_is_traced_whole_although_the_controller_was_started_again_before_it_answered(stage: str) -> None:
+    cell = OutlineDouble()
+    cell.unanswered = stage
+    cell.until("DONE")
+    assert cell.moves()[-len(WHOLE):] == WHOLE or stage in ("retreat", "home")
+    assert cell.status.closed and cell.status.failures == 1 and cell.q == HOME
+
+
+def test_controller_that_is_started_again_and_again_is_given_up() -> None:
+    cell = OutlineDouble()
+    for _ in range(100):
+        cell.step()
+        if cell.status.state == "ERROR":
+            break
+        if cell.motion.state == "active":
+            cell.restart_controller()
+    assert cell.status.state == "ERROR" and cell.status.message.endswith("was forgotten by the controller")
+    assert len(cell.moves()) == MOST_FORGOTTEN + 2
+
+
+def test_arm_that_stands_against_something_is_freed_from_it() -> None:
+    cell = OutlineDouble()
+    cell.abort = "trace"
+    pair = ("robotiq_85_base_link", "Object_2")
+    cell.unplannable = lambda r: "start_in_collision" if cell.moves()[-1:] == ["trace"] and (
+        pair not in r.allowed_collisions and r.stage == "retreat") else ""
+    cell.colliding = pair
+    cell.until("ERROR")
+    assert cell.moves()[-2:] == ["retreat", "home"]
+    assert cell.q == HOME
+
+
+def test_arm_that_can_not_go_home_stays_and_says_so() -> None:
+    cell = OutlineDouble()
+    cell.abort = "trace"
+    cell.unplannable = lambda r: "no_path" if "trace" in cell.moves() else ""
+    cell.until("ERROR")
+    assert cell.moves() == ["approach", "descend", "trace"]
+    assert cell.status.message == "trace aborted: path tolerance; the arm stays where it is: home: no_path"
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        (None, "no contour came from the camera"),
+        (OutlinePoints(message="every contour touches the border of the picture"), "touches the border"),
+        (OutlinePoints(), "no object is chosen"),
+        (outline_of([(0.5, 0.0)], 0), "the contour of Object_1 is a single point"),
+        (outline_of([(0.5, -0.3), (0.52, -0.3), (0.5, -0.28)], 0), "the planning scene does not hold Object_1"),
+    ],
+)
+def test_without_a_usable_contour_it_ends_in_error_with_the_reason(path: OutlinePoints | None, message: str) -> None:
+    cell = OutlineDouble(selection_timeout=3.0, picture_timeout=3.0)
+    cell.path = path
+    cell.until("SELECTING")
+    assert message in cell.status.message
+    began = cell.now
+    cell.until("ERROR")
+    assert cell.now - began >= 2.9
+    assert message in cell.status.message
+    assert cell.requests == []
+
+
+def test_camera_that_is_started_again_costs_no_time_of_the_selection() -> None:
+    cell = OutlineDouble(selection_timeout=3.0, picture_timeout=30.0)
+    chosen, cell.path = cell.path, OutlinePoints(message="no object is chosen")
+    cell.until("SELECTING")
+    came_back = cell.now + 20
+    while cell.now < came_back:
+        cell.camera_on = False
+        cell.step()
+    cell.camera_on = True
+    for _ in range(10):
+        cell.step()
+    assert cell.status.state == "SELECTING"
+    cell.path = chosen
+    cell.until("DONE")
+
+
+def test_selection_is_waited_for_as_long_as_it_takes_when_asked_to() -> None:
+    cell = OutlineDouble(selection_timeout=0.0)
+    chosen, cell.path = cell.path, OutlinePoints(message="no object is chosen")
+    for _ in range(500):
+        cell.step()
+    assert cell.status.state == "SELECTING"
+    cell.path = chosen
+    cell.until("DONE")
+
+
+def test_contour_seen_before_the_arm_came_home_is_not_trusted() -> None:
+    cell = OutlineDouble()
+    cell.until("DONE")
+    cell.camera_on = False
+    cell.task.command("start", cell.view())
+    for _ in range(20):
+        cell.step()
+    assert cell.status.state == "SELECTING"
+    assert cell.moves() == WHOLE
+    cell.camera_on = True
+    cell.until("DONE")
+    assert cell.moves() == WHOLE * 2
+
+
+def test_picture_that_is_too_old_starts_no_motion() -> None:
+    cell = OutlineDouble(selection_timeout=0.0)
+    cell.camera_on = False
+    cell.now += 10
+    for _ in range(200):
+        cell.step()
+    assert cell.status.state == "SELECTING" and cell.status.message == "no fresh picture"
+    assert not any(isinstance(r, m.ExecuteRequest) for r in cell.requests)
+    cell.camera_on = True
+    cell.until("DONE")
+    assert cell.moves() == WHOLE
+
+
+def test_camera_that_freezes_while_the_motions_are_planned_has_them_planned_anew_from_a_newer_picture() -> None:
+    cell = OutlineDouble(selection_timeout=0.0)
+    plan, frozen = cell.unplannable, []
+
+    def freeze(request: m.PlanRequest) -> str:
+        if request.stage == "home" and not frozen:
+            frozen.append(request.id)
+            cell.camera_on = False
+            cell.now += 10
+        return plan(request)
+
+    cell.unplannable = freeze
+    for _ in range(200):
+        cell.step()
+    assert frozen and cell.status.message == "no fresh picture"
+    assert not any(isinstance(r, m.ExecuteRequest) for r in cell.requests)
+    cell.camera_on = True
+    cell.until("DONE")
+    assert cell.moves() == WHOLE
+
+
+def test_camera_that_stays_frozen_ends_the_task_with_that_reason() -> None:
+    cell = OutlineDouble()
+    cell.camera_on = False
+    cell.now += 10
+    cell.until("ERROR")
+    assert cell.status.message == "no fresh picture" and cell.moves() == []
+
+
+def test_arm_that_is_not_at_home_at_the_start_goes_there_first() -> None:
+    cell = OutlineDouble()
+    cell.q = list(AWAY)
+    cell.until("DONE")
+    assert cell.moves() == ["retreat", "home", *WHOLE]
+
+
+@pytest.mark.parametrize("colliding", [None, ("base", "Object_2")])
+def test_arm_that_can_not_go_up_from_where_it_is_found_goes_home_nevertheless(
+    colliding: tuple[str, str] | None,
+) -> None:
+    cell = OutlineDouble()
+    cell.q, cell.colliding = list(AWAY), colliding
+    cell.unplannable = lambda r: "no_ik" if r.stage == "retreat" and not cell.moves() else ""
+    cell.until("DONE")
+    assert cell.moves() == ["home", *WHOLE]
+    assert cell.status.failures == 0
+
+
+def test_motion_of_a_task_before_this_one_is_let_finish() -> None:
+    cell = OutlineDouble()
+    cell.motion = m.MotionStatus(id="other", state="active")
+    for _ in range(20):
+        cell.step()
+    assert cell.requests == []
+    cell.motion = m.MotionStatus(id="other", state="succeeded")
+    cell.until("DONE")
+
+
+def test_motion_stopped_from_outside_pauses_the_task() -> None:
+    cell = OutlineDouble()
+    cell.until("TRACING")
+    cell.motion = cell.motion.model_copy(update={"state": "cancelled", "message": "asked to"})
+    cell.step()
+    assert cell.status.paused
+    assert "resume" in cell.status.message
+
+
+def test_task_that_was_not_started_waits() -> None:
+    cell = OutlineDouble(started=False)
+    for _ in range(20):
+        cell.step()
+    assert (cell.status.state, cell.requests) == ("IDLE", [])
+    cell.task.command("start", cell.view())
+    cell.until("DONE")
+
+
+def test_task_that_ended_in_error_can_be_started_again() -> None:
+    cell = OutlineDouble()
+    cell.unplannable = lambda r: "no_ik"
+    cell.until("ERROR")
+    cell.unplannable = lambda r: ""
+    cell.task.command("start", cell.view())
+    cell.until("DONE")
+    assert cell.moves() == WHOLE
+
+
+def test_motion_that_takes_far_longer_than_planned_is_stopped() -> None:
+    cell = OutlineDouble(overtime=2.0)
+    cell.until("TRACING")
+    cell._arrival = math.inf
+    cell.until("ERROR")
+    assert [type(r) for r in cell.requests].count(m.StopRequest) == 1
+    assert "took longer than 3 s" in cell.status.message
+    assert cell.q == HOME
+
+
+def test_refused_motion_ends_in_error() -> None:
+    cell = OutlineDouble()
+    cell.refuse = "approach"
+    cell.until("ERROR")
+    assert cell.status.message == "approach was refused: no"
+
+
+def test_nearly_whole_contour_is_done_and_not_closed() -> None:
+    cell = OutlineDouble()
+    cell.fraction = 0.995
+    cell.until("DONE")
+    assert (cell.status.fraction, cell.status.closed) == (0.995, False)
+
+
+def test_what_has_not_been_heard_yet_is_named() -> None:
+    cell = OutlineDouble()
+    view = cell.view()
+    view.gripper, view.q = None, None
+    assert cell.task.step(view) == []
+    assert cell.status.message == "waiting for gripper/state, joint_states"

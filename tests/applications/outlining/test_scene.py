@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from applications.outlining.perceived_solids import PerceivedSolid
+from applications.outlining.scene import collision_object, planning_scene
+from common.config import Surroundings, load_cell
+from common.messages import Color, PlanningScene
+from common.perception.intake import Unusable
+from common.scene.home import HomeWatch
+from common.transport.codec import decode, encode
+
+CELL = load_cell("ur5")
+HOME = CELL.robot.named_poses["home"]
+AWAY = [HOME[0] + 0.5, *HOME[1:]]
+
+
+def solid(label: str = "Object_1") -> PerceivedSolid:
+    outline = np.array([(0.45, -0.05), (0.55, -0.05), (0.55, 0.15), (0.45, 0.05)])
+    return PerceivedSolid(0, label, outline, 1.0, 0.1, Color(r=1, g=1, b=0), False)
+
+
+def test_solid_stands_where_it_was_seen() -> None:
+    thing = collision_object(solid())
+    at = thing.pose.position
+    assert (thing.id, thing.role, thing.shape, thing.dimensions) == ("Object_1", "target", "prism", [0.1])
+    assert math.isclose(at.z, 1.05)
+    placed = np.array(thing.outline) + np.array([at.x, at.y])
+    assert np.allclose(placed, solid().outline)
+
+
+def test_scene_holds_fixtures_and_solids_of_the_picture_and_no_container() -> None:
+    around = CELL.section(Surroundings)
+    assert isinstance(around, Surroundings)
+    scene = planning_scene(around, [solid("Object_1"), solid("Object_2")], 7)
+    assert [o.id for o in scene.objects] == ["robot_base", "target_base", "Object_1", "Object_2"]
+    assert (scene.header.stamp, scene.header.frame_id) == (7, "world")
+
+
+def test_scene_that_is_as_full_as_it_may_be_can_be_read_and_a_fuller_one_is_not_made() -> None:
+    around = CELL.section(Surroundings)
+    assert isinstance(around, Surroundings)
+    turn = np.linspace(0, 2 * math.pi, 12, endpoint=False)
+    round_one = replace(solid(), outline=0.1 * np.stack([np.cos(turn), np.sin(turn)], axis=1))
+    full = [replace(round_one, label=f"Object_{index}") for index in range(400)]
+    assert len(decode(PlanningScene, encode(planning_scene(around, full, 7))).objects) == 402
+    long = replace(solid(), outline=np.resize(round_one.outline, (2001, 2)))
+    for crowd in ([*full, solid()], [*full[1:], replace(long, outline=long.outline[:300])], [long]):
+        with pytest.raises(Unusable, match="are more than a planning scene has room for"):
+            planning_scene(around, crowd, 7)
+
+
+def test_arm_that_never_left_home_was_always_there() -> None:
+    watch = HomeWatch(HOME)
+    assert not watch.covers(5)
+    watch.note(HOME, 10)
+    assert watch.covers(5) and watch.covers(20)
+
+
+def test_pictures_count_from_the_return_home_until_the_arm_leaves_again() -> None:
+    watch = HomeWatch(HOME)
+    watch.note(HOME, 10)
+    watch.note(AWAY, 20)
+    watch.note(AWAY, 30)
+    assert watch.covers(15) and not watch.covers(20) and not watch.covers(35)
+    watch.note(HOME, 40)
+    assert not watch.covers(15) and not watch.covers(39)
+    assert watch.covers(40) and watch.covers(100)
+
+
+def test_return_home_at_a_time_to_come_counts_until_the_next_word_of_the_arm() -> None:
+    watch = HomeWatch(HOME)
+    for q, stamp in ((AWAY, 10), (HOME, 2**63 - 1), (HOME, 40)):
+        watch.note(q, stamp)
+    assert not watch.covers(39) and watch.covers(40) and watch.covers(100)
+
+
+def test_arm_that_was_elsewhere_at_first_has_to_come_home() -> None:
+    watch = HomeWatch(HOME)
+    watch.note(AWAY, 10)
+    assert not watch.covers(5) and not watch.covers(15)
+    watch.note(HOME, 20)
+    assert watch.covers(25) and not watch.covers(5)

@@ -1,0 +1,342 @@
+"""Pictures of known layouts in, places out: every ball counted once, every whole one within 3 mm (in fact within 1)."""
+
+import math
+from unittest.mock import patch
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from applications.pick_place.annotation import annotate
+from applications.pick_place.detector import Detector, DetectorOptions, rehearse
+from common.config import Container, Surroundings
+from common.perception.pinhole import Pinhole
+from common.perception.sphere import ray_distances, silhouette, wholly_in_view
+from common.robot.transforms import rpy_to_matrix, transform
+from tests.common.sim.spheres import draw_spheres
+
+around = Surroundings(container=Container())
+camera = Pinhole.from_config(around.camera)
+DETECT = Detector.detect
+detector = Detector(around)
+TOUCHING = 0.06
+LOW, HIGH = (0.08, -0.43), (0.72, 0.43)  # with a pixel to spare to the border of the picture
+PICTURES = [  # noise, brightness, width of the white rim
+    (0, 0, 2), (8, 20, 2), (8, -20, 2), (0, 0, 0), (8, 0, 0),
+]  # fmt: skip
+
+
+def on_table(points):
+    points = np.array(points, dtype=float).reshape(-1, 2)
+    return np.column_stack([points, np.full(len(points), 0.03)])
+
+
+def moved_into_view(shape, rng):
+    """The shape, turned and moved at random, all of it in view."""
+    angle = rng.uniform(0, 2 * math.pi)
+    turn = np.array([(math.cos(angle), -math.sin(angle)), (math.sin(angle), math.cos(angle))])
+    shape = np.array(shape) @ turn.T
+    while True:
+        balls = on_table(shape - shape.mean(axis=0) + rng.uniform(LOW, HIGH))
+        if all(wholly_in_view(camera, ball, 0.03) for ball in balls):
+            return balls
+
+
+def random_layout(rng, low=LOW, high=HIGH):
+    points = []
+    count = rng.integers(1, 9)
+    while len(points) < count:
+        point = rng.uniform(low, high)
+        if all(math.dist(point, other) >= TOUCHING for other in points):
+            points.append(point)
+    return on_table(points)
+
+
+def chain(rng):
+    points = [np.zeros(2)]
+    while len(points) < 5:
+        angle = rng.uniform(-1, 1)
+        point = points[-1] + TOUCHING * np.array((math.cos(angle), math.sin(angle)))
+        if all(math.dist(point, other) >= TOUCHING - 1e-9 for other in points):
+            points.append(point)
+    return points
+
+
+HALF = TOUCHING / 2
+UP = TOUCHING * math.sqrt(3) / 2
+CLUSTERS = {
+    "pair": lambda _: [(0, 0), (TOUCHING, 0)],
+    "chain": chain,
+    "row of four": lambda _: [(TOUCHING * i, 0) for i in range(4)],
+    "triangle": lambda _: [(0, 0), (TOUCHING, 0), (HALF, UP)],
+    "square": lambda _: [(0, 0), (TOUCHING, 0), (0, TOUCHING), (TOUCHING, TOUCHING)],
+    "rhombus": lambda _: [(0, 0), (TOUCHING, 0), (HALF, UP), (TOUCHING + HALF, UP)],
+    "block of five": lambda rng: (
+        rng.uniform(0.065, 0.07) * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
+    ),
+    "seven close together": lambda _: [
+        (0, 0), *((TOUCHING * math.cos(a), TOUCHING * math.sin(a)) for a in np.arange(6) * math.pi / 3)
+    ],
+}  # fmt: skip
+
+
+def check(balls, picture, *, within=0.003, view=camera):
+    """Each ball is found once, those wholly in view within the distance [m] and not marked partial."""
+    found = detector.detect(picture, view)
+    places = np.array([d.position[:2] for d in found]).reshape(-1, 2)
+    taken = set()
+    for ball in balls:
+        distances = np.linalg.norm(places - ball[:2], axis=1)
+        best = int(distances.argmin())
+        assert distances[best] < within, f"ball at {ball} is {distances[best] * 1e3:.1f} mm off"
+        assert not found[best].partial
+        taken.add(best)
+    assert len(taken) == len(balls) == len(found)
+    return found
+
+
+@pytest.mark.parametrize(("noise", "brightness", "rim"), PICTURES)
+def test_every_ball_of_random_layouts_is_found_within_a_millimetre(noise, brightness, rim):
+    rng = np.random.default_rng(1)
+    for _ in range(15):
+        balls = random_layout(rng)
+        picture = draw_spheres(
+            balls, camera, around, noise_std=noise, brightness=brightness, rng=rng, rim_width=rim
+        )
+        check(balls, picture, within=0.001)
+
+
+@pytest.mark.parametrize(
+    ("name", "noise", "brightness", "rim"),
+    # Without rims nothing in the picture shows the ball in the middle of seven.
+    [(name, *p) for name in CLUSTERS for p in PICTURES if p[2] or name != "seven close together"],
+)
+@pytest.mark.slow
+def test_balls_that_touch_are_told_apart(name, noise, brightness, rim):
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        balls = moved_into_view(CLUSTERS[name](rng), rng)
+        picture = draw_spheres(
+            balls, camera, around, noise_std=noise, brightness=brightness, rng=rng, rim_width=rim)
+        check(balls, picture)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_any_layout_without_overlap_is_found(seed):
+    rng = np.random.default_rng(seed)
+    balls = random_layout(rng)
+    check(balls, draw_spheres(balls, camera, around, noise_std=rng.choice([0, 8]), rng=rng))
+
+
+def test_balls_cut_by_the_border_are_found_and_marked_and_disturb_no_other():
+    rng = np.random.default_rng(3)
+    partial = 0
+    for _ in range(25):
+        balls = random_layout(rng, (-0.02, -0.55), (0.82, 0.55))
+        found = detector.detect(draw_spheres(balls, camera, around, rng=rng), camera)
+        places = np.array([d.position[:2] for d in found]).reshape(-1, 2)
+        for d, place in zip(found, places, strict=True):
+            assert np.linalg.norm(balls[:, :2] - place, axis=1).min() < 0.012, "there is a ball wherever one is seen"
+            partial += d.partial
+        for ball in balls:
+            if wholly_in_view(camera, ball, 0.03, margin=1.5):
+                distances = np.linalg.norm(places - ball[:2], axis=1)
+                assert distances.min() < 0.003 and not found[int(distances.argmin())].partial
+            elif not wholly_in_view(camera, ball, 0.03, margin=-0.5) and len(places):
+                distances = np.linalg.norm(places - ball[:2], axis=1)
+                assert distances.min() > 0.02 or found[int(distances.argmin())].partial
+    assert partial > 8
+
+
+def boxed(count, order):
+    c = around.container
+    slots = [
+        np.array((c.x + dx, c.y + dy, c.floor_thickness + 0.03 + 0.06 * layer))
+        for layer in range(2) for dx in (-c.slot_offset, c.slot_offset) for dy in (-c.slot_offset, c.slot_offset)
+    ]  # fmt: skip
+    low = [slots[i] for i in order[:count]]
+    return np.array(low + [slots[4 + i] for i in order[: max(0, count - 4)]])
+
+
+def shown_whole(ball, balls):
+    """Whether nothing nearer to the camera covers any of a ball's silhouette."""
+    rays = camera.directions(np.concatenate([silhouette(camera, ball, r, 60) for r in (0.0299, 0.02, 0.01)]))
+    distance = np.linalg.norm(ball - camera.position)
+    nearer = [b for b in balls if np.linalg.norm(b - camera.position) < distance - 1e-9]
+    return not nearer or bool((ray_distances(rays, np.array(nearer) - camera.position)[0] > 0.03).all())
+
+
+@pytest.mark.parametrize("count", range(1, 9))
+@pytest.mark.parametrize("noise", [0, 8])
+def test_every_ball_in_the_box_that_is_not_covered_is_seen_where_it_is(count, noise):
+    rng = np.random.default_rng(count)
+    for _ in range(3):
+        order = rng.permutation(4)
+        balls = boxed(count, order)
+        found = detector.detect(draw_spheres(balls, camera, around, noise_std=noise, rng=rng), camera)
+        pixels, truth = np.array([d.pixel for d in found]), camera.project(balls)
+        whole = [i for i, ball in enumerate(balls) if shown_whole(ball, balls)]
+        assert whole
+        for i in whole:
+            assert np.linalg.norm(pixels - truth[i], axis=1).min() < 3
+        for pixel in pixels:
+            assert np.linalg.norm(truth - pixel, axis=1).min() < 8, "nothing is seen where nothing is"
+        assert len(whole) <= len(found) <= count
+
+
+def test_a_ball_in_the_air_is_not_taken_for_one_on_the_table():
+    for z in np.arange(0.16, 0.40, 0.02):
+        assert detector.detect(draw_spheres([(0.5, -0.2, z)], camera, around), camera) == []
+
+
+@pytest.mark.parametrize("count", [0, 4, 7])
+def test_a_ball_that_falls_into_the_box_is_seen_nowhere_outside_of_it(count):
+    c = around.container
+    below = boxed(count, range(4)) if count else np.empty((0, 3))
+    for z in np.arange(0.10, 0.32, 0.02):
+        picture = draw_spheres(np.vstack([below, (c.x, c.y, z)]), camera, around)
+        for d in detector.detect(picture, camera):
+            assert detector.resting.meets_container(*camera.ray(d.pixel))
+
+
+def test_a_blurred_picture_still_gives_every_ball():
+    rng = np.random.default_rng(5)
+    for shape in ("block of five", "triangle"):
+        balls = moved_into_view(CLUSTERS[shape](rng), rng)
+        picture = draw_spheres(balls, camera, around, noise_std=4, rng=rng, rim_width=0)
+        check(balls, cv2.GaussianBlur(picture, (0, 0), 1.0))
+
+
+def test_position_lies_on_the_ray_of_the_pixel_at_the_height_of_the_centres():
+    for d in detector.detect(draw_spheres(boxed(8, range(4)), camera, around), camera):
+        assert d.position[2] == 0.03
+        np.testing.assert_allclose(camera.on_plane(d.pixel, 0.03), d.position[:2], atol=1e-9)
+
+
+def test_left_of_the_robot_is_left_in_the_picture():
+    balls = on_table([(0.4, 0.2), (0.4, -0.2)])
+    left, right = sorted(check(balls, draw_spheres(balls, camera, around)), key=lambda d: d.pixel[0])
+    assert left.pixel[0] < 320 < right.pixel[0] and left.position[1] > 0 > right.position[1]
+
+
+def test_a_tilted_camera_gives_the_same_places():
+    T = transform(rpy_to_matrix(math.pi - 0.25, 0.1, -math.pi / 2 + 0.3), (0.35, -0.15, 0.85))
+    tilted = Pinhole(540, 530, 330, 225, 640, 480, T)
+    rng = np.random.default_rng(4)
+    x, y = tilted.on_plane((300, 200), 0.03)
+    balls = on_table([(x, y), (x + 0.06, y), (x - 0.06, y + 0.1), (x + 0.03, y - UP), (x - 0.1, y - 0.1)])
+    assert all(wholly_in_view(tilted, ball, 0.03) for ball in balls)
+    check(balls, draw_spheres(balls, tilted, around, noise_std=4, rng=rng), view=tilted)
+
+
+def test_nothing_red_gives_nothing():
+    assert detector.detect(draw_spheres([], camera, around), camera) == []
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+    assert detector.detect(noise, camera) == []
+
+
+def test_a_picture_that_is_all_red_gives_nothing_and_no_error():
+    red = np.full((480, 640, 3), (26, 38, 255), np.uint8)
+    assert detector.detect(red, camera) == []
+
+
+def test_a_red_square_is_no_ball():
+    picture = draw_spheres([], camera, around)
+    picture[100:220, 350:480] = (26, 38, 255)
+    assert detector.detect(picture, camera) == []
+
+
+def test_the_tiniest_picture_is_looked_at_without_an_error():
+    tiny = Pinhole(520, 520, 0, 0, 1, 1, camera.T_world_optical)
+    assert detector.detect(np.full((1, 1, 3), (26, 38, 255), np.uint8), tiny) == []
+
+
+def test_windows_choose_what_is_a_ball():
+    blue = around.model_copy(update={"ball_color": (0.1, 0.2, 1.0)})
+    picture = draw_spheres(on_table([(0.4, 0.0)]), camera, blue)
+    assert detector.detect(picture, camera) == []
+    options = DetectorOptions(hsv_red_lo1=(110, 120, 80), hsv_red_hi1=(130, 255, 255))
+    assert len(Detector(blue, options).detect(picture, camera)) == 1
+
+
+def test_smaller_blobs_than_the_least_area_are_ignored():
+    picture = draw_spheres(on_table([(0.4, 0.0)]), camera, around)
+    (only,) = detector.detect(picture, camera)
+    assert 900 < only.area < 1300
+    options = DetectorOptions(min_contour_area_px=only.area + 1)
+    assert Detector(around, options).detect(picture, camera) == []
+
+
+def test_annotation_marks_what_was_found_on_a_copy():
+    balls = on_table([(0.5, -0.2), (0.4, 0.465)])
+    picture = draw_spheres(balls, camera, around)
+    before = picture.copy()
+    found = detector.detect(picture, camera)
+    assert [d.partial for d in sorted(found, key=lambda d: d.pixel[0])] == [True, False]
+    shown = annotate(picture, found)
+    np.testing.assert_array_equal(picture, before)
+    for d, color in zip(sorted(found, key=lambda d: d.pixel[0]), ((0, 200, 255), (0, 255, 0)), strict=True):
+        u, v = (round(value) for value in d.pixel)
+        assert tuple(shown[v, u].tolist()) == color
+
+
+def places(detections):
+    return [d.position for d in detections]
+
+
+def test_picture_that_comes_again_and_one_that_differs_are_both_looked_at_rightly():
+    one, other = (draw_spheres(on_table(spots), camera, around) for spots in ([(0.4, 0.1)], [(0.4, 0.1), (0.6, -0.2)]))
+    remembering = Detector(around)
+    fresh = [places(Detector(around).detect(picture, camera)) for picture in (one, one, other, one)]
+    assert [places(remembering.detect(picture.copy(), camera)) for picture in (one, one, other, one)] == fresh
+    assert [len(found) for found in fresh] == [1, 1, 2, 1]
+
+
+def test_same_picture_of_another_camera_shows_balls_elsewhere():
+    remembering = Detector(around)
+    moved = camera.T_world_optical.copy()
+    moved[0, 3] += 0.1
+    elsewhere = Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, moved)
+    picture = draw_spheres(on_table([(0.4, 0.1)]), camera, around)
+    (here,), (there,) = (places(remembering.detect(picture, seen_by)) for seen_by in (camera, elsewhere))
+    np.testing.assert_allclose(np.subtract(there, here), [0.1, 0.0, 0.0], atol=1e-6)
+
+
+def test_caller_that_draws_into_the_picture_or_the_list_spoils_nothing():
+    remembering = Detector(around)
+    picture = draw_spheres(on_table([(0.4, 0.1)]), camera, around)
+    mine = picture.copy()
+    remembering.detect(mine, camera).clear()
+    mine[:] = 0
+    assert remembering.detect(mine, camera) == []
+    assert len(remembering.detect(picture, camera)) == 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_was_found_in_a_picture_does_not_depend_on_the_pictures_before(seed):
+    rng = np.random.default_rng(seed)
+    one_after_the_other = Detector(around)
+    balls = random_layout(rng)
+    looked_at = 0
+    for _ in range(12):
+        kept = balls[rng.random(len(balls)) < 0.8]  # some are taken, others come, some of those touch
+        new = random_layout(rng)[: rng.integers(0, 3)]
+        balls = np.concatenate([kept, new])
+        picture = draw_spheres(balls, camera, around)
+        found = one_after_the_other.detect(picture, camera)
+        alone = Detector(around).detect(picture, camera)
+        assert [one.position for one in found] == [one.position for one in alone]
+        assert [one.area for one in found] == [one.area for one in alone]
+        looked_at += len(found)
+    assert looked_at > 12
+
+
+@pytest.mark.parametrize("height", [-1.0, 0.0, 5.0])
+def test_rehearsal_is_possible_wherever_the_table_is(height):
+    found = []
+    with patch.object(Detector, "detect", lambda self, picture, camera: found.append(DETECT(self, picture, camera))):
+        rehearse(around.model_copy(update={"table_height": height}), DetectorOptions())
+    assert [len(balls) for balls in found] == [3]

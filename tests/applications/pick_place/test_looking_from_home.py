@@ -1,0 +1,96 @@
+"""The task of a cell whose camera is on the hand: it looks from home before it decides, and moves for nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from applications.pick_place.choice import PickPlaceView
+from common import messages as m
+from common.config import CameraConfig, Surroundings, load_cell
+from common.scene.home import is_home
+from tests import pages
+from tests.applications.pick_place.cell_double import CellDouble
+
+CELL = load_cell(str(Path(__file__).parents[3] / "data" / "hand_camera.yaml"))
+HOME = CELL.robot.named_poses["home"]
+AWAY = [position + 0.3 for position in HOME]
+
+
+class HandCell(CellDouble):
+    """Its camera sees from home alone; elsewhere the last picture is the newest."""
+
+    def __init__(self, balls: list[tuple[float, float]], q: list[float], **parameters: Any) -> None:
+        self.q, self._homes, self._seen = q, set[str](), None
+        super().__init__(balls, world=CELL.section(Surroundings), **parameters)
+
+    def view(self) -> PickPlaceView:
+        self.camera_on = is_home(self.q, HOME)
+        view = replace(super().view(), q=list(self.q))
+        if self.camera_on:
+            self._seen = view.scene, view.seen
+        elif self._seen is not None:
+            view = replace(view, scene=view.scene.model_copy(update={"objects": self._seen[0].objects}),
+                           seen=self._seen[1])
+        else:
+            view = replace(view, scene=m.PlanningScene(header=m.Header()), seen=None)
+        return view
+
+    def answer(self, request: m.Message) -> None:
+        if isinstance(request, m.PlanRequest) and isinstance(request.goal, m.JointGoal):
+            self._homes.add(request.id)
+        super().answer(request)
+
+    def _arrive(self, request: m.ExecuteRequest) -> None:
+        super()._arrive(request)
+        self.q = HOME if request.plan in self._homes else AWAY
+
+    def stages(self) -> list[str]:
+        """Names of the motions that were planned."""
+        return [request.stage for request in self.requests if isinstance(request, m.PlanRequest)]
+
+
+def test_it_goes_home_to_look_before_it_chooses_the_next_one_and_before_it_is_done() -> None:
+    cell = HandCell([(0.40, -0.10), (0.52, -0.10)], HOME)
+    totals = set()
+    for _ in range(400):
+        cell.step()
+        totals |= {cell.task.status.total} if cell.task.status.stage else set()
+        if cell.task.status.state == "DONE":
+            break
+    assert (cell.task.status.state, cell.contained, cell.task.status.failures) == ("DONE", 2, 0)
+    assert cell.stages() == ["pre-grasp", "across", "home"] * 2
+    assert totals == {2} and cell.q == HOME
+
+
+def test_it_goes_home_first_from_wherever_it_is_started() -> None:
+    cell = HandCell([(0.40, -0.10)], AWAY)
+    for _ in range(3):
+        cell.step()
+    assert cell.stages() == ["home"]
+    while cell.task.status.state != "DONE":
+        cell.step()
+    assert cell.contained == 1
+
+
+def test_at_the_end_an_arm_that_somebody_brought_elsewhere_stays_there() -> None:
+    cell = HandCell([], HOME)
+    while cell.task.status.state != "DONE":
+        cell.step()
+    cell.q = AWAY
+    before = len(cell.requests)
+    for _ in range(50):
+        cell.step()
+    assert len(cell.requests) == before
+    cell.tell("start")
+    cell.step()
+    assert cell.stages()[-1] == "home"
+
+
+def test_the_camera_of_the_page_is_that_of_the_cell() -> None:
+    said = [yaml.safe_load(text) for kind, text in pages.blocks(pages.text_of("docs/calibration.md")) if kind == "yaml"]
+    camera = next(block["world"]["camera"] for block in said if isinstance(block.get("world"), dict))
+    assert CameraConfig(**camera) == CELL.world.camera

@@ -1,0 +1,60 @@
+import threading
+
+import pytest
+
+from drivers.mujoco import gl
+
+
+@pytest.fixture(autouse=True)
+def forgotten():
+    gl.chosen_gl.cache_clear()
+    yield
+    gl.chosen_gl.cache_clear()
+
+
+def chosen(monkeypatch, *, named="", egl=False, osmesa=False):
+    monkeypatch.setenv(gl.VARIABLE, named)
+    monkeypatch.setattr(gl, "_has_egl", lambda: egl)
+    monkeypatch.setattr(gl.ctypes.util, "find_library", lambda name: "libOSMesa.so.8" if osmesa else None)
+    return gl.chosen_gl()
+
+
+def test_egl_is_taken_before_osmesa_and_rays_where_there_is_neither(monkeypatch, caplog):
+    assert chosen(monkeypatch, egl=True, osmesa=True) == "egl"
+    gl.chosen_gl.cache_clear()
+    assert chosen(monkeypatch, osmesa=True) == "osmesa"
+    gl.chosen_gl.cache_clear()
+    assert chosen(monkeypatch) == ""
+    assert "apt-get install libegl1 libgl1-mesa-dri libopengl0" in caplog.text
+
+
+@pytest.mark.parametrize(("named", "found"), [("osmesa", "osmesa"), (" EGL ", "egl"), ("off", ""), ("glfw", "egl")])
+def test_variable_chooses_what_needs_no_screen(monkeypatch, named, found):
+    assert chosen(monkeypatch, named=named, egl=True) == found
+
+
+def test_which_is_used_is_told_once(monkeypatch, caplog):
+    caplog.set_level("INFO")
+    for _ in range(3):
+        chosen(monkeypatch, egl=True)
+    assert [record.message for record in caplog.records] == ["pictures are drawn by OpenGL (egl, found here)"]
+
+
+def test_a_machine_without_the_library_has_no_egl(monkeypatch):
+    def missing(name):
+        raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setattr(gl.ctypes, "CDLL", missing)
+    assert not gl._has_egl()
+
+
+def test_calls_from_any_thread_run_on_the_same_one():
+    run, found = gl.OneThread("test"), set()
+    found.add(run(threading.get_ident))
+    other = threading.Thread(target=lambda: found.add(run(threading.get_ident)))
+    other.start()
+    other.join()
+    assert len(found) == 1 and threading.get_ident() not in found
+    with pytest.raises(ValueError, match="of the call"):
+        run(lambda: (_ for _ in ()).throw(ValueError("of the call")))
+    run.close()

@@ -1,0 +1,152 @@
+"""The model of a cell has the robot, the objects and the cameras where the configuration has them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from common.config import ObjectConfig, World, load_cell
+from common.messages import Header, WorldObject
+from common.robot.finger_joints import finger_positions
+from common.robot.model import RobotModel
+from common.robot.transforms import pose_to_matrix, transform
+from common.sim.kinematic import KinematicWorld
+from common.sim.objects import solid_of, solid_of_message
+from drivers.mujoco.kept_meshes import kept
+from drivers.mujoco.model import CellModel, build_model
+from drivers.mujoco.things import Thing
+
+SHAPES = [
+    {"id": "ball", "shape": "sphere", "radius": 0.03, "x": 0.3, "y": 0.0},
+    {"id": "crate", "shape": "box", "size": [0.04, 0.06], "height": 0.05, "x": 0.4, "y": 0.0, "yaw": 0.5},
+    {"id": "can", "shape": "cylinder", "radius": 0.03, "height": 0.08, "x": 0.5, "y": 0.0},
+    {"id": "angle", "shape": "prism", "height": 0.03, "x": 0.6, "y": 0.0,
+     "polygon": [[-0.02, -0.02], [0.03, -0.02], [0.03, 0.0], [0.0, 0.0], [0.0, 0.03], [-0.02, 0.03]]},
+    {"id": "ring", "shape": "ring", "radius": 0.04, "inner_radius": 0.02, "height": 0.03, "x": 0.7, "y": 0.0},
+]
+
+
+def thing_of_message(told: WorldObject) -> Thing:
+    """The object that a message tells of, which says no mass."""
+    return Thing(told.id, solid_of_message(told), (told.color.r, told.color.g, told.color.b))
+
+
+def model_of(cell: str, visuals: bool = False) -> tuple[RobotModel, CellModel]:
+    config = load_cell(cell)
+    robot = RobotModel.load(config.robot)
+    told = KinematicWorld(config.world).objects(Header()).objects
+    return robot, build_model(robot, config.world, [thing_of_message(thing) for thing in told], visuals=visuals)
+
+
+@pytest.mark.parametrize("cell", ["panda", "ur5"])
+def test_every_link_is_where_the_planner_has_it(cell: str) -> None:
+    robot, made = model_of(cell)
+    data = mujoco.MjData(made.model)
+    rng, fingers = np.random.default_rng(1), robot.config.gripper
+    assert fingers is not None
+    for _ in range(5):
+        q = rng.uniform(robot.lower, robot.upper)
+        others = dict(zip(fingers.joints, finger_positions(fingers, rng.uniform(0.0, fingers.max_width)), strict=True))
+        made.set_joints(data, [*robot.joint_names, *others], [*q, *others.values()])
+        mujoco.mj_kinematics(made.model, data)
+        for link, T in robot.link_poses(q, others).items():
+            assert data.body(link).xpos == pytest.approx(T[:3, 3], abs=1e-9), link
+            assert data.body(link).xmat == pytest.approx(T[:3, :3].ravel(), abs=1e-9), link
+
+
+def test_many_objects_do_not_touch_each_other_before_they_are_put_anywhere() -> None:
+    config = load_cell("panda")
+    box = solid_of(ObjectConfig.model_validate({"id": "box", "shape": "box", "size": [0.02, 0.02], "height": 0.02,
+                                                "x": 0.0, "y": 0.0}))
+    made = build_model(RobotModel.load(config.robot), config.world, [
+        Thing(f"box_{k}", box, (1.0, 0.0, 0.0)) for k in range(100)])
+    data = mujoco.MjData(made.model)
+    data.qpos[:] = made.start
+    mujoco.mj_forward(made.model, data)
+    assert data.ncon == 0
+
+
+def test_a_joint_without_any_room_between_its_limits_is_held() -> None:
+    config = load_cell("panda")
+    robot = RobotModel.load(config.robot)
+    robot.urdf = robot.urdf.replace("</robot>", '<link name="lid"><inertial><mass value="1"/><inertia ixx="0.01" '
+                                    'iyy="0.01" izz="0.01"/></inertial></link><joint name="latch" type="revolute">'
+                                    '<parent link="panda_link7"/><child link="lid"/><axis xyz="1 0 0"/><limit lower="0"'
+                                    ' upper="0" effort="1" velocity="1"/></joint></robot>')
+    made = build_model(robot, config.world, [])
+    data = mujoco.MjData(made.model)
+    data.qpos[:] = made.start
+    data.qvel[made.dofs["latch"]] = 1.0
+    mujoco.mj_step(made.model, data, 100)
+    assert data.qpos[made.joints["latch"]] == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("cell", ["panda", "ur5"])
+def test_nothing_touches_at_home_but_what_stands_on_something(cell: str) -> None:
+    _, made = model_of(cell)
+    data = mujoco.MjData(made.model)
+    data.qpos[:] = made.start
+    for number, name in enumerate(made.things):
+        made.set_thing(data, name, transform(np.eye(3), (5.0 + number, 0.0, 1.0)))
+    mujoco.mj_forward(made.model, data)
+    assert data.ncon == 0
+
+
+def test_visual_shapes_are_made_once_and_change_nothing_that_moves(
+    monkeypatch: pytest.MonkeyPatch, kept_meshes: Path
+) -> None:
+    _, bare = model_of("panda")
+    _, first = model_of("panda", visuals=True)
+    monkeypatch.setattr("common.robot.visual_meshes.visual_pieces", None)  # not asked again
+    _, again = model_of("panda", visuals=True)
+    assert first.model.nmeshvert == again.model.nmeshvert > bare.model.nmeshvert
+    assert first.joints == bare.joints and first.things == bare.things
+    assert first.model.body_mass == pytest.approx(bare.model.body_mass)
+
+
+def test_what_can_not_be_kept_is_made_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.setenv("ZENCELL_CACHE", str(tmp_path / "file"))
+    for _ in range(2):
+        assert kept("hull", [b"some"], lambda: {"points": np.ones(3)})["points"].sum() == 3
+
+
+def test_cut_short_file_of_a_mesh_is_made_anew(kept_meshes: Path) -> None:
+    made = kept("hull", [b"cut"], lambda: {"points": np.ones(3)})
+    newest = max(kept_meshes.rglob("hull-*.npz"), key=lambda path: path.stat().st_mtime_ns)
+    newest.write_bytes(newest.read_bytes()[:40])
+    assert kept("hull", [b"cut"], lambda: {"points": np.ones(3)})["points"] == pytest.approx(made["points"])
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape["id"])
+def test_every_shape_rests_as_it_was_put(shape: dict[str, object]) -> None:
+    config = load_cell("panda", ["world.count=0"])
+    world = World.model_validate({"fixtures": config.world.fixtures, "objects": [shape]})
+    robot = RobotModel.load(config.robot)
+    (told,) = KinematicWorld(world).objects(Header()).objects
+    made = build_model(robot, world, [thing_of_message(told)])
+    data = mujoco.MjData(made.model)
+    data.qpos[:] = made.start
+    before = pose_to_matrix(told.pose)
+    made.set_thing(data, told.id, before)
+    for _ in range(500):
+        mujoco.mj_step(made.model, data)
+    after = made.pose_of(data, told.id)
+    assert after[:3, 3] == pytest.approx(before[:3, 3], abs=1e-3)
+    assert after[:3, :3] == pytest.approx(before[:3, :3], abs=0.01)
+    assert made.model.body_mass[made.things[told.id].body] == pytest.approx(0.1)
+
+
+def test_camera_looks_where_its_optical_frame_does() -> None:
+    config = load_cell("panda")
+    _, made = model_of("panda")
+    data = mujoco.MjData(made.model)
+    mujoco.mj_forward(made.model, data)
+    (name, camera), = config.world.cameras.items()
+    found = data.camera(name)
+    assert found.xpos == pytest.approx(camera.position)
+    assert -found.xmat.reshape(3, 3)[:, 2] == pytest.approx([0, 0, -1], abs=1e-9)  # down at the table
+    assert found.xmat.reshape(3, 3)[:, 0] == pytest.approx([0, -1, 0], abs=1e-9)  # right in the picture

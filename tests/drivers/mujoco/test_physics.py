@@ -1,0 +1,409 @@
+"""Things fall, roll, are pushed, held by friction alone, and are found again as they were."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from common.config import World, load_cell
+from common.errors import ConfigError, Refused
+from common.hardware.interface import Gripper, Limits, PlacedGripper
+from common.messages import Header, Vector3, WorldEdit, WorldObject
+from common.planning.ik import solve_ik
+from common.robot.finger_joints import finger_positions
+from common.robot.model import RobotModel
+from common.robot.transforms import tool_down
+from common.sim.interface import FeltWorld, PhysicalWorld, load_world
+from drivers.mujoco.world import PhysicsWorld
+
+BALL = {"shape": "sphere", "radius": 0.03, "mass": 0.1}
+CUBE = {"shape": "box", "size": [0.05, 0.05, 0.05], "mass": 0.1}
+PERIOD = 0.01  # [s] of a cycle of control
+GRIPPER = load_cell("panda").robot.gripper
+assert GRIPPER is not None
+
+
+class Rig:
+    """An arm over a table with things on it, and a clock that is moved by hand."""
+
+    def __init__(self, *things: dict[str, Any], cell: str = "panda") -> None:
+        config = load_cell(cell)
+        self.robot = RobotModel.load(config.robot)
+        objects = [{"id": f"thing_{i + 1}", "x": 0.45, "y": 0.0, **thing} for i, thing in enumerate(things)]
+        self.config = World.model_validate({
+            "fixtures": [{"id": "table", "dimensions": [1.0, 1.0, 0.05], "position": [0.5, 0.0, -0.025]}],
+            "containers": {"box": {"x": 0.55, "y": 0.25}}, "objects": objects, "simulator": "mujoco"})
+        self.now = 100.0
+        self.begin(self.robot.named("home"))
+
+    def begin(self, q: Any) -> None:
+        world = load_world(self.config, self.config.objects, None, self.robot.config.gripper)
+        assert isinstance(world, PhysicsWorld)
+        robot = self.robot
+        limits = Limits(tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration)
+        self.world, self.arm = world, world.hardware(robot, limits, np.array(q, float))
+        self.set_point = np.array(q, float)
+
+    @property
+    def fingers(self) -> Gripper:
+        assert self.arm.gripper is not None
+        return self.arm.gripper
+
+    def wait(self, seconds: float) -> None:
+        for _ in range(round(seconds / PERIOD)):
+            self.now += PERIOD
+            self.arm.read(self.now)
+
+    def move(self, to: Any, seconds: float = 1.0) -> None:
+        """Go there along a straight line in the joints, slowly at both ends."""
+        start, way = self.set_point.copy(), np.array(to, float) - self.set_point
+        for step in range(1, round(seconds / PERIOD) + 1):
+            share = step * PERIOD / seconds
+            self.now += PERIOD
+            self.arm.read(self.now)
+            s, ds = 0.5 - 0.5 * math.cos(math.pi * share), 0.5 * math.pi / seconds * math.sin(math.pi * share)
+            self.set_point = start + s * way
+            self.arm.write(self.set_point, ds * way, self.now)
+        self.wait(0.2)
+
+    def above(self, x: float, y: float, z: float) -> Any:
+        found = solve_ik(self.robot, tool_down(x, y, z), self.set_point)
+        assert found is not None
+        return found
+
+    def grip(self, width: float, effort: float = 5.0, seconds: float = 0.8) -> None:
+        self.fingers.command(width, self.now, effort)
+        self.wait(seconds)
+
+    def thing(self, name: str = "thing_1") -> WorldObject:
+        return next(thing for thing in self.world.objects(Header()).objects if thing.id == name)
+
+    def place(self, name: str = "thing_1") -> tuple[float, float, float]:
+        p = self.thing(name).pose.position
+        return p.x, p.y, p.z
+
+    def push(self, name: str, *velocity: float) -> None:
+        cell, data = self.world._built
+        at = cell.things[name].dof
+        data.qvel[at: at + len(velocity)] = velocity
+
+
+def test_ball_rests_where_it_was_put_and_nothing_is_told_of_it() -> None:
+    rig = Rig(BALL)
+    rig.wait(0.1)
+    version = rig.world.version
+    rig.wait(2.0)
+    assert rig.place() == pytest.approx((0.45, 0.0, 0.03), abs=5e-4)
+    assert rig.thing().state == "table" and rig.world.version == version and rig.world.take_events() == []
+
+
+def test_pushed_ball_rolls_and_comes_to_a_stop() -> None:
+    rig = Rig(BALL)
+    rig.push("thing_1", 0.3)
+    rig.wait(0.5)
+    assert rig.place()[0] > 0.5
+    rig.wait(3.0)
+    stopped = rig.place()
+    rig.wait(1.0)
+    assert rig.place() == pytest.approx(stopped, abs=5e-4)
+    assert 0.5 < stopped[0] < 0.8 and rig.thing().state == "table"
+
+
+def test_ball_that_leaves_the_table_is_elsewhere() -> None:
+    rig = Rig({**BALL, "x": 0.95})
+    rig.push("thing_1", 1.0)
+    rig.wait(0.3)
+    assert rig.thing().state == "falling"
+    rig.wait(1.5)
+    assert rig.thing().state == "elsewhere" and rig.place()[2] < -0.5
+
+
+def test_still_arm_stays_where_it_is_against_gravity() -> None:
+    rig = Rig()
+    rig.wait(1.0)
+    q, dq = rig.arm.read(rig.now)
+    assert q == pytest.approx(rig.robot.named("home"), abs=1e-3) and np.abs(dq).max() < 1e-3
+
+
+def test_at_rest_nothing_that_is_measured_changes() -> None:
+    rig = Rig(BALL)
+    rig.wait(0.5)
+    readings = set()
+    for _ in range(50):
+        rig.now += PERIOD
+        q, dq = rig.arm.read(rig.now)
+        readings.add((q.tobytes(), dq.tobytes(), rig.fingers.read(rig.now)))
+    assert len(readings) == 1
+
+
+def test_grasp_lifts_by_friction_and_drops_what_is_let_go() -> None:
+    rig = Rig(BALL)
+    rig.move(rig.above(0.45, 0.0, 0.1))
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    assert not rig.fingers.read(rig.now).holding
+    rig.grip(0.0)
+    reading = rig.fingers.read(rig.now)
+    assert reading.holding and not reading.moving and reading.width == pytest.approx(0.06, abs=3e-3)
+    assert reading.effort == pytest.approx(5.0, rel=0.1)
+    rig.move(rig.above(0.45, 0.0, 0.2))
+    assert rig.thing().state == "held" and rig.place()[2] == pytest.approx(0.2, abs=5e-3)
+    rig.wait(2.0)
+    assert rig.place()[2] == pytest.approx(0.2, abs=5e-3)
+    rig.grip(0.08)
+    rig.wait(1.0)
+    assert rig.thing().state == "table" and rig.place()[2] == pytest.approx(0.03, abs=1e-3)
+    assert [update.data for update in rig.world.take_events()] == ["remove:thing_1", "add:thing_1"]
+
+
+def test_heavy_thing_slips_out_of_weak_fingers() -> None:
+    rig = Rig({**CUBE, "mass": 3.0})
+    rig.move(rig.above(0.45, 0.0, 0.1))
+    rig.move(rig.above(0.45, 0.0, 0.025))
+    rig.grip(0.0, effort=2.0)
+    rig.move(rig.above(0.45, 0.0, 0.2))
+    assert rig.place()[2] < 0.05
+
+
+def test_fingers_close_as_fast_as_they_are_told_to_from_the_first_time_on() -> None:
+    rig = Rig()
+    for _ in range(2):
+        rig.wait(0.1)
+        rig.fingers.command(0.0, rig.now, 5.0)
+        widths = []
+        while rig.fingers.read(rig.now).moving:
+            rig.wait(PERIOD)
+            widths.append(rig.fingers.read(rig.now).width)
+        assert np.abs(np.diff(widths)).max() <= 1.05 * GRIPPER.speed * PERIOD
+        rig.grip(0.08)
+
+
+def test_fingers_close_on_nothing_and_say_so() -> None:
+    rig = Rig()
+    rig.grip(0.0)
+    reading = rig.fingers.read(rig.now)
+    assert reading.width == pytest.approx(0.0, abs=1e-3) and not reading.holding and not reading.moving
+    rig.grip(0.08)
+    assert rig.fingers.read(rig.now).width == pytest.approx(0.08, abs=1e-3)
+
+
+def test_fingers_that_open_against_something_do_not_push_the_arm_away() -> None:
+    rig = Rig({**CUBE, "size": [0.1, 0.1, 0.07], "y": 0.085, "mass": 80.0})  # beside the closed fingers
+    rig.grip(0.0)
+    rig.move(rig.above(0.45, 0.0, 0.1))
+    rig.move(rig.above(0.45, 0.0, 0.05))
+    rig.grip(GRIPPER.max_width, GRIPPER.effort, 2.0)
+    assert rig.fingers.read(rig.now).width < GRIPPER.max_width - 0.01, "they are kept from opening"
+    assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3
+
+
+@pytest.mark.parametrize("cell", ["panda", "ur5"])
+def test_all_joints_of_the_gripper_follow_the_driven_one(cell: str) -> None:
+    rig = Rig(cell=cell)
+    gripper = rig.robot.config.gripper
+    assert gripper is not None
+    model, data = rig.world._built
+    for share in (0.2, 0.7):
+        rig.grip(share * gripper.max_width, gripper.max_effort, 3.0)
+        wanted = finger_positions(gripper, share * gripper.max_width)
+        found = [float(data.qpos[model.joints[name]]) for name in gripper.joints]
+        assert found == pytest.approx(wanted, abs=0.01 if gripper.linkage else 1e-3)
+
+
+def test_stack_falls_when_it_is_touched() -> None:
+    rig = Rig(CUBE, {**CUBE, "position": [0.45, 0.0, 0.075], "x": None, "y": None})
+    rig.wait(1.0)
+    assert rig.place("thing_2")[2] == pytest.approx(0.075, abs=1e-3)
+    rig.grip(0.0)
+    rig.move(rig.above(0.45, -0.12, 0.075))
+    rig.move(rig.above(0.45, 0.02, 0.075))
+    rig.wait(0.5)
+    assert rig.place("thing_2")[2] < 0.06 and rig.place("thing_2")[1] > 0.03
+
+
+def test_what_is_found_again_moves_on_as_it_did() -> None:
+    rig = Rig({**BALL, "x": 0.3}, CUBE)
+    rig.push("thing_1", 0.3, 0.1)
+    rig.wait(0.3)
+    kept, before = rig.world.standing(), rig.place()
+    kept = {name: type(each).model_validate(each.model_dump()) for name, each in kept.items()}
+    rig.wait(0.3)
+    after = rig.place()
+    rig.begin(rig.robot.named("home"))
+    rig.world.restore(kept)
+    rig.now += 1000.0
+    rig.wait(0.01)
+    assert rig.place() == pytest.approx(before, abs=5e-3)
+    rig.wait(0.3)
+    assert rig.place() == pytest.approx(after, abs=5e-3)
+
+
+def test_what_was_held_over_a_restart_is_still_held() -> None:
+    rig = Rig(BALL)
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    rig.grip(0.0)
+    rig.move(rig.above(0.45, 0.0, 0.2))
+    kept, width = rig.world.standing(), rig.fingers.read(rig.now).width
+    rig.begin(rig.set_point)
+    rig.world.restore(kept)
+    assert isinstance(rig.fingers, PlacedGripper)
+    rig.fingers.place(width)
+    rig.fingers.command(0.0, rig.now, 5.0)
+    rig.wait(1.0)
+    assert rig.fingers.read(rig.now).holding
+    assert rig.thing().state == "held" and rig.place()[2] == pytest.approx(0.2, abs=8e-3)
+
+
+def test_edits_add_move_remove_and_reset() -> None:
+    rig = Rig(BALL, {**CUBE, "y": -0.2})
+    rig.wait(0.1)
+    added = rig.world.edit(WorldEdit(op="add", shape="ring", size=Vector3(x=0.06, y=0.06, z=0.03), inner_radius=0.02,
+                                     position=Vector3(x=0.6, y=-0.2), mass=0.25), rig.now)
+    cell, _ = rig.world._built
+    assert cell.model.body_mass[cell.things[added].body] == pytest.approx(0.25)
+    rig.wait(0.5)
+    assert rig.place(added) == pytest.approx((0.6, -0.2, 0.015), abs=1e-3) and rig.place()[0] == pytest.approx(0.45)
+    rig.world.edit(WorldEdit(op="move", id="thing_1", position=Vector3(x=0.3, y=0.1)), rig.now)
+    rig.wait(0.5)
+    assert rig.place() == pytest.approx((0.3, 0.1, 0.03), abs=1e-3)
+    with pytest.raises(Refused, match=r"occupied|overlaps|reach"):
+        rig.world.edit(WorldEdit(op="move", id="thing_1", position=Vector3(x=0.45, y=-0.2)), rig.now)
+    rig.world.edit(WorldEdit(op="remove", id="thing_2"), rig.now)
+    assert rig.world.ids == ["thing_1", added]
+    rig.wait(0.1)
+    rig.world.edit(WorldEdit(op="reset"), rig.now)
+    rig.wait(0.1)
+    assert rig.world.ids == ["thing_1", "thing_2"] and rig.place() == pytest.approx((0.45, 0.0, 0.03), abs=1e-3)
+
+
+def test_what_the_simulator_does_not_take_is_refused_and_changes_nothing() -> None:
+    rig = Rig(BALL)
+    rig.wait(0.1)
+    thin = WorldEdit(op="add", shape="prism", size=Vector3(x=0.1, y=0.1, z=1e-30), position=Vector3(x=0.6, y=-0.2),
+                     polygon=[(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)])
+    rig.world.take_events()
+    with pytest.raises(Refused, match="cannot simulate"):
+        rig.world.edit(thin, rig.now)
+    assert rig.world.ids == ["thing_1"] and rig.world.take_events() == []
+    added = rig.world.edit(WorldEdit(op="add", id="b", position=Vector3(x=0.6, y=-0.2)), rig.now)
+    rig.wait(0.1)
+    assert rig.world.ids == ["thing_1", added] and rig.place()[0] == pytest.approx(0.45)
+
+
+@pytest.mark.parametrize("meanwhile", [None, WorldEdit(op="add", position=Vector3(x=0.3, y=-0.3, z=0.0))])
+def test_what_a_person_lets_slip_falls_out_of_the_fingers(meanwhile: WorldEdit | None) -> None:
+    rig = Rig(BALL)
+    with pytest.raises(Refused, match="between the fingers"):
+        rig.world.edit(WorldEdit(op="drop"), rig.now)
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    rig.grip(0.0)
+    rig.move(rig.above(0.45, 0.0, 0.2))
+    assert rig.world.edit(WorldEdit(op="drop"), rig.now) == "thing_1"
+    if meanwhile is not None:
+        rig.world.edit(meanwhile, rig.now)
+    rig.wait(1.5)
+    assert rig.place()[2] == pytest.approx(0.03, abs=2e-3) and not rig.fingers.read(rig.now).holding
+
+
+def lies_there_and_can_be_taken_again(rig: Rig) -> None:
+    assert math.dist(rig.place(), (0.45, 0.0, 0.03)) < 5e-3
+    assert np.abs(rig.arm.read(rig.now)[0] - rig.set_point).max() < 5e-3, "nor does it push the arm"
+    rig.move(rig.above(0.45, 0.0, 0.2))
+    rig.grip(0.08)
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    rig.grip(0.0)
+    assert rig.fingers.read(rig.now).holding, "and it can be taken again"
+
+
+def test_what_a_person_lets_slip_on_the_table_is_not_flung_away_by_the_fingers_that_close_through_it() -> None:
+    rig = Rig(BALL)
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    rig.grip(0.0)
+    rig.world.edit(WorldEdit(op="drop"), rig.now)
+    rig.wait(3.0)
+    lies_there_and_can_be_taken_again(rig)
+
+
+def test_what_slips_over_a_restart_is_not_flung_away_by_the_fingers_that_are_within_it() -> None:
+    rig = Rig(BALL)
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    rig.grip(0.0)
+    rig.world.edit(WorldEdit(op="drop"), rig.now)
+    rig.wait(0.15)
+    kept, width = rig.world.standing(), rig.fingers.read(rig.now).width
+    assert width < 0.04, "the fingers are within the ball"
+    rig.begin(rig.set_point)
+    rig.world.restore({name: type(each).model_validate(each.model_dump()) for name, each in kept.items()})
+    assert isinstance(rig.fingers, PlacedGripper)
+    rig.fingers.place(width)
+    rig.grip(0.0, seconds=3.0)
+    lies_there_and_can_be_taken_again(rig)
+
+
+def test_what_is_kept_of_a_world_is_of_the_moment() -> None:
+    rig = Rig(BALL)
+    rig.wait(0.5)
+    rig.push("thing_1", 0.2)
+    for _ in range(10):  # more often than is told of anything that moves
+        before = rig.world.standing()["thing_1"].details["qpos"][0]
+        rig.wait(PERIOD)
+        assert rig.world.standing()["thing_1"].details["qpos"][0] - before > 0.1 * PERIOD
+
+
+def test_what_was_carried_over_a_restart_stands_still_with_the_arm() -> None:
+    rig = Rig(BALL)
+    rig.move(rig.above(0.45, 0.0, 0.03))
+    rig.grip(0.0)
+    rig.move(rig.above(0.45, 0.0, 0.2))
+    rig.push("thing_1", 0.0, 1.0)
+    kept = rig.world.standing()
+    assert kept["thing_1"].details["qvel"][1] == 1.0
+    rig.begin(rig.set_point)
+    rig.world.restore(kept)
+    cell, data = rig.world._built
+    assert not data.qvel[cell.things["thing_1"].dof:][:6].any()
+
+
+def test_hold_up_of_the_process_is_no_leap_in_the_world() -> None:
+    rig = Rig(BALL)
+    rig.push("thing_1", 0.2)
+    rig.wait(0.1)
+    before = rig.place()
+    rig.now += 3600.0
+    rig.arm.read(rig.now)
+    assert rig.place() == pytest.approx(before, abs=5e-3)
+
+
+def test_kinds_of_worlds_are_told_apart() -> None:
+    rig = Rig()
+    kinematic = load_world(rig.config.model_copy(update={"simulator": "kinematic"}), [])
+    assert isinstance(rig.world, PhysicalWorld) and not isinstance(rig.world, FeltWorld)
+    assert isinstance(kinematic, FeltWorld) and not isinstance(kinematic, PhysicalWorld)
+
+
+def test_suction_cup_is_refused_and_says_what_does() -> None:
+    rig = Rig()
+    cup = rig.robot.config.gripper.model_copy(update={"cup": object()})  # type: ignore[union-attr]
+    with pytest.raises(ConfigError, match="kinematic"):
+        load_world(rig.config, [], None, cup)
+
+
+def test_without_mujoco_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig()
+    monkeypatch.setattr("drivers.mujoco.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="zencell\\[physics\\]"):
+        load_world(rig.config, [])
+
+
+def test_arm_pushes_with_no_more_than_its_motors_have() -> None:
+    rig = Rig()
+    model, data = rig.world._built
+    limits = rig.robot.model.effortLimit
+    rig.arm.write(rig.set_point + 0.5, 0 * rig.set_point, rig.now)
+    rig.wait(0.05)
+    forces = [abs(float(data.actuator_force[model.actuators[name]])) for name in rig.robot.joint_names]
+    assert (np.array(forces) <= limits + 1e-9).all() and max(forces) > 1.0
+    assert mujoco.mj_versionString()

@@ -1,0 +1,196 @@
+"""The backend of the Franka Research 3, by the maker's library, against franka-sim."""
+
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import ruckig
+
+from common.config import RobotConfig, load_cell
+from common.control.gripper_controller import GripperController
+from common.hardware.driven_gripper import DrivenGripper
+from common.hardware.driver import DrivenArm
+from common.hardware.interface import HardwareFault, Limits
+from common.hardware.loading import load_hardware
+from common.messages import GripperCommand
+from common.robot.model import RobotModel
+from tests.doubles.franka_host import PYTHON, FrankaHost
+from tests.drivers.driven_rig import PERIOD, SWING, TIMEOUT, Rig
+
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(120)]
+if not PYTHON.exists():
+    pytest.skip("make franka-sim", allow_module_level=True)
+pytest.importorskip("pylibfranka", reason="make setup EXTRAS=franka")
+in_real_time = pytest.mark.skipif(
+    not os.environ.get("ZENCELL_TEST_FRANKA"), reason="needs a host that simulates the arm in real time: "
+                                                      "ZENCELL_TEST_FRANKA=1")
+
+SLOWER = 0.6
+ROBOT: RobotConfig = load_cell("panda", ["robot=fr3", "robot.hardware.backend=franka",
+                                         "robot.hardware.options.host=127.0.0.1"]).robot
+MODEL = RobotModel.load(ROBOT)
+LIMITS = Limits(
+    tuple(MODEL.joint_names), MODEL.lower, MODEL.upper, MODEL.velocity, MODEL.acceleration, None, MODEL.jerk)
+
+
+def test_the_hand_grasps_what_is_there_and_opens() -> None:
+    config = ROBOT.gripper
+    assert config is not None
+    with FrankaHost("--gripper-physics", "--gripper-object-width", "0.06"):
+        gripper = DrivenGripper("drivers.franka_hand", {"host": "127.0.0.1"}, config, name="hand")
+        controller, end = GripperController(gripper, config), time.monotonic() + TIMEOUT
+        for name, width, expected, outcome in (("close", 0.0, 0.06, "grasped"), ("open", 0.08, None, "")):
+            said = None
+            while said is None or said.state == "active":
+                assert time.monotonic() < end, said
+                now = time.monotonic()
+                try:
+                    said = controller.update(gripper.read(now), now)
+                    if said.id != name:
+                        said = controller.command(GripperCommand(id=name, width=width, expected_width=expected), now)
+                except HardwareFault:
+                    pass  # it is being connected to
+                time.sleep(PERIOD)
+            assert (said.state, said.outcome) == ("succeeded", outcome), said
+        gripper.close()
+
+
+def made(host: str = "127.0.0.1") -> DrivenArm:
+    options = {**ROBOT.hardware.options, "host": host, "ahead": 0.1}
+    arm = load_hardware(ROBOT.model_copy(update={"hardware": ROBOT.hardware.model_copy(update={"options": options})}),
+                        LIMITS, np.zeros(7))
+    assert isinstance(arm, DrivenArm)
+    return arm
+
+
+@contextmanager
+def rigged() -> Iterator[Rig]:
+    rig = Rig(made(), np.zeros(7))
+    try:
+        yield rig
+    finally:
+        assert rig.arm.gripper is not None
+        rig.arm.gripper.close()
+        rig.arm.close()
+
+
+@pytest.fixture(scope="module")
+def host() -> Iterator[FrankaHost]:
+    with FrankaHost() as host:
+        yield host
+
+
+@pytest.fixture(scope="module")
+def rig(host: FrankaHost) -> Iterator[Rig]:
+    with rigged() as rig:
+        yield rig
+
+
+def goes(rig: Rig, target: np.ndarray, share: float = 1.0) -> str:
+    """Go there as fast as a share of the limits allows: empty at the end, or why it ended before.
+
+    That is by the clock of the simulated arm, which is slower than the host's.
+    """
+    rig.until("")
+    given = ruckig.InputParameter(7)
+    given.current_position, given.target_position = rig.measured.tolist(), target.tolist()
+    given.max_velocity, given.max_acceleration, given.max_jerk = (
+        (share * limit).tolist() for limit in (MODEL.velocity, MODEL.acceleration, MODEL.jerk))
+    way = ruckig.Trajectory(7)
+    ruckig.Ruckig(7).calculate(given, way)
+    began = time.monotonic()
+    while (now := time.monotonic()) < began + way.duration / SLOWER + 1.0:
+        q, dq, _ = way.at_time(min(SLOWER * (now - began), way.duration))
+        if problem := rig.cycle(np.array(q), SLOWER * np.array(dq), now):
+            return problem
+    return ""
+
+
+# Hosts are one at a time: these have their own.
+
+
+@in_real_time
+def test_the_arm_finds_nothing_against_motions_at_all_limits() -> None:
+    with FrankaHost("--enforce-motion-limits", "--enforce-comm-constraints") as judging, rigged() as rig:
+        said = goes(rig, MODEL.named("home"), 0.3)
+        if said or rig.arm.state.speed < 1.0:
+            pytest.skip("this machine is too slow to simulate the arm: what comes late is judged as a jump")
+        rng = np.random.default_rng(1)
+        room = 0.6 * (MODEL.upper - MODEL.lower) / 2
+        for _ in range(6):
+            target = (MODEL.upper + MODEL.lower) / 2 + rng.uniform(-room, room)
+            assert goes(rig, target) == "", judging.text[-2000:]
+            assert np.abs(rig.arm.read(0.0)[0] - target).max() < 5e-3
+
+
+@in_real_time
+def test_a_reflex_says_why_and_is_left_only_when_somebody_asks() -> None:
+    with FrankaHost("--enforce-comm-constraints"), rigged() as rig:
+        rig.until("")
+        for _ in range(30):
+            rig.cycle(None, np.zeros(7))
+        (driver,) = [child for child in multiprocessing.active_children() if "hand" not in child.name]
+        os.kill(driver.pid or 0, signal.SIGSTOP)
+        time.sleep(0.2)  # the arm does without for 20 ms at most
+        os.kill(driver.pid or 0, signal.SIGCONT)
+        assert "communication constraints violation" in rig.until("has stopped for a reflex")
+        assert rig.arm.state.mode == "protective_stop"
+        where = rig.arm.read(0.0)[0]
+        for _ in range(50):
+            rig.cycle(None, np.zeros(7))
+        assert np.allclose(rig.arm.read(0.0)[0], where, atol=1e-3)
+        assert rig.done(rig.arm.order("recover")) == ""
+        rig.until("")
+
+
+def test_nothing_moves_before_somebody_asks_and_it_follows_from_where_it_stands(
+    host: FrankaHost, rig: Rig,
+) -> None:
+    rig.until("")
+    assert rig.arm.state.mode == "running"
+    assert np.allclose(rig.arm.read(0.0)[0], [0, 0, 0, -1.57, 0, 1.57, 0.785], atol=1e-3)
+    assert goes(rig, MODEL.named("home")) == "", host.text[-2000:]
+    assert np.abs(rig.arm.read(0.0)[0] - MODEL.named("home")).max() < 5e-3
+
+
+def test_set_points_that_cease_bring_the_arm_to_rest_by_itself(rig: Rig) -> None:
+    rig.until("")
+    assert rig.swing(SWING / 4) == ""
+    end = time.monotonic() + TIMEOUT
+    while max(map(abs, rig.arm.state.dq)) > 1e-3:  # nobody sends anything
+        assert time.monotonic() < end
+        time.sleep(PERIOD)
+    assert "ceased to come" in rig.until("ceased to come")
+    rig.until_it_moves()
+    assert rig.arm.state.mode == "running", "it had no reason to stop for protection"
+
+
+def test_what_only_desk_can_do_is_refused_with_a_line(rig: Rig) -> None:
+    assert "in Desk" in rig.done(rig.arm.order("enable"))
+    assert "buttons" in rig.done(rig.arm.order("freedrive", 1.0))
+    assert "cannot output" in rig.done(rig.arm.order("output", 1.0, 0.0))
+
+
+def test_the_load_is_told_while_the_arm_rests(rig: Rig) -> None:
+    rig.until("")
+    assert rig.done(rig.arm.order("payload", 0.4, 0.0, 0.0, 0.05)) == ""
+    rig.until_it_moves()
+
+
+def test_a_controller_that_is_frozen_or_started_again_is_found_again_where_it_stands(
+    host: FrankaHost, rig: Rig,
+) -> None:
+    rig.until("")
+    host.freeze(1.0)
+    rig.until_it_moves()
+    host.crash()
+    stood = host.stands
+    rig.until("no word") if rig.arm.state.mode == "running" else None
+    host.boot()
+    rig.until("")
+    assert np.allclose(rig.arm.read(0.0)[0], stood, atol=5e-3), "nothing has moved it"

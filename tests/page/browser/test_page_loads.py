@@ -1,0 +1,137 @@
+"""The page in a real browser: it opens, asks nobody else for anything, and its comings and goings change nothing."""
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import AsyncExitStack
+from pathlib import Path
+
+import msgspec
+import pytest
+import viser
+from websockets import Origin, Subprotocol
+from websockets.asyncio.client import ClientConnection
+from websockets.asyncio.client import connect as connect_socket
+
+from applications.pick_place.topics import PICK_PLACE_STATUS
+from common import topics
+from common.messages import TaskCommand
+from page.guard import close_server, make_server
+from tests.harness import until
+from tests.page.browser.conftest import IN_BROWSER, PATIENCE, Bring, Opened, Viewed, Watched
+
+pytestmark = IN_BROWSER
+
+SECRET = "correct-horse-battery"
+WAITING = ("--set", "autostart=false")
+# Where somebody looks from: the first that a browser tells, and what makes a page of its socket.
+CAMERA = msgspec.msgpack.encode({
+    "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (2.0, 0.0, 1.0), "fov": 1.0, "near": 0.1,
+    "far": 100.0, "image_height": 480, "image_width": 640, "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0),
+})
+
+
+@pytest.mark.parametrize("cell", ["panda", "ur5"])
+async def test_page_opens_without_an_error_and_asks_no_other_host(bring: Bring, watched: Watched, cell: str) -> None:
+    up = await bring("up", cell, *WAITING)
+    page = await watched.open(up.address)
+    await page.wait_for_load_state("networkidle")
+    assert watched.hosts == {"127.0.0.1"}
+    assert watched.errors == [] and watched.failed == []
+
+
+async def test_pages_that_come_and_go_change_nothing_for_the_task(opened: Opened, tmp_path: Path) -> None:
+    """Ten sockets as ten browsers have them, for the price of one browser: who stays, who vanishes, who never reads."""
+    with Viewed(tmp_path, "up", "panda", "--speed", "2", "--set", "world.count=3", *WAITING) as cell:
+        await cell.served()
+        async with cell.listen() as bus, AsyncExitStack() as stack:
+            status = bus.reader(PICK_PLACE_STATUS)
+            sockets = await asyncio.gather(*(stack.enter_async_context(socket_of(cell)) for _ in range(10)))
+            for socket in sockets:
+                await socket.send(CAMERA)
+            for socket in sockets[:9]:
+                await served(socket)
+            await bus.client(topics.TASK_COMMAND).call(TaskCommand(command="start"), PATIENCE)
+            await until(status, lambda told: told.state == "PLACING", PATIENCE)
+            for socket in sockets[:4]:
+                socket.transport.abort()
+            async with opened() as watched:
+                await watched.open(cell.address)
+                errors = list(watched.errors)
+            done = await until(status, lambda told: told.state in ("DONE", "ERROR"), PATIENCE * 2)
+            for socket in sockets[4:9]:
+                await served(socket)
+        cell.interrupt()
+        assert await cell.ended(PATIENCE) == 0, cell.tail()
+        assert errors == []
+        assert (done.state, done.placed) == ("DONE", 3)
+        assert cell.summary["truth"]["in_box"] == 3
+        assert not any(cell.summary["restarts"].values())
+
+
+def socket_of(cell: Viewed) -> connect_socket:
+    """The socket of a page as a browser opens it."""
+    return connect_socket(
+        cell.address.replace("http", "ws"), origin=Origin(cell.address), max_size=None, proxy=None, close_timeout=1,
+        subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], open_timeout=PATIENCE,
+    )
+
+
+async def served(socket: ClientConnection) -> None:
+    """Return when three more messages have come."""
+    for _ in range(3):
+        assert isinstance(await socket.recv(), bytes)
+
+
+@pytest.fixture
+def wide() -> Iterator[viser.ViserServer]:
+    """A page that other machines could reach, for as long as a test takes."""
+    server = make_server("0.0.0.0", 0, SECRET)
+    server.gui.add_button("A button")
+    yield server
+    close_server(server)
+
+
+async def test_token_opens_the_page_once_and_is_not_in_the_address_then(
+    wide: viser.ViserServer, watched: Watched
+) -> None:
+    address = f"http://127.0.0.1:{wide.get_port()}/"
+    stranger = await watched.page.context.new_page()  # whose console tells of the refusal
+    refused = await stranger.goto(address)
+    assert refused is not None and refused.status == 401
+    await stranger.close()
+    page = await watched.open(f"{address}?token={SECRET}")
+    await page.get_by_role("button", name="A button").wait_for()
+    assert page.url == address
+    assert SECRET not in await page.evaluate("document.cookie")
+    await watched.open(address)  # with the cookie
+    assert watched.errors == []
+
+
+async def test_another_web_page_in_the_same_browser_reaches_nothing(wide: viser.ViserServer, watched: Watched) -> None:
+    address = f"127.0.0.1:{wide.get_port()}"
+    page = await watched.open(f"http://{address}/?token={SECRET}")
+    await page.get_by_role("button", name="A button").wait_for()
+    foreign = await page.context.new_page()
+    # Of the same site, which is all that its cookie asks for.
+    await foreign.route("http://127.0.0.1:9/", lambda route: route.fulfill(content_type="text/html", body="<p>evil"))
+    await foreign.goto("http://127.0.0.1:9/")
+    protocol = f"viser-v{viser.__version__}"
+    ended = await foreign.evaluate(
+        """([address, protocol]) => new Promise(resolve => {
+            const socket = new WebSocket(`ws://${address}/`, protocol);
+            socket.onopen = () => resolve("opened");
+            socket.onerror = () => resolve("refused");
+        })""", [address, protocol],
+    )
+    assert ended == "refused"
+    framed = await foreign.evaluate(
+        """address => new Promise(resolve => {
+            const frame = document.createElement("iframe");
+            frame.onload = () => resolve(frame.contentDocument === null ? "not ours to read" : "read");
+            frame.src = `http://${address}/`;
+            document.body.append(frame);
+        })""", address,
+    )
+    assert framed == "not ours to read"
+    frame = foreign.frames[-1]
+    assert await frame.locator("canvas").count() == 0 and "error" in frame.url

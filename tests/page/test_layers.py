@@ -1,0 +1,112 @@
+"""Layers are found by name, those of an application and of a person's own too, and do not get in each other's way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import viser
+
+from common import messages as m
+from common.application import find_application, find_topic
+from common.errors import ConfigError, UnknownName
+from page.layers import find_layers, has_something, layers_shown
+from page.scene import Scene
+from tests.page.scene_cell import Clock, ConsoleDouble, around_of, robot_of
+
+PANDA = find_application("pick_place")
+OWN = '''
+from common import topics
+LABEL = "Width of the hand"
+ON = False
+TOPICS = (topics.GRIPPER_STATE,)
+def show(layer, topic, message):
+    layer.scene.add_label(f"{layer.root}/width", f"{1000 * message.width:.0f} mm")
+'''
+CLASSES = '''
+from page.layers import Layer
+class Floor(Layer):
+    LABEL = "Floor"
+    def build(self):
+        self.scene.add_frame(f"{self.root}/floor")
+class HighWall(Layer):
+    LABEL = "Wall"
+'''
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "page_pkg"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    return folder
+
+
+def test_cell_has_the_layers_of_the_platform_and_of_its_application() -> None:
+    panda, ur5 = find_layers(PANDA), find_layers(find_application("outlining"))
+    everywhere = {"robot", "fixtures", "objects", "plan", "tool_path", "camera", "frames", "truth", "grid",
+                  "collision_shapes", "reach", "points", "compared"}
+    assert {*panda} & {*ur5} == everywhere
+    assert {*panda} - {*ur5} == {"targets", "rejected", "workspace"}
+    assert {*ur5} - {*panda} == {"outline", "contours"}
+    assert (next(iter(panda)), list(panda)[-1]) == ("robot", "grid")  # in the order of their ticks
+    assert all(kind.LABEL for kind in (*panda.values(), *ur5.values()))
+
+
+def test_module_with_topics_and_show_is_a_layer(own: Path, server: viser.ViserServer) -> None:
+    (own / "hand_width.py").write_text(OWN)
+    layers = find_layers(PANDA, ["page_pkg.hand_width"])
+    name = "page_pkg.hand_width"
+    assert (layers[name].LABEL, layers_shown({}, layers)[name]) == ("Width of the hand", False)
+    server.scene.reset()
+    said = {"gripper/state": m.GripperState(width=0.04)}
+    scene = Scene(
+        server, robot_of("panda"), around_of("panda"), {name: layers[name]}, ConsoleDouble(),  # type: ignore[arg-type]
+        lambda topic: said.get(topic.key), shown={name: True}, clock=Clock(),  # type: ignore[arg-type, return-value]
+    )
+    scene.refresh(1.0)
+    label = server.scene.get_handle_by_name(f"/{name}/width")
+    assert isinstance(label, viser.LabelHandle) and label.text == "40 mm"
+
+
+def test_module_may_have_several_layers_as_classes(own: Path) -> None:
+    (own / "house.py").write_text(CLASSES)
+    layers = find_layers(None, ["page_pkg.house"])
+    assert [name for name in layers if "." in name] == ["page_pkg.house.floor", "page_pkg.house.high_wall"]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("import no_such_thing", "cannot be imported: No module named 'no_such_thing'"),
+     ("TOPICS = ()", "has no layer: a class derived from Layer, or LABEL, TOPICS and show"), ],
+)
+def test_module_that_is_no_layer_is_refused_by_name(own: Path, text: str, said: str) -> None:
+    (own / f"wrong_{len(text)}.py").write_text(text)
+    with pytest.raises(ConfigError, match=f"services.viewer.layers: 'page_pkg.wrong_{len(text)}' {said}"):
+        find_layers(PANDA, [f"page_pkg.wrong_{len(text)}"])
+
+
+def test_layout_may_speak_of_layers_of_other_cells() -> None:
+    shown = layers_shown({"outline": False, "their.layer": True, "robot": False}, find_layers(PANDA))
+    assert "outline" not in shown and "their.layer" not in shown and not shown["robot"]
+    with pytest.raises(UnknownName, match="layer 'outlien'"):
+        layers_shown({"outlien": False}, find_layers(PANDA))
+
+
+def test_layer_is_offered_where_something_is_written_that_it_is_about() -> None:
+    layers = find_layers(PANDA)
+    def offered(*keys: str) -> set[str]:
+        return {name for name, kind in layers.items() if has_something(kind, keys)}
+    assert offered() == {"grid"}
+    assert offered("tf", "tf_static", "joint_states") == {
+        "grid", "robot", "collision_shapes", "reach", "frames", "compared"}
+    assert offered("depth_camera/points") - offered() == {"points"}
+    assert offered("camera/camera_info") - offered() == {"camera"}
+    assert offered("scene_objects") - offered() == {"truth"}
+
+
+def test_topics_of_all_layers_are_known() -> None:
+    for name in ("pick_place", "outlining"):
+        for layer in find_layers(find_application(name)).values():
+            for topic in layer.TOPICS:
+                assert topic == find_topic(topic.key)

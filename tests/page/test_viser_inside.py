@@ -1,0 +1,85 @@
+"""The page's files: what the packed page holds, in parts that a browser can keep."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import re
+from pathlib import Path
+
+import pytest
+import viser
+from hypothesis import given
+from hypothesis import strategies as st
+from viser._messages import RunJavascriptMessage
+from viser.infra._async_message_buffer import AsyncMessageBuffer
+
+from page.viser_inside import ALPHABET, client_files, decoded, files_of, overlay
+
+PAGE = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text(encoding="utf-8")
+
+
+def encoded(data: bytes) -> str:
+    """As viser's build writes it."""
+    text = ""
+    for start in range(0, len(data), 4):
+        group = data[start : start + 4]
+        value, letters = int.from_bytes(group, "big"), ""
+        for _ in range(len(group) + 1):
+            value, digit = divmod(value, len(ALPHABET))
+            letters = ALPHABET[digit] + letters
+        text += letters
+    return text
+
+
+@given(st.binary(max_size=40))
+def test_what_was_written_in_letters_is_read_again(data: bytes) -> None:
+    assert decoded(encoded(data)) == data
+
+
+def test_client_of_the_installed_viser_is_taken_apart() -> None:
+    files = client_files()
+    page = gzip.decompress(files["/"].body).decode()
+    parts = set(re.findall(r'"(/[0-9a-f]+\.(?:css|js|wasm))"', page))
+    contents = {path.rsplit(".")[1]: gzip.decompress(files[path].body) for path in parts}
+    assert set(contents) == {"css", "js", "wasm"} and parts | {"/", "/index.html"} == set(files)
+    assert len(page) < 10_000 + len(overlay()) < len(PAGE) and "data-p=" not in page
+    assert 'id="zc-stop"' in page and "STOP" in page
+    assert b"WebSocket" in contents["js"] and contents["wasm"].startswith(b"\0asm") and b"mantine" in contents["css"]
+    assert all(files[path].lasts for path in parts) and not files["/"].lasts
+
+
+def test_name_of_a_part_tells_its_contents() -> None:
+    changed = PAGE.replace('data-ss="', 'data-ss="0', 1)
+    assert set(files_of(changed)) == set(client_files())  # the bar is in the page itself
+    size = int(re.search(r'data-ss="(\d+)"', PAGE)[1])  # type: ignore[index]
+    other = PAGE.replace(f'data-ss="{size}"', f'data-ss="{size - 1}"', 1)
+    assert not {path for path in files_of(other) if path.endswith("css")} & set(client_files())
+
+
+@pytest.mark.parametrize("page", ["<html><head><title>x</title></head></html>", PAGE.replace("data-p=", "data-q=")])
+def test_page_that_is_packed_in_another_way_is_sent_as_it_is(page: str) -> None:
+    files = files_of(page)
+    assert set(files) == {"/", "/index.html"}
+    sent = gzip.decompress(files["/"].body).decode()
+    assert re.sub(r"<head><script>.*?</script>", "<head>", sent, count=1, flags=re.DOTALL) == page
+
+
+async def test_messages_from_another_thread_wake_who_waits_for_them_and_nobody_elsewhere() -> None:
+    buffer = AsyncMessageBuffer(asyncio.get_running_loop(), persistent_messages=False)
+    for number in range(100):
+        waiting = asyncio.create_task(buffer.message_event.wait())
+        await asyncio.sleep(0)
+        woken = list(buffer.message_event._waiters)  # type: ignore[attr-defined]
+        seen = await asyncio.to_thread(_pushed, buffer, number, woken)
+        await asyncio.wait_for(waiting, 10.0)
+        assert seen == [False]
+        buffer.message_event.clear()
+
+
+def _pushed(buffer: AsyncMessageBuffer, number: int, woken: list[asyncio.Future[bool]]) -> list[bool]:
+    """Whether who waits was woken by this thread instead of by the loop."""
+    buffer.message_event.set()
+    found = [future.done() for future in woken]
+    buffer.push(RunJavascriptMessage(f"{number}"))
+    return found

@@ -1,0 +1,208 @@
+"""What is written is what is read: by us and by the library's own reader."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from common.messages import JointState
+from common.remapping import is_cell
+from recording.files import SplitWriter
+from recording.reading import Recording
+from recording.sample import RecordingError, Sample, encoding_of, message_of
+from recording.stamps import Sequences
+from recording.summary import summarise
+from recording.writing import RecordingWriter
+from tests.recording.samples import START, STEP, joints, status, write
+
+texts = st.text(st.characters(codec="utf-8", exclude_characters="/"), min_size=1, max_size=8)
+anything = st.builds(
+    Sample, key=texts.map(lambda text: f"panda/{text}"), payload=st.binary(max_size=200),
+    log_time=st.integers(1, 2**62), publish_time=st.integers(1, 2**62),
+    message=st.sampled_from(["", "Image", "Somebodys"]),
+    kind=st.sampled_from(["stream", "event", "state"]), writer=texts, sequence=st.integers(0, 2**32 - 1),
+    trace=st.sampled_from(["", "abc"]),
+)
+
+
+@given(st.lists(anything, max_size=30, unique_by=lambda s: (s.key, s.writer, s.sequence)), st.integers(1, 7))
+def test_everything_comes_back_as_it_was(
+    tmp_path_factory: pytest.TempPathFactory, samples: list[Sample], every: int
+) -> None:
+    path = write(tmp_path_factory.mktemp("files") / "a.mcap", samples, every=every)
+    with Recording(path) as recording:
+        assert recording.finished
+        assert recording.cell == "panda"
+        assert list(recording.samples()) == samples
+
+
+def test_payloads_are_plain_msgpack_with_the_schema_of_their_class(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", [joints(0), status(1)])
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        found = {channel.topic: (schema, channel, message) for schema, channel, message in reader.iter_messages()}
+        summary = reader.get_summary()
+    schema, channel, message = found["panda/joint_states"]
+    assert (schema.name, schema.encoding, channel.message_encoding) == ("JointState", "jsonschema", "msgpack")
+    assert json.loads(schema.data) == JointState.model_json_schema()
+    assert message.data == joints(0).payload
+    assert (message.log_time, message.publish_time, message.sequence) == (START, START - 1_000_000, 1)
+    assert channel.metadata == {"kind": "stream", "writer": "executor.1"}
+    assert summary.statistics.message_count == 3  # with the one that holds the traces
+
+
+def test_each_writer_of_a_key_has_a_channel(tmp_path: Path) -> None:
+    second = joints(1, writer="executor.2", sequence=1)
+    path = write(tmp_path / "a.mcap", [joints(0), second])
+    with Recording(path) as recording:
+        assert [sample.writer for sample in recording.samples()] == ["executor.1", "executor.2"]
+
+
+def test_what_was_flushed_is_there_while_the_file_is_still_written(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
+    for number in range(5):
+        writer.add(joints(number))
+    writer.flush()
+    writer.add(joints(5))
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert not recording.finished
+        assert list(recording.samples()) == [
+            replace(joints(n), publish_time=START + n * STEP - 1_000_000) for n in range(5)
+        ]
+        assert recording.topics() == {"joint_states": ("JointState", "stream")}
+    writer.close()
+
+
+def test_wanted_topics_from_a_time_on(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", [f(n) for n in range(30) for f in (joints, status)], every=6)
+    with Recording(path) as recording:
+        found = list(recording.samples(lambda topic: topic == "joint_states", START + 20 * STEP))
+        assert [sample.sequence for sample in found] == list(range(21, 31))
+        assert recording.seconds == pytest.approx(0.29)
+
+
+def test_of_one_that_was_cut_no_more_is_read_than_is_asked_for_once_its_channels_are_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
+    for number in range(20):
+        writer.add(joints(number))
+        writer.flush()
+    writer.abandon()
+    read = []
+    with Recording(tmp_path / "a.mcap") as recording:
+        records = recording._records
+        monkeypatch.setattr(recording, "_records", lambda place: read.append(place) or records(place))
+        for asked, most in (("first", 20), ("again", 4)):
+            read.clear()
+            found = recording.samples(since=START + 8 * STEP, until=START + 11 * STEP)
+            assert [sample.sequence for sample in found] == [9, 10, 11, 12], asked
+            assert len(read) == most
+
+
+def test_states_before_a_time_are_the_last_of_each_whoever_wrote_it(tmp_path: Path) -> None:
+    restarted = status(3, writer="task.2", sequence=1)
+    other = status(1, key="panda/gripper/state", message="GripperState")
+    path = write(tmp_path / "a.mcap", [status(0), other, joints(2), restarted, status(4)], every=1)
+    with Recording(path) as recording:
+        found = recording.states_before(START + 4 * STEP)
+        assert [(sample.key, sample.writer) for sample in found] == [
+            ("panda/gripper/state", "task.1"), ("panda/pick_place_status", "task.2")]
+        assert recording.states_before(START) == []
+
+
+def test_files_of_a_split_are_complete_alone(tmp_path: Path) -> None:
+    writer = SplitWriter(tmp_path / "a.mcap", {"cell": "panda"}, most_bytes=6000)
+    writer.describe("run", {"seed": 3})
+    writer.add(status(0, "GRASPING"))
+    for number in range(1, 40):
+        writer.add(joints(number))
+        writer.flush()
+    writer.close({"reason": "test"})
+    assert len(writer.files) > 2
+    assert writer.files[0].name == "a_0.mcap"
+    came: list[int] = []
+    for file in writer.files:
+        with Recording(file) as recording:
+            first, *rest = recording.samples()
+            assert recording.finished and recording.metadata("run") == {"seed": 3}
+            assert first.payload == status(0, "GRASPING").payload
+            assert all(START <= first.log_time <= sample.log_time for sample in rest)
+            came += [sample.sequence for sample in rest]
+    assert came == list(range(2, 41))
+    assert writer.size == sum(file.stat().st_size for file in writer.files)
+
+
+def test_nothing_is_written_over(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", [joints(0)])
+    with pytest.raises(RecordingError, match="is there already"):
+        RecordingWriter(path, {})
+
+
+@pytest.mark.parametrize(("content", "why"), [(None, "there is no such file"), (b"hello world", "is no MCAP file")])
+def test_what_is_no_recording_is_said_in_one_line(tmp_path: Path, content: bytes | None, why: str) -> None:
+    path = tmp_path / "a.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(RecordingError, match=why):
+        Recording(path)
+
+
+def test_summary_counts_by_topic_and_tells_what_was_lost(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
+    for number in range(11):
+        writer.add(joints(number))
+    writer.close({"dropped": {"panda/joint_states": 2}, "missed": {"panda/camera/image_raw": 3}})
+    with Recording(tmp_path / "a.mcap") as recording:
+        summary = summarise(recording)
+    topic = summary.topics["joint_states"]
+    assert (topic.messages, topic.type, topic.kind, topic.dropped) == (11, "JointState", "stream", 2)
+    assert topic.hz == pytest.approx(100)
+    assert topic.bytes == sum(len(joints(n).payload) for n in range(11))
+    assert summary.topics["camera/image_raw"].missed == 3
+    assert (summary.lost, summary.messages, summary.finished) == (5, 11, True)
+    assert json.loads(json.dumps(summary.as_dict()))["topics"]["joint_states"]["writers"] == ["executor.1"]
+
+
+@pytest.mark.parametrize("cell", ["panda", "1", "true", "null", "k\u00fcche", "a.b-c_2"])
+def test_a_cell_is_read_by_the_name_that_it_may_have(tmp_path: Path, cell: str) -> None:
+    assert is_cell(cell)
+    RecordingWriter(tmp_path / "a.mcap", {"cell": cell}).close()
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert recording.cell == cell
+
+
+def test_encoding_names_the_class() -> None:
+    assert message_of("application/msgpack;Image") == "Image"
+    assert message_of("zenoh/bytes") == ""
+    assert encoding_of("Image") == "application/msgpack;Image"
+    assert encoding_of("") == "application/msgpack"
+
+
+def test_repetitions_are_known_and_gaps_counted() -> None:
+    sequences = Sequences()
+    assert [sequences.is_new("k", "w", n) for n in (5, 5, 6, 4, 9)] == [True, False, True, False, True]
+    assert sequences.missed == {"k": 2}
+    assert sequences.is_new("k", "restarted", 1)
+
+
+def test_many_tiny_messages_at_once_can_be_read_again(tmp_path: Path) -> None:
+    samples = [joints(number, payload=b"\x80") for number in range(60_000)]
+    with Recording(write(tmp_path / "a.mcap", samples, every=len(samples))) as recording:
+        assert sum(1 for _ in recording.samples()) == 60_000
+
+
+def test_tiny_messages_under_many_keys_and_long_ones_can_be_read_again(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap", {"cell": "panda"})
+    for turn in range(12):
+        for number in range(2000):
+            assert writer.add(joints(2000 * turn + number, key=f"panda/made/up/{number}", payload=b"\x80"))
+        writer.flush()
+    assert not writer.add(joints(0, key="panda/made/up/0" + 500 * "p"))
+    writer.close()
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert sum(1 for _ in recording.samples()) == 24_000

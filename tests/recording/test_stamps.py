@@ -1,0 +1,52 @@
+import msgpack
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.messages import Header, Image, LogLine, Pose, TFMessage, TransformStamped
+from recording.stamps import restamp, stamp_of
+from tests.recording.samples import packed
+
+TF = TFMessage(transforms=[
+    TransformStamped(header=Header(stamp=5, frame_id="world"), child_frame_id="a", transform=Pose()),
+    TransformStamped(header=Header(stamp=6, frame_id="world"), child_frame_id="b", transform=Pose()),
+])
+
+
+def test_stamp_of_a_picture_is_read_without_its_pixels() -> None:
+    image = Image(header=Header(stamp=123, frame_id="c"), height=480, width=640, encoding="bgr8", data=bytes(921600))
+    assert stamp_of(packed(image)) == 123
+    assert stamp_of(packed(image)[:600]) == 123
+
+
+def test_stamp_of_transforms_is_that_of_the_first() -> None:
+    assert stamp_of(packed(TF)) == 5
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xc1", b"hello", msgpack.packb({"a": 1}), msgpack.packb({"header": 3}),
+                                     msgpack.packb({"transforms": []}), msgpack.packb([1, 2])])
+def test_payload_without_a_header_has_no_stamp_and_is_left_alone(payload: bytes) -> None:
+    assert stamp_of(payload) is None
+    assert restamp(payload, lambda stamp: stamp + 1) == payload
+
+
+@pytest.mark.parametrize("stamp", [-1, 2**63, 2**64 - 1, "7", 1.0])
+def test_a_stamp_that_no_clock_shows_is_none(stamp: object) -> None:  # a file has no room for it either
+    assert stamp_of(msgpack.packb({"header": {"stamp": stamp}})) is None
+
+
+@given(st.binary(max_size=700))
+def test_rubbish_never_raises(payload: bytes) -> None:
+    stamp_of(payload)
+    restamp(payload, lambda stamp: stamp + 1)
+
+
+def test_restamping_moves_every_stamp_and_nothing_else() -> None:
+    moved = TFMessage.model_validate(msgpack.unpackb(restamp(packed(TF), lambda stamp: stamp + 100)))
+    assert [t.header.stamp for t in moved.transforms] == [105, 106]
+    assert moved.transforms[0].transform == TF.transforms[0].transform
+
+
+def test_a_stamp_of_zero_says_that_there_is_none() -> None:
+    line = LogLine(service="s", level="info", message="m")
+    assert restamp(packed(line), lambda stamp: stamp + 100) == packed(line)

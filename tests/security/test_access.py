@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from applications.pick_place.topics import SCENE_BALLS
+from common import topics
+from common.application import all_topics
+from common.config import load_cell
+from common.errors import ConfigError
+from common.process.wiring import wiring_of
+from common.topics import Request, Topic
+from security.access import Rights, access_control, rights_of, rights_of_recorder, rights_of_supervisor
+from security.checking import allowances, require_current
+
+RENEW = "zencell secure init DIR --renew"
+PLACE = Path("certs")
+
+
+@dataclass
+class Declared:
+    reads: set[Topic[Any]] = field(default_factory=set)
+    writes: set[Topic[Any]] = field(default_factory=set)
+    serves: set[Request[Any, Any]] = field(default_factory=set)
+    calls: set[Request[Any, Any]] = field(default_factory=set)
+
+
+CAMERA = Declared(reads={SCENE_BALLS}, writes={topics.CAMERA_IMAGE, topics.CAMERA_INFO})
+TASK = Declared(reads={topics.GRIPPER_STATE}, calls={topics.GRIPPER_COMMAND, topics.PARAMETERS})
+EXECUTOR = Declared(writes={topics.GRIPPER_STATE}, serves={topics.GRIPPER_COMMAND})
+
+
+def cell(**declared: Declared) -> dict[str, Rights]:
+    return {name: rights_of(name, what) for name, what in declared.items()}
+
+
+def allowed(**declared: Declared) -> dict[str, dict[str, set[str]]]:
+    return allowances(access_control({"panda": cell(**declared)}))
+
+
+def test_a_service_may_do_exactly_what_it_declares() -> None:
+    camera = allowed(camera=CAMERA)["panda.camera"]
+    assert camera["writes"] == {"panda/camera/image_raw", "panda/camera/camera_info", "panda/log/camera",
+                                "panda/counters/camera"}
+    assert camera["answers"] == {"panda/camera/camera_info", "panda/param/camera", "panda/counters/camera"}
+    assert camera["reads"] == camera["asks"] == {"panda/scene_balls"}
+    owned = ("camera|image_raw", "camera|camera_info", "log|camera", "counters|camera", "param|camera")
+    assert camera["is there"] == {"panda/alive/camera", "panda/serves/param/camera/camera",
+                                  *(f"panda/owns/{key}/*/camera/*" for key in owned)}
+
+
+def test_who_calls_may_ask_and_who_serves_may_answer() -> None:
+    both = allowed(task=TASK, executor=EXECUTOR)
+    assert both["panda.task"]["asks"] == {"panda/gripper/command", "panda/gripper/state", "panda/param/*"}
+    assert both["panda.task"]["answers"] == {"panda/param/task", "panda/counters/task"}
+    assert both["panda.executor"]["answers"] == {"panda/gripper/command", "panda/gripper/state", "panda/param/executor",
+                                                 "panda/counters/executor"}
+    assert "asks" not in both["panda.executor"]
+
+
+def test_everything_else_is_denied_and_every_rule_names_its_cell_but_to_hear_of_readers() -> None:
+    control = access_control({"panda": {**cell(camera=CAMERA), "supervisor": rights_of_supervisor()}})
+    assert control["enabled"] and control["default_permission"] == "deny"
+    for rule in control["rules"]:
+        assert rule["permission"] == "allow"
+        if rule["id"].endswith(" hears of readers"):  # in whatever expression they read
+            assert (rule["flows"], rule["messages"], rule["key_exprs"]) == (["egress"], ["declare_subscriber"], ["**"])
+        elif rule["id"].startswith("panda."):
+            assert all(key.startswith("panda/") for key in rule["key_exprs"])
+
+
+@pytest.mark.parametrize("name", ["observer", "panda.recorder"])
+def test_who_only_listens_can_ask_for_states_and_for_no_request(name: str) -> None:
+    asks = allowances(access_control({"panda": {"recorder": rights_of_recorder()}}))[name]["asks"]
+    keys = {key.partition("/")[2] for key in asks}
+    assert keys == {topic.expression for topic in all_topics().values() if topic.kind == "state"}
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5"])
+async def test_the_arm_is_had_recover_by_operators_and_by_the_page_and_by_nobody_else(name: str) -> None:
+    loaded = load_cell(name)
+    rights = {entry.name: rights_of(entry.name, await wiring_of(loaded, entry)) for entry in loaded.services.values()}
+    may = allowances(access_control({name: {**rights, "recorder": rights_of_recorder()}}))
+    asking = {who for who, rights in may.items() if {f"{name}/robot/command", "*/**"} & rights.get("asks", set())}
+    assert asking == {f"{name}.viewer", "operator"}
+
+
+def test_rules_that_are_those_of_the_services_are_current() -> None:
+    rights = cell(camera=CAMERA, task=TASK)
+    rules = access_control({"panda": rights, "ur5": cell(other=EXECUTOR)})
+    require_current(PLACE, rules, "panda", rights, RENEW)
+    require_current(PLACE, rules, "panda", cell(camera=CAMERA), RENEW)  # fewer are started
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "reason"),
+    [
+        ({"camera": CAMERA}, {"camera": CAMERA, "task": TASK}, "has no rules for panda.task"),
+        ({"task": Declared()}, {"task": TASK}, r"panda\.task than it declares now.*gripper/command is not allowed"),
+        ({"task": TASK}, {"task": Declared()}, r"panda\.task than it declares now.*is allowed and not needed"),
+    ],
+)
+def test_a_service_that_is_missing_or_different_is_named(
+    before: dict[str, Declared], now: dict[str, Declared], reason: str
+) -> None:
+    with pytest.raises(ConfigError, match=reason) as caught:
+        require_current(PLACE, access_control({"panda": cell(**before)}), "panda", cell(**now), RENEW)
+    assert RENEW in str(caught.value)
+
+
+def test_operators_jog_and_observers_do_not() -> None:
+    both = allowed(task=TASK)
+    assert both["operator"]["writes"] == {"*/motion/jog"} and "writes" not in both["observer"]

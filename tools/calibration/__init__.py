@@ -1,0 +1,1 @@
+"""Calibrate cameras: intrinsics, pose in the cell, hand-eye."""

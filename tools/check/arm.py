@@ -1,0 +1,101 @@
+"""The arm of a cell among what never moves: where it gets to, and what it would touch there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.config import RobotConfig, Surroundings
+from common.errors import ConfigError
+from common.messages import PlanningScene
+from common.messages.basics import Header
+from common.planning.collision import CollisionWorld
+from common.planning.free_axes import about, chooses, solve_in, why_not_in
+from common.planning.ik import solve_ik
+from common.planning.obstacles import ObstacleCache
+from common.planning.robot_geometry import RobotGeometry
+from common.robot.model import RobotModel
+from common.scene.fixtures import container_panels, fixture_objects
+from tools.check.finding import Finding, error, warning
+
+Array = NDArray[np.float64]
+
+RESTARTS = 5  # postures beside that from home in which a place is tried
+SEEDS = 4
+
+
+class Arm:
+    """A robot and its surroundings, as planning has them before anything was seen."""
+
+    def __init__(self, config: RobotConfig, around: Surroundings, geometry: RobotGeometry | None = None) -> None:
+        """Load it.
+
+        Args:
+            config: the robot file.
+            around: fixtures and containers.
+            geometry: of the robot, where that is loaded already.
+
+        Raises:
+            ConfigError: the robot file does not fit its description.
+        """
+        self.robot = geometry.robot if geometry is not None else RobotModel.load(config)
+        self.home: Array = self.robot.named("home")
+        self._cache = ObstacleCache(geometry or RobotGeometry(self.robot))
+        objects = fixture_objects(around)
+        for container in around.containers.values():
+            objects += container_panels(container, around.table_height)
+        self._scene = PlanningScene(header=Header(frame_id="world"), objects=objects)
+
+    def touching(self, q: Array, width: float | None = None) -> tuple[str, str] | None:
+        """What touches what at joint positions (dof,) [rad], with so much between the fingers [m]; None when free."""
+        # What touches at the start of a motion may do so: where it begins elsewhere, nothing is excused.
+        return CollisionWorld(self.robot, self._scene, start=q, cache=self._cache, width=width).colliding_pair(q)
+
+    def check_poses(self) -> Iterator[Finding]:
+        """Named poses in which the arm touches itself or what stands there."""
+        for name in self.robot.config.named_poses:
+            q = self.robot.named(name)
+            if pair := self.touching(q):
+                what = f"robot.named_poses.{name}: {[round(float(value), 4) for value in q]} is in collision, "
+                what += f"{pair[0]} with {pair[1]}"
+                remedy = "correct the pose, or move the fixture, the container or robot.base_position"
+                yield error(what, remedy, refused=True) if name == "home" else warning(what, remedy)
+
+    def why_not(self, poses: Sequence[Array], width: float | None = None, tilt: float = 0.0) -> str:
+        """Why the tool gets to none of some poses (4, 4), world; empty when it gets to one and touches nothing there.
+
+        Args:
+            poses: any of which will do.
+            width: between the fingers [m].
+            tilt: by which an arm that cannot choose the pose may be off [rad]; its yaw is any.
+        """
+        touches = ""
+        for T in poses:
+            for seed in range(SEEDS):
+                rng = np.random.default_rng(seed)
+                start = self.home if seed == 0 else rng.uniform(self.robot.lower, self.robot.upper)
+                if chooses(self.robot):
+                    q = solve_ik(self.robot, T, start, rng=rng, restarts=RESTARTS)
+                else:
+                    q = solve_in(self.robot, about(self.robot, T, tilt), start, rng=rng, restarts=RESTARTS)
+                if q is None:
+                    continue
+                pair = self.touching(q, width)
+                if pair is None:
+                    return ""
+                touches = touches or f"{pair[0]} would touch {pair[1]}"
+        return touches or why_not_in(self.robot, about(self.robot, poses[0], tilt), self.home)
+
+
+def require_free_home(config: RobotConfig, around: Surroundings, geometry: RobotGeometry) -> None:
+    """Return when the arm touches nothing at home.
+
+    Raises:
+        ConfigError: it does; names what touches what.
+    """
+    for found in Arm(config, around, geometry).check_poses():
+        if found.refused:
+            field, _, rest = found.line.partition(": ")
+            raise ConfigError(field, ..., rest)

@@ -1,0 +1,110 @@
+"""Ports, and the versions of what answers at them."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from tools.doctor.finding import Finding, fail, ok, warn
+
+ROUTER_MODULE = "services.router"
+VIEWER_MODULE = "services.viewer"
+PAGE_HOST, PAGE_PORT = "127.0.0.1", 8080
+TIMEOUT = 1.0  # [s]
+
+
+def router(endpoint: str) -> Finding:
+    """Who listens where the router of the domain would."""
+    from common.transport.router import holder_of
+
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=TIMEOUT):
+            pass
+    except ConnectionRefusedError:
+        return ok(f"{endpoint} is free: no cell is up there")
+    except OSError as error:
+        return warn(f"{endpoint} cannot be reached ({error})", "check --connect and the network")
+    holder = holder_of(int(port))
+    if ROUTER_MODULE in holder:
+        return ok(f"{endpoint}: a router of zencell answers there, {holder}")
+    return warn(f"{endpoint} is in use by {holder}", "stop it, or give zencell another --domain")
+
+
+def page() -> Finding:
+    """Who listens where the operator's page would."""
+    from common.transport.router import holder_of
+
+    where = f"port {PAGE_PORT} of the operator's page"
+    with socket.socket() as probe:
+        probe.settimeout(TIMEOUT)
+        if probe.connect_ex((PAGE_HOST, PAGE_PORT)):
+            return ok(f"{where} is free")
+    holder = holder_of(PAGE_PORT)
+    if VIEWER_MODULE in holder:
+        return ok(f"{where}: a page of zencell is served there, {holder}")
+    return warn(f"{where} is in use by {holder}", "zencell takes the next free one; --viewer-port N chooses another")
+
+
+def versions(endpoint: str) -> Iterator[Finding]:
+    """Whether the cells that are up speak the same version of the messages, and are run by this Python."""
+    from common.client.joining import somebody_listens
+
+    if not somebody_listens(endpoint):
+        return
+    for cell, problem in sorted(asyncio.run(schema_problems(endpoint)).items()):
+        if problem:
+            yield fail(f"cell {cell} at {endpoint}: {problem}", "run the cell and this tool from the same version")
+        else:
+            yield ok(f"cell {cell} at {endpoint} speaks the version of this tool")
+    foreign = foreign_interpreters(service_commands())
+    if foreign:
+        listed = ", ".join(f"{pid} ({python})" for pid, python in foreign.items())
+        yield warn(f"services run by another Python than this one: {listed}",
+                   "their packages may differ: start the cell from this environment, or use that one's zencell")
+
+
+async def schema_problems(endpoint: str) -> dict[str, str]:
+    """By cell that is up: what is wrong with the version of its messages; empty when nothing is."""
+    from common import topics
+    from common.client.joining import TOOL, alive
+    from common.errors import DecodeError, NoRouter
+    from common.messages import SupervisorStatus
+    from common.transport.codec import decode, decode_attachment
+    from common.transport.connect import connect
+
+    found: dict[str, str] = {}
+    try:
+        async with connect(cell="_", service=TOOL, endpoint=endpoint, timeout=TIMEOUT) as bus:
+            for cell in {name for name, _ in await alive(bus)}:
+                found[cell] = ""
+                for sample in await bus.raw_get(f"{cell}/{topics.SUPERVISOR_STATUS.key}", TIMEOUT):
+                    try:
+                        decode_attachment(sample.attachment)
+                        decode(SupervisorStatus, sample.payload)
+                    except DecodeError as error:
+                        found[cell] = str(error)
+    except NoRouter:
+        return {}  # what listens there is no router: the line on the port says so
+    return found
+
+
+def service_commands() -> dict[int, list[str]]:
+    """Command lines of all services on this host, by process."""
+    import psutil
+
+    found = {}
+    for process in psutil.process_iter(["cmdline"]):
+        command = process.info["cmdline"] or []
+        if "--gate" in command and "-m" in command:
+            found[process.pid] = command
+    return found
+
+
+def foreign_interpreters(commands: dict[int, list[str]]) -> dict[int, str]:
+    """By process: the Python that runs it, where that is not this one."""
+    here = Path(sys.executable).parent
+    return {pid: command[0] for pid, command in commands.items() if Path(command[0]).parent != here}
