@@ -22,7 +22,7 @@ from common.config.world import Surroundings
 from common.errors import ConfigError
 from common.messages import Header, LogLine
 from common.perception.depth import depth_of
-from common.perception.depth_sources import PACKAGE, Shot
+from common.perception.depth_sources import Shot
 from common.perception.image import image_to_array
 from common.perception.pinhole import Pinhole
 from common.planning.seeing import cloud_points
@@ -240,7 +240,7 @@ async def test_mode_that_the_camera_does_not_have_is_told_with_what_was_asked(ca
 
 
 @pytest.mark.parametrize(("given", "told"), [
-    ({"driver": ""}, "services.camera.driver: '' must be one of realsense, oak, or the dotted name of a module of"),
+    ({"driver": ""}, "services.camera.driver: '' must be one of oak, realsense, or the dotted name of a module of"),
     ({"driver": "my_pkg.nothing"}, "services.camera.driver: 'my_pkg.nothing' cannot be imported: No module named"),
     ({"driver": "common.errors"}, "'common.errors' opens no cameras: it has no Options, open_camera"),
     ({"options": {"fps": 900}}, "services.camera.options.fps: 900 must be less than or equal to 90"),
@@ -258,7 +258,7 @@ async def test_driver_or_option_that_there_is_not_ends_the_start_with_one_line(
 async def test_pictures_that_are_not_as_the_lens_says_end_the_service_with_one_line(
     camera: FakeCamera, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    driver = importlib.import_module(f"{PACKAGE}.{DRIVER}")
+    driver = importlib.import_module(f"drivers.{DRIVER}")
     monkeypatch.setattr(driver, "Shot", lambda colour, depth, age: Shot(colour, depth.astype(np.float64), age))
     with pytest.raises(ConfigError, match=r"'realsense' gives depth of shape \(48, 64\) and type float64"):
         async with running_service(LocalNetwork(), real_depth_camera.run, config_of(), name="camera"):

@@ -15,7 +15,7 @@ from common.scene.home import is_home
 from tests import pages
 from tests.applications.pick_place.cell_double import CellDouble
 
-CELL = load_cell(str(Path(__file__).parents[3] / "data" / "hand_camera.yaml"))
+CELL = load_cell(str(Path(__file__).parents[2] / "data" / "hand_camera.yaml"))
 HOME = CELL.robot.named_poses["home"]
 AWAY = [position + 0.3 for position in HOME]
 
