@@ -46,7 +46,7 @@ from common.messages import (
     WorldEdit,
     WorldEditReply,
 )
-from common.perception.mounted import from_home
+from common.perception.pinhole import cameras_at_home
 from common.process.service import main
 from common.robot.model import RobotModel
 from common.scene.workspace import WorkspaceBounds, bounds_told, reach_reason
@@ -107,7 +107,7 @@ def make_cycle(
     world = None
     if simulated:
         bounds = bounds_told(config.reach.told)
-        seen = from_home(config.world, robot)
+        seen = cameras_at_home(config.world, robot)
         objects = layout(
             seen, config.run.seed, lambda x, y, z: within_reach(robot, (x, y, z), config.grasp, bounds))
         world = load_world(config.world, objects, config.grasp_tolerances, config.robot.gripper)

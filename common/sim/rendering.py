@@ -21,11 +21,11 @@ from common.perception.pinhole import Pinhole
 from common.perception.sphere import silhouette
 from common.robot.transforms import pose_to_matrix
 from common.scene.fixtures import container_panels
-from common.sim.lighting import flat_level
-from common.sim.objects import look_of, solid_of_message
-from common.sim.places import tables
+from common.sim.lighting import white_level
+from common.sim.objects import appearance_of, solid_of_message
 from common.sim.ray_caster import Mesh, View, cast, empty_view
 from common.sim.solids import fixture_mesh, placed, primitive
+from common.sim.table import tables
 
 if TYPE_CHECKING:  # most pictures have no arm in them
     from common.robot.model import RobotModel
@@ -82,7 +82,7 @@ class Renderer:
 
     def light(self, scenery: Scenery) -> None:
         """Take the light of the scenery: nothing looks different, but for who exposes a picture to it."""
-        self.level = flat_level(scenery)
+        self.level = white_level(scenery)
 
     def look_from(self, camera: Pinhole) -> None:
         """Take the camera elsewhere: from there all is seen anew."""
@@ -156,7 +156,7 @@ class Renderer:
         return view
 
     def _mesh(self, thing: WorldObject, known: Mapping[tuple[object, ...], Array]) -> Mesh:
-        look = look_of(thing)
+        look = appearance_of(thing)
         if look not in self._meshes:
             self._meshes[look] = known[look] if look in known else solid_of_message(thing).triangles
         color = (thing.color.r, thing.color.g, thing.color.b)
@@ -172,7 +172,7 @@ class Renderer:
 
 
 def _shapes_of(robot: RobotModel) -> dict[str, Array]:
-    from common.sim.robot_shapes import robot_shapes
+    from common.sim.solids import robot_shapes
 
     return robot_shapes(robot)
 
@@ -201,12 +201,12 @@ def draw(
     objects: Sequence[WorldObject], camera: Pinhole, around: Surroundings, *, noise_std: float = 0.0,
     brightness: float = 0.0, rng: np.random.Generator | None = None, rim_width: float = RIM_WIDTH,
 ) -> Picture:
-    """One plain picture, bgr8 (height, width, 3), of the objects; see `Renderer` and `disturbed`."""
+    """One plain picture, bgr8 (height, width, 3), of the objects; see `Renderer` and `add_image_noise`."""
     picture = Renderer(around, plain=True, camera=camera, rim_width=rim_width).see(objects).colour
-    return disturbed(picture, noise_std, brightness, rng)
+    return add_image_noise(picture, noise_std, brightness, rng)
 
 
-def disturbed(
+def add_image_noise(
     picture: Picture, noise_std: float, brightness: float, rng: np.random.Generator | None = None
 ) -> Picture:
     """The picture with Gaussian noise of that standard deviation, and brightness added to each channel."""
@@ -220,7 +220,7 @@ def disturbed(
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def disturbed_depth(depth: Depth, rng: np.random.Generator, noise_std: float, dropout: float) -> Depth:
+def add_depth_noise(depth: Depth, rng: np.random.Generator, noise_std: float, dropout: float) -> Depth:
     """The depth image with Gaussian noise [m], and with NaN in a part of its pixels."""
     measured = depth
     if noise_std > 0:

@@ -12,8 +12,8 @@ import pytest
 from common.config import CameraConfig, Surroundings
 from common.messages import Color, Pose, Quaternion, Vector3, WorldObject
 from common.perception import boxes
-from common.perception.boxes import BoxDetector, BoxKind, BoxOptions, SeenBox
-from common.perception.intake import Unusable
+from common.perception.boxes import BoxDetector, BoxKind, BoxOptions, DetectedBox
+from common.perception.camera_input import FrameError
 from common.perception.pinhole import Pinhole
 from common.sim.rendering import Renderer
 
@@ -34,7 +34,7 @@ def cube(name: str, x: float, y: float, z: float = SIDE / 2, yaw: float = 0.0, s
     )
 
 
-def seen(*cubes: WorldObject, **options: object) -> list[SeenBox]:
+def seen(*cubes: WorldObject, **options: object) -> list[DetectedBox]:
     view = Renderer(AROUND)
     shown = view.see(list(cubes))
     detector = BoxDetector(BoxOptions.model_validate({"kinds": KINDS, **options}))
@@ -110,6 +110,6 @@ def test_in_a_picture_full_of_noise_a_cube_is_found_and_specks_are_not_looked_in
 def test_camera_that_none_can_be_shows_no_boxes_and_says_so() -> None:
     camera = Pinhole(1e-300, 50.0, 1e5, 24.0, 64, 48, np.eye(4))
     picture, depth = np.full((48, 64, 3), (25, 25, 230), np.uint8), np.full((48, 64), 1.0, np.float32)
-    with pytest.raises(Unusable, match=r"more than 1e\+07 m away"):
+    with pytest.raises(FrameError, match=r"more than 1e\+07 m away"):
         BoxDetector(BoxOptions(kinds={"red": BoxKind(color=(0.9, 0.1, 0.1), size=(0.04, 0.04, 0.04))})).detect(
             picture, depth, camera)

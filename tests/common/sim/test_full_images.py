@@ -6,8 +6,8 @@ from common.config import RobotConfig, Surroundings, check, find_file, read_robo
 from common.messages import Header, JointState
 from common.robot.model import RobotModel
 from common.sim.objects import world_object
-from common.sim.rendering import ARM, Renderer, disturbed_depth
-from common.sim.robot_shapes import robot_shapes, triangles
+from common.sim.rendering import ARM, Renderer, add_depth_noise
+from common.sim.solids import robot_shapes, triangles
 from tests.applications.outlining.outline_scenes import seen_world, world
 
 AROUND = Surroundings.model_validate({f: getattr(world("w5"), f) for f in Surroundings.model_fields})
@@ -86,7 +86,7 @@ def test_shapes_without_triangles_are_refused():
 def test_noise_and_missing_depth_are_as_asked_for():
     depth = np.full((200, 200), 1.5, np.float32)
     depth[0, 0] = np.nan
-    noisy = disturbed_depth(depth, np.random.default_rng(1), 0.002, 0.1)
+    noisy = add_depth_noise(depth, np.random.default_rng(1), 0.002, 0.1)
     assert np.isnan(noisy).mean() == pytest.approx(0.1, abs=0.01) and np.nanstd(noisy) == pytest.approx(0.002, rel=0.05)
     assert noisy.dtype == np.float32 and np.isnan(noisy[0, 0])
-    np.testing.assert_array_equal(disturbed_depth(depth, np.random.default_rng(1), 0, 0), depth)
+    np.testing.assert_array_equal(add_depth_noise(depth, np.random.default_rng(1), 0, 0), depth)

@@ -5,10 +5,10 @@ import pytest
 
 from common.perception.camera_file import CameraFile
 from tests.tools.calibration.rendered_boards import BOARD, Lens, facing, many_poses, render
-from tools.calibration.calibration import (
+from tools.calibration.intrinsics import (
     CalibrationFailed,
     CollectingOptions,
-    ViewCollector,
+    ViewSelector,
     calibrate_intrinsics,
     coverage,
 )
@@ -17,7 +17,7 @@ LENS = Lens()
 
 
 def collect(poses, lens=LENS, board=BOARD, **options):
-    collector = ViewCollector(board, CollectingOptions(**options))
+    collector = ViewSelector(board, CollectingOptions(**options))
     for k, T in enumerate(poses):
         collector.add(render(board, lens, T, seed=k), f"view {k}")
     return collector

@@ -19,12 +19,12 @@ Picture = npt.NDArray[np.uint8]
 Depth = npt.NDArray[np.float32]
 
 
-class CameraGone(ZencellError):
+class CameraLost(ZencellError):
     """The camera is not there, or gives nothing any more: the message says why. It is opened again after a while."""
 
 
 @dataclass(frozen=True)
-class Lens:
+class Intrinsics:
     """The pinhole that took colour and depth, without distortion: size, focal lengths and principal point [px]."""
 
     width: int
@@ -36,7 +36,7 @@ class Lens:
 
 
 @dataclass(frozen=True)
-class Shot:
+class RgbdFrame:
     """What a depth camera sees at one instant, colour and depth pixel by pixel through the same lens.
 
     Attributes:
@@ -53,13 +53,13 @@ class Shot:
 class DepthSource(Protocol):
     """A depth camera that is open."""
 
-    lens: Lens
+    lens: Intrinsics
 
-    def read(self) -> Shot:
+    def read(self) -> RgbdFrame:
         """The next shot.
 
         Raises:
-            CameraGone: there is none.
+            CameraLost: there is none.
         """
 
     def close(self) -> None:
@@ -75,12 +75,12 @@ class Driver(Protocol):
         """The camera, asked for pictures of that width and height [px], so many a second [Hz].
 
         Raises:
-            CameraGone: it is not there.
+            CameraLost: it is not there.
             ConfigError: it is no such camera.
         """
 
 
-def find_driver(name: str, given: dict[str, Any], field: str) -> tuple[Driver, Parameters]:
+def find_camera_driver(name: str, given: dict[str, Any], field: str) -> tuple[Driver, Parameters]:
     """A driver by its name, or by the dotted name of its module, and its options.
 
     Args:
@@ -101,7 +101,7 @@ def find_driver(name: str, given: dict[str, Any], field: str) -> tuple[Driver, P
     return driver, check(driver.Options, given, f"{field.rpartition('.')[0]}.options")
 
 
-def maker_of(driver: str, package: str) -> Any:
+def import_sdk(driver: str, package: str) -> Any:
     """The package of a camera's maker, which is imported only now.
 
     Raises:
@@ -114,7 +114,7 @@ def maker_of(driver: str, package: str) -> Any:
                           ) from None
 
 
-def require_whole(shot: Shot, lens: Lens, field: str, name: str) -> None:
+def require_frame_shape(shot: RgbdFrame, lens: Intrinsics, field: str, name: str) -> None:
     """Return when the pictures are as the lens says.
 
     Raises:

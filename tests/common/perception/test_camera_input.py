@@ -3,8 +3,8 @@ import pytest
 
 from common.config import CameraConfig
 from common.messages import Header, Image, TFMessage, TransformStamped
+from common.perception.camera_input import CameraCache, FrameError, decode_image, resolve_camera
 from common.perception.image import array_to_image
-from common.perception.intake import Cameras, Unusable, camera_of, picture_of
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import matrix_to_pose
 
@@ -21,20 +21,20 @@ tf = TFMessage(
 
 def test_camera_is_put_together_from_camera_info_and_tf():
     for frame in ("", "optical"):
-        made = camera_of(info, tf, frame)
+        made = resolve_camera(info, tf, frame)
         np.testing.assert_allclose(made.T_world_optical, camera.T_world_optical, atol=1e-12)
         assert (made.fx, made.cx, made.width) == (520, 16, 32)
 
 
 def test_camera_is_worked_out_again_for_other_messages_only():
-    cameras = Cameras()
+    cameras = CameraCache()
     first = cameras.of(info, tf)
     assert cameras.of(info, tf) is first
     moved = camera.T_world_optical.copy()
     moved[0, 3] += 0.1
     transform = tf.transforms[0].model_copy(update={"transform": matrix_to_pose(moved)})
     np.testing.assert_allclose(cameras.of(info, TFMessage(transforms=[transform])).T_world_optical, moved, atol=1e-12)
-    with pytest.raises(Unusable):
+    with pytest.raises(FrameError):
         cameras.of(info, None)
 
 
@@ -49,15 +49,15 @@ def test_camera_is_worked_out_again_for_other_messages_only():
     ],
 )
 def test_what_is_missing_or_wrong_is_named(arguments, kind, told):
-    with pytest.raises(Unusable, match=told) as caught:
-        camera_of(*arguments)
+    with pytest.raises(FrameError, match=told) as caught:
+        resolve_camera(*arguments)
     assert caught.value.kind == kind
 
 
 def test_pictures_come_as_bgr_whatever_order_they_were_sent_in():
     pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(picture_of(array_to_image(pixels, "bgr8"), camera), pixels)
-    np.testing.assert_array_equal(picture_of(array_to_image(pixels, "rgb8"), camera), pixels[..., ::-1])
+    np.testing.assert_array_equal(decode_image(array_to_image(pixels, "bgr8"), camera), pixels)
+    np.testing.assert_array_equal(decode_image(array_to_image(pixels, "rgb8"), camera), pixels[..., ::-1])
 
 
 @pytest.mark.parametrize(
@@ -72,6 +72,6 @@ def test_pictures_come_as_bgr_whatever_order_they_were_sent_in():
     ],
 )
 def test_a_picture_that_is_none_has_its_kind(image, kind):
-    with pytest.raises(Unusable) as caught:
-        picture_of(image, camera)
+    with pytest.raises(FrameError) as caught:
+        decode_image(image, camera)
     assert caught.value.kind == kind

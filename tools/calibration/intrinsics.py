@@ -12,7 +12,7 @@ from pydantic import Field
 
 from common.config import Parameters
 from common.errors import ZencellError
-from tools.calibration.board import Board, NotSeen, Sighting
+from tools.calibration.board import Board, BoardDetection, NoBoard
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
@@ -84,14 +84,14 @@ class IntrinsicCalibration:
         return sum(view.corners for view in self.views)
 
 
-class ViewCollector:
+class ViewSelector:
     """Takes pictures one after another and keeps views of the board that are sharp and unlike those before."""
 
     def __init__(self, board: Board, options: CollectingOptions | None = None) -> None:
         """No picture was seen yet."""
         self.board = board
         self.options = options or CollectingOptions()
-        self.views: list[Sighting] = []
+        self.views: list[BoardDetection] = []
         self.pictures = 0
         self._left_out: Counter[str] = Counter()
         self._example: dict[str, str] = {}
@@ -109,7 +109,7 @@ class ViewCollector:
         """
         self.pictures += 1
         sighting = self.board.find(picture, name)
-        if isinstance(sighting, NotSeen):
+        if isinstance(sighting, NoBoard):
             return self._leave_out(sighting.kind, sighting.reason)
         if self.views and sighting.size != self.views[0].size:
             raise CalibrationFailed(f"{name} is {sighting.size[0]}x{sighting.size[1]}, but {self.views[0].name} is "
@@ -153,7 +153,7 @@ class ViewCollector:
         return reason
 
 
-def coverage(views: list[Sighting]) -> tuple[float, list[str]]:
+def coverage(views: list[BoardDetection]) -> tuple[float, list[str]]:
     """Part of the picture's cells in which a corner was seen, and names of the ninths of it without any."""
     if not views:
         return 0.0, [name for row in _REGIONS for name in row]
@@ -165,7 +165,7 @@ def coverage(views: list[Sighting]) -> tuple[float, list[str]]:
     return len(cells) / (CELLS[0] * CELLS[1]), unseen
 
 
-def calibrate_intrinsics(views: list[Sighting], options: CollectingOptions | None = None) -> IntrinsicCalibration:
+def calibrate_intrinsics(views: list[BoardDetection], options: CollectingOptions | None = None) -> IntrinsicCalibration:
     """The lens that fits all views best; views that do not fit the others are dropped.
 
     Zhang's method, refined over all corners, as OpenCV has it. Z. Zhang, A flexible new technique for camera
@@ -202,7 +202,7 @@ def calibrate_intrinsics(views: list[Sighting], options: CollectingOptions | Non
     return IntrinsicCalibration(left[0].size, k, k_std, d, float(rms), fitted, dropped, part, unseen)
 
 
-def _fit(views: list[Sighting], k_coefficients: int) -> tuple[float, Array, list[float], Array, Array]:
+def _fit(views: list[BoardDetection], k_coefficients: int) -> tuple[float, Array, list[float], Array, Array]:
     """rms [px], K (3, 3), distortion, standard deviations, and the rms of each view [px]."""
     flags = sum(_FIXED[k_coefficients:]) | (cv2.CALIB_RATIONAL_MODEL if k_coefficients > 3 else 0)
     if k_coefficients == 0:
@@ -223,7 +223,7 @@ def _fit(views: list[Sighting], k_coefficients: int) -> tuple[float, Array, list
 
 
 def _deviations(
-    views: list[Sighting], K: Array, distortion: list[float], poses: list[tuple[Array, Array]], rms: float
+    views: list[BoardDetection], K: Array, distortion: list[float], poses: list[tuple[Array, Array]], rms: float
 ) -> Array:
     """Standard deviations of fx, fy, cx, cy [px] when corners err independently; infinite for what cannot be told.
 
@@ -246,7 +246,7 @@ def _deviations(
     return np.asarray(np.sqrt(variances)[:4], float)
 
 
-def _distance(a: Sighting, b: Sighting) -> float:
+def _distance(a: BoardDetection, b: BoardDetection) -> float:
     """How far the outer corners of the board lie apart in two views, as a part of the picture's diagonal."""
     apart = np.linalg.norm(a.outline - b.outline, axis=1).mean()
     return float(apart / np.hypot(*a.size))

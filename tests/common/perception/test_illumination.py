@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from common.perception.white import green_gain, looked_at, with_green
+from common.perception.illumination import amplify_green, green_gain, looked_at
 from common.sim.lighting import tint
 
 TABLE, RED = (0.10, 0.35, 0.55), (0.10, 0.15, 1.0)  # blue, green, red
@@ -22,7 +22,7 @@ def table(kelvin: float, light: float = 255.0, red: float = 0.0) -> np.ndarray:
 @pytest.mark.parametrize("kelvin", [5000, 6500, 10_000])
 def test_usual_light_changes_nothing(kelvin: float) -> None:
     picture = table(kelvin)
-    assert green_gain(picture) == 1.0 and with_green(picture, 1.0) is picture
+    assert green_gain(picture) == 1.0 and amplify_green(picture, 1.0) is picture
 
 
 @pytest.mark.parametrize("kelvin", [2000, 2400, 2700, 3000])
@@ -30,7 +30,7 @@ def test_usual_light_changes_nothing(kelvin: float) -> None:
 @pytest.mark.parametrize("red", [0.0, 0.3])
 def test_green_is_raised_in_warm_light_so_far_that_a_table_is_not_red(light: float, red: float, kelvin: float) -> None:
     picture = table(kelvin, 0.5 * light, red)
-    raised = with_green(picture, green_gain(picture))
+    raised = amplify_green(picture, green_gain(picture))
     assert green_gain(picture) > 1.2
     hue = cv2.cvtColor(raised, cv2.COLOR_BGR2HSV)[..., 0]
     assert hue[-1, 0] > 12, "of 0 to 10 red is"
@@ -56,5 +56,5 @@ def test_light_is_that_of_the_part_of_a_picture_that_shows_the_table() -> None:
 def test_in_warm_light_a_highlight_on_a_ball_stays_red_and_the_table_is_none() -> None:
     picture = np.full((240, 320, 3), (4, 67, 238), np.uint8)  # of a lamp of 2700 K, overexposed
     picture[100:110, 100:110] = (6, 48, 255)
-    hue = cv2.cvtColor(with_green(picture, green_gain(picture)), cv2.COLOR_BGR2HSV)[..., 0]
+    hue = cv2.cvtColor(amplify_green(picture, green_gain(picture)), cv2.COLOR_BGR2HSV)[..., 0]
     assert hue[105, 105] <= 10 and hue[0, 0] > 12

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.config import Fixture, World
-from common.sim.places import Slots, Table
+from common.sim.table import Slots, Table
 
 PILLAR = Fixture(id="pillar", shape="cylinder", dimensions=[0.05, 0.2], position=(0.3, 0.3, 0.1))
 BEAM = Fixture(id="beam", dimensions=[0.4, 0.02, 0.1], position=(0.3, -0.3, 0.05), rpy=(0.0, 0.0, math.pi / 4))

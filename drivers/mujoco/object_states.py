@@ -13,7 +13,7 @@ from common.config import World
 from common.robot.model import RobotModel
 from common.robot.transforms import transform
 from common.sim.bodies import Body, State
-from common.sim.places import is_inside
+from common.sim.table import is_inside
 from drivers.mujoco.model import CellModel
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ RESTS = 0.02  # [m/s] what is slower has come to lie
 
 
 class Contacts:
-    """Who touches whom in a model: objects by fingers, by the floor, and by anything at all."""
+    """Who set_contact whom in a model: objects by fingers, by the floor, and by anything at all."""
 
     def __init__(self, cell: CellModel, robot: RobotModel) -> None:
         """Find out which geom is of what."""
@@ -97,7 +97,7 @@ class Watch:
         return "table", ""
 
 
-def differs(T: Array, other: Array) -> bool:
+def pose_changed(T: Array, other: Array) -> bool:
     """Whether two poses (4, 4) differ by so much that it is told."""
     if float(np.abs(T[:3, 3] - other[:3, 3]).max()) > MOVED:
         return True
@@ -105,7 +105,7 @@ def differs(T: Array, other: Array) -> bool:
     return math.acos(min(max(cosine, -1.0), 1.0)) > TURNED
 
 
-def straightened(T: Array) -> Array:
+def snap_upright(T: Array) -> Array:
     """The pose, upright where it is so nearly: physics tilts what stands by microns."""
     if not UPRIGHT < T[2, 2] < 1:
         return T

@@ -18,10 +18,10 @@ Picture = npt.NDArray[np.uint8]
 
 UNKNOWN_CAMERA = "unknown_camera"
 FARTHEST = 1e7  # [m] along each axis that a message has room for
-MOST_THINGS = 250  # found in a picture: neither a list of targets nor a planning scene has room for many more
+MAX_DETECTIONS = 250  # found in a picture: neither a list of targets nor a planning scene has room for many more
 
 
-class Unusable(ZencellError):
+class FrameError(ZencellError):
     """A picture that cannot be looked at. `kind` tells causes apart: unknown_camera, camera, size, encoding, ..."""
 
     def __init__(self, kind: str, message: str) -> None:
@@ -29,29 +29,28 @@ class Unusable(ZencellError):
         self.kind = kind
 
 
-def require_room(things: int) -> None:
+def require_capacity(things: int) -> None:
     """Return when so many things that were found in a picture can be told of; some of them are never left out.
 
     Raises:
-        Unusable: they are too many.
+        FrameError: they are too many.
     """
-    if things > MOST_THINGS:
-        raise Unusable("crowded", f"{things} things in it are more than a planning scene has room for: is the picture "
-                                  "full of noise?")
+    if things > MAX_DETECTIONS:
+        raise FrameError("crowded", f"{things} objects in it are more than a planning scene has room for: is the "
+                                    "image full of noise?")
 
 
-def require_near(places: npt.ArrayLike) -> None:
+def require_in_range(places: npt.ArrayLike) -> None:
     """Return when places in world [m] that were told by a camera are so near that a message can say where they are.
 
     Raises:
-        Unusable: one of them is farther, or nowhere: the camera looks along the plane on which it was looked for, or is
-            none that there can be.
+        FrameError: one of them is farther, or not finite: the camera looks along the search plane, or is invalid.
     """
     if not (np.abs(np.asarray(places, dtype=float)) <= FARTHEST).all():
-        raise Unusable("far", f"something in it would be more than {FARTHEST:g} m away: is the camera's pose right?")
+        raise FrameError("far", f"something in it would be more than {FARTHEST:g} m away: is the camera's pose right?")
 
 
-class LeftOut:
+class SkippedFrames:
     """Frames that could not be used: told once for each cause, counted after that."""
 
     def __init__(self, log: logging.Logger, what: str) -> None:
@@ -59,14 +58,14 @@ class LeftOut:
         self._log, self._what = log, what
         self.counts: Counter[str] = Counter()
 
-    def note(self, error: Unusable | ImageError) -> None:
+    def note(self, error: FrameError | ImageError) -> None:
         """Take note of a frame that was left out; that no camera is known yet is usual in the first moments."""
         self.counts[error.kind] += 1
         if self.counts[error.kind] == 1 and error.kind != UNKNOWN_CAMERA:
             self._log.warning("%s left out: %s (told once; further ones are counted)", self._what, error)
 
 
-def camera_of(
+def resolve_camera(
     info: CameraInfo | None, fixed: TFMessage | None, frame_id: str = "", *, moving: TransformHistory | None = None,
     stamp: int = 0,
 ) -> Pinhole:
@@ -80,23 +79,23 @@ def camera_of(
         stamp: of the picture [ns].
 
     Raises:
-        Unusable: one of them is missing or says something that no pinhole camera does. Of kind `early` it may help to
+        FrameError: one of them is missing or says something that no pinhole camera does. Of kind `early` it may help to
             wait: the next message of tf may say where the camera was.
     """
     if info is None or fixed is None:
         missing = "camera_info" if info is None else "tf_static"
-        raise Unusable(UNKNOWN_CAMERA, f"no {missing} came yet")
+        raise FrameError(UNKNOWN_CAMERA, f"no {missing} came yet")
     history = moving if moving is not None else TransformHistory()
     try:
         return Pinhole.from_info(info, history.pose(frame_id or info.header.frame_id, fixed, stamp))
     except NoTransform as error:
-        raise Unusable(error.kind, str(error)) from None
+        raise FrameError(error.kind, str(error)) from None
     except CameraError as error:
-        raise Unusable("camera", str(error)) from None
+        raise FrameError("camera", str(error)) from None
 
 
-class Cameras:
-    """`camera_of` that gives the same camera for the same messages, and for one that has not moved meanwhile."""
+class CameraCache:
+    """`resolve_camera` that gives the same camera for the same messages, and for one that has not moved meanwhile."""
 
     def __init__(self) -> None:
         """Nothing is known yet."""
@@ -112,7 +111,7 @@ class Cameras:
         same = last is not None and last[0] is info and last[1] is fixed and last[2] == frame_id
         if last is not None and same and not moves:
             return last[3]
-        camera = camera_of(info, fixed, frame_id, moving=self.moving, stamp=stamp)
+        camera = resolve_camera(info, fixed, frame_id, moving=self.moving, stamp=stamp)
         if last is not None and same and np.array_equal(camera.T_world_optical, last[3].T_world_optical):
             return last[3]
         assert info is not None and fixed is not None
@@ -120,31 +119,31 @@ class Cameras:
         return camera
 
 
-def picture_of(image: Image, camera: Pinhole) -> Picture:
+def decode_image(image: Image, camera: Pinhole) -> Picture:
     """The bgr8 picture (height, width, 3) of an image message.
 
     Raises:
-        Unusable: another size than the camera has, not a colour picture, or bytes that do not add up.
+        FrameError: another size than the camera has, not a colour picture, or bytes that do not add up.
     """
     if (image.width, image.height) != (camera.width, camera.height):
-        raise Unusable(
+        raise FrameError(
             "size", f"image of {image.width}x{image.height}, but camera_info says {camera.width}x{camera.height}"
         )
-    return colour_picture(image)
+    return decode_color_image(image)
 
 
-def colour_picture(image: Image) -> Picture:
+def decode_color_image(image: Image) -> Picture:
     """The bgr8 picture (height, width, 3) of an image message, whatever camera took it.
 
     Raises:
-        Unusable: not a colour picture, or bytes that do not add up.
+        FrameError: not a colour picture, or bytes that do not add up.
     """
     if image.encoding not in ("bgr8", "rgb8"):
-        raise Unusable("encoding", f"encoding {image.encoding!r} is no colour picture; choices: bgr8, rgb8")
+        raise FrameError("encoding", f"encoding {image.encoding!r} is no colour picture; choices: bgr8, rgb8")
     try:
         pixels: Picture = image_to_array(image)
     except ImageError as error:
-        raise Unusable(error.kind, str(error)) from None
+        raise FrameError(error.kind, str(error)) from None
     if image.encoding == "bgr8":
         return pixels
     import cv2  # many read clouds by this module, and no picture

@@ -11,12 +11,12 @@ from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
 from common.sim.interface import load_renderer
 from drivers.mujoco import rendering
-from drivers.mujoco.gl import chosen_gl
+from drivers.mujoco.gl import select_gl
 from drivers.mujoco.rendering import PhysicsRenderer
 
 CELL = load_cell("panda")
 ROBOT = RobotModel.load(CELL.robot)
-GL = chosen_gl()
+GL = select_gl()
 PLACES = [(0.40, 0.0, 0.03), (0.55, -0.20, 0.03), (0.30, 0.12, 0.03), (0.58, 0.10, 0.03)]
 ABOVE = Light(position=(0.4, 0.0, 2.0), aim=(0.4, 0.0, 0.0))
 ASIDE = Light(position=(0.4, 1.0, 1.0), aim=(0.4, 0.0, 0.0))
@@ -203,11 +203,11 @@ def test_pictures_are_drawn_by_rays_where_opengl_is_there_and_does_not_work(monk
 
 def test_simulator_of_the_cell_says_who_draws(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "off")
-    chosen_gl.cache_clear()
+    select_gl.cache_clear()
     try:
         found = load_renderer(CELL.world, Scenery(simulator="mujoco"), lambda: ROBOT, plain=True, camera=SMALL)
     finally:
-        chosen_gl.cache_clear()
+        select_gl.cache_clear()
     assert isinstance(found, PhysicsRenderer) and found.needs_arm
     drawn_flat = load_renderer(CELL.world, Scenery(), lambda: ROBOT, plain=True, camera=SMALL)
     assert not drawn_flat.needs_arm

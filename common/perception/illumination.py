@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 Picture = npt.NDArray[np.uint8]
-Chosen = npt.NDArray[np.bool_]
+BoolMask = npt.NDArray[np.bool_]
 
 STRIDE = 8  # [px] between the pixels that are looked at
 DIM = 20  # [0..255] what is darker tells no colour
@@ -31,7 +32,7 @@ def looked_at(height: int, width: int) -> npt.NDArray[np.float64]:
     return np.stack([u, v], axis=-1).astype(float)
 
 
-def green_gain(picture: Picture, table: Chosen | None = None) -> float:
+def green_gain(picture: Picture, table: BoolMask | None = None) -> float:
     """By how much green is too weak in a bgr8 picture (height, width, 3); 1 in any usual light.
 
     Args:
@@ -50,7 +51,7 @@ def green_gain(picture: Picture, table: Chosen | None = None) -> float:
     return math.exp(STEP * round(missing / STEP))
 
 
-def blue_share(picture: Picture, table: Chosen) -> float:
+def blue_share(picture: Picture, table: BoolMask) -> float:
     """The blue of what a bgr8 picture (height, width, 3) shows of a table, compared with its green; 0 where it is dark.
 
     `table` is as that of `green_gain`.
@@ -61,7 +62,7 @@ def blue_share(picture: Picture, table: Chosen) -> float:
     return float(np.median(pixels[:, 0] / pixels[:, 1])) if len(pixels) else 0.0
 
 
-def with_green(picture: Picture, gain: float) -> Picture:
+def amplify_green(picture: Picture, gain: float) -> Picture:
     """The picture with its green so much stronger; itself for a gain of 1."""
     if gain == 1.0:
         return picture
@@ -69,3 +70,30 @@ def with_green(picture: Picture, gain: float) -> Picture:
     table = np.clip(np.rint(gain * np.arange(256)), 0, 255).astype(np.uint8)
     raised[..., 1] = table[picture[..., 1]]
     return raised
+
+
+# Whether a picture tells anything at all: a covered lens, a lamp that is off or a blinded sensor show nothing."""
+
+DARK = 16  # [0..255] nothing in the picture is brighter
+BRIGHT = 250  # [0..255] nothing in it is darker
+EVEN = 4.0  # [0..255] what is left of noise when blocks are averaged: nothing has an edge
+BLOCK = 16  # [px] side of a block
+
+
+def blank_image_reason(picture: Picture) -> str:
+    """Why a bgr8 picture (height, width, 3) tells nothing; empty when it shows something.
+
+    Blocks are averaged, so that noise is no detail. The brightest and the darkest per mille are left out: a hot pixel
+    or a gleam beside a cover is no view.
+    """
+    height, width = picture.shape[:2]
+    size = max(1, width // BLOCK), max(1, height // BLOCK)
+    blocks = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    low, high = np.percentile(blocks, (0.1, 99.9), axis=0)
+    if high.max() <= DARK:
+        return "the picture is dark: is the camera covered, or the light off?"
+    if low.min() >= BRIGHT:
+        return "the picture is white: it is exposed too long"
+    if (high - low).max() <= EVEN:
+        return "the picture shows nothing but one colour: is the camera covered?"
+    return ""

@@ -22,7 +22,7 @@ from common.config.world import Surroundings
 from common.errors import ConfigError
 from common.messages import Header, LogLine
 from common.perception.depth import depth_of
-from common.perception.depth_sources import Shot
+from common.perception.depth_drivers import RgbdFrame
 from common.perception.image import image_to_array
 from common.perception.pinhole import Pinhole
 from common.planning.seeing import cloud_points
@@ -48,7 +48,7 @@ class FakeCamera:
     def __init__(self) -> None:
         self.plugged, self.coeffs, self.opened, self.stopped = True, [0.0] * 5, 0, 0
         self.streams: dict[str, tuple[Any, ...]] = {}
-        self.shot: Shot | None = None  # what it sees, where that matters
+        self.shot: RgbdFrame | None = None  # what it sees, where that matters
         self.lenses = {"color": (40.0, 41.0, 31.0, 23.0), "depth": (35.0, 35.0, 30.0, 22.0)}
 
     def module(self) -> types.ModuleType:
@@ -259,7 +259,8 @@ async def test_pictures_that_are_not_as_the_lens_says_end_the_service_with_one_l
     camera: FakeCamera, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     driver = importlib.import_module(f"drivers.{DRIVER}")
-    monkeypatch.setattr(driver, "Shot", lambda colour, depth, age: Shot(colour, depth.astype(np.float64), age))
+    monkeypatch.setattr(driver, "RgbdFrame",
+                        lambda colour, depth, age: RgbdFrame(colour, depth.astype(np.float64), age))
     with pytest.raises(ConfigError, match=r"'realsense' gives depth of shape \(48, 64\) and type float64"):
         async with running_service(LocalNetwork(), real_depth_camera.run, config_of(), name="camera"):
             await asyncio.sleep(10)
@@ -277,7 +278,7 @@ async def test_it_writes_what_the_simulated_camera_writes_and_reads_nothing(came
 LENS = (40.0, 40.0, 31.5, 23.5)
 
 
-def drawn() -> Shot:
+def drawn() -> RgbdFrame:
     """What a camera above the objects of a cell sees, and depth of which a part was not measured."""
     cell = load_cell("ur5", world="w3")
     T = Pinhole.from_config(cell.world.camera).T_world_optical
@@ -286,13 +287,13 @@ def drawn() -> Shot:
     depth = view.depth_within(0.1, 10.0)
     depth[:, 3] = np.nan
     assert len(np.unique(depth[np.isfinite(depth)])) > 1, "something stands there"
-    return Shot(view.colour, depth)
+    return RgbdFrame(view.colour, depth)
 
 
 class FakeOak:
     """What depthai knows of a camera, whose pictures are a shot."""
 
-    def __init__(self, shot: Shot) -> None:
+    def __init__(self, shot: RgbdFrame) -> None:
         self.shot, self.plugged, self.closed, self.aligned_by = shot, True, 0, ""
         self.asked: dict[str, Any] = {}
         self.platform = "RVC2"

@@ -1,4 +1,4 @@
-"""Meshes of a robot as MuJoCo takes them. They are read once and kept, by their content, in the folder of caches."""
+"""Meshes of a robot as MuJoCo takes them. They are read once and cached, by their content, in the folder of caches."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from common.mesh_files import triangles_of
 from common.robot.model import RobotModel
 
 CACHE_VARIABLE = "ZENCELL_CACHE"  # folder for what can be made again; else zencell in that of the user
-_FORMAT = b"1"  # of what is kept: another number is made anew
+_FORMAT = b"1"  # of what is cached_arrays: another number is made anew
 if TYPE_CHECKING:
     from common.robot.visual_meshes import Piece
 
@@ -26,7 +26,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def cache_folder() -> Path:
-    """Where what can be made again is kept: it need not be there."""
+    """Where what can be made again is cached_arrays: it need not be there."""
     if named := os.environ.get(CACHE_VARIABLE):
         return Path(named)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zencell"
@@ -41,10 +41,10 @@ def hull_points(path: Path) -> NDArray[np.float64]:
     def read() -> Arrays:
         return {"points": np.unique(triangles_of("robot.urdf", path).reshape(-1, 3), axis=0)}
 
-    return kept("hull", [path.read_bytes()], read)["points"]
+    return cached_arrays("hull", [path.read_bytes()], read)["points"]
 
 
-def visual_arrays(robot: RobotModel, triangles: int) -> list[Piece]:
+def cached_visual_meshes(robot: RobotModel, triangles: int) -> list[Piece]:
     """What is seen of all links with about so many triangles: see `common.robot.visual_meshes`."""
     from common.robot.visual_meshes import Piece, seen_shapes, visual_pieces  # brings trimesh
 
@@ -58,7 +58,7 @@ def visual_arrays(robot: RobotModel, triangles: int) -> list[Piece]:
             made[f"{name}|vertices"], made[f"{name}|faces"] = piece.vertices, piece.faces
         return made
 
-    found = kept("visual", [robot.urdf.encode(), str(triangles).encode(), *files], make)
+    found = cached_arrays("visual", [robot.urdf.encode(), str(triangles).encode(), *files], make)
     pieces = {}
     for name, vertices in found.items():
         number, link, red, green, blue, what = name.split("|")
@@ -68,8 +68,8 @@ def visual_arrays(robot: RobotModel, triangles: int) -> list[Piece]:
     return [pieces[number] for number in sorted(pieces)]
 
 
-def kept(kind: str, content: list[bytes], make: Callable[[], Arrays]) -> Arrays:
-    """What was made of the content before, or is made now and kept where that can be done."""
+def cached_arrays(kind: str, content: list[bytes], make: Callable[[], Arrays]) -> Arrays:
+    """What was made of the content before, or is made now and cached_arrays where that can be done."""
     digest = hashlib.sha256(_FORMAT)
     for part in content:
         digest.update(len(part).to_bytes(8, "little") + part)

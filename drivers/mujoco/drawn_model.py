@@ -1,6 +1,6 @@
 """A MuJoCo model to look at: what is fixed, the robot's visual meshes and the objects in their true shapes.
 
-Nothing in it has mass or touches: links and objects are put where they are told to be. It is not the model that moves
+Nothing in it has mass or contact: links and objects are put where they are told to be. It is not the model that moves
 things, whose shapes are coarser.
 """
 
@@ -17,10 +17,10 @@ from common.messages import WorldObject
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_quaternion, pose_to_matrix
-from common.sim.objects import Solid, look_of, solid_of_message
-from common.sim.places import tables
-from drivers.mujoco.kept_meshes import visual_arrays
-from drivers.mujoco.surroundings import add_surroundings
+from common.sim.objects import Solid, appearance_of, solid_of_message
+from common.sim.table import tables
+from drivers.mujoco.mesh_cache import cached_visual_meshes
+from drivers.mujoco.scene import add_surroundings
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ class DrawnModel:
         self._links: list[str] = []
         if robot is not None:
             self._add_robot(spec, robot)
-        self.looks = tuple(look_of(thing) for thing in objects)
+        self.looks = tuple(appearance_of(thing) for thing in objects)
         for number, thing in enumerate(objects):
             _add_object(spec, number, thing)
         for geom in spec.geoms:
@@ -85,7 +85,7 @@ class DrawnModel:
         self.data.mocap_quat[self._at[body]] = (w, x, y, z)
 
     def _add_robot(self, spec: mujoco.MjSpec, robot: RobotModel) -> None:
-        for number, piece in enumerate(visual_arrays(robot, TRIANGLES)):
+        for number, piece in enumerate(cached_visual_meshes(robot, TRIANGLES)):
             body = spec.body(f"link:{piece.link}")
             if body is None:
                 body = spec.worldbody.add_body(name=f"link:{piece.link}", mocap=True, pos=AWAY)
