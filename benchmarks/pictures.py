@@ -61,7 +61,7 @@ def draw_one(name: str, count: int) -> None:
 
         def draw(renderer: PhysicsRenderer = renderer, states: list[JointState] = states) -> object:
             states.reverse()  # it moved: else it would not be drawn again
-            return renderer.see(objects, states[0])
+            return renderer.render(objects, states[0])
 
         print(f"  {what:24} {cost(draw, count)}")
 
@@ -81,7 +81,7 @@ def errors() -> None:
     cell = load_cell("panda")
     robot, camera = RobotModel.load(cell.robot), Pinhole.from_config(cell.world.camera)
     objects: list[WorldObject] = load_world(cell.world, cell.world.objects).objects(Header()).objects
-    seen = PhysicsRenderer(cell.world, EVEN, robot, camera, depth=False, gl=select_gl()).see(
+    seen = PhysicsRenderer(cell.world, EVEN, robot, camera, depth=False, gl=select_gl()).render(
         objects, at_home(robot, 2.8)).colour.astype(int)
     red = (seen[..., 2] > 60) & (seen[..., 2] > 3 * seen[..., :2].max(axis=2))
     _, _, _, middles = cv2.connectedComponentsWithStats(red.astype(np.uint8))

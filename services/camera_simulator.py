@@ -62,8 +62,8 @@ async def run(bus: Bus, config: Config) -> None:
         state = joints.latest if joints is not None else None
         if state is not None and camera.is_at(state):
             header = header.model_copy(update={"stamp": state.header.stamp})
-        view = (await asyncio.to_thread(camera.shoot, world, state, header.stamp) if camera.takes_long(world)
-                else camera.shoot(world, state, header.stamp))
+        view = (await asyncio.to_thread(camera.capture, world, state, header.stamp) if camera.takes_long(world)
+                else camera.capture(world, state, header.stamp))
         picture = add_image_noise(view.colour, config.noise_std, config.brightness, rng)
         if sent is None or picture is not shown:
             sent, shown = array_to_image(picture, "bgr8", header), picture

@@ -51,7 +51,7 @@ async def run(bus: Bus, config: Config) -> None:
 
     def look(world: WorldObjects, state: JointState | None, now: int) -> View:
         """What the camera measures."""
-        seen = camera.shoot(world, state, now)
+        seen = camera.capture(world, state, now)
         return View(seen.colour, simulate_depth(seen.depth, camera.pinhole, config, rng))
 
     await bus.ready()

@@ -105,10 +105,10 @@ class SimulatedCamera:
                 and self._model().order(joints.name, joints.position) is not None)
 
     def takes_long(self, truth: WorldObjects) -> bool:
-        """Whether to `shoot` may take longer than a moment."""
+        """Whether to `capture` may take longer than a moment."""
         return self._config.sub_exposures > 1 or self._renderer.takes_long(truth.objects)
 
-    def shoot(self, truth: WorldObjects, joints: JointState | None, now: int) -> View:
+    def capture(self, truth: WorldObjects, joints: JointState | None, now: int) -> View:
         """The picture that comes out, and the depth of the world as it is at the end of the exposure, without noise.
 
         Args:
@@ -119,7 +119,7 @@ class SimulatedCamera:
         lit = self._light()
         if lit != self._lit:
             self._lit = lit
-            self._renderer.light(lit)
+            self._renderer.set_light(lit)
         self._movement.take(truth)
         views = []
         for ago in times(self._sensor.exposure, self._config.sub_exposures):
@@ -127,8 +127,8 @@ class SimulatedCamera:
             if self.moves and state is not None:
                 q = self._model().order(state.name, state.position)
                 if q is not None:
-                    self._renderer.look_from(self._mounted.at(q))
-            views.append(self._renderer.see(self._movement.objects(ago, now), state))
+                    self._renderer.move_camera(self._mounted.at(q))
+            views.append(self._renderer.render(self._movement.objects(ago, now), state))
         pictures = [self._lens.bend(view.colour) for view in views]
         picture = self._lens.come_out(self._sensor.expose(pictures, self._renderer.level))
         return View(picture, views[-1].depth)

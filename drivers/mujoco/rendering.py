@@ -70,24 +70,24 @@ class PhysicsRenderer:
         self._seen: View | None = None
         self._objects: list[WorldObject] = []
         self._joints: Array | None = None
-        self.light(scenery)
+        self.set_light(scenery)
 
-    def light(self, scenery: Scenery) -> None:
+    def set_light(self, scenery: Scenery) -> None:
         """Take the light of the scenery."""
         self._scenery = scenery.model_copy()
         self.level = np.maximum(white_level(scenery), 1e-3)
         self._seen = None
 
-    def look_from(self, camera: Pinhole) -> None:
+    def move_camera(self, camera: Pinhole) -> None:
         """Take the camera elsewhere; its intrinsics stay."""
         if not np.allclose(camera.T_world_optical, self.camera.T_world_optical, rtol=0, atol=STILL_POSE):
             self.camera, self._seen = camera, None
 
     def takes_long(self, objects: Sequence[WorldObject]) -> bool:
-        """Whether to `see` the objects may take longer than a moment: it always may."""
+        """Whether to `render` the objects may take longer than a moment: it always may."""
         return True
 
-    def see(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
+    def render(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
         """The view of the objects and of the arm in that state; what is "elsewhere" is not seen."""
         shown = [thing for thing in objects if thing.state != "elsewhere"]
         positions = None if joints is None else np.array(joints.position)

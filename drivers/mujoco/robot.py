@@ -15,9 +15,9 @@ from common.robot.description import find_description
 from common.robot.finger_joints import finger_factors
 from common.robot.merging import WORLD
 from common.robot.model import RobotModel
-from common.robot.transforms import matrix_to_quaternion, rpy_to_matrix, transform
+from common.robot.transforms import rpy_to_matrix, transform
 from drivers.mujoco.mesh_cache import cached_visual_meshes, hull_points
-from drivers.mujoco.scene import COLLIDES, ROBOT, SOLIMP, SOLREF, set_contact, set_finger_contact, visual_only
+from drivers.mujoco.scene import COLLIDES, ROBOT, SOLIMP, SOLREF, set_contact, set_finger_contact, visual_only, wxyz
 
 if TYPE_CHECKING:
     from common.robot.visual_meshes import Piece
@@ -86,12 +86,6 @@ def pose_of_origin(origin: ET.Element | None) -> Array:
     """(4, 4) that an <origin> describes."""
     x, y, z = _numbers(origin, "xyz", "0 0 0")
     return transform(rpy_to_matrix(*_numbers(origin, "rpy", "0 0 0")), (x, y, z))
-
-
-def wxyz(rotation: Array) -> list[float]:
-    """Quaternion w, x, y, z, as MuJoCo has it, of a (3, 3) rotation."""
-    x, y, z, w = matrix_to_quaternion(rotation)
-    return [w, x, y, z]
 
 
 def _place(what: Any, origin: ET.Element | None) -> None:

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from common.config import CameraConfig, Container, Fixture, Surroundings
 from common.config.objects import TCP
 from common.robot.model import RobotModel
-from common.robot.transforms import rpy_to_matrix
+from common.robot.transforms import matrix_to_quaternion, rpy_to_matrix
 from common.sim.footprints import convex_parts
 from common.sim.objects import Solid
 from common.sim.resting import FLOOR_BELOW_TABLE
-from drivers.mujoco.robot import wxyz
 
 Array = NDArray[np.float64]
 
@@ -124,6 +123,12 @@ _MEETS = {ROBOT: 0, FIXED: ROBOT, OBJECT: ROBOT | FIXED | OBJECT, HIDDEN: 0}
 
 # Groups of shapes, for who draws them: what is only seen, and what only collides.
 SEEN, COLLIDES = 2, 3
+
+
+def wxyz(rotation: Array) -> list[float]:
+    """Quaternion w, x, y, z, as MuJoCo has it, of a (3, 3) rotation."""
+    x, y, z, w = matrix_to_quaternion(rotation)
+    return [w, x, y, z]
 
 
 def set_contact(geom: Any, kind: int, *, group: int = 0) -> Any:

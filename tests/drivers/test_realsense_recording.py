@@ -39,7 +39,7 @@ def drawn(number: int) -> RgbdFrame:
     T = Pinhole.from_config(cell.world.camera).T_world_optical
     objects = load_world(cell.world, cell.world.objects).objects(Header()).objects
     lens = Pinhole(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, T)
-    view = Renderer(cell.world, camera=lens).see(objects)
+    view = Renderer(cell.world, camera=lens).render(objects)
     depth = view.depth_within(0.1, 10.0) + np.float32(0.01 * number)
     depth[HOLE] = np.nan
     assert len(np.unique(depth[np.isfinite(depth)])) > 1, "something stands there"

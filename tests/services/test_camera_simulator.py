@@ -130,7 +130,7 @@ async def test_loop_turns_while_a_picture_takes_long(monkeypatch):
             assert go_on.wait(10)
         return see(renderer, objects, *rest)
 
-    monkeypatch.setattr(Renderer, "see", slow)
+    monkeypatch.setattr(Renderer, "render", slow)
     async with running_service(net, run, config):
         truth.put(balls((0.5, -0.2, 0.03)))
         before = await next_of(images)

@@ -120,10 +120,10 @@ def test_camera_that_was_taken_elsewhere_sees_what_one_does_that_always_was_ther
     there = mounted.at(HOME + 0.1)
     for robot in (None, ROBOT):
         moved = Renderer(AROUND, robot, plain=robot is None, camera=mounted.at())
-        before = moved.see(things, joints(0, HOME)).colour.copy()
-        moved.look_from(there)
+        before = moved.render(things, joints(0, HOME)).colour.copy()
+        moved.move_camera(there)
         fresh = Renderer(AROUND, robot, plain=robot is None, camera=there)
-        seen, expected = moved.see(things, joints(0, HOME)), fresh.see(things, joints(0, HOME))
+        seen, expected = moved.render(things, joints(0, HOME)), fresh.render(things, joints(0, HOME))
         np.testing.assert_array_equal(seen.colour, expected.colour)
         np.testing.assert_array_equal(seen.depth, expected.depth)
         assert not np.array_equal(seen.colour, before)

@@ -17,7 +17,7 @@ CAMERA = Pinhole.from_config(AROUND.camera)
 
 @pytest.mark.parametrize("plain", [True, False])
 def test_an_empty_table_shows_something_also_in_little_light_and_noise(plain: bool) -> None:
-    picture = Renderer(AROUND, plain=plain, camera=CAMERA).see([]).colour
+    picture = Renderer(AROUND, plain=plain, camera=CAMERA).render([]).colour
     dim = (picture * 0.3).astype(np.uint8)
     for shown in (picture, dim, add_image_noise(dim, 8.0, 0.0, np.random.default_rng(1))):
         assert blank_image_reason(shown) == ""

@@ -32,7 +32,7 @@ def test_whatever_is_drawn_of_the_arm_is_hidden_and_little_more(robot: RobotMode
     for _ in range(4):
         q = robot.named("home") + rng.uniform(-0.6, 0.6, 7)
         state = JointState(header=Header(), name=list(robot.joint_names), position=q.tolist(), velocity=[], effort=[])
-        arm = (renderer.see([], state).colour != empty.see([]).colour).any(axis=2)
+        arm = (renderer.render([], state).colour != empty.render([]).colour).any(axis=2)
         hidden = silhouettes.hidden(camera, [q])
         assert hidden.away is not None
         mask = cv2.resize((hidden.away <= MARGIN).astype(np.uint8), (camera.width, camera.height), interpolation=0) > 0

@@ -34,13 +34,13 @@ def is_arm(seen):
 
 
 def test_at_home_the_arm_is_not_before_the_objects(view, robot):
-    seen = view.see(OBJECTS, joints(robot, robot.named("home")))
+    seen = view.render(OBJECTS, joints(robot, robot.named("home")))
     assert not is_arm(seen).any()
     np.testing.assert_array_equal(seen.colour, seen_world("w5")[1])
 
 
 def test_the_arm_hides_what_is_below_it_and_is_where_its_kinematics_say(view, robot):
-    seen = view.see(OBJECTS, joints(robot, OVER))
+    seen = view.render(OBJECTS, joints(robot, OVER))
     arm = is_arm(seen)
     assert arm.any() and seen.depth[arm].max() < 1.75
     wrist = robot.link_poses(OVER)["wrist_3_link"][:3, 3]
@@ -50,17 +50,17 @@ def test_the_arm_hides_what_is_below_it_and_is_where_its_kinematics_say(view, ro
 
 def test_only_what_changed_is_cast_again(view, robot):
     home = joints(robot, robot.named("home"))
-    first = view.see(OBJECTS, home)
-    assert view.see(OBJECTS, home.model_copy(update={"position": [p + 1e-6 for p in home.position]})) is first
-    assert view.see(OBJECTS, joints(robot, OVER)) is not first
-    fewer = view.see(OBJECTS[:1], home)
+    first = view.render(OBJECTS, home)
+    assert view.render(OBJECTS, home.model_copy(update={"position": [p + 1e-6 for p in home.position]})) is first
+    assert view.render(OBJECTS, joints(robot, OVER)) is not first
+    fewer = view.render(OBJECTS[:1], home)
     assert fewer.depth.sum() > first.depth.sum() or np.nanmax(np.where(np.isfinite(fewer.depth), 0, 1)) == 1
     assert (fewer.colour != first.colour).any()
 
 
 def test_without_a_whole_joint_state_there_is_no_arm(view, robot):
     part = JointState(header=Header(), name=robot.joint_names[:3], position=OVER[:3])
-    assert not is_arm(view.see(OBJECTS, part)).any() and not is_arm(view.see(OBJECTS, None)).any()
+    assert not is_arm(view.render(OBJECTS, part)).any() and not is_arm(view.render(OBJECTS, None)).any()
 
 
 def test_links_have_the_shapes_of_the_description(robot):

@@ -326,5 +326,5 @@ def test_the_simulator_is_found_by_name_and_a_wrong_name_lists_the_choices() -> 
     assert isinstance(load_world(world, world.objects), KinematicWorld)
     with pytest.raises(UnknownName, match="unknown simulator 'physics'; choices: kinematic"):
         load_world(world.model_copy(update={"simulator": "physics"}), world.objects)
-    with pytest.raises(ConfigError, match=r"world\.simulator: 'common\.sim\.places' is no simulator"):
+    with pytest.raises(ConfigError, match=r"world\.simulator: 'common\.sim\.table' is no simulator"):
         load_world(world.model_copy(update={"simulator": "common.sim.table"}), world.objects)

@@ -49,7 +49,7 @@ def is_color(picture: Any, rgb: tuple[float, float, float]) -> Any:
 @pytest.mark.parametrize("shape", THINGS)
 def test_an_object_is_seen_where_its_surface_is(shape: str, plain: bool) -> None:
     seen = thing(**THINGS[shape], yaw=0.4)
-    view = Renderer(AROUND, plain=plain).see([seen])
+    view = Renderer(AROUND, plain=plain).render([seen])
     blue = is_color(view.colour, BLUE)
     corners = solid_of_message(seen).triangles.reshape(-1, 3)
     T = np.eye(4)
@@ -69,27 +69,27 @@ def test_what_is_nearer_hides_what_is_farther_whatever_their_shapes() -> None:
     u, v = np.rint(CAMERA.project([0.45, -0.1, 0.08])).astype(int)
     renderer = Renderer(AROUND, plain=True)
     red = (1.0, 0.15, 0.1)
-    assert is_color(renderer.see([above, below]).colour, red)[v, u]
+    assert is_color(renderer.render([above, below]).colour, red)[v, u]
     lifted = thing(shape="box", size=[0.2, 0.2, 0.02], z=0.2)
-    assert is_color(renderer.see([above, lifted]).colour, BLUE)[v, u]
-    assert not is_color(renderer.see([above, lifted]).colour, red).any()
+    assert is_color(renderer.render([above, lifted]).colour, BLUE)[v, u]
+    assert not is_color(renderer.render([above, lifted]).colour, red).any()
 
 
 def test_fixtures_are_seen_in_their_colour_and_a_plain_table_is_grey() -> None:
     u, v = np.rint(CAMERA.project([0.6, 0.2, 0.3])).astype(int)
-    plain, full = (Renderer(AROUND, plain=plain).see([]).colour for plain in (True, False))
+    plain, full = (Renderer(AROUND, plain=plain).render([]).colour for plain in (True, False))
     assert is_color(plain, POST.color)[v, u] and is_color(full, POST.color)[v, u]
     assert not is_color(plain, TABLE.color).any() and is_color(full, TABLE.color).any()
 
 
 def test_what_is_held_is_hidden_in_a_plain_picture_and_shown_in_a_full_one() -> None:
     held = thing(**THINGS["box"]).model_copy(update={"state": "held"})
-    assert not is_color(Renderer(AROUND, plain=True).see([held]).colour, BLUE).any()
-    assert is_color(Renderer(AROUND).see([held]).colour, BLUE).any()
+    assert not is_color(Renderer(AROUND, plain=True).render([held]).colour, BLUE).any()
+    assert is_color(Renderer(AROUND).render([held]).colour, BLUE).any()
 
 
 def test_depth_is_that_of_the_top_of_a_thing() -> None:
-    view = Renderer(AROUND).see([thing(**THINGS["cylinder"])])
+    view = Renderer(AROUND).render([thing(**THINGS["cylinder"])])
     u, v = np.rint(CAMERA.project([0.45, -0.1, 0.08])).astype(int)
     assert view.depth[v, u] == pytest.approx(0.8 - 0.08, abs=1e-4)
     assert view.depth[10, 10] == pytest.approx(0.8, abs=1e-4)
@@ -97,11 +97,11 @@ def test_depth_is_that_of_the_top_of_a_thing() -> None:
 
 def test_colour_and_turn_of_a_thing_are_news_for_a_camera() -> None:
     renderer = Renderer(AROUND, plain=True)
-    first = renderer.see([thing(**THINGS["box"])]).colour
-    assert (renderer.see([thing(**THINGS["box"], yaw=0.5)]).colour != first).any()
+    first = renderer.render([thing(**THINGS["box"])]).colour
+    assert (renderer.render([thing(**THINGS["box"], yaw=0.5)]).colour != first).any()
     green = thing(**THINGS["box"]).model_copy(update={"color": Color(r=0, g=1, b=0)})
-    assert is_color(renderer.see([green]).colour, (0.0, 1.0, 0.0)).any()
-    np.testing.assert_array_equal(renderer.see([thing(**THINGS["box"])]).colour, first)
+    assert is_color(renderer.render([green]).colour, (0.0, 1.0, 0.0)).any()
+    np.testing.assert_array_equal(renderer.render([thing(**THINGS["box"])]).colour, first)
 
 
 def test_spheres_that_lie_as_before_are_drawn_as_before_and_not_worked_out_again(
@@ -116,13 +116,13 @@ def test_spheres_that_lie_as_before_are_drawn_as_before_and_not_worked_out_again
     seen_sphere = rendering._seen_sphere
     monkeypatch.setattr(rendering, "_seen_sphere", seen)
     renderer, places = Renderer(AROUND, plain=True), [(0.4, 0.1, 0.03), (0.45, 0.15, 0.03), (0.6, -0.2, 0.03)]
-    renderer.see(spheres(places, AROUND).objects)
+    renderer.render(spheres(places, AROUND).objects)
     for moved in ((0.43, 0.14, 0.03), (0.43, 0.14, 0.05)):
         places[0] = moved
         worked_out.clear()
-        picture = renderer.see(spheres(places, AROUND).objects).colour
+        picture = renderer.render(spheres(places, AROUND).objects).colour
         assert len(worked_out) == 1
-        np.testing.assert_array_equal(picture, Renderer(AROUND, plain=True).see(spheres(places, AROUND).objects).colour)
+        np.testing.assert_array_equal(picture, Renderer(AROUND, plain=True).render(spheres(places, AROUND).objects).colour)
 
 
 # --- messages ---
@@ -134,7 +134,7 @@ def test_an_object_of_a_recording_from_before_has_a_pose_and_a_size(shape: str) 
     before = WorldObject.model_validate({
         "id": "thing", "shape": shape, "outline": now.outline, "hole": now.hole, "base": now.base,
         "height": now.height, "color": now.color})
-    one, other = (Renderer(AROUND).see([told]).colour for told in (now, before))
+    one, other = (Renderer(AROUND).render([told]).colour for told in (now, before))
     assert (one != other).any(axis=2).mean() < 1e-4, "it is drawn as it would be now"
     assert before.size.z == pytest.approx(now.size.z)
 
@@ -166,5 +166,5 @@ def test_object_that_has_no_shape_is_no_message(wrong):
 def test_shapes_that_are_not_seen_any_more_are_not_kept() -> None:
     renderer = Renderer(AROUND)
     for k in range(20):
-        renderer.see([thing(shape="box", size=[0.05, 0.05, 0.02 + 0.001 * k])])
+        renderer.render([thing(shape="box", size=[0.05, 0.05, 0.02 + 0.001 * k])])
     assert len(renderer._meshes) == 1

@@ -51,7 +51,7 @@ SMALL = camera(160, 120, 79.5, 59.5)
 
 def drawn(objects, joints=AWAY, *, scenery=None, view=SMALL, gl=GL, world=CELL.world):
     scenery = scenery or Scenery(lights={"above": ABOVE})
-    return PhysicsRenderer(world, scenery, ROBOT, view, depth=True, gl=gl).see(objects, joints)
+    return PhysicsRenderer(world, scenery, ROBOT, view, depth=True, gl=gl).render(objects, joints)
 
 
 def red(picture):
@@ -155,7 +155,7 @@ def test_light_that_is_dimmed_or_warm_is_told_to_the_sensor_and_in_the_colours()
                       ABOVE.model_copy(update={"temperature": 2700.0})))
     np.testing.assert_allclose(dim.level, bright.level / 10)
     assert warm.level[2] > bright.level[2] and warm.level[0] < 0.5 * bright.level[0]
-    one, other = bright.see(balls(), AWAY).colour, dim.see(balls(), AWAY).colour
+    one, other = bright.render(balls(), AWAY).colour, dim.render(balls(), AWAY).colour
     np.testing.assert_allclose(one, other, atol=2)
 
 
@@ -164,10 +164,10 @@ def test_one_lamp_gets_darker_than_the_others():
     lamps = {"left": Light(position=(0.4, 0.6, 1.0), aim=(0.4, 0.2, 0.0), parallel=False, shadow=False),
              "right": Light(position=(0.4, -0.6, 1.0), aim=(0.4, -0.2, 0.0), parallel=False, shadow=False)}
     renderer = PhysicsRenderer(CELL.world, Scenery(lights=lamps), ROBOT, SMALL, depth=False, gl=GL)
-    both = renderer.see([], AWAY).colour * renderer.level
+    both = renderer.render([], AWAY).colour * renderer.level
     lamps = lamps | {"right": lamps["right"].model_copy(update={"illuminance": 20.0})}
-    renderer.light(Scenery(lights=lamps))
-    one = renderer.see([], AWAY).colour * renderer.level
+    renderer.set_light(Scenery(lights=lamps))
+    one = renderer.render([], AWAY).colour * renderer.level
     left, right = slice(20, 40), slice(120, 140)  # +y is left in the picture
     assert one[:, right].mean() < 0.6 * both[:, right].mean() < one[:, left].mean()
 
@@ -184,10 +184,10 @@ def test_lamp_shines_within_its_cone_only(gl):
 def test_what_is_out_of_sight_is_not_drawn_and_what_stands_still_is_not_drawn_again():
     renderer = PhysicsRenderer(CELL.world, Scenery(), ROBOT, SMALL, depth=False, gl="")
     things = balls()
-    first = renderer.see(things, AWAY)
-    assert renderer.see(list(things), AWAY) is first
+    first = renderer.render(things, AWAY)
+    assert renderer.render(list(things), AWAY) is first
     gone = [thing.model_copy(update={"state": "elsewhere"}) for thing in things]
-    assert not red(renderer.see(gone, AWAY).colour).any() and red(first.colour).any()
+    assert not red(renderer.render(gone, AWAY).colour).any() and red(first.colour).any()
 
 
 @pytest.mark.parametrize("error", [ImportError, RuntimeError, AttributeError, ctypes.ArgumentError])
@@ -197,7 +197,7 @@ def test_pictures_are_drawn_by_rays_where_opengl_is_there_and_does_not_work(monk
 
     monkeypatch.setattr(rendering, "gl_context", broken)
     renderer = PhysicsRenderer(CELL.world, Scenery(), ROBOT, SMALL, depth=False, gl="egl")
-    assert red(renderer.see(balls(), AWAY).colour).any()
+    assert red(renderer.render(balls(), AWAY).colour).any()
     assert "drawn by rays, without shadows: OpenGL (egl) does not work: no glGetError" in caplog.text
 
 
