@@ -86,7 +86,7 @@ def main() -> None:
         sensor = CameraParameters(auto_exposure=True, full_well=10_000, white_balance="off" if number % 2 else "auto")
         eye = SimulatedCamera(around, light, cell.robot, sensor, rng, plain=True,
                               lens=Lens(camera, distorted=True, rectify=True))
-        picture = eye.shoot(WorldObjects(objects=objects(places, around)), joints, 0).colour
+        picture = eye.capture(WorldObjects(objects=objects(places, around)), joints, 0).colour
         q = robot.order(joints.name, joints.position)
         assert q is not None
         hidden = silhouettes.hidden(eye.pinhole, [q])

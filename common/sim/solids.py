@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
-import coal
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from common.config import Fixture
-from common.robot.model import RobotModel
 from common.robot.transforms import invert, rpy_to_matrix, transform
 from common.sim.ray_caster import Mesh
+
+if TYPE_CHECKING:  # a camera without an arm in its image loads no robot
+    import coal
+
+    from common.robot.model import RobotModel
 
 Array = NDArray[np.float64]
 
@@ -133,6 +136,8 @@ def robot_shapes(robot: RobotModel) -> dict[str, Array]:
     Raises:
         ConfigError: a mesh is not there.
     """
+    import pinocchio as pin
+
     parts: dict[str, list[Array]] = {}
     for item in robot.full_geometry(pin.GeometryType.COLLISION).geometryObjects:
         frame = robot.full_model.frames[item.parentFrame]
@@ -147,6 +152,8 @@ def triangles(shape: coal.CollisionGeometry) -> Array:
     Raises:
         ValueError: a shape that is neither mesh, box, cylinder, capsule nor sphere.
     """
+    import coal
+
     if isinstance(shape, coal.BVHModelBase):  # its points are scaled already
         corners = [[shape.tri_indices(i)[k] for k in range(3)] for i in range(shape.num_tris)]
         return np.asarray(np.array(shape.vertices())[np.array(corners)], dtype=float)

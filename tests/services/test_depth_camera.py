@@ -283,7 +283,8 @@ def drawn() -> RgbdFrame:
     cell = load_cell("ur5", world="w3")
     T = Pinhole.from_config(cell.world.camera).T_world_optical
     objects = load_world(cell.world, cell.world.objects).objects(Header()).objects
-    view = Renderer(cell.world, camera=Pinhole(*(10 * f for f in LENS[:2]), *LENS[2:], WIDTH, HEIGHT, T)).render(objects)
+    camera = Pinhole(*(10 * f for f in LENS[:2]), *LENS[2:], WIDTH, HEIGHT, T)
+    view = Renderer(cell.world, camera=camera).render(objects)
     depth = view.depth_within(0.1, 10.0)
     depth[:, 3] = np.nan
     assert len(np.unique(depth[np.isfinite(depth)])) > 1, "something stands there"

@@ -80,7 +80,7 @@ def test_balls_are_found_in_drawn_light_and_shadow(number: int) -> None:
     joints = JointState(header=Header(), name=[*robot.joint_names, *locked], position=[*q.tolist(), *locked.values()])
     sensor = CameraParameters(auto_exposure=True, full_well=10_000)
     eye = SimulatedCamera(AROUND, lit, CELL.robot, sensor, rng, plain=True)
-    assert max(errors(eye.shoot(WorldObjects(objects=balls()), joints, 0).colour)) < 0.003
+    assert max(errors(eye.capture(WorldObjects(objects=balls()), joints, 0).colour)) < 0.003
 
 
 @pytest.mark.parametrize(("color", "count"), [

@@ -109,9 +109,9 @@ def camera(**parameters):
 def test_what_moves_is_blurred_along_its_way_by_as_much_as_it_moved():
     still, moving = camera(), camera(sub_exposures=5)
     for one in (still, moving):
-        table = one.shoot(WorldObjects(), None, 0).colour.astype(int)
-        one.shoot(sphere(0.40, 0), None, 0)
-        picture = one.shoot(sphere(0.56, 80_000_000), None, 80_000_000).colour.astype(int)  # 2 m/s along x
+        table = one.capture(WorldObjects(), None, 0).colour.astype(int)
+        one.capture(sphere(0.40, 0), None, 0)
+        picture = one.capture(sphere(0.56, 80_000_000), None, 80_000_000).colour.astype(int)  # 2 m/s along x
         changed = np.argwhere(np.abs(picture - table).max(axis=2) > 8)
         rows = np.ptp(changed[np.abs(changed[:, 1] - 320) < 3][:, 0])
         if one is still:
@@ -123,7 +123,7 @@ def test_what_moves_is_blurred_along_its_way_by_as_much_as_it_moved():
 def test_light_that_changes_is_seen_at_once():
     config = CameraParameters()
     one = SimulatedCamera(CELL.world, Scenery(), CELL.robot, config, np.random.default_rng(0), plain=True)
-    bright = one.shoot(WorldObjects(), None, 0).colour
+    bright = one.capture(WorldObjects(), None, 0).colour
     config.ambient = 20.0
-    dark = one.shoot(WorldObjects(), None, 0).colour
+    dark = one.capture(WorldObjects(), None, 0).colour
     assert dark.mean() == pytest.approx(bright.mean() * 370 / 500, rel=0.02)
