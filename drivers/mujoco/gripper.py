@@ -7,8 +7,8 @@ import math
 import mujoco
 
 from common.config import GripperConfig
-from common.hardware.fingers import Fingers
 from common.hardware.interface import GripperReading
+from common.hardware.mock import SimulatedFingers
 from common.robot.finger_joints import driven_position, finger_positions, width_at
 from drivers.mujoco.model import CellModel
 from drivers.mujoco.servo import FINGER_LEAD, limit_force, width_slope
@@ -26,7 +26,7 @@ class PhysicsFingers:
     def __init__(self, config: GripperConfig) -> None:
         """Begin open, with all the force that there is."""
         self._config = config
-        self._profile = Fingers(config, config.max_width)  # where they would be with nothing between them
+        self._profile = SimulatedFingers(config, config.max_width)  # where they would be with nothing between them
         self._target, self._effort = config.max_width, config.max_effort
         self._at_once = False  # they press since before this process began
         self._standing_since = math.inf  # [s] short of the target

@@ -11,7 +11,7 @@ import pytest
 
 from common.config import World, load_cell
 from common.errors import ConfigError, Refused
-from common.hardware.interface import Gripper, Limits, PlacedGripper
+from common.hardware.interface import Gripper, Limits, PlaceableGripper
 from common.messages import Header, Vector3, WorldEdit, WorldObject
 from common.planning.ik import solve_ik
 from common.robot.finger_joints import finger_positions
@@ -249,7 +249,7 @@ def test_what_was_held_over_a_restart_is_still_held() -> None:
     kept, width = rig.world.standing(), rig.fingers.read(rig.now).width
     rig.begin(rig.set_point)
     rig.world.restore(kept)
-    assert isinstance(rig.fingers, PlacedGripper)
+    assert isinstance(rig.fingers, PlaceableGripper)
     rig.fingers.place(width)
     rig.fingers.command(0.0, rig.now, 5.0)
     rig.wait(1.0)
@@ -337,7 +337,7 @@ def test_what_slips_over_a_restart_is_not_flung_away_by_the_fingers_that_are_wit
     assert width < 0.04, "the fingers are within the ball"
     rig.begin(rig.set_point)
     rig.world.restore({name: type(each).model_validate(each.model_dump()) for name, each in kept.items()})
-    assert isinstance(rig.fingers, PlacedGripper)
+    assert isinstance(rig.fingers, PlaceableGripper)
     rig.fingers.place(width)
     rig.grip(0.0, seconds=3.0)
     lies_there_and_can_be_taken_again(rig)
