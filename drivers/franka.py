@@ -51,7 +51,7 @@ class Options(Parameters):
     """Address of the arm, and how it is driven."""
 
     host: str = Field(description="address of the controller")
-    ahead: float = Field(0.05, ge=0.01, le=0.5, description="set-points are sent this early [s]; it hides shorter delays")
+    ahead: float = Field(0.05, ge=0.01, le=0.5, description="set-points are sent so early [s]: hides shorter delays")
     realtime: bool = Field(True, description="ask the system for real-time priority; set to false on a host with few "
                                              "cores that also simulates the arm")
     world: Literal["real", "simulated"] = Field(

@@ -58,7 +58,7 @@ class Options(Parameters):
 
     host: str = Field(description="address of the controller")
     model: str = Field(pattern=MODELS, description="as on its type plate, in small letters")
-    ahead: float = Field(0.05, ge=0.01, le=0.5, description="set-points are sent this early [s]; it hides shorter delays")
+    ahead: float = Field(0.05, ge=0.01, le=0.5, description="set-points are sent so early [s]: hides shorter delays")
     lookahead: float = Field(0.03, ge=0.03, le=0.2, description="servoJ smooths over this [s]")
     gain: float = Field(300.0, ge=100, le=2000, description="servoJ follows with this gain")
     world: Literal["real", "simulated"] = Field(
