@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup franka-sim run up test test-all containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
+.PHONY: setup franka-sim run up test test-all campaign containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
 
 setup: $(STAMP)
 
@@ -36,15 +36,18 @@ up: setup  ## the same, and stay until Ctrl-C
 	$(BIN)/zencell up panda
 
 # Hundreds of processes are started: each compiles the sources again where nothing may keep what was compiled.
-test test-all: export PYTHONDONTWRITEBYTECODE =
+test test-all campaign: export PYTHONDONTWRITEBYTECODE =
 
 test: setup
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 test-all: setup  ## `make test`, and what takes long
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not container and not alone and not browser"
-	$(BIN)/python -m pytest -q -m "browser and not container and not alone"  # cells and Chromium: one after another
-	$(BIN)/python -m pytest -q -m alone || [ $$? = 5 ]  # none where no driver is installed
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not container and not alone and not browser and not campaign"
+	$(BIN)/python -m pytest -q -m "browser and not container and not alone and not campaign"  # cells and Chromium: one after another
+	$(BIN)/python -m pytest -q -m "alone and not campaign" || [ $$? = 5 ]  # none where no driver is installed
+
+campaign: setup  ## tests that repeat over hundreds of seeds, or for minutes
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m campaign || [ $$? = 5 ]  # 5: none is marked
 
 containers: setup  ## build the image and run a cell in containers; needs a container engine
 	$(BIN)/python -m pytest -q -m container tests/deploy

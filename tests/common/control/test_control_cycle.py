@@ -234,9 +234,9 @@ def test_progress_is_told_about_ten_times_a_second(rig, rest_to_rest):
 def test_stop_reports_cancelled(rig, rest_to_rest):
     rig.execute("a", rest_to_rest([0, 0], [0.5, 0.5], 2.0))
     rig.run(1.0)
-    assert rig.cycle.authority.stop(StopRequest(id="a", reason="person"), rig.now).state == "active"
+    assert rig.cycle.authority.stop(StopRequest(id="a", reason="enough"), rig.now).state == "active"
     rig.run(0.5)
-    assert (rig.motions[-1].state, rig.motions[-1].message) == ("cancelled", "person")
+    assert (rig.motions[-1].state, rig.motions[-1].message) == ("cancelled", "enough")
     assert not any(rig.joints[-1].velocity)
 
 
@@ -495,7 +495,7 @@ def test_hold_for_a_goal_keeps_that_goal_and_ends_with_it(rig, rest_to_rest):
     rig.run(2.0)
     status = rig.motions[-1]
     assert status.state == "active" and not status.paused and "held: mug is in the way of hand" in status.message
-    assert [(one.by, one.reason) for one in status.inhibits] == [("scene_monitor", "mug is in the way of hand")]
+    assert [(one.by, one.reason) for one in status.interlocks] == [("scene_monitor", "mug is in the way of hand")]
     rig.cycle.authority.stop(StopRequest(id="a", by="requester"), rig.now)
     rig.run(0.5)
     assert (rig.motions[-1].state, rig.motions[-1].held) == ("cancelled", False)
@@ -509,7 +509,7 @@ def test_the_scene_monitor_lets_go_of_nobody_elses_hold(rig, rest_to_rest):
     rig.cycle.authority.hold(in_the_way("a"))
     rig.cycle.authority.hold(in_the_way("a", hold=False))
     rig.run(1.0)
-    assert rig.motions[-1].held_by == ["person"] and rig.motions[-1].progress < 0.1
+    assert rig.motions[-1].held_by == ["operator"] and rig.motions[-1].progress < 0.1
     rig.cycle.authority.hold(in_the_way("a"))
     rig.cycle.authority.hold(HoldRequest(hold=False, owner="anna"))
     rig.run(1.0)

@@ -80,7 +80,7 @@ def test_stopped_robot_stays_where_it_is_whoever_starts_again_until_a_person_sta
         await until(status, lambda s: not s.started and "by bert" in s.message)
         await assert_rests(cell, bus)
         await command(bus, "start", "anna")
-        assert not (await until(motion, lambda m: not m.inhibits)).stopped
+        assert not (await until(motion, lambda m: not m.interlocks)).stopped
 
     summary = SimulatedCell("panda", ["world.count=1"], visit=visit).summary
     assert summary["truth"]["in_box"] == 1 and summary["failures"] == 0
@@ -98,7 +98,7 @@ def test_hold_of_a_person_and_the_speed_outlive_executor_and_task_and_nobody_els
         await held(motion)
         await again(cell, bus, EXECUTOR)
         found = await until(motion, lambda m: m.state == "none")
-        assert found.held and [hold.by for hold in found.inhibits] == ["anna"] and found.speed_scaling == 0.05
+        assert found.held and [hold.by for hold in found.interlocks] == ["anna"] and found.speed_scaling == 0.05
         await assert_rests(cell, bus)
         await again(cell, bus, TASK, EXECUTOR)
         assert "by anna" in (await until(status, lambda s: s.paused and "found held" in s.message)).message

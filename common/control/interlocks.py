@@ -11,11 +11,11 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from common.errors import Refused
-from common.messages import HoldRequest, Inhibit, StopRequest
-from common.messages.execution import NOT_KEPT
+from common.messages import UNKNOWN_OPERATOR, HoldRequest, Interlock, StopRequest
+from common.messages.basics import either_name
+from common.messages.execution import NOT_PERSISTED
 from common.sources import wall_ns
 
-SOMEBODY = "person"  # who gave no name: everybody lets go of that hold
 OTHERS = "others"  # share one entry when there are too many
 MOST = 16  # entries of persons
 MOST_REASON = 300  # characters
@@ -25,10 +25,10 @@ STOPPED = "stopped"
 LATEST = 7 * 10**18  # [ns since the Unix epoch], in the year 2191: a later `since` leaves no room for those after it
 
 
-def _not_late(inhibit: Inhibit) -> Inhibit:
-    if inhibit.since > LATEST:
-        raise ValueError(f"since {inhibit.since} is later than {LATEST}")
-    return inhibit
+def _not_late(interlock: Interlock) -> Interlock:
+    if interlock.since > LATEST:
+        raise ValueError(f"since {interlock.since} is later than {LATEST}")
+    return interlock
 
 
 class Speed(BaseModel):
@@ -46,69 +46,70 @@ class Record(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     version: Literal[1] = 1
-    inhibits: list[Annotated[Inhibit, AfterValidator(_not_late)]] = Field([], max_length=2 * MOST - 8)  # and our own
+    interlocks: list[Annotated[Interlock, AfterValidator(_not_late)]] = Field(
+        [], max_length=2 * MOST - 8, validation_alias=either_name("interlocks"))  # and our own
     goals: list[str] = Field([], max_length=MOST_GOALS)
     speed: Speed | None = None
-    newest: int = Field(0, ge=0, le=LATEST)  # `since` of the newest inhibit there ever was
+    newest: int = Field(0, ge=0, le=LATEST)  # `since` of the newest interlock there ever was
     arm_stopped: bool = False  # the arm's own controller had stopped it for safety, and nobody has had it recover yet
 
 
-class Inhibits:
+class Interlocks:
     """Says whether the robot may move, and remembers who said that it may not."""
 
     def __init__(self, record: Record | None = None, now: Callable[[], int] = wall_ns) -> None:
         """Begin with what was recorded; `now` is the time since the Unix epoch [ns]."""
         record = record or Record()
-        self._persons = {(inhibit.kind, inhibit.by): inhibit for inhibit in record.inhibits}
-        self._own: dict[str, Inhibit] = {}  # watchdog and controller
+        self._persons = {(interlock.kind, interlock.by): interlock for interlock in record.interlocks}
+        self._own: dict[str, Interlock] = {}  # watchdog and controller
         self._goals = dict.fromkeys(record.goals)
         self._newest = record.newest
         self._now = now
-        self._problem, self._kept = "", record.inhibits
+        self._problem, self._kept = "", record.interlocks
         self.speed, self.arm_stopped = record.speed, record.arm_stopped
 
     @property
     def record(self) -> Record:
         """What has to outlive the process."""
-        return Record(inhibits=[*self._persons.values()], goals=[*self._goals], speed=self.speed, newest=self._newest,
+        return Record(interlocks=[*self._persons.values()], goals=[*self._goals], speed=self.speed, newest=self._newest,
                       arm_stopped=self.arm_stopped)
 
     @property
-    def all(self) -> list[Inhibit]:
+    def all(self) -> list[Interlock]:
         """All that keeps the robot from moving."""
         return [*map(self._as_kept, self._persons.values()), *self._own.values()]
 
     def note_kept(self, record: Record, problem: str = "") -> None:
         """Take note of what outlives the process, and of why the rest does not: `all` says so from now on."""
-        self._problem, self._kept = problem, record.inhibits
+        self._problem, self._kept = problem, record.interlocks
 
     @property
-    def holds(self) -> list[Inhibit]:
+    def holds(self) -> list[Interlock]:
         """What persons hold."""
-        return [inhibit for inhibit in self._persons.values() if inhibit.kind == "held"]
+        return [interlock for interlock in self._persons.values() if interlock.kind == "held"]
 
     @property
-    def stops(self) -> list[Inhibit]:
+    def stops(self) -> list[Interlock]:
         """What persons stopped."""
-        return [inhibit for inhibit in self._persons.values() if inhibit.kind == "stopped"]
+        return [interlock for interlock in self._persons.values() if interlock.kind == "stopped"]
 
     def stop(self, request: StopRequest) -> None:
         """Take note that a person stopped the robot."""
         self._put("stopped", request.owner, request.reason)
 
-    def hold(self, request: HoldRequest) -> list[Inhibit]:
+    def hold(self, request: HoldRequest) -> list[Interlock]:
         """Take note that somebody holds the robot, or what that request lets go of: of none that is another's."""
-        if request.by != "person":
+        if request.by != "operator":
             self.hold_ourselves(request.by, request.hold, request.reason)
             return []
         if request.hold:
             self._put("held", request.owner, request.reason)
             return []
-        let_go = [inhibit for inhibit in self._persons.values() if _lets_go(request, inhibit)]
-        for inhibit in let_go:
-            del self._persons[inhibit.kind, inhibit.by]
-            if request.into_stop and ("stopped", inhibit.by) not in self._persons:
-                self._persons["stopped", inhibit.by] = inhibit.model_copy(update={"kind": "stopped"})
+        let_go = [interlock for interlock in self._persons.values() if _lets_go(request, interlock)]
+        for interlock in let_go:
+            del self._persons[interlock.kind, interlock.by]
+            if request.into_stop and ("stopped", interlock.by) not in self._persons:
+                self._persons["stopped", interlock.by] = interlock.model_copy(update={"kind": "stopped"})
         return let_go
 
     def hold_ourselves(self, holder: str, hold: bool, reason: str) -> None:
@@ -126,46 +127,47 @@ class Inhibits:
         while len(self._goals) > MOST_GOALS:
             del self._goals[next(iter(self._goals))]
 
-    def objection(self, goal: str, owner: str = "", heard: int | None = None) -> Refused | None:
+    def objection(self, goal: str, owner: str = "", acknowledged: int | None = None) -> Refused | None:
         """What speaks against a motion of arm or fingers, or None.
 
         Args:
             goal: its id.
             owner: the person who asks for it. The stops of this person, and of nobody else, do not speak against it
                 when they were heard of before it was asked for.
-            heard: `since` of the newest inhibit that this person had heard of.
+            heard: `since` of the newest interlock that this person had heard of.
         """
         if goal in self._goals:
             return Refused(STOPPED, f"goal {goal!r} was stopped before")
-        passes = (owner, SOMEBODY) if owner and heard is not None else ()
-        stops = [stop for stop in self.stops if stop.by not in passes or stop.since > (heard or 0)]
-        return Refused(STOPPED, "; ".join(stop.told for stop in stops)) if stops else None
+        passes = (owner, UNKNOWN_OPERATOR) if owner and acknowledged is not None else ()
+        stops = [stop for stop in self.stops if stop.by not in passes or stop.since > (acknowledged or 0)]
+        return Refused(STOPPED, "; ".join(stop.description for stop in stops)) if stops else None
 
-    def _as_kept(self, inhibit: Inhibit) -> Inhibit:
-        if not self._problem or inhibit in self._kept:
-            return inhibit
-        reason = f"{NOT_KEPT} ({self._problem}), lost if the executor ends{inhibit.reason and f'; {inhibit.reason}'}"
-        return inhibit.model_copy(update={"reason": reason[:MOST_REASON]})
+    def _as_kept(self, interlock: Interlock) -> Interlock:
+        if not self._problem or interlock in self._kept:
+            return interlock
+        reason = f"{NOT_PERSISTED} ({self._problem}), lost if the executor ends"
+        reason += interlock.reason and f"; {interlock.reason}"
+        return interlock.model_copy(update={"reason": reason[:MOST_REASON]})
 
     def _put(self, kind: Literal["stopped", "held"], owner: str, reason: str) -> None:
-        by = owner or SOMEBODY
+        by = owner or UNKNOWN_OPERATOR
         if (kind, by) not in self._persons and len(self._persons) >= MOST:
             by = OTHERS
         self._persons[kind, by] = self._made(kind, by, reason)
 
-    def _made(self, kind: Literal["stopped", "held"], by: str, reason: str) -> Inhibit:
+    def _made(self, kind: Literal["stopped", "held"], by: str, reason: str) -> Interlock:
         self._newest = max(self._newest + 1, self._now())
-        return Inhibit(kind=kind, by=by, reason=reason[:MOST_REASON], since=self._newest)
+        return Interlock(kind=kind, by=by, reason=reason[:MOST_REASON], since=self._newest)
 
 
-def _lets_go(request: HoldRequest, inhibit: Inhibit) -> bool:
-    if request.heard is not None and inhibit.since > request.heard:
+def _lets_go(request: HoldRequest, interlock: Interlock) -> bool:
+    if request.acknowledged is not None and interlock.since > request.acknowledged:
         return False  # was said after that request was decided
     if request.override:
         return True
-    if inhibit.kind == "stopped":
+    if interlock.kind == "stopped":
         return request.stops
-    return inhibit.by in (request.owner, SOMEBODY)
+    return interlock.by in (request.owner, UNKNOWN_OPERATOR)
 
 
 def speed_of(kept: Speed | None, configured: float) -> float:
@@ -181,5 +183,5 @@ def speed_of(kept: Speed | None, configured: float) -> float:
 def damaged(why: str) -> Record:
     """A record in the place of one that cannot be read: stopped, and slow."""
     reason = f"what persons decided cannot be read: {why}. Look at the cell before you start it"
-    stop = Inhibit(kind="stopped", by="trajectory_executor", reason=reason[:MOST_REASON], since=wall_ns())
-    return Record(inhibits=[stop], speed=Speed(scaling=SLOWEST), newest=stop.since, arm_stopped=True)
+    stop = Interlock(kind="stopped", by="trajectory_executor", reason=reason[:MOST_REASON], since=wall_ns())
+    return Record(interlocks=[stop], speed=Speed(scaling=SLOWEST), newest=stop.since, arm_stopped=True)
