@@ -27,7 +27,7 @@ from common.hardware.interface import (
     Hardware,
     HardwareFault,
     Limits,
-    PlacedGripper,
+    PlaceableGripper,
     SimulatedGripper,
     Vector,
 )
@@ -246,7 +246,7 @@ class ControlCycle:
         self._world.restore(state.objects)
         self.restored = True
         fingers = self._hardware.gripper
-        if self._gripper is None or not isinstance(fingers, PlacedGripper) or state.width is None:
+        if self._gripper is None or not isinstance(fingers, PlaceableGripper) or state.width is None:
             return
         fingers.place(state.width)
         told = state.told_width

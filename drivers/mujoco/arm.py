@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 from common.config import GripperConfig
-from common.hardware.fingers import Fingers
 from common.hardware.interface import Gripper, GripperReading, Vector
+from common.hardware.mock import SimulatedFingers
 from common.robot.finger_joints import driven_position, finger_positions, width_at
 from common.robot.model import RobotModel
 from drivers.mujoco.model import CellModel
@@ -137,7 +137,7 @@ class PhysicsFingers:
     def __init__(self, config: GripperConfig) -> None:
         """Begin open, with all the force that there is."""
         self._config = config
-        self._profile = Fingers(config, config.max_width)  # where they would be with nothing between them
+        self._profile = SimulatedFingers(config, config.max_width)  # where they would be with nothing between them
         self._target, self._effort = config.max_width, config.max_effort
         self._at_once = False  # they press since before this process began
         self._standing_since = math.inf  # [s] short of the target

@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common import messages as m
-from common.hardware.fingers import Fingers
 from common.hardware.interface import HardwareFault, Limits, Vector
-from common.hardware.mock import MockHardware
+from common.hardware.mock import MockHardware, SimulatedFingers
 from common.messages import GripperCommand, HoldRequest, StopRequest
 from tests.common.control.test_control_cycle import GRIPPER, START, Rig
 from tests.common.hardware.conftest import Make
@@ -27,7 +26,7 @@ WITHIN = 0.005  # [m]
 class LateArm(MockHardware):
     """At each set-point so much later [s]."""
 
-    def __init__(self, start: Vector, delay: float, gripper: Fingers) -> None:
+    def __init__(self, start: Vector, delay: float, gripper: SimulatedFingers) -> None:
         super().__init__(start, gripper)
         self._delay = delay
         self._sent = [(-math.inf, start, 0.0 * start)]
@@ -45,7 +44,7 @@ class Hand(Rig):
     """The hand above a ball, or with the ball in it and on its way somewhere else."""
 
     def __init__(self, limits: Limits, trajectory: Make, holding: bool, delay: float = 0.0) -> None:
-        super().__init__(limits, LateArm(START, delay, Fingers(GRIPPER, 0.08)))
+        super().__init__(limits, LateArm(START, delay, SimulatedFingers(GRIPPER, 0.08)))
         self.cycle._arm.delay = delay
         self.step()
         if holding:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from common.hardware.interface import Limits
-from drivers.ur import Options, UrArm
+from drivers.ur import LONGEST_STEP, STATE_TIMEOUT, Options, SilenceTimer, UrArm
 
 SIX = np.ones(6)
 LIMITS = Limits(tuple("abcdef"), -6 * SIX, 6 * SIX, 3 * SIX, 5 * SIX, 10 * SIX, 500 * SIX)
@@ -94,6 +94,24 @@ def test_a_program_that_is_ended_at_the_pendant_ends_freedrive(controller: Contr
     assert arm.read().mode == "freedrive"
     controller.program, controller.by_hand = False, False
     state = arm.read()
-    assert (state.mode, state.message) == ("idle", "its program has ended, and is begun again")
+    assert (state.mode, state.message) == ("idle", "its program has ended, and is restarted")
     controller.program = True
     assert arm.read().mode == "running"
+
+
+# --- for how long nothing new was received ---
+
+
+def test_silence_grows_with_the_time_listened_and_ends_with_a_message() -> None:
+    silence = SilenceTimer()
+    assert silence.update(10.0, True) == 0.0
+    lengths = [silence.update(10.0 + 0.002 * n, False) for n in range(1, 101)]
+    assert lengths[-1] == pytest.approx(0.2) and lengths[70] <= STATE_TIMEOUT < lengths[80]
+    assert silence.update(10.3, True) == 0.0
+
+
+def test_time_in_which_the_driver_was_held_up_is_no_silence() -> None:
+    silence = SilenceTimer()
+    silence.update(10.0, True)
+    assert silence.update(11.0, False) == LONGEST_STEP
+    assert silence.update(11.002, False) == pytest.approx(LONGEST_STEP + 0.002)
