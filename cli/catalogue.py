@@ -64,7 +64,7 @@ def service(
         python_path,
         require_module,
     )
-    from common.transport.keys import ROUTER
+    from common.transport.session import ROUTER
 
     number, endpoint = place_of(domain, connect)
     launch = Launch(cell, tuple(overrides or ()), world, options.whole("--seed", seed, 0), number, endpoint)

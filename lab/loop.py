@@ -75,7 +75,7 @@ class VirtualLoop(base_events.BaseEventLoop):
     """A loop of one thread on a virtual clock, which begins at 0; the seed decides how long calls beside it take.
 
     What would run in another thread runs at once and in one go; its result comes after the time that it is said to
-    have taken. The loop is also what everything takes its time and its ids from: a `common.sources.Sources`.
+    have taken. The loop is also what everything takes its time and its ids from: a `common.time_source.TimeSource`.
     """
 
     # Of asyncio's own loop, whose turns it takes:

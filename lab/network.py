@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 
 from common.transport.local import Lane, LocalNetwork, LocalSession, intersects
-from common.transport.session import Declared, OnSample, RawSample
+from common.transport.session import Declaration, OnSample, RawSample
 from lab.loop import VirtualLoop
 
 Link = tuple["VirtualSession", "VirtualSession", Lane, str]
@@ -75,7 +75,7 @@ class VirtualSession(LocalSession):
         """Call back when the link was cut or stands again."""
         self._on_change.append(on_change)
 
-    def subscriber(self, key: str, on_sample: OnSample) -> Declared:
+    def subscriber(self, key: str, on_sample: OnSample) -> Declaration:
         """Call back for each value put under a matching key."""
         _of(self.network).on_listen(self, key)
         return super().subscriber(key, on_sample)
@@ -111,7 +111,7 @@ class VirtualNetwork(LocalNetwork):
         self._sessions.append(session)
         return session
 
-    def notice(self, session: LocalSession, sample: RawSample) -> None:
+    def observe_put(self, session: LocalSession, sample: RawSample) -> None:
         """Show what is put to who looks on."""
         self.on_put(_ours(session), sample)
 
@@ -183,7 +183,7 @@ class VirtualNetwork(LocalNetwork):
             if session.connected:
                 session.cut = True
                 session.links += 1
-                for asked in list(session.asking):
+                for asked in list(session.pending):
                     self._arrive_at(self._loop.time(), session, session, asked.finish)
                 self._lose(session)
                 for watcher, token in self._seen_by(session):
@@ -230,7 +230,7 @@ class VirtualNetwork(LocalNetwork):
             for entry in table:
                 entry.declared = entry.session is not session
             table[:] = [entry for entry in table if entry.declared]
-        self.forget_matches()
+        self.clear_matches()
         self._sessions.remove(session)
         self._arrival = {link: due for link, due in self._arrival.items() if session not in link[:2]}
         self._lateness = {link: late for link, late in self._lateness.items() if session not in link[:2]}
@@ -238,7 +238,7 @@ class VirtualNetwork(LocalNetwork):
     def _lose(self, session: VirtualSession) -> None:
         """Have everybody else hear that a session is gone: its tokens, and what it was asked."""
         for other in [other for other in self._sessions if other is not session and other.connected]:
-            for asked in list(other.asking):
+            for asked in list(other.pending):
                 for query in [query for query in asked.open if query.responder is session]:
                     self._tell_late((session, other, "query", query.key), partial(asked.finish, query))
         for entry in self.tokens:

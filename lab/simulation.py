@@ -22,14 +22,14 @@ import numpy as np
 
 from common import topics
 from common.application import find_application
+from common.atomic_file import STATE_VARIABLE
 from common.clock import Clock
 from common.config import Cell
-from common.kept_file import STATE_VARIABLE
 from common.messages import TaskStatus
-from common.sources import drawn_from
 from common.supervision.launch import Launch
 from common.supervision.operation import supervise
 from common.supervision.supervisor import Supervisor
+from common.time_source import use_time_source
 from common.transport.bus import Bus
 from common.transport.codec import decode
 from common.transport.session import RawSample
@@ -148,7 +148,7 @@ class Simulation:
     def run(self) -> Outcome:
         """What became of it; what the visit raises is raised."""
         began = time.process_time()
-        with drawn_from(self._loop), shown_to(self.invariants.on_set_point), _state_folder(), _quiet():
+        with use_time_source(self._loop), shown_to(self.invariants.on_set_point), _state_folder(), _quiet():
             try:
                 self._loop.run_until_complete(self._run())
             finally:

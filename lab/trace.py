@@ -9,7 +9,7 @@ from typing import Any
 from common import topics
 from common.messages import SupervisorStatus
 from common.transport.codec import decode, decode_attachment
-from common.transport.reader import Newness
+from common.transport.reader import SequenceFilter
 from common.transport.session import RawSample
 from recording.own import Own
 from recording.sample import Sample, message_of
@@ -34,7 +34,7 @@ class Trace:
         """
         self._writer = RecordingWriter(path, about)
         self._kinds = own.kinds(own.topics())
-        self._newness: dict[str, Newness] = {}
+        self._newness: dict[str, SequenceFilter] = {}
         self._run_known = False
         self._flushed = 0
 
@@ -46,7 +46,7 @@ class Trace:
     def add(self, raw: RawSample, now: int) -> None:
         """Write a message that is put now [ns since the Unix epoch], unless it is put again."""
         origin = decode_attachment(raw.attachment)
-        if origin is None or not self._newness.setdefault(raw.key, Newness()).is_new(origin):
+        if origin is None or not self._newness.setdefault(raw.key, SequenceFilter()).is_new(origin):
             return
         topic = raw.key.partition("/")[2]
         if topic == topics.SUPERVISOR_STATUS.key and not self._run_known:

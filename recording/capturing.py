@@ -12,8 +12,8 @@ from common.errors import DecodeError
 from common.messages import SupervisorStatus
 from common.transport.codec import decode, decode_attachment
 from common.transport.credentials import secure_folder
-from common.transport.keys import owns_key
 from common.transport.ownership import Owner
+from common.transport.session import owns_key
 from recording.own import Own
 from recording.reading import MOST_SPEED, MOST_TEXT
 from recording.sample import Sample, message_of
@@ -22,7 +22,7 @@ from recording.writing import RUN, run_of
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
-    from common.transport.session import Declared, RawSample
+    from common.transport.session import Declaration, RawSample
     from recording.selection import Selection
     from recording.sink import Sink
 
@@ -51,13 +51,13 @@ class Capture:
         self._known = own.topics()
         self._kinds = own.kinds(self._known)
         self._run_known = False
-        self._declared: list[Declared] = []
+        self._declared: list[Declaration] = []
 
     async def begin(self) -> None:
         """Listen from now on; returns when the values of all states that were there are in the recording."""
         wanted = [f"{self._bus.cell}/{key}" for key in self._selection.expressions]
         # Where no file of the cell was given, tokens tell which services have their keys under other names.
-        self._declared = [self._bus.raw_watch(owns_key(self._bus.cell), self._on_owner)]
+        self._declared = [self._bus.raw_watch_tokens(owns_key(self._bus.cell), self._on_owner)]
         status = f"{self._bus.cell}/{topics.SUPERVISOR_STATUS.key}"
         self._declared += [self._bus.raw_subscriber(key, self.on_sample) for key in wanted]
         if f"{self._bus.cell}/**" not in wanted and status not in wanted:

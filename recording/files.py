@@ -14,20 +14,20 @@ MOST_STATES = 500  # with which a file begins: those that were said last
 
 
 class SplitWriter:
-    """Writes FILE.mcap, or FILE_0.mcap, FILE_1.mcap, ... of about `most_bytes` each.
+    """Writes FILE.mcap, or FILE_0.mcap, FILE_1.mcap, ... of about `max_bytes` each.
 
     A file after the first begins with the last value of every state and with the same descriptions, so that each can
     be used alone.
     """
 
-    def __init__(self, path: Path, about: Mapping[str, Any], most_bytes: int | None = None) -> None:
+    def __init__(self, path: Path, about: Mapping[str, Any], max_bytes: int | None = None) -> None:
         """Create the first file.
 
         Raises:
             RecordingError: it is there already, or cannot be written.
         """
         self._path = path
-        self._most = most_bytes
+        self._most = max_bytes
         self._descriptions: dict[str, Mapping[str, Any]] = {ABOUT: about}
         self._states: dict[tuple[str, str], Sample] = {}
         self._earlier_messages = 0

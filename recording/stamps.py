@@ -8,10 +8,10 @@ from typing import Any
 
 import msgpack
 
-from common.messages.basics import MOST_STAMP
+from common.messages.basics import MAX_STAMP
 
 # Whoever is on the network can make up any number of them: known are those heard of last, and counted the first.
-MOST_WRITERS, MOST_KEYS = 10_000, 1000
+MOST_WRITERS, MAX_KEYS = 10_000, 1000
 SEEN_BYTES = 512  # from the front of a payload, where the header is
 
 
@@ -34,7 +34,7 @@ def _first_stamp(unpacker: Any) -> int | None:
         if name == "header":
             header = unpacker.unpack()
             stamp = header.get("stamp") if isinstance(header, dict) else None
-            return stamp if isinstance(stamp, int) and 0 <= stamp <= MOST_STAMP else None
+            return stamp if isinstance(stamp, int) and 0 <= stamp <= MAX_STAMP else None
         if name == "transforms":
             return _first_stamp(unpacker) if unpacker.read_array_header() else None
         unpacker.skip()
@@ -87,6 +87,6 @@ class Sequences:
                 del self._newest[next(iter(self._newest))]
         elif sequence <= before:
             return False
-        elif sequence > before + 1 and (key in self.missed or len(self.missed) < MOST_KEYS):
+        elif sequence > before + 1 and (key in self.missed or len(self.missed) < MAX_KEYS):
             self.missed[key] += sequence - before - 1
         return True

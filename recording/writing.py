@@ -13,7 +13,7 @@ import msgpack
 from mcap.writer import CompressionType, Writer
 
 from common.messages import SupervisorStatus
-from common.messages.basics import MOST_NAME
+from common.messages.basics import MAX_NAME
 from recording.decoding import schema_of
 from recording.sample import RecordingError, Sample
 from recording.stamps import stamp_of
@@ -178,7 +178,7 @@ class RecordingWriter:
             if about not in self._about:
                 return None
             writer = ""
-        if len(sample.key) > LONGEST_KEY or len(sample.message) > MOST_NAME:
+        if len(sample.key) > LONGEST_KEY or len(sample.message) > MAX_NAME:
             return None
         if (about, writer) not in self._channels:
             self._about.add(about)

@@ -10,7 +10,8 @@ import contextlib
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
+from pathlib import Path
+from typing import Protocol, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -53,7 +54,7 @@ from common.robot.model import RobotModel
 from common.scene.workspace import WorkspaceBounds, bounds_told, reach_reason
 from common.sim.interface import GraspTolerances, PhysicalWorld, load_world
 from common.sim.layout import layout
-from common.sim.standing import SavedBeside, Standing, state_file
+from common.sim.standing import SavedBeside, Standing, StateFile, state_file
 from common.transport.bus import Bus
 
 T = TypeVar("T")
@@ -144,14 +145,39 @@ def within_reach(
     return all(not reach_reason(robot, (s * x, s * y, z), grasp, bounds, explained=False) for s in scales)
 
 
-async def run(bus: Bus, config: Config) -> None:
-    """Control the arm until cancelled."""
-    async with contextlib.AsyncExitStack() as ours:
-        await control(bus, config, ours)
+FileLock = Callable[[Path, str], contextlib.AbstractAsyncContextManager[None]]
 
 
-async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> None:
-    """Control the arm until cancelled; what is ours alone meanwhile is let go of afterwards."""
+class Saver(Protocol):
+    """Saves snapshots of the simulated world."""
+
+    def save(self, state: Standing) -> None:
+        """Save a snapshot."""
+
+    def close(self) -> None:
+        """Finish and close the file."""
+
+
+async def run(
+    bus: Bus, config: Config, *, file_lock: FileLock = sole_use, saver: Callable[[StateFile], Saver] = SavedBeside
+) -> None:
+    """Control the arm until cancelled.
+
+    Args:
+        bus: in the cell.
+        config: parameters.
+        file_lock: keeps other processes, also of another cell of that name, from the interlock store.
+        saver: saves snapshots of the simulated world without blocking the loop.
+    """
+    async with contextlib.AsyncExitStack() as exits:
+        await control(bus, config, exits, file_lock, saver)
+
+
+async def control(
+    bus: Bus, config: Config, exits: contextlib.AsyncExitStack, file_lock: FileLock,
+    saver: Callable[[StateFile], Saver],
+) -> None:
+    """Control the arm until cancelled; `exits` releases its file lock."""
     simulated = is_simulated(config.robot)
     joints, motion = bus.writer(topics.JOINT_STATES), bus.writer(topics.MOTION_STATUS)
     robot, owner = bus.writer(topics.ROBOT_STATUS), bus.writer(topics.MOTION_OWNER)
@@ -307,10 +333,10 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
             moving = asyncio.create_task(in_world(cycle.due), name="world")
             cycle.due = None
 
-    bus.keep_parameters = keep_speed
+    bus.save_parameters = keep_speed
     bus.serve(topics.MOTION_EXECUTE, execute)
     bus.serve(topics.MOTION_FOLLOWED, followed)
-    bus.serve(topics.MOTION_STOP, stop, most=MOST_STOPS, crowded=stops_unread)
+    bus.serve(topics.MOTION_STOP, stop, max_pending=MOST_STOPS, on_overload=stops_unread)
     bus.serve(topics.MOTION_HOLD, hold)
     bus.serve(topics.MOTION_OWN, own)
     bus.serve(topics.ROBOT_COMMAND, order)
@@ -318,12 +344,10 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
         bus.serve(topics.GRIPPER_COMMAND, command)
     if simulated:
         bus.serve(topics.WORLD_EDIT, edit)
-    await bus.owned()  # until then another executor may change what is read now
+    await bus.acquire_keys()  # before, another executor may still change the file
     file = record_file(bus.cell)
-    if not bus.declares_only:
-        if bus.has_process:  # nor may one of another cell of that name
-            await ours.enter_async_context(sole_use(file.path, f"{bus.service} of {bus.cell}"))
-        file.require_writable()
+    await exits.enter_async_context(file_lock(file.path, f"{bus.service} of {bus.cell}"))
+    file.require_writable()
     began = bus.clock.now_ns()  # who had the arm while we waited may have carried out what was decided until now
     decisions = Decisions(file, bus.log)
     interlocks, configured = decisions.interlocks, config.speed_scaling
@@ -340,7 +364,7 @@ async def control(bus: Bus, config: Config, ours: contextlib.AsyncExitStack) -> 
     )
     cycle.beside = True
     decisions.on_change = cycle.authority.report_interlocks
-    memory = SavedBeside(standing_file) if standing_file and bus.has_threads else standing_file
+    memory = saver(standing_file) if standing_file else None
     if cycle.restored:
         bus.log.info("the arm and what is about it are as they were")
     alone, task = Alone(), config.members.task

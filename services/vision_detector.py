@@ -111,8 +111,8 @@ async def run(bus: Bus, config: Config) -> None:
     news = asyncio.Event()
     detector = Detector(config.world, config)
     left_out = SkippedFrames(bus.log, "a picture")
-    if not bus.declares_only:
-        rehearse(config.world, config)
+    await bus.acquire_keys()
+    rehearse(config.world, config)
     await bus.ready()
 
     async def watch_depths() -> None:

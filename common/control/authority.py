@@ -22,7 +22,7 @@ from common.messages import (
     OwnRequest,
     StopRequest,
 )
-from common.sources import monotonic
+from common.time_source import monotonic
 
 
 class Authority:

@@ -454,7 +454,7 @@ class ControlCycle:
         told, said, now = self._told_motion, self._arm.said, header.stamp * 1e-9
         if told is not None and (
             told.progress == self._arm.progress or now - self._told_motion_at < PROGRESS_PERIOD
-        ) and (said == self._said or told.same_but(self._arm.status, "progress")):
+        ) and (said == self._said or told.equals_except(self._arm.status, "progress")):
             self._said = said
             return None
         self._told_motion, self._told_motion_at, self._said = self._arm.status, now, said
@@ -473,7 +473,7 @@ class ControlCycle:
         state, told = self._gripper.state, self._told_gripper
         if told is state:
             return None
-        if told is not None and told.same_but(state, "width", "position") and (
+        if told is not None and told.equals_except(state, "width", "position") and (
             told.width == state.width or now - self._told_gripper_at < FINGERS_PERIOD
         ):
             return None

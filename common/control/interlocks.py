@@ -14,7 +14,7 @@ from common.errors import Refused
 from common.messages import UNKNOWN_OPERATOR, HoldRequest, Interlock, StopRequest
 from common.messages.basics import either_name
 from common.messages.execution import NOT_PERSISTED
-from common.sources import wall_ns
+from common.time_source import wall_ns
 
 OTHERS = "others"  # share one entry when there are too many
 MOST = 16  # entries of persons

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from common.errors import Refused
 from common.messages import MotionOwner, OwnRequest
-from common.sources import wall_ns
+from common.time_source import wall_ns
 
 NOT_OWNER = "not_owner"
 

@@ -6,12 +6,12 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+from common.atomic_file import STATE_VARIABLE, AtomicFile, Unreadable, state_folder
 from common.control.interlocks import Record, damaged
 from common.errors import ConfigError
-from common.kept_file import STATE_VARIABLE, KeptFile, Unreadable, lasting_folder
 
 
-class RecordFile(KeptFile[Record]):
+class RecordFile(AtomicFile[Record]):
     """What is to be known before the robot moves: a file that cannot be read keeps it from moving."""
 
     def __init__(self, path: Path) -> None:
@@ -47,4 +47,4 @@ def record_file(cell: str, environ: Mapping[str, str] = os.environ) -> RecordFil
     Raises:
         ConfigError: there is no home to keep it in.
     """
-    return RecordFile(lasting_folder(environ) / f"{cell}.inhibits.json")
+    return RecordFile(state_folder(environ) / f"{cell}.inhibits.json")

@@ -10,9 +10,9 @@ import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
 
+from common.atomic_file import STATE_VARIABLE
 from common.errors import ConfigError
-from common.kept_file import STATE_VARIABLE
-from common.sources import monotonic
+from common.time_source import monotonic
 
 PATIENCE = 3.0  # [s] for a process that ends just now: it brakes first
 LOOK_AGAIN = 0.02  # [s]

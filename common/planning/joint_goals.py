@@ -14,7 +14,7 @@ from common.planning.free_axes import why_not_in
 from common.planning.goal_sampling import sample_goals
 from common.planning.problem import NOT_APPLICABLE, Cancel, GoalChoice, Problem, Region, Result
 from common.planning.resolving import quicker_goals
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 

@@ -45,7 +45,7 @@ from common.planning.robot_geometry import RobotGeometry
 from common.planning.timing import BLENDS, retime, slowed
 from common.planning.validation import Fault, validate
 from common.robot.model import RobotModel
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from common.messages import PlanAttempt
 from common.planning.collision import CollisionWorld, Pair
 from common.planning.retiming import RetimingFailed, TimedPath, TooLong
 from common.robot.model import RobotModel
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ class Problem:
         velocity, acceleration, jerk: scaled limits (dof,).
         attempts: how many tries a sampling planner has.
         deadline: of the search; latest: when a path that was found in time is timed and checked. Both are on the
-            monotonic clock of common.sources [s].
+            monotonic clock of common.time_source [s].
     """
 
     robot: RobotModel

@@ -23,7 +23,7 @@ from common.planning.problem import Arc, Cancel, GoalChoice, Part, Problem, Regi
 from common.planning.retiming import RetimingFailed, TooLong, parametrise
 from common.robot.model import RobotModel
 from common.robot.transforms import transform
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 Choices = tuple[Array | Region, ...]

@@ -17,10 +17,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from common.messages.robot import MOST_POINTS, MOST_SECONDS
+from common.messages.robot import MAX_POINTS, MAX_SECONDS
 from common.planning.kernel.speeds import fastest
 from common.planning.path import SmoothPath
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 
@@ -63,9 +63,9 @@ def require_tellable(trajectory: TimedPath) -> None:
     Raises:
         TooLong: too_long: it has too many states, or takes longer than any motion does.
     """
-    if (states := len(trajectory.times)) > MOST_POINTS or trajectory.duration > MOST_SECONDS:
+    if (states := len(trajectory.times)) > MAX_POINTS or trajectory.duration > MAX_SECONDS:
         told = f"the trajectory has {states} states and takes {trajectory.duration:.3g} s"
-        raise TooLong("too_long", f"{told}, {MOST_POINTS} states and {MOST_SECONDS:g} s are the most")
+        raise TooLong("too_long", f"{told}, {MAX_POINTS} states and {MAX_SECONDS:g} s are the most")
 
 
 def parametrise(
@@ -86,7 +86,7 @@ def parametrise(
         speed: highest ds/dt: that of the tool along a path that is measured by the tool's way [m/s]. Or how it follows
             from the path: (P + 1,) where its pieces meet.
         braking: limits (dof,) that hold instead of `acceleration` where speed along the path is lost.
-        deadline: on the monotonic clock of common.sources [s], after which no finer grid is begun.
+        deadline: on the monotonic clock of common.time_source [s], after which no finer grid is begun.
 
     Raises:
         RetimingFailed: no speed is feasible somewhere.
@@ -101,8 +101,8 @@ def parametrise(
     for _ in range(_REFINEMENTS):
         if monotonic() > deadline:
             raise TooLong("timeout", "planning was ended while the path was timed")
-        if (states := len(path.lengths) + move / step) > MOST_POINTS:
-            raise TooLong("too_long", f"the path takes {states:.3g} states, a trajectory has {MOST_POINTS} at most")
+        if (states := len(path.lengths) + move / step) > MAX_POINTS:
+            raise TooLong("too_long", f"the path takes {states:.3g} states, a trajectory has {MAX_POINTS} at most")
         trajectory = _timed(path.divided(step), limit_v, limit_a, limit_b, speed)
         if _overshoot(trajectory, np.maximum(limit_a, limit_b)) <= _OVERSHOOT:
             return trajectory

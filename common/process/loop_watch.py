@@ -17,8 +17,8 @@ import time
 from collections.abc import Callable
 from typing import NoReturn
 
-from common.transport.handoff import Doorbell
-from common.waking import Waking
+from common.time_source import WatchdogClock
+from common.transport.session import LoopNotifier
 
 STUCK_EXIT = 70  # exit code of a process that ended itself because its loop was stuck
 PERIOD = 0.25  # [s] between two questions
@@ -33,7 +33,7 @@ class Turning:
 
     def __init__(self) -> None:
         """Begin as if it had just turned."""
-        self._awake = Waking(2 * PERIOD)
+        self._awake = WatchdogClock(2 * PERIOD)
         self._turned = True
         self._since = 0.0
 
@@ -43,7 +43,7 @@ class Turning:
 
     def still_for(self, now: float) -> float:
         """For how long it has not turned [s], given what the clock says [s, monotonic]; to be asked each period."""
-        awake = self._awake.look(now)
+        awake = self._awake.advance(now)
         if self._turned:
             self._turned, self._since = False, awake
         return awake - self._since
@@ -56,7 +56,7 @@ class LoopWatch:
         """Begin to watch; `limit()` is how long the loop may stand still now [s], 0 for ever."""
         self._limit = limit
         self._turning = Turning()
-        self._doorbell = Doorbell(loop, self._turning.turned)
+        self._doorbell = LoopNotifier(loop, self._turning.turned)
         self._stopped = threading.Event()
         threading.Thread(target=self._watch, name="loop watch", daemon=True).start()
 
@@ -69,7 +69,7 @@ class LoopWatch:
         armed = 0.0
         while not self._stopped.wait(PERIOD):
             now, limit = time.monotonic(), self._limit()
-            self._doorbell.ring()
+            self._doorbell.notify()
             still = self._turning.still_for(now)
             if limit and now - armed > 1.0 and not self._stopped.is_set():
                 armed = now

@@ -21,7 +21,7 @@ def serve_parameters(bus: Bus, config: Parameters) -> None:
             for line in lines:
                 bus.log.info("%s (by %s)", line, request.by or "somebody")
             bus.parameters_changed()
-            await bus.keep_parameters()
+            await bus.save_parameters()
         parameters = describe(config, bus.service, started)
         return ParameterReply(header=bus.header(), service=bus.service, parameters=parameters)
 

@@ -22,11 +22,17 @@ from common.process.log import BusLog, log_to_stderr
 from common.process.loop_watch import LoopWatch
 from common.process.parameters import serve_parameters
 from common.transport.bus import Bus
-from common.transport.credentials import Credentials, common_name, credentials_of, secure_folder
+from common.transport.credentials import (
+    PERIOD,
+    CertificateMonitor,
+    Credentials,
+    common_name,
+    credentials_of,
+    secure_folder,
+)
 from common.transport.endpoint import endpoint_of
-from common.transport.expiry import PERIOD, EndWatch
-from common.transport.handoff import call_on_loop
-from common.transport.zenoh_session import ZenohSession, close_bounded, open_zenoh
+from common.transport.session import call_on_loop
+from common.transport.zenoh_session import ZenohSession, close_within, open_zenoh
 
 log = logging.getLogger(__name__)
 
@@ -211,17 +217,17 @@ async def _live(run: Run[P], start: Start[P], lifeline: Lifeline) -> int:
             root.removeHandler(to_topic)
             await bus.close()
     finally:
-        await close_bounded(session, _CLOSE_SECONDS)
+        await close_within(session, _CLOSE_SECONDS)
 
 
 async def _watch_end(bus: Bus, credentials: Credentials | None) -> None:
     """Log when the certificate of the process is about to end, as the page shows it."""
     if credentials is None:
         return
-    watch = EndWatch(credentials.certificate.parent, frozenset([credentials.certificate.stem]))
+    watch = CertificateMonitor(credentials.certificate.parent, frozenset([credentials.certificate.stem]))
     await bus.ready_event.wait()
     while True:
-        watch.tell(bus.log)
+        watch.log_new(bus.log)
         await asyncio.sleep(PERIOD)
 
 
@@ -278,7 +284,7 @@ class Ending(Protocol):
 async def serve(run: Run[P], bus: Bus, config: P, lifeline: Ending) -> int:
     """Be the service on a bus; the exit code of its process."""
     try:
-        bus.hold_back()
+        bus.defer_writes()
         serve_parameters(bus, config)
         await bus.run(run(bus, config))
     except (ConfigError, UnknownName) as error:  # found only by using it: a description that is not there

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-from common.kept_file import KeptFile, Unreadable, standing_folder
+from common.atomic_file import AtomicFile, Unreadable, runtime_folder
 from common.tasks.engine import Task
 from common.transport.bus import Bus
 
@@ -19,18 +19,16 @@ class Memory:
         """Keep nothing yet."""
         self._bus, self._task = bus, task
         self._kept = task.memory
-        self._file: KeptFile[Any] | None = None
+        self._file: AtomicFile[Any] | None = None
         self._saving: asyncio.Task[None] | None = None
 
     async def begin(self) -> None:
         """Have the task remember what was kept, if it has a memory at all."""
-        folder = standing_folder()
+        folder = runtime_folder()
         if self._kept is None or folder is None:
             return
-        await self._bus.owned()  # until then another one of this name may still write
-        if self._bus.declares_only:
-            return
-        self._file = KeptFile(folder / f"{self._bus.cell}.{self._bus.service}.json", type(self._kept))
+        await self._bus.acquire_keys()  # before, another process of this name may still write the file
+        self._file = AtomicFile(folder / f"{self._bus.cell}.{self._bus.service}.json", type(self._kept))
         try:
             kept = self._file.find()
         except Unreadable as error:  # the next that is kept takes its place
@@ -47,7 +45,7 @@ class Memory:
             return
         self._saving = group.create_task(self._save(self._file), name="memory")
 
-    async def _save(self, file: KeptFile[Any]) -> None:
+    async def _save(self, file: AtomicFile[Any]) -> None:
         """Write the newest, as often as it takes: until then a task that is started again knows what was before."""
         told = False
         while True:

@@ -14,11 +14,11 @@ from common.process.orders import BY_THEMSELVES, GOAL_TIMEOUT, Answered, Orders
 from common.process.task_memory import Memory
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
-from common.sources import monotonic, new_id
 from common.tasks.deciding import TaskConfig
 from common.tasks.engine import Task
 from common.tasks.stages import Command, View, without_far
 from common.tasks.watchdogs import LOOK_PERIOD, LivenessWatchdog
+from common.time_source import monotonic, new_id
 from common.topics import Topic
 from common.transport.bus import Bus
 from common.transport.reader import Reader
@@ -201,7 +201,7 @@ class TaskRunner(Generic[V]):
             now.message = f"{WAITS}{trouble}"
         elif now.message.startswith(WAITS):
             now.message = ""
-        if before and before.same_but(now, "task_seconds", "header"):
+        if before and before.equals_except(now, "task_seconds", "header"):
             return
         if now.state == "ERROR" and (before is None or before.state != "ERROR"):
             self._bus.log.error("%s", now.message)

@@ -69,9 +69,7 @@ def require_one_owner(wirings: Mapping[str, Wiring]) -> None:
 
 
 class Recorder(Bus):
-    """A bus on a network of its own that notes what is declared, and never gets past `ready`."""
-
-    declares_only = True
+    """A bus on a network of its own that records declarations, and never gets past `acquire_keys` or `ready`."""
 
     def __init__(self, service: str = "recorded", topics: Mapping[str, str] | None = None) -> None:
         super().__init__(LocalNetwork().session(), service=service, cell="recorded", clock=Clock(), topics=topics)
@@ -97,11 +95,8 @@ class Recorder(Bus):
         self.wiring.calls.add(self._in_cell(topic))
         return super().client(topic)
 
-    async def owned(self) -> None:
-        """Go on: nobody else is there."""
-
-    async def ready(self) -> None:
-        """Wait to be ended: all is declared."""
+    async def acquire_keys(self) -> None:
+        """Wait for cancellation: everything is declared. What a service loads or opens after this is not needed."""
         self._remapping.require_used(self.service)
         self.ready_event.set()
         await asyncio.get_running_loop().create_future()

@@ -9,8 +9,8 @@ from types import MappingProxyType
 from common.config import Watchdogs
 from common.messages import Notice, ServiceStatus, SupervisorStatus
 from common.messages.basics import clean
-from common.transport.keys import ROUTER
-from common.waking import Waking
+from common.time_source import WatchdogClock
+from common.transport.session import ROUTER
 
 PERIOD = 0.25  # [s] between two looks
 LEASE = 2.0  # [s] after which a connection counts as lost on which nothing comes
@@ -48,7 +48,7 @@ class LivenessWatchdog:
     def __init__(self, watchdogs: Watchdogs) -> None:
         """Blame nobody yet."""
         self._limits = watchdogs
-        self._awake = Waking(2 * PERIOD)
+        self._awake = WatchdogClock(2 * PERIOD)
         self._heard: dict[str, _Heard] = {}
         self._waited: Mapping[str, float] = {}
         self._router_blamed = False
@@ -72,7 +72,7 @@ class LivenessWatchdog:
             stopped: names of those that the system does not run (SIGSTOP).
             waited: for how long each was kept waiting for a processor since it was started [s]; 0 where it is not told.
         """
-        awake, self._waited = self._awake.look(now), waited
+        awake, self._waited = self._awake.advance(now), waited
         if not self._limits.silence:
             return []
         verdicts = []

@@ -14,14 +14,13 @@ from common import topics
 from common.config import Cell
 from common.errors import ConfigError, DecodeError, NoRouter, ZencellError
 from common.messages import Notice, ServiceStatus, SupervisorStatus
-from common.sources import monotonic
 from common.supervision.interrupts import Interrupts
 from common.supervision.launch import Launch
 from common.supervision.liveness_watchdog import PERIOD, Elsewhere, LivenessWatchdog
 from common.supervision.supervisor import Supervisor
-from common.transport.credentials import SUPERVISOR
-from common.transport.expiry import EndWatch
-from common.transport.keys import alive_key
+from common.time_source import monotonic
+from common.transport.credentials import SUPERVISOR, CertificateMonitor
+from common.transport.session import alive_key
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -97,7 +96,7 @@ async def _work(
 ) -> T:
     from common.process.log import BusLog
     from common.supervision.plain_keys import keep_plain_keys
-    from common.transport.connect import connect
+    from common.transport.zenoh_session import connect
 
     timeout = CONNECT_TIMEOUT if launch.connect else None  # our own router is watched by the supervisor
     connecting = connect(cell=cell.name, service=NAME, endpoint=endpoint, clock=launch.clock, timeout=timeout,
@@ -157,7 +156,7 @@ async def ask_for_the_late(cell: str, endpoint: str, supervisor: Supervisor, nea
         supervisor: of the processes.
         near: endpoints of the same router to be tried first.
     """
-    from common.transport.connect import connect
+    from common.transport.zenoh_session import connect
 
     late: set[str] = set()
     while True:
@@ -200,12 +199,12 @@ async def _publish(bus: Bus, cell: Cell, launch: Launch, supervisor: Supervisor,
     """Say on supervisor/status whenever something has changed; take note of a router that is back."""
     out = bus.writer(topics.SUPERVISOR_STATUS)
     told: tuple[list[ServiceStatus], list[Notice]] = [], []
-    ends, notices, looked = EndWatch(), list[Notice](), -NOTICE_PERIOD
+    ends, notices, looked = CertificateMonitor(), list[Notice](), -NOTICE_PERIOD
     while True:
         supervisor.mark_connected(bus.connected)
         if monotonic() - looked >= NOTICE_PERIOD:
             looked = monotonic()
-            notices = [Notice(urgent=urgent, message=line, host=elsewhere.host) for urgent, line in ends.ending()]
+            notices = [Notice(urgent=urgent, message=line, host=elsewhere.host) for urgent, line in ends.warnings()]
         away = elsewhere.statuses(bus.alive.names), [*notices, *elsewhere.notices]
         if supervisor.changed.is_set() or away != told:
             supervisor.changed.clear()

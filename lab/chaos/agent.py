@@ -20,7 +20,7 @@ from common.application import all_topics
 from common.config import World
 from common.errors import DecodeError, RequestFailed
 from common.messages import Message, WorldEdit
-from common.sources import monotonic
+from common.time_source import monotonic
 from common.transport.codec import (
     DEFAULT_LIMIT,
     Attachment,

@@ -11,8 +11,8 @@ from common.hardware.loading import is_simulated
 from common.supervision.supervisor import Supervisor
 from common.topics import AnyTopic
 from common.transport.bus import Bus
-from common.transport.keys import ROUTER
 from common.transport.ownership import Owner
+from common.transport.session import ROUTER
 from lab.chaos.agent import Chaos
 from lab.chaos.plan import CELL_SECONDS, faults, plan
 from tools.check.cell import seen_from_home

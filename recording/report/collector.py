@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from common import topics
-from common.sources import monotonic
 from common.supervision.rates import Rates
+from common.time_source import monotonic
 from recording.report.fold import Fold
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from common.client.arm import Arm
 from common.client.hearing import Ear
 from common.client.operator_motion import MotionFailed, OperatorMotion
 from common.errors import ConfigError
-from common.sources import wall_ns
+from common.time_source import wall_ns
 from common.transport.local import LocalNetwork
 
 HOME = m.JointGoal(named="home")

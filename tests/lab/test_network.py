@@ -6,7 +6,7 @@ import contextvars
 from common.clock import Clock
 from common.errors import NoResponder, RequestLost, RequestTimeout
 from common.messages import HoldRequest, MotionStatus, SceneUpdate
-from common.sources import drawn_from
+from common.time_source import use_time_source
 from common.topics import MOTION_HOLD, MOTION_STATUS, SCENE_OBJECT_UPDATES
 from common.transport.bus import Bus
 from lab.loop import VirtualLoop
@@ -38,7 +38,7 @@ def run(main, weather=FAIR):
                 task.cancel()
             await asyncio.gather(*left, return_exceptions=True)
 
-    with drawn_from(loop):
+    with use_time_source(loop):
         try:
             return loop.run_until_complete(whole())
         finally:

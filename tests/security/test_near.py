@@ -14,7 +14,7 @@ import pytest
 
 from common.supervision.launch import Launch, free_endpoints
 from common.transport.credentials import credentials_of
-from common.transport.endpoint import LINKS, NEAR_MS, near_of
+from common.transport.endpoint import LINKS, NEAR_MS, nearby_endpoints
 from common.transport.router import Router
 from common.transport.zenoh_session import ZenohSession, open_zenoh
 from security.certificates import Authority
@@ -166,6 +166,6 @@ def test_supervisor_hands_down_where_the_router_of_its_domain_is_near(monkeypatc
     monkeypatch.setenv("ZENCELL_SECURE", "somewhere")
     launch = Launch("panda", domain=3, near=("tls/127.0.0.1:1", "tls/127.0.0.1:2"))
     environment = launch.environment({})
-    assert near_of("tls/127.0.0.1:7450", environment) == ["tls/127.0.0.1:1", "tls/127.0.0.1:2"]
-    assert near_of("tls/192.168.1.10:7450", environment) == [] == near_of("tls/127.0.0.1:7450", {})
+    assert nearby_endpoints("tls/127.0.0.1:7450", environment) == ["tls/127.0.0.1:1", "tls/127.0.0.1:2"]
+    assert nearby_endpoints("tls/192.168.1.10:7450", environment) == [] == nearby_endpoints("tls/127.0.0.1:7450", {})
     assert launch.router_command()[-5:] == ["--near", "tls/127.0.0.1:1", "--near", "tls/127.0.0.1:2", "--gate"]

@@ -10,17 +10,16 @@ from tools.doctor.finding import Finding, fail, ok, warn
 
 def certificates(now: datetime.datetime | None = None) -> Iterator[Finding]:
     """Until when those of `ZENCELL_SECURE` are valid; nothing for an open cell."""
-    from common.transport.credentials import secure_folder
-    from common.transport.expiry import ends_in, warning_of
+    from common.transport.credentials import expiries_in, expiry_warning, secure_folder
 
     folder = secure_folder()
     if folder is None:
         return
     at = now or datetime.datetime.now(datetime.UTC)
-    ends = ends_in(folder)
+    ends = expiries_in(folder)
     if not ends:
         yield fail(f"{folder} has no certificates that can be read", "make them with `zencell secure init`")
-    found = {name: warning_of(name, until, at) for name, until in ends.items()}
+    found = {name: expiry_warning(name, until, at) for name, until in ends.items()}
     for told in found.values():
         if told is not None:
             urgent, line = told

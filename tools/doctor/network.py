@@ -18,7 +18,7 @@ TIMEOUT = 1.0  # [s]
 
 def router(endpoint: str) -> Finding:
     """Who listens where the router of the domain would."""
-    from common.transport.router import holder_of
+    from common.transport.router import port_holder
 
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     try:
@@ -28,7 +28,7 @@ def router(endpoint: str) -> Finding:
         return ok(f"{endpoint} is free: no cell is up there")
     except OSError as error:
         return warn(f"{endpoint} cannot be reached ({error})", "check --connect and the network")
-    holder = holder_of(int(port))
+    holder = port_holder(int(port))
     if ROUTER_MODULE in holder:
         return ok(f"{endpoint}: a router of zencell answers there, {holder}")
     return warn(f"{endpoint} is in use by {holder}", "stop it, or give zencell another --domain")
@@ -36,14 +36,14 @@ def router(endpoint: str) -> Finding:
 
 def page() -> Finding:
     """Who listens where the operator's page would."""
-    from common.transport.router import holder_of
+    from common.transport.router import port_holder
 
     where = f"port {PAGE_PORT} of the operator's page"
     with socket.socket() as probe:
         probe.settimeout(TIMEOUT)
         if probe.connect_ex((PAGE_HOST, PAGE_PORT)):
             return ok(f"{where} is free")
-    holder = holder_of(PAGE_PORT)
+    holder = port_holder(PAGE_PORT)
     if VIEWER_MODULE in holder:
         return ok(f"{where}: a page of zencell is served there, {holder}")
     return warn(f"{where} is in use by {holder}", "zencell takes the next free one; --viewer-port N chooses another")
@@ -74,7 +74,7 @@ async def schema_problems(endpoint: str) -> dict[str, str]:
     from common.errors import DecodeError, NoRouter
     from common.messages import SupervisorStatus
     from common.transport.codec import decode, decode_attachment
-    from common.transport.connect import connect
+    from common.transport.zenoh_session import connect
 
     found: dict[str, str] = {}
     try:

@@ -20,7 +20,7 @@ from common.planning.goal_sampling import least_time
 from common.planning.joint_goals import joint_goals, straight_edge
 from common.planning.problem import Cancel, Problem, Result
 from common.robot.model import RobotModel
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from common.planning.joint_goals import joint_goals, straight_edge
 from common.planning.kernel.planner import Found, find_path
 from common.planning.kernel.world import KernelWorld
 from common.planning.problem import NOT_APPLICABLE, Cancel, Problem, Result
-from common.sources import monotonic
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import pytest
 
 from common.config import load_cell
 from common.messages import Header, JointState, TFMessage, TransformStamped
-from common.messages.basics import MOST_STAMP
+from common.messages.basics import MAX_STAMP
 from common.robot.model import RobotModel
 from common.robot.transform_history import KEPT, MOST_FRAMES, NoTransform, TransformHistory
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, transform
@@ -94,7 +94,7 @@ def test_frames_that_are_made_up_push_out_none_that_is_told_of_again() -> None:
 
 def test_stamp_of_a_time_to_come_hides_nothing_that_is_told_after_it() -> None:
     history = told([0, 20 * MS])
-    made_up = [each.model_copy(update={"header": Header(stamp=MOST_STAMP, frame_id=each.header.frame_id)})
+    made_up = [each.model_copy(update={"header": Header(stamp=MAX_STAMP, frame_id=each.header.frame_id)})
                for each in told_at(40 * MS).transforms]
     history.note(TFMessage(transforms=made_up))
     for stamp in (60 * MS, 80 * MS):

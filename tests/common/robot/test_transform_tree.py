@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from common.errors import UnknownName
 from common.messages import Header, Pose, TFMessage, TransformStamped, Vector3
-from common.messages.basics import MOST_STAMP
+from common.messages.basics import MAX_STAMP
 from common.robot.transform_history import MOST_FRAMES
 from common.robot.transform_tree import NotConnected, TransformTree
 from common.robot.transforms import invert, matrix_to_rpy, rpy_to_matrix, transform
@@ -76,7 +76,7 @@ def test_older_transform_does_not_replace_a_newer_one_and_a_child_may_move_to_an
 
 def test_stamp_of_a_time_to_come_hides_nothing_that_is_told_after_it() -> None:
     tree = TransformTree()
-    for stamp, x in ((MOST_STAMP, 1), (20, 2), (10, 3)):
+    for stamp, x in ((MAX_STAMP, 1), (20, 2), (10, 3)):
         tree.set("belt", "part", moved(x), stamp)
     assert tree.pose("belt", "part")[0, 3] == 2.0 and tree.stamp_of("part") == 20
 

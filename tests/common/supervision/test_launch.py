@@ -9,7 +9,7 @@ from common.clock import Clock
 from common.config import ServiceEntry, load_cell
 from common.errors import ConfigError, ZencellError
 from common.supervision.launch import Launch, clock_of, place_of, require_free_port, require_modules
-from common.transport.endpoint import small_keys_renamed
+from common.transport.endpoint import remapped_small_keys
 
 ENTRY = ServiceEntry(name="it", module="own.package.it")
 
@@ -26,11 +26,11 @@ def test_a_service_is_told_all_that_the_person_asked_for() -> None:
 
 def test_the_router_is_told_small_keys_that_the_cell_has_under_other_names() -> None:
     cell = load_cell(str(Path(__file__).parents[2] / "data" / "two_cameras.yaml"))
-    small = small_keys_renamed(entry.topics for entry in cell.services.values())
+    small = remapped_small_keys(entry.topics for entry in cell.services.values())
     sides = [f"{side}/{key}" for side in ("left", "right") for key in ("camera/camera_info", "detected_objects")]
     assert set(sides) <= set(small) and not any("image" in key for key in small)
     assert Launch("my.yaml").router_command(small[:1])[-3:] == ["--small", small[0], "--gate"]
-    assert small_keys_renamed(entry.topics for entry in load_cell("panda").services.values()) == []
+    assert remapped_small_keys(entry.topics for entry in load_cell("panda").services.values()) == []
 
 
 def test_with_an_endpoint_there_is_no_domain_to_go_to() -> None:

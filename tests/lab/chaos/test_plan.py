@@ -21,10 +21,10 @@ from common.transport.codec import (
     decode_attachment,
     encode,
     encode_attachment,
-    require_whole,
+    require_intact,
 )
 from common.transport.ownership import Owner
-from common.transport.reader import Newness
+from common.transport.reader import SequenceFilter
 from common.transport.session import RawSample
 from lab.chaos.agent import damaged, next_damaged, nonsense
 from lab.chaos.plan import CELL_SECONDS, LABELS, Fault, Form, Kind, faults, plan
@@ -102,11 +102,11 @@ def test_a_key_under_another_name_is_disturbed_as_what_its_service_calls_it() ->
 def test_damaged_messages_are_refused(form: Form) -> None:
     payload = encode(PickPlaceStatus(placed=3))
     attachment = Attachment("smart_pick_place.1", 7, checksum=checksum_of("panda/pick_place_status", payload))
-    require_whole(attachment, "panda/pick_place_status", payload)
+    require_intact(attachment, "panda/pick_place_status", payload)
     for seed in range(50):
         bad = damaged(payload, form, np.random.default_rng(seed))
         with pytest.raises(DecodeError):
-            require_whole(attachment, "panda/pick_place_status", bad)
+            require_intact(attachment, "panda/pick_place_status", bad)
             decode(PickPlaceStatus, bad)
         if form == "huge":
             break
@@ -119,14 +119,14 @@ def test_a_picture_that_is_damaged_where_no_checksum_looks_costs_one_picture() -
     def heard(number: int) -> Attachment:
         return Attachment("depth_camera.1", number, checksum=checksum_of(key, payload))
 
-    newness = Newness()
+    newness = SequenceFilter()
     assert newness.is_new(heard(7))
     real = RawSample(key, payload, "", encode_attachment(heard(7)))
     bad = (next_damaged(real, heard(7), "flipped", rng) for _ in range(100))
     body, beside = next((body, beside) for body, beside in bad if body[:CHECKED_BYTES] == payload[:CHECKED_BYTES])
     attachment = decode_attachment(beside)
     assert attachment is not None and body != payload
-    require_whole(attachment, key, body)
+    require_intact(attachment, key, body)
     assert newness.is_new(attachment) and not newness.is_new(heard(8)) and newness.is_new(heard(9))
 
 

@@ -28,8 +28,8 @@
 
 /* q(t) = c[0] + c[1] t + c[2] t^2 + c[3] t^3, 0 <= t <= 1 */
 typedef struct {
-    double c[4][MOST_JOINTS];
-    double speed[MOST_JOINTS], bend[MOST_JOINTS]; /* largest |q'| and |q''| */
+    double c[4][MAX_JOINTS];
+    double speed[MAX_JOINTS], bend[MAX_JOINTS]; /* largest |q'| and |q''| */
     double beyond; /* [m] at most by which joints slide out of their limits, where levers are longer */
 } curve;
 
@@ -337,7 +337,7 @@ static inline void leave(halves *h, int right, int entry, double since, double u
 static int probes_free(scratch *c, const curve *e) {
     static const double times[PROBES] = {0.5, 0.25, 0.75, 0.875, 0.125, 0.625, 0.375};
     const world *w = c->w;
-    double q[MOST_JOINTS], dq[MOST_JOINTS];
+    double q[MAX_JOINTS], dq[MAX_JOINTS];
     if (c->hot[0] < 0) return 1;
     for (int k = 0; k < PROBES; k++) {
         at_time(w, e, times[k], q, dq);
@@ -354,7 +354,7 @@ static int probes_free(scratch *c, const curve *e) {
 /* Whether the whole curve is free. Else `hit_pair` and `hit_at` say what touches or cannot be proved, and where. */
 static int curve_free(scratch *c, const curve *e) {
     const world *w = c->w;
-    double q[MOST_JOINTS], dq[MOST_JOINTS], most = 0; /* how fast any point moves */
+    double q[MAX_JOINTS], dq[MAX_JOINTS], most = 0; /* how fast any point moves */
     double far = 0;
     c->edges++;
     for (int j = 0; j < w->dof; j++)
@@ -494,7 +494,7 @@ static int first_hit(scratch *c, int count, const double *path) {
             if (!state_free(c, q)) return i;
             continue;
         }
-        double away[MOST_JOINTS] = {0};
+        double away[MAX_JOINTS] = {0};
         int known = 1; /* all are numbers */
         for (int k = i; k <= j; k++)
             for (int d = 0; d < dof; d++) {

@@ -37,7 +37,7 @@ static void rotation_vector(const double *R, double *out) {
    joint of the chain adds to it. Returns whether q is within the tolerances. */
 static int tool_error(const arm *a, const double *q, const pose *target, double *error, double (*J)[6]) {
     pose T = {{1, 0, 0, 0, 1, 0, 0, 0, 1}, {0, 0, 0}};
-    double at[MOST_JOINTS][3];
+    double at[MAX_JOINTS][3];
     for (int i = 0; i < a->joints; i++) {
         const joint *joint = &a->w->joint[a->chain[i]];
         double value = q[a->chain[i] - 1];
@@ -118,7 +118,7 @@ static int turns_round(const world *w, int j) {
    back by a full turn where it can be, and the search ends where five steps do not halve the square of the error. */
 static int converge(const arm *a, const pose *target, int steps, int anywhere, double *q) {
     const world *w = a->w;
-    double J[MOST_JOINTS][6], error[6], step[MOST_JOINTS], last = INFINITY;
+    double J[MAX_JOINTS][6], error[6], step[MAX_JOINTS], last = INFINITY;
     for (int n = 0; n < steps; n++) {
         if (tool_error(a, q, target, error, J)) return 1;
         double size = dot3(error, error) + dot3(error + 3, error + 3);
@@ -126,7 +126,7 @@ static int converge(const arm *a, const pose *target, int steps, int anywhere, d
             if (!(size < 0.5 * last)) return 0;
             last = size;
         }
-        int left_out[MOST_JOINTS] = {0};
+        int left_out[MAX_JOINTS] = {0};
         for (int tries = 0, blocked = 1; blocked && tries < 3; tries++) {
             blocked = 0;
             damped_step(a, J, left_out, error, 0.05 * fmin(1.0, size) + 1e-7, step);

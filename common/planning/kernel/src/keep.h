@@ -42,7 +42,7 @@ static int keeps_state(scratch *c, const double *q) {
 /* Whether all is kept to along a curve, but for shares of the slack; else `hit_at` says where it is not. */
 static int keeps_curve(scratch *c, const curve *e, double accepted, double proved) {
     const world *w = c->w;
-    double M[2], K[2], q[MOST_JOINTS], dq[MOST_JOINTS], t = 0;
+    double M[2], K[2], q[MAX_JOINTS], dq[MAX_JOINTS], t = 0;
     bounds(w, e, w->keep_tool, 0, w->keep_lever, &M[0], &K[0]);
     bounds(w, e, w->keep_tool, 0, w->turn_lever, &M[1], &K[1]);
     for (int look = 0; look < MOST_LOOKS; look++) {
@@ -111,7 +111,7 @@ static int broken(const scratch *c, const kept *k, double *left, double *row) {
 /* Moves q, within the limits, to where all is kept to; 0 where it gets stuck. */
 static int project(scratch *c, double *q) {
     const world *w = c->w;
-    double J[MOST_KEPT][MOST_JOINTS], A[MOST_KEPT][MOST_KEPT], x[MOST_KEPT];
+    double J[MOST_KEPT][MAX_JOINTS], A[MOST_KEPT][MOST_KEPT], x[MOST_KEPT];
     for (int n = 0; n < MOST_PROJECTIONS; n++) {
         int rows = 0;
         forward(c, q);
@@ -131,7 +131,7 @@ static int project(scratch *c, double *q) {
             A[r][r] = 1 / sqrt(fmax(A[r][r], 1e-12));
             x[r] *= A[r][r];
         }
-        double step[MOST_JOINTS], most = 0;
+        double step[MAX_JOINTS], most = 0;
         for (int r = rows - 1; r >= 0; r--) {
             for (int k = r + 1; k < rows; k++) x[r] -= A[k][r] * x[k];
             x[r] *= A[r][r];

@@ -67,7 +67,7 @@ static void turn_z(const double *axis, double *R) {
    in the parents' frames, unit axes (dof, 3), limits. NULL when it does not fit. */
 API world *zk_world(int dof, const int *parents, const int *kinds, const double *placements, const double *axes,
                     const double *lower, const double *upper) {
-    if (dof < 1 || dof >= MOST_JOINTS) return NULL;
+    if (dof < 1 || dof >= MAX_JOINTS) return NULL;
     world *w = calloc(1, sizeof *w);
     if (!w) return NULL;
     w->dof = dof, w->joints = dof + 1;
@@ -363,7 +363,7 @@ API int zk_thin(int count, const double *points, const uint8_t *skip, double sid
    where the robot is at q. margins: of each shape, EXCUSED for those that do not count. */
 API void zk_near(scratch *c, const double *q, const double *margins, int count, const double *points, uint8_t *out) {
     const world *w = c->w;
-    double reach[MOST_JOINTS], axis[3] = {0, 0, 1}; /* squares of how far from their middles bodies count */
+    double reach[MAX_JOINTS], axis[3] = {0, 0, 1}; /* squares of how far from their middles bodies count */
     forward(c, q);
     middles(c);
     for (int j = 0; j < w->joints; j++) reach[j] = -1;

@@ -135,7 +135,7 @@ static int step_towards(run *r, const double *a, const double *q, double far, do
 /* A new node towards q, from the nearest one: its index, or -1. */
 static int extend(run *r, tree *t, int from, const double *q, double square, int *reached) {
     int dof = t->dof;
-    double far = sqrt(square), to[MOST_JOINTS];
+    double far = sqrt(square), to[MAX_JOINTS];
     const double *a = t->q + (size_t)dof * from;
     if (r->c->w->keeps) return step_towards(r, a, q, far, to, reached) ? add_node(t, to, from) : -1;
     *reached = far <= r->o->range;
@@ -149,7 +149,7 @@ static int extend(run *r, tree *t, int from, const double *q, double square, int
 static int search(run *r, tree trees[2], int meet[2], rng *random, plan_report *report) {
     const world *w = r->c->w;
     int dof = w->dof, grows = 0;
-    double q[MOST_JOINTS], square;
+    double q[MAX_JOINTS], square;
     while (trees[0].count + trees[1].count < r->o->nodes) {
         int stop = stopped(r);
         if (stop) return stop;
@@ -231,7 +231,7 @@ static int shorten(run *r, int count, int room, double *path, rng *random, plan_
             double swap = s;
             s = t, t = swap;
         }
-        double ends[2][MOST_JOINTS], at[2] = {s, t}, sum = 0;
+        double ends[2][MAX_JOINTS], at[2] = {s, t}, sum = 0;
         int piece[2] = {-1, -1};
         for (int i = 0; i + 1 < count; i++) {
             const double *a = path + (size_t)dof * i, *b = a + dof;
@@ -249,7 +249,7 @@ static int shorten(run *r, int count, int room, double *path, rng *random, plan_
         double before = 0, *first = path + (size_t)dof * (piece[0] + 1);
         before += sqrt(distance2(dof, ends[0], first)) + sqrt(distance2(dof, ends[1], path + (size_t)dof * piece[1]));
         before += path_length(dof, dropped, first);
-        double after = sqrt(distance2(dof, ends[0], ends[1])), new[MOST_FOLLOWED * MOST_JOINTS];
+        double after = sqrt(distance2(dof, ends[0], ends[1])), new[MOST_FOLLOWED * MAX_JOINTS];
         int added = after > before - 1e-3 * total ? 0 : follow(r, ends[0], ends[1], new);
         if (!added || count - dropped + added > room || path_length(dof, added, new) > before - 1e-3 * total) {
             failed++;

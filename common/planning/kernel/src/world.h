@@ -4,7 +4,7 @@
 
 #include "points.h"
 
-#define MOST_JOINTS 32 /* the first stands for the world */
+#define MAX_JOINTS 32 /* the first stands for the world */
 #define EXCUSED (-1e9) /* [m] a margin that every distance keeps */
 #define HOT 8
 #define TOUCHING 1e-9  /* [m] shapes this close touch: what cannot be told apart from contact is contact */
@@ -16,7 +16,7 @@ typedef struct {
     pose place;       /* in the frame of the parent; frames are turned so that z is the axis */
     double turned[9]; /* from the turned frame to the frame that was given */
     int depth;        /* joints from the world to this one, itself included */
-    int chain[MOST_JOINTS];
+    int chain[MAX_JOINTS];
 } joint;
 
 typedef struct {
@@ -36,7 +36,7 @@ typedef struct {
 
 typedef struct {
     double middle[3], sphere;        /* in the frame of the joint */
-    double reach[MOST_JOINTS];     /* levers of the middle */
+    double reach[MAX_JOINTS];     /* levers of the middle */
 } body;
 
 #define MOST_KEPT 8
@@ -51,31 +51,31 @@ typedef struct {
 
 typedef struct {
     int dof, joints, shapes, pairs, room;
-    joint joint[MOST_JOINTS]; /* joint i > 0 is moved by q[i - 1] */
-    double lower[MOST_JOINTS], upper[MOST_JOINTS];
-    double stroke[MOST_JOINTS]; /* [m] how far each joint slides within its limits */
+    joint joint[MAX_JOINTS]; /* joint i > 0 is moved by q[i - 1] */
+    double lower[MAX_JOINTS], upper[MAX_JOINTS];
+    double stroke[MAX_JOINTS]; /* [m] how far each joint slides within its limits */
     shape *shape;
-    double (*lever)[MOST_JOINTS]; /* of each shape about each joint [m]: as far from the axis as it ever gets */
-    double (*reach)[MOST_JOINTS]; /* the same of the middle of its sphere */
+    double (*lever)[MAX_JOINTS]; /* of each shape about each joint [m]: as far from the axis as it ever gets */
+    double (*reach)[MAX_JOINTS]; /* the same of the middle of its sphere */
     pair *pair;
     group *group;
     int groups, *member;
-    body body[MOST_JOINTS];
+    body body[MAX_JOINTS];
     double *far, *near; /* margins [m] of the pairs; near holds while the tool is near its start */
     int excuses;        /* whether near and far differ */
     int tool;           /* joint that carries the tool point */
     double tip[3], origin[3], leash;
-    double tip_lever[MOST_JOINTS];
+    double tip_lever[MAX_JOINTS];
     int keeps, keep_tool; /* what the tool keeps to, and the joint that carries it */
     kept keep[MOST_KEPT];
-    double keep_tip[3], keep_lever[MOST_JOINTS], turn_lever[MOST_JOINTS];
+    double keep_tip[3], keep_lever[MAX_JOINTS], turn_lever[MAX_JOINTS];
 } world;
 
 /* What one thread needs to answer questions. */
 typedef struct {
     const world *w;
-    pose T[MOST_JOINTS];
-    double spin[MOST_JOINTS][3], slide[MOST_JOINTS][3]; /* twist of each joint's body: angular, linear at the origin */
+    pose T[MAX_JOINTS];
+    double spin[MAX_JOINTS][3], slide[MAX_JOINTS][3]; /* twist of each joint's body: angular, linear at the origin */
     double (*middle)[3];
     pose *T_shape;
     unsigned *stamp, now;
@@ -99,7 +99,7 @@ static double axis_distance(const double *p) { return sqrt(p[0] * p[0] + p[1] * 
 /* Levers of a sphere of radius r about a point of a joint's frame: for every joint above, the farthest that any of its
    points can be from the axis, whatever the positions within limits of the joints between. */
 static void levers_of(const world *w, int j, const double *at, double r, double *lever) {
-    memset(lever, 0, sizeof(double) * MOST_JOINTS);
+    memset(lever, 0, sizeof(double) * MAX_JOINTS);
     if (!j) return;
     double beyond = norm3(at) + r;
     lever[j] = w->joint[j].kind == PRISMATIC ? 1.0 : axis_distance(at) + r;
@@ -128,10 +128,10 @@ static void measure(world *w, int i) {
                 act(&s->placed, p, out);
                 beyond = fmax(beyond, norm3(out)), most = fmax(most, axis_distance(out));
             }
-        double origin[3] = {0, 0, 0}, own[MOST_JOINTS];
+        double origin[3] = {0, 0, 0}, own[MAX_JOINTS];
         levers_of(w, s->joint, origin, beyond, own);
         if (w->joint[s->joint].kind != PRISMATIC) own[s->joint] = most;
-        for (int k = 0; k < MOST_JOINTS; k++) w->lever[i][k] = fmin(w->lever[i][k], own[k]);
+        for (int k = 0; k < MAX_JOINTS; k++) w->lever[i][k] = fmin(w->lever[i][k], own[k]);
     }
 }
 
