@@ -75,7 +75,7 @@ def test_the_end_is_that_of_the_certificate(folder: Path) -> None:
 
 @pytest.mark.parametrize(("days", "urgent", "said"), [
     (9, None, ""), (11, False, "in 29 days"), (38, False, "in 2 days"), (39.5, True, "in 12 hours"),
-    (41, True, "has ended"),
+    (41, True, "expired on"),
 ])
 def test_it_is_said_30_days_and_one_day_before(
     folder: Path, monkeypatch: pytest.MonkeyPatch, days: float, urgent: bool | None, said: str
@@ -100,7 +100,7 @@ def test_each_end_is_logged_once_and_once_more_when_it_is_urgent(folder: Path) -
     assert watch.look(now_in(42)) == []
     own = CertificateMonitor(folder, frozenset(["panda.camera"]))
     ((_, line),) = own.look(now_in(11))
-    assert "the certificate of panda.camera ends on" in line
+    assert "the certificate of panda.camera expires on" in line
     assert f"`zencell secure renew {folder}`" in line
 
 
@@ -163,7 +163,7 @@ def test_what_cannot_be_used_leaves_in_force_what_was_there(
     with caplog.at_level(logging.ERROR, "router"):
         (folder / "router.key").write_bytes((folder / "operator.key").read_bytes())
         until("nothing was said", lambda: caplog.records)
-    assert "those of before stay in force" in caplog.text
+    assert "the previous ones stay in force" in caplog.text
     assert is_let_in(endpoint, credentials_of("operator", folder))
 
 

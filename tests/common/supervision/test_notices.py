@@ -47,7 +47,7 @@ async def test_supervisor_tells_of_certificates_that_end_until_they_are_renewed(
         net.bus("supervisor"), load_cell("panda"), Launch("panda"), supervisor, elsewhere))  # type: ignore[arg-type]
     own, far = (await asyncio.wait_for(heard.next(), 20)).notices
     assert far == FAR and (own.host, own.urgent) == ("arm", False)
-    assert "the certificate of router ends on" in own.message and f"`zencell secure renew {tmp_path}`" in own.message
+    assert "the certificate of router expires on" in own.message and f"`zencell secure renew {tmp_path}`" in own.message
     issue(tmp_path, 300)
     assert (await asyncio.wait_for(heard.next(), 20)).notices == [FAR]
     publishing.cancel()
