@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.perception.image_files import displayable
+from common.perception.image import displayable
 from recording.decoding import Decoder
 from recording.names import file_names
 from recording.reading import Recording, Wanted

@@ -7,8 +7,8 @@ import math
 from common.config import World
 from common.messages import WorldObject, WorldObjects
 from common.sim.kinematic import GRAVITY
-from common.sim.layout import wholly_in_picture
-from drivers.mujoco.contact import ROLLING
+from common.sim.layout import sphere_in_image
+from drivers.mujoco.scene import ROLLING
 
 CLEARANCE = 0.12  # [m] from the container's edge: what falls between its wall and this may be hidden by it
 FALLS_STRAIGHT = "kinematic"  # the world in which what is let go has no speed
@@ -60,7 +60,7 @@ class Slipping:
         return all(far > CLEARANCE or far < -wall for far, wall in off)
 
     def _is_seen(self, place: Place, radius: float) -> bool:
-        return any(wholly_in_picture(camera, place, self._world.table_height + radius, radius)
+        return any(sphere_in_image(camera, place, self._world.table_height + radius, radius)
                    for camera in self._world.cameras.values())
 
 
