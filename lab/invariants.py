@@ -356,7 +356,7 @@ class Invariants:
             for speed in _speeds(request):
                 self._cap, self._cap_at = speed, None
         stop = isinstance(request, StopRequest) or (isinstance(request, HoldRequest) and request.hold)
-        if stop and getattr(request, "by", "") == "person" and self._last_word in ENDS:
+        if stop and getattr(request, "by", "") == "operator" and self._last_word in ENDS:
             self._ended, self._ended_at, self._ended_by = True, None, current_incarnation()
         if isinstance(request, GOALS) and isinstance(answer, MotionStatus | GripperState):
             accepted = answer.state != "rejected"

@@ -111,9 +111,9 @@ class OperatorModel:
         seconds = float(random.uniform(*START_LATE))
 
         async def start() -> None:
-            heard = heard_of.latest.newest if heard_of.latest else 0
+            acknowledged = heard_of.latest.newest if heard_of.latest else 0
             with contextlib.suppress(RequestFailed):
-                await command.call(m.TaskCommand(command="start", heard=heard), PERSON_TIMEOUT)
+                await command.call(m.TaskCommand(command="start", acknowledged=acknowledged), PERSON_TIMEOUT)
 
         with contextlib.suppress(RequestFailed):
             await command.wait_available(PERSON_TIMEOUT)
@@ -156,14 +156,14 @@ class OperatorModel:
             rests = (JOG_LATE + DEADMAN + STANDS) * speed
             return age < JOG_LATE * speed and sight.clear(state, scene, velocities, age + rests)
 
-        await _insist(bus, topics.MOTION_OWN, m.OwnRequest(act="take", owner=PERSON, over=True))
+        await _insist(bus, topics.MOTION_OWN, m.OwnRequest(act="take", owner=m.UNKNOWN_OPERATOR, over=True))
         for _ in range(JOGS):
             velocities = {str(random.choice(joints)): float(random.uniform(-1.0, 1.0))}
             for _ in range(int(random.integers(1, MOST_JOG))):
                 if not clear(velocities):
                     break
-                heard = heard_of.latest.newest if heard_of.latest else 0
-                jogs.put(m.JogCommand(header=bus.header(), owner=PERSON, heard=heard, joints=velocities))
+                acknowledged = heard_of.latest.newest if heard_of.latest else 0
+                jogs.put(m.JogCommand(header=bus.header(), acknowledged=acknowledged, joints=velocities))
                 await asyncio.sleep(JOG_PERIOD)
             await asyncio.sleep(float(random.uniform(0.0, JOG_GAP)))
         await self._start(bus, heard_of)
@@ -208,8 +208,8 @@ class OperatorModel:
         """Start the task as a person does: again, as long as the robot stays stopped."""
         status = bus.reader(self._status)
         while True:
-            heard = motion.latest.newest if motion.latest else 0  # who has heard nothing lets go of nothing
-            await _insist(bus, topics.TASK_COMMAND, m.TaskCommand(command="start", heard=heard))
+            acknowledged = motion.latest.newest if motion.latest else 0  # who has heard nothing lets go of nothing
+            await _insist(bus, topics.TASK_COMMAND, m.TaskCommand(command="start", acknowledged=acknowledged))
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(PERSON_TIMEOUT):
                     while not _started(status.latest, motion.latest):  # noqa: ASYNC110 - time is free here
@@ -239,7 +239,7 @@ class OperatorModel:
 
 def _started(task: m.TaskStatus | None, motion: m.MotionStatus | None) -> bool:
     """Whether nothing that a person said keeps the task any more."""
-    kept = motion is None or any(inhibit.by in (PERSON, PAGE) for inhibit in motion.inhibits)
+    kept = motion is None or any(interlock.by in (m.UNKNOWN_OPERATOR, PAGE) for interlock in motion.interlocks)
     return task is not None and task.started and not kept
 
 

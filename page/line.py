@@ -130,7 +130,7 @@ class Line:
         """Why who looks may not move the arm, whatever the arm does."""
         doors = self._desk.doors
         if owner is not None and owner.asked and owner.kind != "task" and owner.owner != doors.person:
-            return f"the motion is {owner.told}: Take it over, or wait until it is given back"
+            return f"the motion is {owner.description}: Take it over, or wait until it is given back"
         return doors.objection(VISITOR.get(), "operate")
 
     def _heard(self, connection: ServerConnection, data: str | bytes, delays: Delays) -> bool:

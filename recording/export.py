@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.messages import Image, JointState, Message, PointCloud2
-from common.perception.image_files import displayable
+from common.perception.image import displayable
 from recording.reader import Recording, Wanted
 from recording.sample import Decoder, RecordingError
 from recording.writer import ExportFailed

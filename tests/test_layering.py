@@ -139,7 +139,7 @@ PLATFORM_SERVICES = (
 APPLICATIONS = [path.parent.name for path in sorted((ROOT / "applications").glob("*/__init__.py"))]
 PARTS_ALL_LOOK_FOR = ("STATUS", "DECIDED_BY", "REJECTED", "DETECTED", "ANNOTATED", "MASK", "VIEWS")
 SHORT_FORMS = (  # where the fields of older world files are read, and the arguments of an older function
-    "common/config/short_forms.py", "common/sim/drawing.py",
+    "common/config/short_forms.py",
 )
 
 

@@ -10,7 +10,7 @@ from applications.outlining.messages import Contours
 from applications.outlining.perceived_solids import PerceivedSolid
 from common import messages as m
 from common.config import Surroundings
-from common.perception.intake import Unusable, require_near
+from common.perception.camera_input import FrameError, require_in_range
 from common.scene.fixtures import fixture_objects
 
 MOST_PICTURES = 20  # that the boxes about all contours of a picture cover together: to look into more takes minutes
@@ -21,30 +21,30 @@ def require_apart(contours: Contours) -> None:
     """Return when contours lie so much beside one another in their picture as those of things do.
 
     Raises:
-        Unusable: they do not.
+        FrameError: they do not.
     """
     covered = 0.0
     for contour in contours.contours:
         pixels = np.clip(np.array(contour.pixels), 0, (contours.width, contours.height))
         covered += float(np.prod(pixels.max(axis=0) - pixels.min(axis=0)))
     if covered > MOST_PICTURES * contours.width * contours.height:
-        raise Unusable("crowded", f"its {len(contours.contours)} contours cover it more than {MOST_PICTURES} times")
+        raise FrameError("crowded", f"its {len(contours.contours)} contours cover it more than {MOST_PICTURES} times")
 
 
 def planning_scene(around: Surroundings, solids: Sequence[PerceivedSolid], stamp: int) -> m.PlanningScene:
     """Fixtures and perceived solids, in world, as seen in the picture with that stamp.
 
     Raises:
-        Unusable: more is seen, or farther away, than there is room for; what stands somewhere is not left out of a
+        FrameError: more is seen, or farther away, than there is room for; what stands somewhere is not left out of a
             scene.
     """
     corners = [len(solid.outline) for solid in solids]
     if len(corners) > MOST or sum(corners) > MOST_CORNERS or max(corners, default=0) > MOST_OF_ONE:
-        raise Unusable("crowded", f"{len(corners)} objects with {sum(corners)} corners are more than a planning scene "
-                                  "has room for: is the picture full of noise?")
+        raise FrameError("crowded", f"{len(corners)} objects with {sum(corners)} corners are more than a planning "
+                                  "scene has room for: is the image full of noise?")
     for solid in solids:
-        require_near(solid.outline)
-        require_near((solid.base, solid.base + solid.height))
+        require_in_range(solid.outline)
+        require_in_range((solid.base, solid.base + solid.height))
     header = m.Header(stamp=stamp, frame_id="world")
     return m.PlanningScene(header=header, objects=[*fixture_objects(around), *map(collision_object, solids)])
 

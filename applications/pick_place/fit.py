@@ -16,7 +16,7 @@ from common.perception.sphere import ray_distances
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
-Chosen = npt.NDArray[np.bool_]
+BoolMask = npt.NDArray[np.bool_]
 
 _FACING = 0.6  # cosine between the inward normal of the outline and the direction to the centre
 
@@ -59,9 +59,9 @@ def _gradients(outline: Outline, misfit: _Misfit, centers: Array, which: Index, 
     return gradients
 
 
-def near_points(outline: Outline, centers: Array, radius: float, gate: float) -> Chosen:
+def near_points(outline: Outline, centers: Array, radius: float, gate: float) -> BoolMask:
     """(n, k) which points of an outline lie within the gate [m] of the silhouettes of spheres and face as these do."""
-    chosen: Chosen = np.abs(_compare(outline, centers, radius).beyond) < gate
+    chosen: BoolMask = np.abs(_compare(outline, centers, radius).beyond) < gate
     return chosen
 
 

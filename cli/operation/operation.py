@@ -21,7 +21,7 @@ from common.terminal import printable
 if TYPE_CHECKING:
     from cli.operation.screen import Content, Screen
     from common.config import Cell
-    from common.messages import Inhibit
+    from common.messages import Interlock
     from common.supervision.supervisor import Supervisor
     from common.transport.bus import Bus
     from lab.chaos.agent import Chaos
@@ -314,11 +314,11 @@ class Operation:
         if not self._simulated:
             self._tell_kept(kept)
         if (self._simulated and kept) or (not self.cell.run.autostart and not kept):  # who says `run` says start
-            heard = max((inhibit.since for inhibit in kept), default=0)  # a stop that comes now stays
-            start = TaskCommand(command="start", by=person(), override=bool(kept), heard=heard)
+            acknowledged = max((interlock.since for interlock in kept), default=0)  # a stop that comes now stays
+            start = TaskCommand(command="start", by=person(), override=bool(kept), acknowledged=acknowledged)
             await bus.client(topics.TASK_COMMAND).call(start, START_REQUEST_TIMEOUT)
-            for inhibit in kept:
-                self._note(f"Let go: {self.cell.name} was {inhibit.told}")
+            for interlock in kept:
+                self._note(f"Let go: {self.cell.name} was {interlock.description}")
 
         async def end() -> None:
             if self.first is not None:
@@ -345,10 +345,10 @@ class Operation:
         await beside(self._disturbing(), collector.run())
         return 0
 
-    def _tell_kept(self, kept: list[Inhibit]) -> None:
-        for inhibit in kept:
-            verb = "start" if inhibit.kind == "stopped" else "resume"
-            self._note(f"{self.cell.name} is {inhibit.told}: `zencell task {verb}` lets it go on")
+    def _tell_kept(self, kept: list[Interlock]) -> None:
+        for interlock in kept:
+            verb = "start" if interlock.kind == "stopped" else "resume"
+            self._note(f"{self.cell.name} is {interlock.description}: `zencell task {verb}` lets it go on")
 
     def _note(self, line: str) -> None:
         assert self._screen is not None

@@ -13,8 +13,8 @@ import numpy as np
 from common.config import World
 from common.messages import WorldObject, WorldObjects
 from common.sim.kinematic import GRAVITY
-from common.sim.layout import wholly_in_picture
-from drivers.mujoco.contact import ROLLING
+from common.sim.layout import sphere_in_image
+from drivers.mujoco.scene import ROLLING
 
 Kind = Literal["kill", "restart", "freeze", "delay", "corrupt", "replay", "drop"]
 Form = Literal["", "truncated", "flipped", "noise", "wrong type", "huge"]
@@ -195,7 +195,7 @@ class SlipGate:
         return all(far > CLEARANCE or far < -wall for far, wall in off)
 
     def _is_seen(self, place: Place, radius: float) -> bool:
-        return any(wholly_in_picture(camera, place, self._world.table_height + radius, radius)
+        return any(sphere_in_image(camera, place, self._world.table_height + radius, radius)
                    for camera in self._world.cameras.values())
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.messages import Image, Message
-from common.perception.intake import Unusable, colour_picture
+from common.perception.camera_input import FrameError, decode_color_image
 from recording.export import image_topics
 from recording.sample import Decoder
 
@@ -116,8 +116,8 @@ def _small(message: Message | None) -> Picture | None:
     if not isinstance(message, Image) or message.width * message.height > MOST_PIXELS:
         return None
     try:
-        picture = colour_picture(message)
-    except Unusable:
+        picture = decode_color_image(message)
+    except FrameError:
         return None
     scale = min(1.0, WIDTH / message.width, HEIGHT / message.height)
     size = max(1, round(scale * message.width)), max(1, round(scale * message.height))

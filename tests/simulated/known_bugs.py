@@ -13,7 +13,7 @@ from common import topics
 from common.config import load_cell
 from common.control.controller import TrajectoryController
 from common.control.goals import GoalMemory
-from common.control.inhibits import Record
+from common.control.interlocks import Record
 from common.control.limiter import Limiter
 from common.control.ownership import Ownership
 from common.control.record_file import RecordFile

@@ -77,10 +77,10 @@ def seen_from_home(cell: Cell, robot: RobotModel | None = None) -> Cell:
     """
     if not cell.world.on_hand:
         return cell
-    from common.perception.mounted import from_home
+    from common.perception.pinhole import cameras_at_home
     from common.robot.model import RobotModel
 
-    return cell.model_copy(update={"world": from_home(cell.world, robot or RobotModel.load(cell.robot))})
+    return cell.model_copy(update={"world": cameras_at_home(cell.world, robot or RobotModel.load(cell.robot))})
 
 
 def check_model(cell: Cell) -> Iterator[Finding]:

@@ -9,7 +9,7 @@ import pytest
 from common.application import all_topics
 from common.config import World, load_cell
 from common.messages import Header, Pose, Vector3, WorldObject, WorldObjects
-from drivers.mujoco.contact import THING, TIMESTEP, touches
+from drivers.mujoco.scene import OBJECT, TIMESTEP, set_contact
 from lab.chaos import agent
 from lab.chaos.plan import SlipGate, thrown
 
@@ -66,7 +66,7 @@ def test_a_camera_on_the_hand_sees_what_it_sees_from_home(monkeypatch: pytest.Mo
     statuses = [SimpleNamespace(name=entry.name, pid=1) for entry in cell.services.values()]
     bus: Any = SimpleNamespace(clock=SimpleNamespace(speed=1.0))
     supervisor: Any = SimpleNamespace(statuses=statuses)
-    agent.create_chaos(bus, cell, supervisor, all_topics(), 1, 6.0, until_ended=True)
+    agent.chaos_in(bus, cell, supervisor, all_topics(), 1, 6.0, until_ended=True)
     assert may(SlipGate(worlds[0]), 0.40, -0.05) and not may(SlipGate(worlds[0]), 0.40, -0.60)
 
 
@@ -75,10 +75,10 @@ def test_a_ball_gets_as_far_as_is_reckoned(speed: float) -> None:
     mujoco = pytest.importorskip("mujoco", reason="make setup EXTRAS=physics")
     spec = mujoco.MjSpec()
     spec.option.timestep = TIMESTEP
-    touches(spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1]), THING)
+    set_contact(spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1]), OBJECT)
     body = spec.worldbody.add_body(pos=[0, 0, 0.25])
     body.add_freejoint()
-    touches(body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.05), THING)
+    set_contact(body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.05), OBJECT)
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qvel[0] = speed
