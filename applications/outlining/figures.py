@@ -19,7 +19,7 @@ from common.topics import JOINT_STATES, SCENE_OBJECTS, Topic
 from recording.report import application
 
 if TYPE_CHECKING:
-    from recording.report.gathering import Gathering
+    from recording.report.history import RunHistory
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ class Figures(application.Figures):
         super().__init__(robot, pictured=pictured)
         self.traced = Traced(robot)
 
-    def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
+    def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
         """The task, the contour, the arm and the truth."""
         traced = self.traced
         return {
@@ -87,7 +87,7 @@ class Figures(application.Figures):
                 facts.append((name, f"{figures['mean']:.2f} mm ({figures['max']:.2f} at most)"))
         return facts
 
-    def picture(self, run: Gathering, tool: Array) -> application.Section:
+    def picture(self, run: RunHistory, tool: Array) -> application.Section:
         """The contour that was detected and the way that the tool tip took along it, from above."""
         return application.Section("outline", "Outline", (
             f"{self.traced.picture()}<p>{self.traced.figures()['points']} points of the contour; the true edge is "
@@ -161,7 +161,7 @@ class Traced:
         import matplotlib as mpl
         from matplotlib.figure import Figure
 
-        from recording.report.figures import LINES, QUIET, STYLE, from_above, svg
+        from recording.report.charts import LINES, QUIET, STYLE, from_above, svg
 
         contour, (_, tips), edges = self._path_points(), self._tips(), self._outlines()
         with mpl.rc_context(STYLE):

@@ -21,8 +21,8 @@ from common.scene.workspace import ReachCache, bounds_told, reach_reason, yaw_ca
 from common.sim.layout import layout
 from common.sim.objects import initial_pose, solid_of
 from common.sim.table import is_inside
+from tools.check import Finding, error, warning
 from tools.check.arm import Arm
-from tools.check.finding import Finding, error, warning
 
 ALONG = 0.03  # [m] by which the place above a container may be missed: half of place_pos_tol
 

@@ -26,7 +26,7 @@ class _Shown:
     look: SetPoint | None = None
 
 
-class WatchedArm:
+class ObservedArm:
     """An arm of whose set-points none goes unseen."""
 
     def __init__(self, below: Hardware, limits: Limits) -> None:
@@ -53,21 +53,21 @@ class WatchedArm:
         self._below.close()
 
 
-def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> WatchedArm:
+def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> ObservedArm:
     """The arm of the backend below."""
     below = robot.model_copy(update={"hardware": HardwareConfig(backend=options.backend, options=options.options)})
-    return WatchedArm(load_hardware(below, limits, start), limits)
+    return ObservedArm(load_hardware(below, limits, start), limits)
 
 
 def around(
     robot: RobotConfig, limits: Limits, start: Vector, options: Options, arm: Callable[[], Hardware]
-) -> WatchedArm:
+) -> ObservedArm:
     """The arm of a simulated world, which takes the place of the backend below."""
     below = robot.model_copy(update={"hardware": HardwareConfig(backend=options.backend, options=options.options)})
-    return WatchedArm(load_hardware(below, limits, start, arm), limits)
+    return ObservedArm(load_hardware(below, limits, start, arm), limits)
 
 
-def with_watched_arm(cell: Cell) -> Cell:
+def with_observed_arm(cell: Cell) -> Cell:
     """The cell with its arm being watched.
 
     Raises:
@@ -81,7 +81,7 @@ def with_watched_arm(cell: Cell) -> Cell:
 
 
 @contextmanager
-def shown_to(look: SetPoint) -> Iterator[None]:
+def observe_set_points(look: SetPoint) -> Iterator[None]:
     """Inside, `look` sees every set-point."""
     before, _Shown.look = _Shown.look, look
     try:

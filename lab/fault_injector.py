@@ -17,11 +17,11 @@ from common.topics import Topic
 from lab.chaos.agent import Chaos
 from lab.chaos.plan import Fault as Bad
 from lab.chaos.plan import Form
-from lab.faults import Amid, Fault, Plan
-from lab.loop import Life, context_of
-from lab.network import VirtualSession
-from lab.persons import Persons
-from lab.process import Host, VirtualBus, VirtualProcess
+from lab.faults import Amid, Fault, FaultPlan
+from lab.loop import Incarnation, context_of
+from lab.network import SimulatedSession
+from lab.operator_model import OperatorModel
+from lab.processes import SimulatedBus, SimulatedHost, SimulatedProcess
 
 AGAIN = 0.1  # [s] between looks whether something has come about
 LATEST = 0.3  # [s] after which a process crashes that does not get to the turn at which it was to
@@ -34,11 +34,11 @@ FORMS: tuple[Form, ...] = ("truncated", "flipped", "noise", "wrong type")
 BAD_MESSAGES = 4  # under one key, at most
 
 
-class Misfortune:
+class FaultInjector:
     """Lets go wrong in one run what its plan says; `made` counts."""
 
     def __init__(
-        self, host: Host, plan: Plan, seed: int, status: Topic[Any], tell: Callable[[str], None]
+        self, host: SimulatedHost, plan: FaultPlan, seed: int, status: Topic[Any], tell: Callable[[str], None]
     ) -> None:
         """Prepare.
 
@@ -51,11 +51,11 @@ class Misfortune:
         """
         self.made: Counter[str] = Counter()
         self.lose_supervisor: Callable[[], Awaitable[object]] = asyncio.Event().wait  # and bring the cell up again
-        self._seconds: list[VirtualProcess] = []
+        self._seconds: list[SimulatedProcess] = []
         self._strange = np.random.default_rng([seed, 10])
         self._host, self._plan, self._tell = host, plan, tell
         self._network = host.network
-        self.persons = Persons(host, seed, self._strange, status, tell, self.made)
+        self.persons = OperatorModel(host, seed, self._strange, status, tell, self.made)
 
     async def run(self) -> None:
         """Return when all has happened; cancelled, nothing more does."""
@@ -116,7 +116,7 @@ class Misfortune:
         else:
             process.terminate()
 
-    async def _crash(self, process: VirtualProcess, fault: Fault) -> bool:
+    async def _crash(self, process: SimulatedProcess, fault: Fault) -> bool:
         """Whether the process crashed, at its turn or somewhat later."""
         life, pid = process.life, process.pid
         process.kill_at_turn(fault.turns)
@@ -132,7 +132,7 @@ class Misfortune:
             self._note(fault, process.name)
         return life.over
 
-    async def _victim(self, fault: Fault) -> tuple[VirtualProcess, VirtualSession]:
+    async def _victim(self, fault: Fault) -> tuple[SimulatedProcess, SimulatedSession]:
         """Whom a fault hits: who has to do with the next goal, its target, or another that runs."""
         processes = self._host.processes
         names = [fault.target, *processes]
@@ -174,7 +174,7 @@ class Misfortune:
         finally:
             requests.on_begin = lambda asker, asked, key: None
 
-    def _mend(self, session: VirtualSession) -> None:
+    def _mend(self, session: SimulatedSession) -> None:
         if not session.detached and not self._network.router_lost:
             self._network.mend([session])
 
@@ -195,7 +195,8 @@ class Misfortune:
         entry = next(entry for entry in self._host.cell.services.values() if entry.name == fault.target)
         while (session := self._host.processes[fault.target].session) is None or session.cut:  # noqa: ASYNC110
             await asyncio.sleep(AGAIN)
-        second = VirtualProcess(self._host, entry, lambda name, line: self._tell(f"second {name}: {line}"), beside=True)
+        second = SimulatedProcess(
+            self._host, entry, lambda name, line: self._tell(f"second {name}: {line}"), beside=True)
         self._seconds.append(second)
         second.start()
         second.release()
@@ -215,14 +216,14 @@ class Misfortune:
 
     def _begin_strange(self, _fault: Fault) -> asyncio.Task[None]:
         self._tell("FAULT hostile: messages that nobody can read under all keys")
-        context = context_of(Life(STRANGER))
+        context = context_of(Incarnation(STRANGER))
         session = self._network.attach(context, STRANGER, self.made["hostile"])
         return context.run(lambda: asyncio.create_task(self._be_strange(session)))
 
-    async def _be_strange(self, session: VirtualSession) -> None:
+    async def _be_strange(self, session: SimulatedSession) -> None:
         """Put damaged messages and nonsense under every key, and ask for nonsense."""
         host, random = self._host, self._strange
-        bus = VirtualBus(session, STRANGER, host.cell.name, host.clock, host.requests)
+        bus = SimulatedBus(session, STRANGER, host.cell.name, host.clock, host.requests)
         known = {**topics.platform_topics(), **find_application(host.cell.application).topics}
         keys = [key for key in known if topics.SERVICE not in key]
         bad = [

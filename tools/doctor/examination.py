@@ -1,4 +1,4 @@
-"""Robots and cells: whether their files can be used as they are."""
+"""All that is looked at on a machine, in the order in which it matters."""
 
 from __future__ import annotations
 
@@ -8,7 +8,31 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from tools.doctor.finding import Finding, fail, ok
+from tools.doctor import Finding, clocks, fail, machine, network, ok, software
+
+
+def examine(endpoint: str) -> Iterator[Finding]:
+    """All findings; the router and its cells are looked for at an endpoint."""
+    yield software.python()
+    yield from software.packages()
+    yield software.extras()
+    yield software.kernel()
+    yield from robots()
+    yield from cells()
+    yield network.router(endpoint)
+    yield from network.versions(endpoint)
+    yield from clocks.clocks(endpoint)
+    yield from network.certificates()
+    yield network.page()
+    yield from software.cameras()
+    yield from machine.processes()
+    yield machine.shared_memory()
+    yield machine.memory()
+    yield machine.cores()
+    yield machine.disk()
+    yield machine.open_files()
+    yield machine.clock()
+    yield machine.container_engine()
 
 
 def robots() -> Iterator[Finding]:

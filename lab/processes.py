@@ -22,8 +22,8 @@ from common.process.service import serve
 from common.sources import monotonic
 from common.topics import Request, Topic
 from common.transport.bus import Bus, Client, Reader
-from lab.loop import Life, VirtualLoop, context_of
-from lab.network import VirtualNetwork, VirtualSession
+from lab.loop import Incarnation, VirtualTimeLoop, context_of
+from lab.network import SimulatedNetwork, SimulatedSession
 
 Q = TypeVar("Q", bound=Message)
 A = TypeVar("A", bound=Message)
@@ -50,7 +50,7 @@ class SkewedClock(Clock):
 
 
 @dataclass
-class Requests:
+class RequestLog:
     """What became of all requests of a cell, those that are under way, and what was read that should not have been."""
 
     outcomes: Counter[str] = field(default_factory=Counter)
@@ -68,7 +68,7 @@ class Requests:
 class _WatchedClient(Client[Q, A]):
     """A client of whose requests is noted how they end."""
 
-    noted: Requests
+    noted: RequestLog
 
     async def call(self, request: Q, timeout: float = 5.0) -> A:
         """The answer to a request."""
@@ -98,7 +98,7 @@ class _WatchedClient(Client[Q, A]):
 class _WatchedReader(Reader[M]):
     """A reader that notes what it should have left out."""
 
-    noted: Requests
+    noted: RequestLog
 
     def _decode(self, arrived: Any) -> bool:
         known: dict[str, int] = self.__dict__.setdefault("_known", {})
@@ -110,14 +110,14 @@ class _WatchedReader(Reader[M]):
         return super()._decode(arrived)
 
 
-class VirtualBus(Bus):
+class SimulatedBus(Bus):
     """A bus of whose requests is noted how they end, with a log of its own."""
 
     make_reader, make_client = _WatchedReader, _WatchedClient
     has_threads = has_process = False
 
     def __init__(
-        self, session: VirtualSession, service: str, cell: str, clock: Clock, noted: Requests,
+        self, session: SimulatedSession, service: str, cell: str, clock: Clock, noted: RequestLog,
         topics: Mapping[str, str] | None = None,
     ) -> None:
         """Take a place in a cell."""
@@ -153,17 +153,17 @@ class VirtualBus(Bus):
 
 
 @dataclass
-class Host:
+class SimulatedHost:
     """Where the processes of a simulated cell run, and what they share."""
 
-    loop: VirtualLoop
-    network: VirtualNetwork
+    loop: VirtualTimeLoop
+    network: SimulatedNetwork
     cell: Cell
     clock: Clock
     random: np.random.Generator
-    requests: Requests = field(default_factory=Requests)
-    processes: dict[str, VirtualProcess] = field(default_factory=dict)
-    ended: list[tuple[Life, asyncio.Task[int]]] = field(default_factory=list)  # cut off, not cleared away yet
+    requests: RequestLog = field(default_factory=RequestLog)
+    processes: dict[str, SimulatedProcess] = field(default_factory=dict)
+    ended: list[tuple[Incarnation, asyncio.Task[int]]] = field(default_factory=list)  # cut off, not cleared away yet
     started: int = 0
     skews: dict[str, float] = field(default_factory=dict)  # by service [s]
     crashes: list[str] = field(default_factory=list)  # of services, by themselves
@@ -191,24 +191,24 @@ class _Ending:
         return bool(self.reason)
 
 
-class VirtualProcess:
+class SimulatedProcess:
     """A child of the supervisor that is a task of this process."""
 
     def __init__(
-        self, host: Host, entry: ServiceEntry, on_line: Callable[[str, str], None], *, beside: bool = False
+        self, host: SimulatedHost, entry: ServiceEntry, on_line: Callable[[str, str], None], *, beside: bool = False
     ) -> None:
         """Describe a process without starting it; `beside` that of the supervisor, which knows nothing of it."""
         self.name = entry.name
         self.tail: deque[str] = deque(maxlen=TAIL_LINES)
-        self.life = Life(self.name)
-        self.bus: VirtualBus | None = None
+        self.life = Incarnation(self.name)
+        self.bus: SimulatedBus | None = None
         self._host, self._entry, self._on_line = host, entry, on_line
         self._pid: int | None = None
         self._began = 0.0
         self._code: asyncio.Future[int] | None = None
         self._gate: asyncio.Event | None = None
         self._task: asyncio.Task[int] | None = None
-        self._session: VirtualSession | None = None
+        self._session: SimulatedSession | None = None
         self._ending = _Ending()
         if beside:
             host.twice[self.name] += 1
@@ -240,7 +240,7 @@ class VirtualProcess:
         host = self._host
         host.started += 1
         self._pid, self._began = 1000 + host.started, monotonic()
-        self.life, self._ending = Life(self.name), _Ending()
+        self.life, self._ending = Incarnation(self.name), _Ending()
         self._code, self._gate = host.loop.create_future(), asyncio.Event()
         context = context_of(self.life)
         session = self._session = host.network.attach(context, self.name, self._pid)
@@ -248,7 +248,7 @@ class VirtualProcess:
         task = self._task = context.run(lambda: asyncio.create_task(self._run(session, boot), name=self.name))
         task.add_done_callback(self._done)
 
-    async def _run(self, session: VirtualSession, boot: float) -> int:
+    async def _run(self, session: SimulatedSession, boot: float) -> int:
         await asyncio.sleep(boot)
         assert self._gate is not None
         await self._gate.wait()
@@ -256,7 +256,7 @@ class VirtualProcess:
         module: ModuleType = importlib.import_module(self._entry.module)
         config = service_config(host.cell, self.name, module.Config)
         clock = SkewedClock(host.clock, round(host.skews.get(self.name, 0.0) * 1e9))
-        self.bus = bus = VirtualBus(session, self.name, host.cell.name, clock, host.requests, self._entry.topics)
+        self.bus = bus = SimulatedBus(session, self.name, host.cell.name, clock, host.requests, self._entry.topics)
         bus.log.addHandler(_Tail(self._say))
         try:
             return await serve(module.run, bus, config, self._ending)
@@ -319,7 +319,7 @@ class VirtualProcess:
         self._gone(SIGKILL)
 
     @property
-    def session(self) -> VirtualSession | None:
+    def session(self) -> SimulatedSession | None:
         """Its place on the network while it runs."""
         return self._session if self._pid is not None else None
 

@@ -13,12 +13,13 @@ import numpy.typing as npt
 
 from common.messages import Image, Message
 from common.perception.camera_input import FrameError, decode_color_image
-from recording.decoding import Decoder
-from recording.pictures import image_topics
+from recording.export import image_topics
+from recording.sample import Decoder
 
 if TYPE_CHECKING:
-    from recording.reading import Recording
-    from recording.report.gathering import Gathering
+    from recording.reader import Recording
+    from recording.report.history import RunHistory
+
 
 Picture = npt.NDArray[np.uint8]
 
@@ -33,7 +34,7 @@ QUALITY = 60  # of WebP, 1 to 100
 
 
 @dataclass
-class Film:
+class Clip:
     """Pictures about a moment.
 
     Attributes:
@@ -59,7 +60,7 @@ class Film:
         return f"data:image/webp;base64,{base64.b64encode(film.tobytes()).decode()}"
 
 
-def moments(run: Gathering) -> list[tuple[float, str]]:
+def moments(run: RunHistory) -> list[tuple[float, str]]:
     """When [s] something went wrong for the first times, and what; what one film shows is told once.
 
     What is lost goes before what was only tried again: a run may well end DONE after either. The last one is how it
@@ -81,7 +82,7 @@ def moments(run: Gathering) -> list[tuple[float, str]]:
     return sorted(kept[:MOST])
 
 
-def films(recording: Recording, run: Gathering) -> list[Film]:
+def films(recording: Recording, run: RunHistory) -> list[Clip]:
     """A film of each moment and camera of which there are pictures.
 
     Raises:
@@ -91,13 +92,13 @@ def films(recording: Recording, run: Gathering) -> list[Film]:
     if not wanted:
         return []
     topics = image_topics(recording, lambda topic: topic.endswith(RAW))[:MOST_CAMERAS]
-    found = [Film(at, what, topic) for at, what in wanted for topic in topics]
+    found = [Clip(at, what, topic) for at, what in wanted for topic in topics]
     for at, _ in wanted if topics else ():
         _fill({film.topic: film for film in found if film.at == at}, recording, at)
     return [film for film in found if len(film.pictures) > 1]
 
 
-def _fill(films_of: dict[str, Film], recording: Recording, moment: float) -> None:
+def _fill(films_of: dict[str, Clip], recording: Recording, moment: float) -> None:
     """Put the pictures about a moment [s] into the film of each topic; only those that it shows are looked at."""
     decoder = Decoder([Image])
     since, until = (max(0, recording.start + round(1e9 * at)) for at in (moment - BEFORE, moment + AFTER))

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import threading
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from common import topics
+from common.application import all_topics, bring_in
+from common.config import Cell
 from common.errors import DecodeError
 from common.messages import SupervisorStatus
+from common.remapping import Remapping
 from common.transport.codec import decode, decode_attachment
 from common.transport.credentials import secure_folder
 from common.transport.keys import owns_key
 from common.transport.ownership import Owner
-from recording.own import Own
-from recording.reading import MOST_SPEED, MOST_TEXT
-from recording.sample import Sample, message_of
-from recording.stamps import Sequences
-from recording.writing import RUN, run_of
+from recording.reader import MOST_SPEED, MOST_TEXT
+from recording.sample import Sample, Sequences, message_of
+from recording.writer import RUN, run_of
 
 if TYPE_CHECKING:
     from common.transport.bus import Bus
@@ -26,13 +30,14 @@ if TYPE_CHECKING:
     from recording.selection import Selection
     from recording.sink import Sink
 
+
 ASK_TIMEOUT = 1.0  # [s] for the values of states
 
 
 class Capture:
     """Hands every wanted message to a sink, repetitions left out and gaps counted."""
 
-    def __init__(self, bus: Bus, selection: Selection, sink: Sink, own: Own | None = None) -> None:
+    def __init__(self, bus: Bus, selection: Selection, sink: Sink, own: CustomTopics | None = None) -> None:
         """Take nothing yet.
 
         Args:
@@ -47,7 +52,7 @@ class Capture:
         self._sink = sink
         self._lock = threading.Lock()
         self._ahead = time.time_ns() - time.monotonic_ns()  # a step of the system clock must not turn messages round
-        own = own or Own()
+        own = own or CustomTopics()
         self._known = own.topics()
         self._kinds = own.kinds(self._known)
         self._run_known = False
@@ -121,3 +126,36 @@ def _origin(raw: RawSample) -> tuple[str, int, str]:
     except DecodeError:
         attachment = None
     return (attachment.writer, attachment.sequence, attachment.trace) if attachment else ("", 0, "")
+
+
+@dataclass(frozen=True)
+class CustomTopics:
+    """Modules of a person's own, and keys under other names."""
+
+    modules: tuple[str, ...] = ()
+    renamed: tuple[Mapping[str, str], ...] = ()  # as common/remapping.py has it, by service
+
+    @classmethod
+    def of(cls, cell: Cell) -> CustomTopics:
+        """That of a cell file."""
+        services = cell.services.values()
+        named = dict.fromkeys([cell.application, *(entry.module for entry in services)])
+        own = (name for name in named if "." in name and not name.startswith("services."))
+        return cls(tuple(own), tuple(entry.topics for entry in services if entry.topics))
+
+    @classmethod
+    def read(cls, text: str) -> CustomTopics:
+        """What `str` wrote."""
+        return cls(*(tuple(part) for part in json.loads(text)))
+
+    def __str__(self) -> str:
+        return json.dumps([self.modules, self.renamed])
+
+    def topics(self) -> dict[str, Any]:
+        """Every topic by its key before it is renamed; the messages of all modules are known from now on."""
+        return {**all_topics(), **bring_in(self.modules)}
+
+    def kinds(self, known: Mapping[str, Any]) -> dict[str, str]:
+        """Kinds of topics by key in the cell."""
+        kinds = {key: str(topic.kind) for key, topic in known.items()}
+        return kinds | {Remapping(table).key(key): kind for table in self.renamed for key, kind in kinds.items()}

@@ -5,27 +5,33 @@ It is fed by whoever listens to a cell that is up, and from a recording alike; i
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from common import topics
 from common import topics as t
 from common.application import Application, applications
 from common.config import RobotConfig
 from common.messages import Message, TaskStatus
+from common.sources import monotonic
+from common.supervision.rates import Rates
 from common.topics import Topic
 from recording.report.application import Figures, Listener, figures_of
 from recording.report.summary import Summary
 
 if TYPE_CHECKING:
-    from recording.report.gathering import Gathering
+    from common.transport.bus import Bus, Reader
+    from recording.report.history import RunHistory
 
 
-class Fold:
+class RunAggregator:
     """What a cell said, folded into the figures of its run. Feed it every message of its `topics`."""
 
     def __init__(
         self, cell: str, application: Application | None, *, robot: RobotConfig | None = None, seed: int = 0,
-        speed: float = 1.0, containers: Sequence[str] = (), gathering: Gathering | None = None,
+        speed: float = 1.0, containers: Sequence[str] = (), gathering: RunHistory | None = None,
         listeners: Mapping[Topic[Any], Listener] | None = None,
     ) -> None:
         """Start with nothing heard.
@@ -61,11 +67,11 @@ class Fold:
         self._hear(t.SCENE_OBJECTS, lambda _, message: summary.truth.on_objects(message))
         if self.figures.TRUTH is not None:
             self._hear(self.figures.TRUTH, lambda _, message: summary.truth.on_labels(message))
-        for topic, listener in (*self.figures.hears().items(), *(listeners or {}).items()):
+        for topic, listener in (*self.figures.listeners().items(), *(listeners or {}).items()):
             self._hear(topic, listener)
         if gathering is not None:
             gathering.truth = summary.truth
-            for topic, listener in gathering.hears().items():
+            for topic, listener in gathering.listeners().items():
                 self._hear(topic, listener)
 
     def _hear(self, topic: Topic[Any], listener: Listener) -> None:
@@ -121,6 +127,85 @@ class Fold:
                 self.gathering.latencies.append(age_ms)
 
 
-def application_in(keys: Sequence[str]) -> Application | None:
+def recorded_application(keys: Sequence[str]) -> Application | None:
     """The application that comes with the project and whose status is among these keys; None when there is none."""
     return next((found for found in applications() if found.status.key in keys), None)
+
+
+SETTLE_TIMEOUT = 2.0  # [s] for what still falls after the task ended
+ENDED = ("DONE", "ERROR")
+
+
+class Collector:
+    """Feeds a `RunAggregator` and `Rates` from a cell's topics."""
+
+    def __init__(self, bus: Bus, fold: RunAggregator, started_at: float, on_progress: Callable[[str], None]) -> None:
+        """Declare what is listened to.
+
+        Args:
+            bus: of the cell.
+            fold: is fed.
+            started_at: when this process began [s, monotonic].
+            on_progress: called with a line whenever the task got further.
+        """
+        self.rates = Rates()
+        self.ended = asyncio.Event()
+        self._fold = fold
+        self._clock = bus.clock
+        self._started_at = started_at
+        self._on_progress = on_progress
+        self._progress = fold.progress
+        self._readers: list[Reader[Any]] = [bus.reader(topic) for topic in fold.topics]
+        self._counters = bus.reader(replace(topics.COUNTERS, plain=False))
+        self._heard = asyncio.Event()
+
+    async def run(self) -> None:
+        """Listen until cancelled."""
+        following = [asyncio.create_task(self._follow(reader)) for reader in self._readers]
+        following.append(asyncio.create_task(self._follow_counters()))
+        try:
+            await asyncio.gather(*following)
+        finally:
+            for task in following:
+                task.cancel()
+
+    async def settle(self) -> None:
+        """Wait until nothing is on its way any more, for a short time at most, and read the truth."""
+        deadline = monotonic() + SETTLE_TIMEOUT
+        try:
+            async with asyncio.timeout(SETTLE_TIMEOUT):
+                while not self._fold.summary.truth.settled:
+                    self._heard.clear()
+                    await self._heard.wait()
+        except TimeoutError:
+            pass
+        # The task may say DONE a moment before the world says that the last object has come to rest.
+        await asyncio.sleep(min(0.2, max(0.0, deadline - monotonic())))
+        self.read_truth()
+
+    def read_truth(self) -> None:
+        """Take note of where everything really lies now."""
+        for reader in self._readers:
+            if reader.topic in self._fold.truths and (latest := reader.latest) is not None:
+                self._take(reader.topic.key, latest)
+
+    def _take(self, key: str, message: Any) -> None:
+        self._fold.on(key, message, monotonic() - self._started_at, self._clock.now_ns())
+
+    async def _follow(self, reader: Reader[Any]) -> None:
+        async for message in reader:
+            before = self._fold.status
+            self._take(reader.topic.key, message)
+            self._heard.set()
+            status = self._fold.status
+            if status is None or status is before:
+                continue
+            if (line := self._fold.progress) != self._progress:
+                self._progress = line
+                self._on_progress(line)
+            if status.state in ENDED:
+                self.ended.set()
+
+    async def _follow_counters(self) -> None:
+        async for counters in self._counters:
+            self.rates.update(counters, monotonic())

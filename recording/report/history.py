@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,8 +12,83 @@ import numpy.typing as npt
 
 from common import messages as m
 from common import topics as t
+from common.messages import PoseArray, WorldObjects
 from common.topics import Topic
-from recording.report.truth import Truth
+
+SAME = 0.05  # [m] from where something is to where it was seen: less well where the picture cuts it off
+BOX = "box"  # the container of recordings that do not tell its id
+
+
+@dataclass(frozen=True)
+class TrueObject:
+    """An object: its centre [m] in world, what becomes of it, and the container in which it lies."""
+
+    position: tuple[float, float, float]
+    state: str
+    container: str = ""
+
+
+@dataclass
+class Truth:
+    """Where everything is, as it was said last."""
+
+    containers: tuple[str, ...] = ()  # of the cell, as far as they are known
+    _objects: list[TrueObject] | None = None
+    _labelled: list[TrueObject] | None = None
+
+    def on_objects(self, message: WorldObjects) -> None:
+        """Take note of all objects; in old recordings they do not tell what becomes of them."""
+        if all("state" in thing.model_fields_set for thing in message.objects):
+            self._objects = [
+                TrueObject((thing.pose.position.x, thing.pose.position.y, thing.pose.position.z), thing.state,
+                      thing.container)
+                for thing in message.objects
+            ]
+
+    def on_labels(self, message: PoseArray) -> None:
+        """Take note of what is told as poses with labels."""
+        labels = message.labels or [""] * len(message.poses)
+        self._labelled = [
+            TrueObject((pose.position.x, pose.position.y, pose.position.z), "contained" if label == BOX else label,
+                  BOX if label == BOX else "")
+            for pose, label in zip(message.poses, labels, strict=False)
+        ]
+
+    @property
+    def things(self) -> list[TrueObject] | None:
+        """Everything that there is; None when nobody said anything, as with real hardware."""
+        if self._objects or self._labelled is None:
+            return self._objects
+        return self._labelled
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is on its way any more."""
+        return not any(thing.state in ("falling", "held") for thing in self.things or ())
+
+    def left(self, named: Sequence[Sequence[float]]) -> list[TrueObject]:
+        """What lies in no container and at none of the places (x, y, ...) [m] that are named."""
+        return [thing for thing in self.things or () if thing.state != "contained" and all(
+            math.dist(thing.position[:2], place[:2]) > SAME for place in named)]
+
+    def counted(self) -> dict[str, Any] | None:
+        """How much lies in containers, on the table and anywhere else; None without simulated hardware."""
+        if self.things is None:
+            return None
+        contained = _counts(self.containers, (t.container for t in self.things if t.state == "contained"))
+        in_box, on_table = sum(contained.values()), sum(thing.state == "table" for thing in self.things)
+        elsewhere = len(self.things) - in_box - on_table
+        return {"in_box": in_box, "on_table": on_table, "elsewhere": elsewhere, "containers": contained}
+
+
+def _counts(known: Iterable[str], found: Iterable[str]) -> dict[str, int]:
+    counts = dict.fromkeys(known, 0)
+    for name in found:
+        counts[name] = counts.get(name, 0) + 1
+    return counts
+
+
+
 
 Array = npt.NDArray[np.float64]
 
@@ -80,7 +156,7 @@ class Service:
 
 
 @dataclass
-class Gathering:
+class RunHistory:
     """Feed it the messages of a run in the order in which they came."""
 
     tasks: list[Span] = field(default_factory=list)  # label: state, note: what is worked on
@@ -111,7 +187,7 @@ class Gathering:
     _scene: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     _in_place: set[str] = field(default_factory=set)  # ids of objects that lay or moved where they may
 
-    def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
+    def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
         """What of the platform's topics is listened to."""
         return {
             t.MOTION_STATUS: self.on_motion, t.GRIPPER_STATE: self.on_gripper, t.DISPLAY_TRAJECTORY: self.on_trajectory,

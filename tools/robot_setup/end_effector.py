@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.robot.model import RobotModel
-from tools.robot_setup.fingers import PARALLEL, Grip, links_moved, measure, tool_complaints
-from tools.robot_setup.jaw import jaw_complaints, measure_jaw
-from tools.robot_setup.tree import Joint, Tree
+from common.robot.transforms import invert
+from tools.robot_setup.fingers import PARALLEL, Grip, check_jaw, check_tool_frame, links_moved, measure, measure_jaw
+from tools.robot_setup.tree import Arm, Joint, Tree
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ SPEED = 0.1  # of the width, where the URDF gives none for the driven joint [m/s
 
 
 @dataclass
-class Hand:
+class GripperProposal:
     """What the `gripper` section of a robot file says, and what was measured, in the frame of the palm."""
 
     palm: str
@@ -39,7 +39,9 @@ class Hand:
     remarks: list[str] = field(default_factory=list)
 
 
-def find_hand(robot: RobotModel, tree: Tree, fingers: Sequence[Joint], points: dict[str, Array]) -> Hand | str:
+def find_gripper(
+    robot: RobotModel, tree: Tree, fingers: Sequence[Joint], points: dict[str, Array]
+) -> GripperProposal | str:
     """The gripper that some joints make, or why they make none that the platform drives.
 
     One joint is driven and the others follow it: as the URDF says by `mimic`, or two slides that move alike. Slides
@@ -86,7 +88,7 @@ def find_hand(robot: RobotModel, tree: Tree, fingers: Sequence[Joint], points: d
     if grip.turned > PARALLEL:
         return (f"the pads {' and '.join(grip.pads)} turn by {math.degrees(grip.turned):.0f} degrees while they close; "
                 "the platform drives pads that stay parallel")
-    hand = Hand(palm, [joint.name for joint in order], mimic, None, [palm, *grip.pads], round(2 * high, 4),
+    hand = GripperProposal(palm, [joint.name for joint in order], mimic, None, [palm, *grip.pads], round(2 * high, 4),
                 round(min(2 * (driven.velocity or SPEED / 2), 0.2), 4), grip)
     if still:
         hand.remarks.append(f"gripper: {', '.join(still)} stands still: it moves on its own beside {driven.name}")
@@ -96,10 +98,10 @@ def find_hand(robot: RobotModel, tree: Tree, fingers: Sequence[Joint], points: d
 def complaints(robot: RobotModel) -> list[str]:
     """What of the tool's frame and the fingers is not as the platform takes it to be, in one line each."""
     gripper = robot.config.gripper
-    return jaw_complaints(robot) if gripper is not None and gripper.jaw is not None else tool_complaints(robot)
+    return check_jaw(robot) if gripper is not None and gripper.jaw is not None else check_tool_frame(robot)
 
 
-def _jaw(robot: RobotModel, joint: Joint, points: dict[str, Array]) -> Hand | str:
+def _jaw(robot: RobotModel, joint: Joint, points: dict[str, Array]) -> GripperProposal | str:
     """The hand of one finger against a fixed one, where it turns."""
     if joint.kind != "revolute":
         return f"{joint.name} slides one finger against a fixed one; the platform drives jaws that turn, or pairs"
@@ -111,7 +113,7 @@ def _jaw(robot: RobotModel, joint: Joint, points: dict[str, Array]) -> Hand | st
     jaw = {"radius": found.radius, "angle": found.angle, "closed": found.closed, "opens": found.opens}
     links = list(dict.fromkeys([found.carrier, *found.grip.pads]))
     speed = round(min(found.radius * 0.5 * (joint.velocity or 0.5), 0.2), 4)
-    hand = Hand(found.carrier, [joint.name], [1.0], None, links, found.max_width, speed, found.grip, jaw=jaw)
+    hand = GripperProposal(found.carrier, [joint.name], [1.0], None, links, found.max_width, speed, found.grip, jaw=jaw)
     hand.remarks.append("gripper.jaw: one finger is fixed; the tool centre point is in the middle of the open jaws, so "
                         "that closing brings the fixed finger and what is W mm wide together by "
                         f"({1e3 * found.max_width:.0f} - W) / 2 mm")
@@ -129,7 +131,7 @@ def _without_others(tree: Tree, fingers: Sequence[Joint]) -> tuple[list[Joint], 
     return [joint for joint in fingers if joint.name not in still], still
 
 
-def _slides(hand: Hand, low: float, high: float) -> Hand:
+def _slides(hand: GripperProposal, low: float, high: float) -> GripperProposal:
     closed = hand.grip.widths[0]
     if low > 0:  # they may be farther out than where they would meet, which the shapes tell
         hand.closed = round(low - closed / 2, 5)
@@ -144,7 +146,7 @@ def _slides(hand: Hand, low: float, high: float) -> Hand:
     return hand
 
 
-def _with_linkage(hand: Hand, driven: Joint, angles: Array) -> Hand | str:
+def _with_linkage(hand: GripperProposal, driven: Joint, angles: Array) -> GripperProposal | str:
     """With the parallelogram that fits the measured widths: 2 L (sin(open - a) - sin(open - closed)) at an angle a."""
     grip = hand.grip
     columns = np.column_stack([np.cos(angles), -np.sin(angles), np.ones(len(angles))])
@@ -177,7 +179,7 @@ def _palm(tree: Tree, fingers: Sequence[Joint]) -> str:
     return shared[-1]
 
 
-def section(hand: Hand, closing: str) -> dict[str, Any]:
+def section(hand: GripperProposal, closing: str) -> dict[str, Any]:
     """The `gripper` section of a robot file whose tool closes along an axis."""
     values: dict[str, Any] = {"joints": hand.joints}
     if any(factor != 1 for factor in hand.mimic):
@@ -192,3 +194,61 @@ def section(hand: Hand, closing: str) -> dict[str, Any]:
         "links": hand.links, "max_width": hand.max_width, "closing_axis": closing, "speed": hand.speed,
         "fingers": {"depth": round(hand.grip.depth, 4), "half_width": round(hand.grip.half_width, 4)},
     }
+
+
+
+
+def out_of(robot: RobotModel, arm: Arm, links: Sequence[str]) -> Array:
+    """(3,) unit vector out of the tool, in the frame of the wrist: along the last joint, away from the arm.
+
+    Which way that is say the links at the end, seen from the joints before: the first from which they are off.
+    """
+    q = (robot.lower + robot.upper) / 2
+    poses = robot.link_poses(q)
+    T_world_wrist = poses[arm.wrist]
+    column = robot.joint_names.index(arm.joints[-1].name)
+    jacobian = robot.jacobian(q)[:, column]
+    turning = float(np.linalg.norm(jacobian[3:])) > 0.5
+    axis = T_world_wrist[:3, :3].T @ (jacobian[3:] if turning else jacobian[:3])
+    axis = axis / np.linalg.norm(axis)
+    ends = [invert(T_world_wrist) @ poses[link] for link in links]
+    for joint in (arm.joints[-1], *arm.joints[-2::-1]):
+        start = (invert(T_world_wrist) @ poses[joint.child])[:3, 3]
+        offsets = [float((end[:3, 3] - start) @ axis) for end in ends]
+        farthest = max(offsets, key=abs)
+        if abs(farthest) > 1e-3:
+            return np.asarray(axis * np.sign(farthest))
+    return np.asarray(axis)
+
+
+def flange_links(tree: Tree, arm: Arm) -> list[str]:
+    """Links at the end of the arm that may be its flange: those without shapes, where there are some."""
+    rigid = tree.rigid_with(arm.wrist)
+    return [link for link in rigid[1:] if link not in tree.shaped] or rigid
+
+
+def find_flange(robot: RobotModel, tree: Tree, arm: Arm, tip: str | None) -> tuple[str, Array]:
+    """The link that a tool is mounted on, and out of the tool (3,) in its frame: `tip`, or the outermost.
+
+    Of several at one place the one whose z axis points out.
+    """
+    links = flange_links(tree, arm)
+    poses = robot.link_poses((robot.lower + robot.upper) / 2)
+    out = poses[arm.wrist][:3, :3] @ out_of(robot, arm, links)
+    if tip is None:
+        tip = max(links, key=lambda link: (
+            round(float(poses[link][:3, 3] @ out), 2), round(float(poses[link][:3, 2] @ out), 2)))
+    return tip, np.asarray(poses[tip][:3, :3].T @ out)
+
+
+def rotation_between(one: Array, other: Array) -> Array:
+    """(3, 3) the shortest rotation that takes a unit vector to another, of several any."""
+    axis, cosine = np.cross(one, other), float(one @ other)
+    if np.linalg.norm(axis) < 1e-6:
+        if cosine > 0:
+            return np.eye(3)
+        across = np.cross(one, np.eye(3)[int(np.argmin(np.abs(one)))])
+        across = across / np.linalg.norm(across)
+        return np.asarray(2 * np.outer(across, across) - np.eye(3))
+    K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.asarray(np.eye(3) + K + K @ K / (1 + cosine))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from recording.report.gathering import SAME_PLACE, Gathering, Span
+from recording.report.history import SAME_PLACE, RunHistory, Span
 
 Array = npt.NDArray[np.float64]
 
@@ -43,7 +43,7 @@ class JointLimits:
     velocity: Array
 
 
-def timeline(run: Gathering, state_colors: Mapping[str, str]) -> str:
+def timeline(run: RunHistory, state_colors: Mapping[str, str]) -> str:
     """What the task, the motion, the gripper and the processes did, over time.
 
     Args:
@@ -144,7 +144,7 @@ def joints(times: Array, positions: Array, velocities: Array, names: Sequence[st
         return svg(figure, "joints")
 
 
-def top_view(run: Gathering, tool: Array, marks: Mapping[str, Mapping[tuple[int, int], int]]) -> str:
+def top_view(run: RunHistory, tool: Array, marks: Mapping[str, Mapping[tuple[int, int], int]]) -> str:
     """The place of work from above, as a person at the robot sees it: +x up, +y to the left.
 
     Args:

@@ -1,11 +1,11 @@
-"""Persons who come between in a simulated cell: they stop, start, slow down and move the robot at bad moments."""
+"""OperatorModel who come between in a simulated cell: they stop, start, slow down and move the robot at bad moments."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,15 +13,20 @@ import numpy as np
 from common import messages as m
 from common import topics
 from common.client.operator_motion import MotionFailed, OperatorMotion
+from common.config import Cell
 from common.control.jogging import DEADMAN, STANDS
 from common.errors import RequestFailed
+from common.messages import JointState, PlanningScene
+from common.planning.collision import CollisionWorld
+from common.planning.obstacles import ObstacleCache
+from common.planning.robot_geometry import RobotGeometry
 from common.process.persist import persist
+from common.robot.model import RobotModel
 from common.topics import Request, Topic
 from common.transport.reader import Reader
 from lab.faults import Fault
-from lab.loop import Life, context_of
-from lab.process import Host, VirtualBus
-from lab.sight import Sight
+from lab.loop import Incarnation, context_of
+from lab.processes import SimulatedBus, SimulatedHost
 
 AGAIN = 0.1  # [s] between looks whether something has come about
 PERSON, PAGE = "person", "page"
@@ -42,15 +47,15 @@ JOG_PERIOD, JOG_GAP = 0.02, 0.5  # [s] between those, and at most between two of
 JOG_LATE = 0.3  # [s] after which a jog command does nothing any more, nor a person who has not seen the arm for so long
 PERSON_LATE = 1.0  # [s] at most between a person's stop and what is done next, in two places at once
 
-Act = Callable[[VirtualBus, Fault], Coroutine[Any, Any, None]]
+Act = Callable[[SimulatedBus, Fault], Coroutine[Any, Any, None]]
 
 
-class Persons:
+class OperatorModel:
     """Do in one run what its plan says."""
 
     def __init__(
-        self, host: Host, seed: int, strange: np.random.Generator, status: Topic[Any], tell: Callable[[str], None],
-        made: Counter[str],
+        self, host: SimulatedHost, seed: int, strange: np.random.Generator, status: Topic[Any],
+        tell: Callable[[str], None], made: Counter[str],
     ) -> None:
         """Prepare.
 
@@ -86,11 +91,11 @@ class Persons:
         number, told, act = self.acts[fault.kind]
         if told:
             self._tell(f"FAULT {fault.kind}: {told}")
-        context = context_of(Life(PERSON))
+        context = context_of(Incarnation(PERSON))
         session = self._network.attach(context, PERSON, number + self._made[fault.kind])
 
         async def be() -> None:
-            bus = VirtualBus(session, PERSON, self._host.cell.name, self._host.clock, self._host.requests)
+            bus = SimulatedBus(session, PERSON, self._host.cell.name, self._host.clock, self._host.requests)
             try:
                 await act(bus, fault)
             finally:
@@ -99,7 +104,7 @@ class Persons:
 
         return context.run(lambda: asyncio.create_task(be()))
 
-    async def _stop_again(self, bus: VirtualBus, _fault: Fault) -> None:
+    async def _stop_again(self, bus: SimulatedBus, _fault: Fault) -> None:
         """Start the task; stop the robot while that is on its way; start it again some time later."""
         host, random = self._host, self._late
         command, heard_of = bus.client(topics.TASK_COMMAND), bus.reader(topics.MOTION_STATUS)
@@ -121,7 +126,7 @@ class Persons:
         await asyncio.sleep(float(random.uniform(*LOOKS_ON)))
         await self._start(bus, heard_of)
 
-    async def _give_up(self, bus: VirtualBus, _fault: Fault) -> None:
+    async def _give_up(self, bus: SimulatedBus, _fault: Fault) -> None:
         """Stop the task; send the arm home, which comes late; give that up; start the task."""
         host, random = self._host, self._late
         heard_of, motion = bus.reader(topics.MOTION_STATUS), OperatorMotion(bus, [bus.reader(self._status)])
@@ -135,12 +140,12 @@ class Persons:
         await asyncio.sleep(GOAL_LATE[1])
         await self._start(bus, heard_of)
 
-    async def _take_over(self, bus: VirtualBus, _fault: Fault) -> None:
+    async def _take_over(self, bus: SimulatedBus, _fault: Fault) -> None:
         """Take the motion over, jog joints as far as nothing is in the way, and start the task, which hands it over."""
         host, random = self._host, self._late
         heard_of, jogs = bus.reader(topics.MOTION_STATUS), bus.writer(topics.MOTION_JOG)
         states, scenes = bus.reader(topics.JOINT_STATES), bus.reader(topics.PLANNING_SCENE)
-        joints, sight, speed = host.cell.robot.joints, Sight(host.cell), host.clock.speed
+        joints, sight, speed = host.cell.robot.joints, ClearanceCheck(host.cell), host.clock.speed
 
         def clear(velocities: dict[str, float]) -> bool:
             """Whether the arm would come to rest before anything in its way, however late this command comes."""
@@ -163,7 +168,7 @@ class Persons:
             await asyncio.sleep(float(random.uniform(0.0, JOG_GAP)))
         await self._start(bus, heard_of)
 
-    async def _slow_down(self, bus: VirtualBus, fault: Fault) -> None:
+    async def _slow_down(self, bus: SimulatedBus, fault: Fault) -> None:
         """Set the speed, and set it back some time later."""
         share = float(self._strange.uniform(SLOWEST, SLOW))
         self._tell(f"FAULT slowed: to {share:.0%} for {fault.seconds:.1f} s")
@@ -172,7 +177,7 @@ class Persons:
             await _insist(bus, topics.parameters_of(self._executor), asked)
             await asyncio.sleep(fault.seconds)
 
-    async def _end_and_start(self, bus: VirtualBus, _fault: Fault) -> None:
+    async def _end_and_start(self, bus: SimulatedBus, _fault: Fault) -> None:
         """Stop or pause the robot; let those crash who could start it again; start it some time later."""
         host, random = self._host, self._ends
         heard_of = bus.reader(topics.MOTION_STATUS)
@@ -199,7 +204,7 @@ class Persons:
             return
         await self._start(bus, heard_of)
 
-    async def _start(self, bus: VirtualBus, motion: Reader[m.MotionStatus]) -> None:
+    async def _start(self, bus: SimulatedBus, motion: Reader[m.MotionStatus]) -> None:
         """Start the task as a person does: again, as long as the robot stays stopped."""
         status = bus.reader(self._status)
         while True:
@@ -213,7 +218,7 @@ class Persons:
             if _started(status.latest, motion.latest):
                 return
 
-    async def _be_person(self, bus: VirtualBus, _fault: Fault) -> None:
+    async def _be_person(self, bus: SimulatedBus, _fault: Fault) -> None:
         """Stop the task; then send the arm home and start the task, from two places that know nothing of each other."""
         bus.session.slow = float(self._random.uniform(0.0, PERSON_SLOW))
         command, heard_of = bus.client(topics.TASK_COMMAND), bus.reader(topics.MOTION_STATUS)
@@ -238,6 +243,40 @@ def _started(task: m.TaskStatus | None, motion: m.MotionStatus | None) -> bool:
     return task is not None and task.started and not kept
 
 
-async def _insist(bus: VirtualBus, request: Request[Any, Any], message: m.Message) -> None:
+async def _insist(bus: SimulatedBus, request: Request[Any, Any], message: m.Message) -> None:
     """Ask until there is an answer, whatever it is."""
     await persist(bus.client(request), message, PERSON_TIMEOUT, lambda error: None, lambda problem: None)
+
+
+class ClearanceCheck:
+    """Looks where an arm would go that is jogged.
+
+    A jogged arm goes where it is told, and a simulated one goes through what a real one would run into: nobody could
+    bring it away from there, because from inside a solid there is no plan.
+    """
+
+    def __init__(self, cell: Cell) -> None:
+        """Know the arm."""
+        self._robot = RobotModel.load(cell.robot)
+        self._cache = ObstacleCache(RobotGeometry(self._robot))
+        self._gripper = cell.robot.gripper.links if cell.robot.gripper else []
+        self._padding = cell.motion.object_padding
+
+    def clear(self, state: JointState, scene: PlanningScene, asked: Mapping[str, float], seconds: float) -> bool:
+        """Whether the arm touches nothing that a retreat would not free it from, if it went on for so long.
+
+        Args:
+            state: of the arm when it was seen last.
+            scene: what stands around.
+            asked: velocities of joints [rad/s]; the others go on until they rest.
+            seconds: of cell time.
+        """
+        robot, names = self._robot, self._robot.joint_names
+        q, dq = dict(zip(state.name, state.position, strict=True)), dict(zip(state.name, state.velocity, strict=False))
+        if not all(name in q for name in names):
+            return False
+        start = np.array([q[name] for name in names])
+        ahead = start + seconds * np.array([asked.get(name, dq.get(name, 0.0)) for name in names])
+        fingers = [(link, thing.id) for link in self._gripper for thing in scene.objects if thing.role == "target"]
+        world = CollisionWorld(robot, scene, start=start, padding=self._padding, allowed=fingers, cache=self._cache)
+        return not world.collides(start) and world.edge_free(start, np.clip(ahead, robot.lower, robot.upper))

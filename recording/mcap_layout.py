@@ -63,7 +63,7 @@ class Layout:
     loose_messages: int = 0  # outside of chunks, as other programs may write them
 
 
-def layout_of(file: BinaryIO, path: Path) -> Layout:
+def read_layout(file: BinaryIO, path: Path) -> Layout:
     """What lies where in a file, which may end anywhere.
 
     Raises:
@@ -187,5 +187,3 @@ def _records(contents: bytes) -> Iterator[McapRecord]:
         else:
             stream.read(length)
     raise ValueError
-
-

@@ -14,9 +14,9 @@ import msgpack
 from mcap.records import Channel, Message, Schema
 
 from common.remapping import is_cell
-from recording.layout import DAMAGE, ChunkPlace, Layout, layout_of, records_of
+from recording.mcap_layout import DAMAGE, ChunkPlace, Layout, read_layout, records_of
 from recording.sample import RecordingError, Sample
-from recording.writing import ABOUT, ENDED, RUN, TRACES_SCHEMA
+from recording.writer import ABOUT, ENDED, RUN, TRACES_SCHEMA, ExportFailed, RecordingWriter, WriteFailed
 
 Wanted = Callable[[str], bool]  # is given a topic: the key without the cell
 MOST_SPEED = 1000.0
@@ -56,7 +56,7 @@ class Recording:
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
         try:
-            self.layout: Layout = layout_of(self.file, path)
+            self.layout: Layout = read_layout(self.file, path)
             if self.layout.loose_messages:
                 raise RecordingError(f"{path}: has messages outside of chunks, which no recording of zencell has")
         except BaseException:
@@ -275,3 +275,62 @@ def _traces(data: bytes) -> dict[tuple[int, int], str]:
         return {(channel, sequence): str(trace) for channel, sequence, trace in msgpack.unpackb(data)["traces"]}
     except (ValueError, TypeError, LookupError, msgpack.UnpackException, RecursionError):
         return {}  # they tell where messages came from, which are there without them
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """What was saved, and what was not."""
+
+    messages: int
+    seconds: float
+    was_finished: bool
+    lost_bytes: int  # after the last whole record
+    damaged_chunks: int
+
+
+def recover(source: Path, target: Path) -> Recovered:
+    """What was saved of a recording into a new file that is whole and indexed.
+
+    Every chunk that is whole in the source is in the target.
+
+    Raises:
+        RecordingError: the source is no recording, or the target is there already or cannot be written.
+    """
+    if target.exists():
+        raise RecordingError(f"{target}: is there already; choose another name")
+    beside = target.with_name(target.name + ".part")
+    beside.unlink(missing_ok=True)
+    try:
+        with Recording(source) as recording:
+            saved = _copy(recording, beside)
+        beside.replace(target)
+    except WriteFailed as error:
+        raise ExportFailed(target, error.why) from None
+    finally:
+        beside.unlink(missing_ok=True)
+    return saved
+
+
+def _copy(recording: Recording, target: Path) -> Recovered:
+    layout = recording.layout
+    writer = RecordingWriter(target, recording.metadata(ABOUT))
+    damaged = 0
+    try:
+        names = dict.fromkeys(record.name for record in layout.metadata if record.name != ABOUT)
+        for name in names:
+            writer.describe(name, recording.metadata(name))
+        for place in layout.chunks:
+            try:
+                samples = list(recording.samples_of(records_of(recording.file, place)))
+            except DAMAGE:
+                damaged += 1
+                continue
+            for sample in samples:
+                writer.add(sample)
+    except BaseException:
+        writer.abandon()
+        raise
+    lost = layout.size - layout.whole
+    ended = {} if recording.finished else {"reason": "cut", "lost_bytes": lost}
+    writer.close({**recording.metadata(ENDED), **ended, "recovered": True, "damaged_chunks": damaged})
+    return Recovered(writer.messages, recording.seconds, recording.finished, 0 if recording.finished else lost, damaged)

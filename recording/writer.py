@@ -6,6 +6,7 @@ import errno
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,7 @@ from mcap.writer import CompressionType, Writer
 
 from common.messages import SupervisorStatus
 from common.messages.basics import MOST_NAME
-from recording.decoding import schema_of
-from recording.sample import RecordingError, Sample
-from recording.stamps import stamp_of
+from recording.sample import RecordingError, Sample, schema_of, stamp_of
 
 # Of a file; whoever is on the network can make any number up, and readers take no file of many more. One of another
 # writer is found room for where its key is known.
@@ -41,7 +40,7 @@ def run_of(status: SupervisorStatus) -> dict[str, Any]:
     return status.model_dump(include={"speed", "epoch", "seed", "world", "overrides"})
 
 
-class WritingFailed(RecordingError):
+class WriteFailed(RecordingError):
     """The disk takes no more; what was written before is kept."""
 
     exit_code = 1
@@ -53,7 +52,7 @@ class WritingFailed(RecordingError):
         self.errno = error.errno
 
 
-class NotMade(RecordingError):
+class ExportFailed(RecordingError):
     """A file that is made of a recording does not fit on the disk; nothing of it is kept."""
 
     exit_code = 1
@@ -85,7 +84,7 @@ class AppendedFile:
         """Append all of the data, which are whole records.
 
         Raises:
-            WritingFailed: the disk takes no more; none of the data are in the file then.
+            WriteFailed: the disk takes no more; none of the data are in the file then.
         """
         view = memoryview(data)
         while view:
@@ -93,7 +92,7 @@ class AppendedFile:
                 written = os.write(self._file, view)
             except OSError as error:
                 os.ftruncate(self._file, self._size)
-                raise WritingFailed(self.path, error) from None
+                raise WriteFailed(self.path, error) from None
             view = view[written:]
         self._size += len(data)
         return len(data)
@@ -154,7 +153,7 @@ class RecordingWriter:
         It is on disk after the next `flush`, or when the chunk is full.
 
         Raises:
-            WritingFailed: the disk takes no more.
+            WriteFailed: the disk takes no more.
         """
         channel = self._channel_of(sample)
         if channel is None:
@@ -198,7 +197,7 @@ class RecordingWriter:
         """Put everything on disk that was written so far, as one chunk.
 
         Raises:
-            WritingFailed: the disk takes no more.
+            WriteFailed: the disk takes no more.
         """
         self._add_traces()
         self._writer.flush()  # type: ignore[no-untyped-call]
@@ -218,7 +217,7 @@ class RecordingWriter:
         """Write the rest, how it ended and the index, and close the file.
 
         Raises:
-            WritingFailed: the disk takes no more.
+            WriteFailed: the disk takes no more.
         """
         try:
             self.flush()
@@ -231,3 +230,101 @@ class RecordingWriter:
     def abandon(self) -> None:
         """Close the file as it is, after a failure."""
         self._file.close()
+
+
+MOST_STATES = 500  # with which a file begins: those that were said last
+
+
+class SplitWriter:
+    """Writes FILE.mcap, or FILE_0.mcap, FILE_1.mcap, ... of about `most_bytes` each.
+
+    A file after the first begins with the last value of every state and with the same descriptions, so that each can
+    be used alone.
+    """
+
+    def __init__(self, path: Path, about: Mapping[str, Any], most_bytes: int | None = None) -> None:
+        """Create the first file.
+
+        Raises:
+            RecordingError: it is there already, or cannot be written.
+        """
+        self._path = path
+        self._most = most_bytes
+        self._descriptions: dict[str, Mapping[str, Any]] = {ABOUT: about}
+        self._states: dict[tuple[str, str], Sample] = {}
+        self._earlier_messages = 0
+        self._earlier_bytes = 0
+        self.files: list[Path] = []
+        self._file = self._open()
+
+    @property
+    def messages(self) -> int:
+        """Messages in all files; a state that opens a file counts again."""
+        return self._earlier_messages + self._file.messages
+
+    @property
+    def size(self) -> int:
+        """Bytes on disk of all files."""
+        return self._earlier_bytes + self._file.size
+
+    def _open(self) -> RecordingWriter:
+        numbered = self._path.with_name(f"{self._path.stem}_{len(self.files)}{self._path.suffix}")
+        path = self._path if self._most is None else numbered
+        writer = RecordingWriter(path, self._descriptions[ABOUT])
+        self.files.append(path)
+        return writer
+
+    def describe(self, name: str, values: Mapping[str, Any]) -> None:
+        """Write a metadata record, also into the files that follow."""
+        self._descriptions[name] = values
+        self._file.describe(name, values)
+
+    def add(self, sample: Sample) -> bool:
+        """Write a message; whether there was room for its key.
+
+        Raises:
+            RecordingError: the disk takes no more.
+        """
+        written = self._file.add(sample)
+        if self._most is None or not written:
+            return written
+        if sample.kind == "state":
+            self._states.pop((sample.key, sample.writer), None)
+            self._states[sample.key, sample.writer] = sample
+            while len(self._states) > MOST_STATES:
+                del self._states[next(iter(self._states))]
+        if self._file.size >= self._most:
+            self._next(sample.log_time)
+        return written
+
+    def _next(self, now: int) -> None:
+        full = self._file
+        full.close()
+        self._earlier_messages += full.messages
+        self._earlier_bytes += full.size
+        self._file = self._open()
+        for name, values in self._descriptions.items():
+            if name != ABOUT:
+                self._file.describe(name, values)
+        for state in self._states.values():
+            self._file.add(replace(state, log_time=now))
+
+    def flush(self) -> None:
+        """Put everything on disk.
+
+        Raises:
+            WriteFailed: the disk takes no more.
+        """
+        self._file.flush()
+
+    def close(self, ended: Mapping[str, Any] | None = None) -> None:
+        """Write the rest and how it ended, and close.
+
+        Raises:
+            WriteFailed: the disk takes no more.
+        """
+        self._file.close(ended)
+
+    def abandon(self) -> None:
+        """Close as it is, after a failure."""
+        self._file.abandon()
