@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from applications.outlining.messages import OutlinePoints
-from applications.outlining.perceived_solids import PerceivedSolid
-from applications.outlining.scene import planning_scene
-from applications.outlining.topics import CONTOUR_PATH
+from applications.outlining.solids import PerceivedSolid, planning_scene
+from applications.outlining.topics import CONTOUR_PATH, OutlinePoints
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings, Tunable
 from common.messages import Header, Pose, Vector3, WorldObject

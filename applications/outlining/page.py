@@ -9,9 +9,17 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from applications.outlining.contours_choice import middle_of
-from applications.outlining.messages import Contour, OutlineSelect, OutlineSelection, OutlineStatus
-from applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_SELECT, OUTLINE_STATUS
+from applications.outlining.contour_choice import middle_of
+from applications.outlining.topics import (
+    CONTOUR_PATH,
+    CONTOURS,
+    OUTLINE_SELECT,
+    OUTLINE_STATUS,
+    Contour,
+    OutlineSelect,
+    OutlineSelection,
+    OutlineStatus,
+)
 from common import topics
 from common.config import Fixture
 from common.messages import CollisionObject, MotionStatus, TaskStatus

@@ -18,7 +18,7 @@ from common.terminal import echo
 from common.verbs import BeforeRun
 
 if TYPE_CHECKING:
-    from applications.outlining.messages import OutlineSelect
+    from applications.outlining.topics import OutlineSelect
     from common.config import Cell
     from common.verbs import Shell
 
@@ -39,8 +39,8 @@ def snapshot(
 
     A cell that is up is asked; else its services are started for it, without the task, and stopped again.
     """
-    from applications.outlining.asking import store
-    from applications.outlining.contours_choice import parse_choice
+    from applications.outlining.contour_choice import parse_choice
+    from applications.outlining.visits import store
 
     shell: Shell = context.obj
     visit = partial(store, folder=Path(folder), wanted=parse_choice(select))
@@ -55,7 +55,7 @@ def outline(
     overrides: list[str] | None = None, world: str | None = None,
 ) -> None:
     """Find the outline in the files of a folder, write its stages there and plan its tracing; nothing moves."""
-    from applications.outlining.contours_choice import parse_choice
+    from applications.outlining.contour_choice import parse_choice
     from common.config import load_cell
 
     wanted = parse_choice(select)
@@ -71,7 +71,7 @@ def select(
     cell: str | None = None, domain: str | None = None, connect: str | None = None,
 ) -> None:
     """Choose the object to outline."""
-    from applications.outlining.contours_choice import parse_choice
+    from applications.outlining.contour_choice import parse_choice
     from applications.outlining.topics import OUTLINE_SELECT
 
     wanted = parse_choice(which)
@@ -95,8 +95,8 @@ def before_run(
     if not ask and source is None:
         return BeforeRun(overrides)
     from applications.outlining import TASK
-    from applications.outlining.asking import CHOOSE_BY_HAND, ask_person, require_terminal
     from applications.outlining.stage_files import CLEARED, read_coordinates
+    from applications.outlining.visits import CHOOSE_BY_HAND, ask_person, require_terminal
     from common.config import load_cell
 
     for option, wanted in (("--ask", ask), ("--from", source is not None)):
@@ -114,9 +114,9 @@ def before_run(
 
 def _stages(shell: Shell, cell: Cell, place: Path, wanted: OutlineSelect, *, keep: bool) -> None:
     from applications.outlining import stage_files
-    from applications.outlining.legs import Legs
     from applications.outlining.offline import perceive, plan_outline
-    from applications.outlining.scene import planning_scene
+    from applications.outlining.solids import planning_scene
+    from applications.outlining.task import Legs
     from common.config import Surroundings
     from common.perception.mounted import Mounted
     from common.planning.pipeline import PlanningPipeline

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from applications.outlining.messages import OutlinePoints, OutlineStatus
-from applications.pick_place.messages import PickPlaceStatus
+from applications.outlining.topics import OutlinePoints, OutlineStatus
+from applications.pick_place.topics import PickPlaceStatus
 from cli.main import app
 from common import messages as m
 from common.transport.codec import encode

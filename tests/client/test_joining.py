@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS
+from applications.pick_place.topics import PICK_PLACE_STATUS, PickPlaceStatus
 from common.client import joining
 from common.client.cell import Cell
 from common.client.hearing import NothingHeard

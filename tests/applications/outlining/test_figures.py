@@ -9,9 +9,8 @@ import math
 import numpy as np
 import pytest
 
-from applications.outlining.figures import Figures, Traced, distances
-from applications.outlining.messages import OutlinePoints, OutlineStatus
-from applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS
+from applications.outlining.recording import Figures, Traced, distances
+from applications.outlining.topics import CONTOUR_PATH, OUTLINE_STATUS, OutlinePoints, OutlineStatus
 from common import messages as m
 from common import topics
 from common.application import Application

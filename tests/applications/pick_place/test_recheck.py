@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from applications.pick_place.recheck import Recheck, Recording
+from applications.pick_place.contact_check import Recheck, Recording
 from common.application import Application
 from common.config import load_cell
 from common.messages import GripperState, Header, JointState, Pose, PoseArray, Vector3

@@ -2,8 +2,13 @@
 
 import asyncio
 
-from applications.pick_place.messages import PickPlaceStatus
-from applications.pick_place.topics import PICK_PLACE_STATUS, REJECTED_TARGETS, SCENE_BALLS, VALIDATED_TARGETS
+from applications.pick_place.topics import (
+    PICK_PLACE_STATUS,
+    REJECTED_TARGETS,
+    SCENE_BALLS,
+    VALIDATED_TARGETS,
+    PickPlaceStatus,
+)
 from common import topics
 from common.application import Application
 from common.clock import Clock

@@ -5,7 +5,7 @@ from types import ModuleType
 
 import pytest
 
-from applications.pick_place.messages import PickPlaceStatus
+from applications.pick_place.topics import PickPlaceStatus
 from common import topics
 from common.application import Application
 from common.messages import Header, MotionStatus, Pose, PoseArray, TaskStatus, WorldObject, WorldObjects

@@ -13,22 +13,24 @@ import yaml
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
-from applications.outlining.messages import (
+from applications.outlining.page import choose
+from applications.outlining.topics import (
+    CONTOUR_PATH,
+    CONTOURS,
+    OUTLINE_STATUS,
     Contour,
     Contours,
     OutlinePoints,
     OutlineSelect,
     OutlineStatus,
 )
-from applications.outlining.page import choose
-from applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
-from applications.pick_place.messages import PickPlaceStatus
 from applications.pick_place.topics import (
     DETECTED_OBJECTS,
     DETECTION_IMAGE,
     PICK_PLACE_STATUS,
     REJECTED_TARGETS,
     WORKSPACE_MARKERS,
+    PickPlaceStatus,
 )
 from common import messages as m
 from common import topics
