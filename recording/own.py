@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from common.application import all_topics, bring_in
+from common.application import all_topics, import_topics
 from common.config import Cell
 from common.remapping import Remapping
 
@@ -37,7 +37,7 @@ class Own:
 
     def topics(self) -> dict[str, Any]:
         """Every topic by its key before it is renamed; the messages of all modules are known from now on."""
-        return {**all_topics(), **bring_in(self.modules)}
+        return {**all_topics(), **import_topics(self.modules)}
 
     def kinds(self, known: Mapping[str, Any]) -> dict[str, str]:
         """Kinds of topics by key in the cell."""

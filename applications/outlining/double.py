@@ -15,8 +15,6 @@ from common.process.planning_scene import SceneWriter
 from common.scene.home import HomeWatch
 from common.transport.bus import Bus
 
-REPLACES = ("depth_camera", "contour_detector", "pixel_to_world", "duplicate_remover", "outline_scene")
-SETTINGS = ("motion.velocity_scaling=0.6", "motion.acceleration_scaling=1.0")
 WORLD = "world"
 
 

@@ -27,7 +27,7 @@ UNHEARD = 2.0  # [s] at begin and end in which the tool may have gone on without
 MOST_STATES = 100_000  # joint states of one tracing that are kept: a quarter of an hour at 100 Hz
 
 
-class Figures(application.Figures):
+class OutlineFigures(application.Figures):
     """The block "outline" of a summary, and what a report shows of the outline."""
 
     STATE_COLORS: ClassVar = {

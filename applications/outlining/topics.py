@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field, computed_field, model_validator
 
 from common import messages as m
+from common.application import ApplicationTopics
 from common.messages.basics import SMALL, Count, Finite, Header, Label, Message, Name, Text
 from common.messages.geometry import Color, Pose, PoseArray
 from common.messages.task import TaskStatus
@@ -139,6 +140,7 @@ CONTOUR_PATH = Topic("contour_path", OutlinePoints, "state", "the same, cleared 
 OUTLINE_STATUS = Topic("outline_status", OutlineStatus, "state", "state and figures")
 OUTLINE_SELECT = Request("outline/select", OutlineSelect, OutlineSelection, "choose the object to outline")
 
-STATUS = OUTLINE_STATUS
-DECIDED_BY = CONTOUR_PATH
-ANNOTATED = CONTOUR_IMAGE
+TOPICS = ApplicationTopics(
+    declared=(CONTOURS, CONTOUR_IMAGE, CONTOUR_POINTS, CONTOUR_PATH, OUTLINE_STATUS, OUTLINE_SELECT),
+    status=OUTLINE_STATUS, decided_by=CONTOUR_PATH, annotated=CONTOUR_IMAGE,
+)

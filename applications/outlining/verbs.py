@@ -15,7 +15,7 @@ import typer
 
 from common.errors import ConfigError
 from common.terminal import echo
-from common.verbs import BeforeRun
+from common.verbs import BeforeRun, Verbs
 
 if TYPE_CHECKING:
     from applications.outlining.topics import OutlineSelect
@@ -81,9 +81,6 @@ def select(
     shell.send(OUTLINE_SELECT, wanted, cell, domain, connect)
 
 
-VERBS = {"snapshot": snapshot, "outline": outline, "task select": select}
-
-
 def before_run(
     cell: str, overrides: list[str], world: str | None, *, ask: Ask = False, source: From = None
 ) -> BeforeRun:
@@ -94,13 +91,13 @@ def before_run(
     """
     if not ask and source is None:
         return BeforeRun(overrides)
-    from applications.outlining import TASK
+    from applications.outlining import APPLICATION
     from applications.outlining.stage_files import CLEARED, read_coordinates
     from applications.outlining.visits import CHOOSE_BY_HAND, ask_person, require_terminal
     from common.config import load_cell
 
     for option, wanted in (("--ask", ask), ("--from", source is not None)):
-        if wanted and load_cell(cell, overrides, world=world).task != TASK:
+        if wanted and load_cell(cell, overrides, world=world).task != APPLICATION.task:
             raise ConfigError(option, cell, f"needs a cell that outlines objects, such as {CELL}")
     if ask and source is not None:
         raise ConfigError("--ask", ..., "and --from are two ways to choose: give one of them")
@@ -149,3 +146,6 @@ def _stages(shell: Shell, cell: Cell, place: Path, wanted: OutlineSelect, *, kee
     for leg, response in plan_outline(pipeline, legs, cleared, label, scene, given=keep):
         echo(f"  {leg.name:<8} {leg.seconds:6.2f} s by {response.planner}, planned in "
                    f"{1e3 * response.seconds:.0f} ms, fraction {response.fraction:.2f}")
+
+
+VERBS = Verbs(commands={"snapshot": snapshot, "outline": outline, "task select": select}, before_run=before_run)

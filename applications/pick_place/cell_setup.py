@@ -12,6 +12,7 @@ import numpy as np
 
 from applications.pick_place.detector import DetectorOptions
 from applications.pick_place.grasping import RELEASED
+from common.application import Checks
 from common.config import CameraConfig, Cell, Container, Grasp, ObjectConfig, Reach, service_config
 from common.config.basics import Rgb
 from common.errors import ConfigError
@@ -183,7 +184,7 @@ RING = 0.08  # width of a ring of places about the base, all of which are to be 
 Place = tuple[float, float]
 
 
-def fitted(robot: RobotModel, cell: dict[str, Any]) -> dict[str, Any]:
+def fit_world(robot: RobotModel, cell: dict[str, Any]) -> dict[str, Any]:
     """The tree of a cell file, with a world in reach of the robot, heights of grasps and bounds of the workspace.
 
     Balls lie at random places, another for each seed, in a picture whose middle is that of what is reached.
@@ -279,3 +280,6 @@ def _released(robot: RobotModel, place: Place, grasp: Grasp) -> bool:
     """Whether the tool comes above the box, coming from home."""
     at, tilt = (*place, grasp.drop_z), grasp.tilt(robot.dof) if chooses(robot) else RELEASED
     return solve_down(robot, at, 0.0, robot.named("home"), tilt=tilt, restarts=20, iterations=40) is not None
+
+
+CHECKS = Checks(quick=quick, reach=reach)

@@ -16,8 +16,6 @@ from common.process.planning_scene import SceneWriter
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 
-REPLACES = ("camera_simulator", "vision_detector", "workspace_validator", "scene_manager")
-SETTINGS = ("world.count=1", "motion.velocity_scaling=0.6", "motion.acceleration_scaling=1.0")
 WORLD = "world"
 
 

@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import computed_field, model_validator
 
 from common import messages as m
+from common.application import ApplicationTopics
 from common.messages.task import TaskStatus
 from common.topics import Topic
 
@@ -59,13 +60,6 @@ WORKSPACE_MARKERS = Topic("workspace_markers", m.MarkerArray, "state",
 PICK_PLACE_STATUS = Topic("pick_place_status", PickPlaceStatus, "state",
                           "IDLE, GRASPING, PLACING, HOMING, DONE or ERROR, and counters")
 
-STATUS = PICK_PLACE_STATUS
-DECIDED_BY = VALIDATED_TARGETS
-REJECTED = REJECTED_TARGETS
-DETECTED = DETECTED_OBJECTS
-ANNOTATED = DETECTION_IMAGE
-MASK = DETECTION_MASK
-
 
 def scene_balls(truth: m.WorldObjects) -> m.PoseArray:
     """The spheres of the simulated world, with their states as labels: what lies in a container is in the box."""
@@ -77,4 +71,9 @@ def scene_balls(truth: m.WorldObjects) -> m.PoseArray:
     )
 
 
-VIEWS = {SCENE_BALLS: scene_balls}
+TOPICS = ApplicationTopics(
+    declared=(SCENE_BALLS, DETECTED_OBJECTS, DETECTION_IMAGE, DETECTION_MASK, VALIDATED_TARGETS, REJECTED_TARGETS,
+              WORKSPACE_MARKERS, PICK_PLACE_STATUS),
+    status=PICK_PLACE_STATUS, decided_by=VALIDATED_TARGETS, rejected=REJECTED_TARGETS, detected=DETECTED_OBJECTS,
+    annotated=DETECTION_IMAGE, mask=DETECTION_MASK, truth_views={SCENE_BALLS: scene_balls},
+)

@@ -10,7 +10,7 @@ from applications.pick_place.topics import (
     PickPlaceStatus,
 )
 from common import topics
-from common.application import Application
+from common.application import find_application
 from common.clock import Clock
 from common.messages import (
     Header,
@@ -66,7 +66,7 @@ async def test_collector_hears_the_cell_and_waits_for_what_still_falls() -> None
     net = LocalNetwork()
     clock = Clock(2.0)
     cell = net.bus("cell", cell="test", clock=clock)
-    fold = Fold("test", Application("pick_place"), speed=2.0)
+    fold = Fold("test", find_application("pick_place"), speed=2.0)
     progress: list[str] = []
     collector = Collector(net.bus("supervisor", cell="test", clock=clock), fold, 0.0, progress.append)
     listening = asyncio.create_task(collector.run())

@@ -290,11 +290,13 @@ async def test_application_without_a_page_gets_the_buttons_and_words_of_every_ta
 ) -> None:
     (tmp_path / "apps").mkdir()
     (tmp_path / "apps" / "moving.py").write_text("""
+from common.application import Application, ApplicationTopics
 from common.messages import TaskStatus
 from common.topics import Topic
 class MovingStatus(TaskStatus):
     pass
 STATUS = Topic("moving_status", MovingStatus, "state", "how far the moving is")
+APPLICATION = Application(topics=ApplicationTopics(status=STATUS))
 """)
     monkeypatch.syspath_prepend(tmp_path)
     members = Members(services=["trajectory_executor", "viewer", "mover"], task="mover", application="apps.moving")
