@@ -103,7 +103,7 @@ def arm(repeat: int) -> None:
         positions = positions + 0.01
         state = JointState(header=Header(), name=robot.joint_names, position=positions.tolist())
         start = time.perf_counter()
-        camera.see(objects, state)
+        camera.render(objects, state)
         times.append(1e3 * (time.perf_counter() - start))
     print(f"\na frame in which the arm has moved: {min(times[1:]):.0f} ms (at most 200 for 5 Hz)")
     compare_with_embree(meshes, camera.camera, repeat)

@@ -35,7 +35,7 @@ from common.topics import CAMERA_IMAGE, CAMERA_INFO, GRIPPER_STATE, SCENE_OBJECT
 from common.transport.codec import decode
 from common.transport.local import LocalNetwork
 from page.guard import close_server, make_server
-from recording.reading import Recording
+from recording.reader import Recording
 from tests import pages
 from tests.harness import ask, free_domain
 from tests.page.scene_cell import Stage

@@ -136,7 +136,7 @@ PLATFORM_SERVICES = (
 )
 APPLICATIONS = [path.parent.name for path in sorted((ROOT / "applications").glob("*/__init__.py"))]
 SHORT_FORMS = (  # where the fields of older world files are read, and the arguments of an older function
-    "common/config/short_forms.py", "common/sim/drawing.py",
+    "common/config/short_forms.py",
 )
 
 
@@ -275,7 +275,7 @@ def test_circles_are_seen() -> None:
 
 @pytest.mark.parametrize("does", [
     "import services.camera_simulator, common.sim.kinematic",
-    "import common.supervision.supervisor, recording.report.collector, cli.operation.operation as o\n"
+    "import common.supervision.supervisor, recording.report.aggregator, cli.operation.operation as o\n"
     "o.Operation('panda', connect='tcp/127.0.0.1:9')",
 ], ids=["camera", "supervisor"])
 def test_process_that_plans_nothing_loads_no_planner(does: str) -> None:

@@ -16,7 +16,7 @@ from recording.foxglove_scene import closed_line, entity, update
 from recording.report import application
 
 if TYPE_CHECKING:
-    from recording.report.gathering import Gathering
+    from recording.report.history import RunHistory
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class OutlineFigures(application.Figures):
         super().__init__(robot, pictured=pictured)
         self.traced = Traced(robot)
 
-    def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
+    def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
         """The task, the contour, the arm and the truth."""
         traced = self.traced
         return {
@@ -84,7 +84,7 @@ class OutlineFigures(application.Figures):
                 facts.append((name, f"{figures['mean']:.2f} mm ({figures['max']:.2f} at most)"))
         return facts
 
-    def picture(self, run: Gathering, tool: Array) -> application.Section:
+    def picture(self, run: RunHistory, tool: Array) -> application.Section:
         """The contour that was detected and the way that the tool tip took along it, from above."""
         return application.Section("outline", "Outline", (
             f"{self.traced.picture()}<p>{self.traced.figures()['points']} points of the contour; the true edge is "
@@ -158,7 +158,7 @@ class Traced:
         import matplotlib as mpl
         from matplotlib.figure import Figure
 
-        from recording.report.figures import LINES, QUIET, STYLE, from_above, svg
+        from recording.report.charts import LINES, QUIET, STYLE, from_above, svg
 
         contour, (_, tips), edges = self._path_points(), self._tips(), self._outlines()
         with mpl.rc_context(STYLE):

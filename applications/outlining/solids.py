@@ -14,8 +14,8 @@ from applications.outlining.topics import Contour, Contours
 from common import messages as m
 from common.config import Surroundings
 from common.messages import Color
+from common.perception.camera_input import FrameError, require_in_range
 from common.perception.depth import Depth, DepthError
-from common.perception.intake import Unusable, require_near
 from common.perception.pinhole import Pinhole
 from common.scene.fixtures import fixture_objects
 
@@ -122,30 +122,30 @@ def require_apart(contours: Contours) -> None:
     """Return when contours lie so much beside one another in their picture as those of things do.
 
     Raises:
-        Unusable: they do not.
+        FrameError: they do not.
     """
     covered = 0.0
     for contour in contours.contours:
         pixels = np.clip(np.array(contour.pixels), 0, (contours.width, contours.height))
         covered += float(np.prod(pixels.max(axis=0) - pixels.min(axis=0)))
     if covered > MOST_PICTURES * contours.width * contours.height:
-        raise Unusable("crowded", f"its {len(contours.contours)} contours cover it more than {MOST_PICTURES} times")
+        raise FrameError("crowded", f"its {len(contours.contours)} contours cover it more than {MOST_PICTURES} times")
 
 
 def planning_scene(around: Surroundings, solids: Sequence[PerceivedSolid], stamp: int) -> m.PlanningScene:
     """Fixtures and perceived solids, in world, as seen in the picture with that stamp.
 
     Raises:
-        Unusable: more is seen, or farther away, than there is room for; what stands somewhere is not left out of a
+        FrameError: more is seen, or farther away, than there is room for; what stands somewhere is not left out of a
             scene.
     """
     corners = [len(solid.outline) for solid in solids]
     if len(corners) > MOST or sum(corners) > MOST_CORNERS or max(corners, default=0) > MOST_OF_ONE:
-        raise Unusable("crowded", f"{len(corners)} objects with {sum(corners)} corners are more than a planning scene "
-                                  "has room for: is the picture full of noise?")
+        raise FrameError("crowded", f"{len(corners)} objects with {sum(corners)} corners are more than a planning "
+                                    "scene has room for: is the image full of noise?")
     for solid in solids:
-        require_near(solid.outline)
-        require_near((solid.base, solid.base + solid.height))
+        require_in_range(solid.outline)
+        require_in_range((solid.base, solid.base + solid.height))
     header = m.Header(stamp=stamp, frame_id="world")
     return m.PlanningScene(header=header, objects=[*fixture_objects(around), *map(collision_object, solids)])
 

@@ -115,13 +115,13 @@ def _stages(shell: Shell, cell: Cell, place: Path, wanted: OutlineSelect, *, kee
     from applications.outlining.solids import planning_scene
     from applications.outlining.task import Legs
     from common.config import Surroundings
-    from common.perception.mounted import Mounted
+    from common.perception.pinhole import MountedCamera
     from common.planning.pipeline import PlanningPipeline
     from common.robot.model import RobotModel
 
     around = cell.section(Surroundings)
     assert isinstance(around, Surroundings)
-    camera = Mounted(around.camera, RobotModel.load(cell.robot)).at()
+    camera = MountedCamera(around.camera, RobotModel.load(cell.robot)).at()
     picture, depth = stage_files.read_pictures(place)
     size, expected = f"{depth.shape[1]}x{depth.shape[0]}", f"{camera.width}x{camera.height}"
     if size != expected:

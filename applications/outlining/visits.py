@@ -23,9 +23,9 @@ from applications.outlining.topics import (
 )
 from common import topics
 from common.errors import ConfigError, NoResponder, RemoteError, RequestFailed, RequestLost, ZencellError
+from common.perception.camera_input import decode_color_image
 from common.perception.depth import depth_of
 from common.perception.image import image_to_array
-from common.perception.intake import colour_picture
 from common.terminal import printable
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ async def store(bus: Bus, folder: Path, wanted: OutlineSelect | None) -> str:
             noting.append(asyncio.create_task(_note(contours, seen, more)))
             picture, depth = await _pair(pictures, depths, chosen_at)
             # Beside the loop: of what comes while it is held up all but the newest would be lost.
-            await asyncio.to_thread(stage_files.write_pictures, folder, colour_picture(picture), depth_of(depth))
+            await asyncio.to_thread(stage_files.write_pictures, folder, decode_color_image(picture), depth_of(depth))
             while True:
                 more.clear()
                 since = [path for stamp, path in sorted(cleared.items()) if stamp >= picture.header.stamp]

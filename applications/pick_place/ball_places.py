@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from applications.pick_place.grasping import Config
 from common.config import Container, Fixture, Surroundings
-from common.perception.occlusion import Hidden, Silhouettes
+from common.perception.occlusion import Occlusion, RobotSilhouettes
 from common.perception.pinhole import Pinhole
 from common.robot.model import RobotModel
 from common.scene.workspace import WorkspaceBounds, outside_reason
@@ -144,7 +144,7 @@ class Region:
         ]).reshape(-1, 3)
         self._seen_by: dict[int, tuple[Pinhole, Bools]] = {}
 
-    def within(self, camera: Pinhole, silhouettes: Silhouettes, robot: RobotModel) -> Bools:
+    def within(self, camera: Pinhole, silhouettes: RobotSilhouettes, robot: RobotModel) -> Bools:
         """(n,) the places that a camera sees while neither container nor the robot's foot is before them."""
         known = self._seen_by.get(id(camera))
         if known is not None and known[0] is camera:
@@ -161,7 +161,7 @@ class Region:
         self._seen_by[id(camera)] = camera, found
         return found
 
-    def hidden(self, views: Iterable[tuple[Bools, Hidden | None]]) -> float:
+    def hidden(self, views: Iterable[tuple[Bools, Occlusion | None]]) -> float:
         """The share of what any of several views can see that none of them shows now.
 
         Args:
@@ -182,7 +182,7 @@ def looking_poses(
 
     The least turn first, of those that hide as little as may be; else the one that hides least.
     """
-    silhouettes, home = Silhouettes(robot, carries), robot.named("home")
+    silhouettes, home = RobotSilhouettes(robot, carries), robot.named("home")
     within = [region.within(camera, silhouettes, robot) for camera in cameras]
     found: list[tuple[float, list[float]]] = []
     for turn in sorted(np.radians(np.arange(-165, 166, 15)).tolist(), key=lambda turn: (abs(turn), turn)):

@@ -24,10 +24,10 @@ from common.robot.model import RobotModel
 from common.robot.transforms import tool_down
 from common.scene.workspace import ReachCache, WorkspaceBounds, bounds_told, reach_reason, yaw_candidates
 from common.sim.layout import layout
-from common.sim.objects import pose_of, solid_of
-from common.sim.places import is_inside
+from common.sim.objects import initial_pose, solid_of
+from common.sim.table import is_inside
+from tools.check import Finding, error, warning
 from tools.check.arm import Arm
-from tools.check.finding import Finding, error, warning
 from tools.robot_setup.home import hits
 
 ALONG = 0.03  # [m] by which the place above a container may be missed: half of place_pos_tol
@@ -74,7 +74,7 @@ def _seen(
                     f"set services.{next(iter(detectors))}.hsv_red_lo1 and hsv_red_hi1, or another colour")
     if not thing.placed:
         return
-    at = pose_of(thing, solid_of(thing))[:3, 3]
+    at = initial_pose(thing, solid_of(thing))[:3, 3]
     areas = {name: _area(at, radius, camera) / options.min_contour_area_px for name, (options, camera) in
              detectors.items()}
     best = max(areas, key=lambda name: areas[name])
@@ -141,7 +141,7 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
                lambda x, y, z: not reach_reason(arm.robot, (x, y, z), cell.grasp, bounds, explained=False))
         things = [thing for thing in cell.world.objects if thing.placed]
     for thing in things:
-        x, y, z = (float(value) for value in pose_of(thing, solid_of(thing))[:3, 3])
+        x, y, z = (float(value) for value in initial_pose(thing, solid_of(thing))[:3, 3])
         if any(is_inside(container, x, y) for container in cell.world.containers.values()):
             continue
         what = f"world.objects: {thing.id} at ({x:z.3f}, {y:z.3f}, {z:.3f}) cannot be taken"

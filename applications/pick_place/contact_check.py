@@ -39,7 +39,7 @@ class Recording:
     grips: list[GripperState] = field(default_factory=list)
     balls: list[PoseArray] = field(default_factory=list)
 
-    def hears(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
+    def listeners(self) -> dict[Topic[Any], Callable[[float, Any], None]]:
         """What a fold is to hand over."""
         return {
             topics.JOINT_STATES: lambda _, state: _keep(self.joints, state),

@@ -16,8 +16,8 @@ from applications.pick_place.topics import DETECTED_OBJECTS
 from common import topics
 from common.config import Parameters, RobotConfig, Surroundings
 from common.messages import Marker, MarkerArray, Rejection, Vector3
-from common.perception.intake import LeftOut, Unusable, require_room
-from common.perception.occlusion import Hidden, RobotBefore, Silhouettes
+from common.perception.camera_input import FrameError, SkippedFrames, require_capacity
+from common.perception.occlusion import Occlusion, RobotOcclusion, RobotSilhouettes
 from common.perception.pinhole import Pinhole
 from common.process.camera_reader import CameraReader
 from common.robot.model import RobotModel
@@ -48,7 +48,7 @@ class Seen:
     frame: MarkerArray
     camera: Pinhole
     at_times: bool = False
-    hidden: Hidden | None = None
+    hidden: Occlusion | None = None
 
 
 class Views:
@@ -76,13 +76,13 @@ class Views:
         self._joints = bus.reader(topics.JOINT_STATES)
         self._watches_home = only_at_home or around.on_hand
         self._radius, self._config = around.ball_radius, robot
-        self._robot: tuple[RobotModel, Silhouettes] | None = None
-        self._before: dict[int, RobotBefore] = {}
+        self._robot: tuple[RobotModel, RobotSilhouettes] | None = None
+        self._before: dict[int, RobotOcclusion] = {}
         self._views = list(names)
         self._names, self._home = robot.joints, HomeWatch(robot.named_poses["home"])
         self._only_at_home = only_at_home
         self._newest: list[Seen | None] = [None for _ in keys]
-        self._left_out = LeftOut(log, "a frame of detections")
+        self._left_out = SkippedFrames(log, "a frame of detections")
 
     async def watch(self, look: Callable[[int, Seen], Awaitable[None]]) -> None:
         """Have every frame looked at as it comes, one after the other, with the number of its view; never returns."""
@@ -95,9 +95,9 @@ class Views:
                 if (moves or self._only_at_home) and not self._home.covers(stamp):
                     continue
                 try:
-                    require_room(len(frame.markers))
+                    require_capacity(len(frame.markers))
                     camera = await cameras.of(frame.header, own_frame=False)
-                except Unusable as error:
+                except FrameError as error:
                     self._left_out.note(error)
                     continue
                 hidden = self._hidden(number, frame, camera) if not moves else None
@@ -134,21 +134,21 @@ class Views:
                 self._home.note([found[name] for name in self._names], state.header.stamp)
 
     @property
-    def robot(self) -> tuple[RobotModel, Silhouettes]:
+    def robot(self) -> tuple[RobotModel, RobotSilhouettes]:
         """A robot of its own and its outlines, read when somebody asks for the first time."""
         if self._robot is None:
             robot = RobotModel.load(self._config)
-            self._robot = robot, Silhouettes(robot, self._radius)
+            self._robot = robot, RobotSilhouettes(robot, self._radius)
         return self._robot
 
-    def _hidden(self, number: int, frame: MarkerArray, camera: Pinhole) -> Hidden | None:
+    def _hidden(self, number: int, frame: MarkerArray, camera: Pinhole) -> Occlusion | None:
         """What cannot be judged in a picture: all of it, or what the robot is before."""
         if frame.blind:
-            return Hidden(camera, frame.blind)
+            return Occlusion(camera, frame.blind)
         if self._cameras[number].without_robot:
             return None
         robot, silhouettes = self.robot
-        before = self._before.setdefault(number, RobotBefore(silhouettes))
+        before = self._before.setdefault(number, RobotOcclusion(silhouettes))
         state = self._joints.latest
         q = robot.order(state.name, state.position) if state is not None else None
         return before.in_picture(camera, frame.header.stamp, q, state.header.stamp if state is not None else 0)
@@ -164,7 +164,7 @@ class Views:
         return frame if len(kept) == len(frame.markers) else frame.model_copy(update={"markers": kept})
 
 
-def _clear_of(frame: MarkerArray, hidden: Hidden | None, radius: float) -> MarkerArray:
+def _clear_of(frame: MarkerArray, hidden: Occlusion | None, radius: float) -> MarkerArray:
     """The frame without what reaches into the part of its picture that cannot be judged: it is held, or cut off."""
     if hidden is None or not frame.markers:
         return frame

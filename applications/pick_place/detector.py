@@ -48,10 +48,9 @@ from applications.pick_place.segmentation import (
 from applications.pick_place.sphere_fit import Fit, fit_each, fit_spheres, separate
 from common.config import CameraConfig, Parameters, Surroundings, Tunable
 from common.perception.depth import Depth
-from common.perception.exposure import blindness
+from common.perception.illumination import BoolMask, blank_image_reason, blue_share, looked_at
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouettes
-from common.perception.white import Chosen, blue_share, looked_at
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
@@ -145,7 +144,7 @@ class Detector:
         self.options = options or DetectorOptions()
         self.resting = Resting.of(surroundings)
         self._around = surroundings
-        self._table: tuple[Pinhole, Chosen | None] | None = None  # where the last camera shows it
+        self._table: tuple[Pinhole, BoolMask | None] | None = None  # where the last camera shows it
         self._masks = Masks()
         self._outlines: dict[Traced, Outline] = {}  # of the last picture: what is there again is not worked out again
         self._fits: dict[_Key, list[_Round]] = {}
@@ -177,7 +176,7 @@ class Detector:
         if last and masks.closed is last[0] and camera is last[1] and self.options == last[2]:
             return list(last[3])
         found = [one for one in self._look_at(masks, camera) if not self._is_floor(one, picture, camera)]
-        self.blind = "" if found else blindness(picture)
+        self.blind = "" if found else blank_image_reason(picture)
         self._last = (masks.closed, camera, self.options.model_copy(), found)
         return list(found)
 
@@ -198,7 +197,7 @@ class Detector:
             for middle, contour in middles(closed, self.options.min_contour_area_px)
             if not any(cv2.pointPolygonTest(contour, one.pixel, False) >= 0 for one in found)
         ] + self._thin(narrow, camera))
-        self.blind, self.too_small, self._last = "" if found else blindness(picture), 0, None
+        self.blind, self.too_small, self._last = "" if found else blank_image_reason(picture), 0, None
         return sorted(found, key=lambda d: (d.pixel[1], d.pixel[0]))
 
     def _look_at(self, masks: RedMasks, camera: Pinhole) -> list[Detection]:

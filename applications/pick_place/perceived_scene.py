@@ -15,7 +15,7 @@ from applications.pick_place.ball_places import Resting
 from common import messages as m
 from common.config import GripperConfig, Parameters, Surroundings, Tunable
 from common.messages import Color, Marker, Quaternion
-from common.perception.occlusion import Hidden
+from common.perception.occlusion import Occlusion
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix
 from common.scene.fixtures import color_of, fixed_objects
@@ -234,7 +234,7 @@ class PerceivedScene:
         self._stamp = 0
 
     def see(self, detections: m.MarkerArray, camera: Pinhole, T_world_tcp: Array | None, view: int = 0,
-            at_times: bool = False, hidden: Hidden | None = None) -> None:
+            at_times: bool = False, hidden: Occlusion | None = None) -> None:
         """Take in the detections of one frame, of one of several views.
 
         A frame that was taken before the hand last closed or opened still shows what is in the hand now on the table:
@@ -280,7 +280,7 @@ class PerceivedScene:
         if at_times:
             self._lasts.add(view)
 
-    def _keep_hidden(self, view: int, now: Occupied, hidden: Hidden) -> None:
+    def _keep_hidden(self, view: int, now: Occupied, hidden: Occlusion) -> None:
         """Slots in which something was and which cannot be judged now stay as they were."""
         before = self._occupied.get(view)
         slots = sorted((before.seen | before.beneath) - now.seen - now.beneath) if before else []

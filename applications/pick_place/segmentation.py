@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from common.perception.illumination import BoolMask, amplify_green, green_gain
 from common.perception.pinhole import Pinhole
-from common.perception.white import Chosen, green_gain, with_green
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.uint8]
@@ -231,7 +231,7 @@ class _Known:
     picture: Picture
     colours: Colours
     gain: float  # of green, for the colour of the light
-    table: Chosen | None
+    table: BoolMask | None
     masks: RedMasks
 
 
@@ -242,7 +242,7 @@ class Masks:
         """Nothing was seen yet."""
         self._known: _Known | None = None
 
-    def of(self, picture: Picture, colours: Colours, table: Chosen | None = None) -> RedMasks:
+    def of(self, picture: Picture, colours: Colours, table: BoolMask | None = None) -> RedMasks:
         """What is red in a bgr8 picture. The masks are not to be written to.
 
         Args:
@@ -257,7 +257,7 @@ class Masks:
                 return known.masks
         gain = green_gain(picture, table)
         if known is None or part is None or gain != known.gain or _share(part, picture) > _MOST:
-            masks = _masks(with_green(picture, gain), colours)
+            masks = _masks(amplify_green(picture, gain), colours)
             self._known = _Known(picture.copy(), colours, gain, table, masks)
             return masks
         reach = 4 * (colours.kernel_px // 2) + 2  # of erosion and dilation, twice: so far a pixel acts on the masks
@@ -267,7 +267,7 @@ class Masks:
         offset = inner[0].start - outer[0].start, inner[1].start - outer[1].start
         size = inner[0].stop - inner[0].start, inner[1].stop - inner[1].start
         within = slice(offset[0], offset[0] + size[0]), slice(offset[1], offset[1] + size[1])
-        for whole, fresh in zip(masks, _masks(with_green(picture[outer], gain), colours), strict=True):
+        for whole, fresh in zip(masks, _masks(amplify_green(picture[outer], gain), colours), strict=True):
             whole[inner] = fresh[within]
         self._known = _Known(known.picture, colours, gain, table, masks)
         return masks

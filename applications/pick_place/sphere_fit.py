@@ -15,7 +15,7 @@ from common.perception.sphere import ray_distances, silhouettes
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
-Chosen = npt.NDArray[np.bool_]
+BoolMask = npt.NDArray[np.bool_]
 
 _FACING = 0.6  # cosine between the inward normal of the outline and the direction to the centre
 
@@ -58,9 +58,9 @@ def _gradients(outline: Outline, misfit: _Misfit, centers: Array, which: Index, 
     return gradients
 
 
-def near_points(outline: Outline, centers: Array, radius: float, gate: float) -> Chosen:
+def near_points(outline: Outline, centers: Array, radius: float, gate: float) -> BoolMask:
     """(n, k) which points of an outline lie within the gate [m] of the silhouettes of spheres and face as these do."""
-    chosen: Chosen = np.abs(_compare(outline, centers, radius).beyond) < gate
+    chosen: BoolMask = np.abs(_compare(outline, centers, radius).beyond) < gate
     return chosen
 
 
@@ -194,7 +194,7 @@ _MOST_CANDIDATES = 40
 @dataclass(frozen=True)
 class _Candidate:
     center: Array  # (3,) relative to the optical centre [m]
-    points: Chosen  # of the outline that belong to it
+    points: BoolMask  # of the outline that belong to it
     support: int  # how many these are
     whole: float  # points that its whole outline has
 
@@ -331,7 +331,7 @@ def _is_before(upper: _Candidate, lower: _Candidate, outline: Outline, radius: f
     return bool(np.count_nonzero(distance < radius - 2 * _NEAR) > _HIDDEN * lower.whole)
 
 
-def _red_at(pixels: Array, mask: Mask, camera: Pinhole) -> tuple[Chosen, Chosen]:
+def _red_at(pixels: Array, mask: Mask, camera: Pinhole) -> tuple[BoolMask, BoolMask]:
     """Which pixels are in the picture, and which of all are red in it; in the shape of the pixels, without (u, v)."""
     nearest = np.rint(np.where(np.isfinite(pixels), pixels, -1.0)).astype(int)
     seen = np.asarray(camera.in_picture(nearest))
@@ -339,18 +339,18 @@ def _red_at(pixels: Array, mask: Mask, camera: Pinhole) -> tuple[Chosen, Chosen]
     return seen, seen & (mask[v, u] > 0)
 
 
-def _are_red(centers: Array, mask: Mask, camera: Pinhole, radius: float) -> Chosen:
+def _are_red(centers: Array, mask: Mask, camera: Pinhole, radius: float) -> BoolMask:
     """(k,) whether what balls there would cover of the picture is red."""
     places = centers + camera.position
     outlines, middles = silhouettes(camera, places, 0.82 * radius, 16), camera.project(places)[:, None]
     rings = [middles + part * (outlines - middles) for part in (0.25, 0.55, 0.8, 1.0)]
     seen, red = _red_at(np.concatenate(rings, axis=1), mask, camera)
     visible = np.count_nonzero(seen, axis=1)
-    good: Chosen = (visible > 0) & (np.count_nonzero(red, axis=1) >= _COVERED * visible)
+    good: BoolMask = (visible > 0) & (np.count_nonzero(red, axis=1) >= _COVERED * visible)
     return good
 
 
-def _end(centers: Array, mask: Mask, camera: Pinhole, radius: float) -> Chosen:
+def _end(centers: Array, mask: Mask, camera: Pinhole, radius: float) -> BoolMask:
     """(k,) whether balls end where they should: what is red around them is other balls. Larger things go on and on."""
     rings = silhouettes(camera, centers + camera.position, 1.15 * radius, 32)
     _, red = _red_at(rings, mask, camera)
@@ -358,5 +358,5 @@ def _end(centers: Array, mask: Mask, camera: Pinhole, radius: float) -> Chosen:
     inside = (distance < 1.05 * radius).reshape(*rings.shape[:2], len(centers))
     inside[np.arange(len(centers)), :, np.arange(len(centers))] = False  # itself explains nothing
     going_on = red & ~inside.any(axis=2)
-    good: Chosen = np.count_nonzero(going_on, axis=1) <= _MOST_GOING_ON * rings.shape[1]
+    good: BoolMask = np.count_nonzero(going_on, axis=1) <= _MOST_GOING_ON * rings.shape[1]
     return good

@@ -279,7 +279,7 @@ class Deciding(Generic[V]):
         self.row.clear()
         self._planning = None
 
-    def stop(self, view: V, reason: str, by: Literal["person", "requester"] = "requester") -> list[Command]:
+    def stop(self, view: V, reason: str, by: Literal["operator", "requester"] = "requester") -> list[Command]:
         """Throw the row away and bring the arm to rest; fingers finish what they began."""
         self.clear()
         self.look_after = view.now

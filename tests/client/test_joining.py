@@ -89,7 +89,7 @@ async def test_arm_is_stopped_and_task_started_under_the_keys_that_the_program_m
         Cell("two_arms", remapped=LEFT, owner="anna") as left, Cell("two_arms", owner="anna") as right,
     ):
         stopped = await left.arm.stop("smoke")
-        assert [stop.by for stop in (await left.arm.status()).inhibits] == ["anna"]
+        assert [stop.by for stop in (await left.arm.status()).interlocks] == ["anna"]
         assert await joining.newest_heard(left.bus) == stopped.newest > 0 == await joining.newest_heard(right.bus)
         assert left.bus.full_key(await left.task.topic()) == "two_arms/left/pick_place_status"
         await left.task.start()

@@ -19,8 +19,7 @@ from common.planning.ik import solve_ik
 from common.robot.model import RobotModel
 from common.robot.transforms import rpy_to_matrix, transform
 from common.transport.local import LocalNetwork
-from recording.report.collector import Collector
-from recording.report.fold import Fold
+from recording.report.aggregator import Collector, RunAggregator
 from recording.report.summary import describe
 
 CELL = load_cell("ur5")
@@ -153,7 +152,7 @@ def test_progress_of_an_outline_in_one_line() -> None:
 
 def test_without_its_robot_what_the_task_tells_is_all_that_is_known() -> None:
     told = OutlineFigures()
-    told.hears()[OUTLINE_STATUS](0.0, status("DONE", 1, closed=True, fraction=0.75))
+    told.listeners()[OUTLINE_STATUS](0.0, status("DONE", 1, closed=True, fraction=0.75))
     outline = told.blocks()["outline"]
     assert outline["object"] == "Object_1" and outline["closed"] and outline["fraction"] == 0.75
     assert outline["deviation_mm"] is None and outline["tracking_mm"] is None
@@ -167,7 +166,7 @@ def test_an_outline_that_a_file_gave_is_no_picture() -> None:
 async def test_collector_follows_an_outline_to_its_end() -> None:
     net = LocalNetwork()
     cell = net.bus("cell", cell="test")
-    fold = Fold("test", find_application("outlining"), robot=CELL.robot)
+    fold = RunAggregator("test", find_application("outlining"), robot=CELL.robot)
     assert isinstance(fold.figures, OutlineFigures)
     bus, lines = net.bus("supervisor", cell="test"), asyncio.Queue[str]()
     collector = Collector(bus, fold, 0.0, lines.put_nowait)

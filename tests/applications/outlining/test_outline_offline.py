@@ -43,7 +43,7 @@ def pipeline() -> PlanningPipeline:
 
 def photographed(objects: list[ObjectConfig]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     state = m.JointState(header=m.Header(), name=CELL.robot.joints, position=CELL.robot.named_poses["home"])
-    seen = view().see([world_object(thing) for thing in objects], state)
+    seen = view().render([world_object(thing) for thing in objects], state)
     return seen.colour, seen.depth_within(0.10, 2.25)
 
 

@@ -26,9 +26,8 @@ from common.transport.codec import (
 from common.transport.ownership import Owner
 from common.transport.reader import Newness
 from common.transport.session import RawSample
-from lab.chaos.agent import damaged, next_damaged, nonsense
+from lab.chaos.agent import damaged, keys_of, next_damaged, nonsense
 from lab.chaos.plan import CELL_SECONDS, LABELS, Fault, Form, Kind, faults, plan
-from lab.chaos.setting import keys_of
 
 PROCESSES = ["router", "motion_planner", "trajectory_executor", "smart_pick_place"]
 KEYS = ["camera/image_raw", "gripper/state", "motion/plan"]

@@ -2,6 +2,8 @@
 
 import asyncio
 
+from common.client.rates import MOST_SERVICES, Rates
+
 from applications.pick_place.topics import (
     PICK_PLACE_STATUS,
     REJECTED_TARGETS,
@@ -22,10 +24,8 @@ from common.messages import (
     ServiceCounters,
     Vector3,
 )
-from common.supervision.rates import MOST_SERVICES, Rates
 from common.transport.local import LocalNetwork
-from recording.report.collector import Collector
-from recording.report.fold import Fold
+from recording.report.aggregator import Collector, RunAggregator
 
 
 def test_rates_come_from_what_readers_count() -> None:
@@ -66,7 +66,7 @@ async def test_collector_hears_the_cell_and_waits_for_what_still_falls() -> None
     net = LocalNetwork()
     clock = Clock(2.0)
     cell = net.bus("cell", cell="test", clock=clock)
-    fold = Fold("test", find_application("pick_place"), speed=2.0)
+    fold = RunAggregator("test", find_application("pick_place"), speed=2.0)
     progress: list[str] = []
     collector = Collector(net.bus("supervisor", cell="test", clock=clock), fold, 0.0, progress.append)
     listening = asyncio.create_task(collector.run())

@@ -17,8 +17,8 @@ from common.messages import (
     WorldObjects,
 )
 from recording.report.application import Figures
+from recording.report.history import Truth
 from recording.report.summary import Rejected, Summary, describe, percentile
-from recording.report.truth import Truth
 
 PLAN = PlanFigure(planner="cartesian", seconds=0.01, fraction=1.0, attempts=1)
 
