@@ -2,8 +2,6 @@
 
 import asyncio
 
-from common.client.rates import MOST_SERVICES, Rates
-
 from applications.pick_place.topics import (
     PICK_PLACE_STATUS,
     REJECTED_TARGETS,
@@ -24,6 +22,7 @@ from common.messages import (
     ServiceCounters,
     Vector3,
 )
+from common.supervision.rates import MOST_SERVICES, Rates
 from common.transport.local import LocalNetwork
 from recording.report.aggregator import Collector, RunAggregator
 
