@@ -1,4 +1,4 @@
-"""The quick look at a cell that a process of its own takes."""
+"""The quick check at a cell that a process of its own takes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from common.config import load_cell
-from tools.check.cell import doubts, warnings_in_subprocess
+from tools.check.cell import quick_warnings, warnings_in_subprocess
 
 ROOT = str(Path(__file__).resolve().parents[3])
 
@@ -36,4 +36,4 @@ APPLICATION = Application(topics=ApplicationTopics(status=STATUS), checks=Checks
 
 async def test_quick_look_finds_beside_what_it_finds_here() -> None:
     cell = load_cell("panda")
-    assert await warnings_in_subprocess(cell, {**os.environ, "PYTHONPATH": ROOT}) == doubts(cell)
+    assert await warnings_in_subprocess(cell, {**os.environ, "PYTHONPATH": ROOT}) == quick_warnings(cell)
