@@ -31,7 +31,8 @@ EXECUTOR, FEWER_CYCLES = "trajectory_executor", {"joint_state_rate": 25.0}  # [H
 
 def settings_of(application: str) -> tuple[str, ...]:
     """What its application sets in a cell with doubles, as of `--set`, before all that a person sets."""
-    return tuple(getattr(find_application(application).double, "SETTINGS", ()))
+    double = find_application(application).double
+    return double.settings if double is not None else ()
 
 
 def with_doubles(cell: Cell) -> Cell:
@@ -42,13 +43,13 @@ def with_doubles(cell: Cell) -> Cell:
     """
     double = find_application(cell.application).double
     if double is None:
-        raise ConfigError("--doubles", cell.application, "has no module double, which would stand for its perception")
+        raise ConfigError("--doubles", cell.application, "has no simulation double of its perception")
     services: dict[str, ServiceEntry] = {}
     for name, entry in cell.services.items():
         if entry.kind == PLANNER:
             services[name] = ServiceEntry(name=name, module=PLANNER_DOUBLE)
-        elif entry.kind in double.REPLACES:
-            services.setdefault(PERCEPTION, ServiceEntry(name=PERCEPTION, module=double.__name__))
+        elif entry.kind in double.replaces:
+            services.setdefault(PERCEPTION, ServiceEntry(name=PERCEPTION, module=double.module))
         elif entry.kind == EXECUTOR:
             services[name] = entry.model_copy(update={"parameters": FEWER_CYCLES | entry.parameters})
         elif entry.kind not in LEFT_OUT:

@@ -116,13 +116,13 @@ class Invariants:
         self._requests, self._now = requests, now
         requests.on_ask, requests.on_serve, requests.on_answer = self._on_ask, self._on_serve, self._on_answer
         application = find_application(cell.application)
-        self._fills, self._wrong_in = application.fills, application.wrong_in
+        self._fills, self._wrong_in = application.fills_containers, application.truth_check
         self._newest_truth = b""  # as it travelled
         self._doubles = {entry.name for entry in cell.services.values() if is_double(entry)}
         self._cycle = CYCLES / rate_of(cell)  # [s] of cell time
-        known: dict[str, AnyTopic] = {**topics.platform_topics(), **application.topics}
+        known: dict[str, AnyTopic] = {**topics.platform_topics(), **application.topics_by_key}
         self._objects = f"{cell.name}/{topics.SCENE_OBJECTS.key}"
-        self._truth = [self._objects, *(f"{cell.name}/{view.key}" for view in application.views)]
+        self._truth = [self._objects, *(f"{cell.name}/{view.key}" for view in application.truth_views)]
         self._messages = {t.message.__name__: t.message for t in known.values()}
         self._log = f"/{topics.LOG.expression.partition('/')[0]}/"
         self._motion = f"{cell.name}/{topics.MOTION_STATUS.key}"

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from applications.pick_place.choice import Pick, PickPlaceView
-from applications.pick_place.parameters import RELEASED, Config
+from applications.pick_place.grasping import RELEASED, Config
 from common import messages as m
 from common.config import GripperConfig
 from common.planning.free_axes import ALL

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from applications.pick_place.blobs import Mask, Outline
+from applications.pick_place.segmentation import Mask, Outline
 from common.perception.pinhole import Pinhole
 from common.perception.sphere import ray_distances, silhouettes
 

@@ -8,7 +8,7 @@ from typing import Self
 from pydantic import Field, model_validator
 
 from common.config import Grasp, GripperConfig, Parameters, Surroundings, Tunable
-from common.tasks.deciding import TaskConfig
+from common.tasks.decisions import TaskConfig
 
 PLACES = {"finger_inner": "gripper.fingers.inner", "finger_outer": "gripper.fingers.depth, from the inner face",
           "finger_half_width": "gripper.fingers.half_width"}

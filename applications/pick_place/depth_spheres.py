@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from applications.pick_place.blobs import Mask
+from applications.pick_place.segmentation import Mask
 from common.perception.depth import Depth, Rays, is_valid
 from common.perception.pinhole import Pinhole
 

@@ -9,9 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from applications.outlining import stage_files
-from applications.outlining.contours_choice import NoSuchContour, described, middle_of, parse_choice
-from applications.outlining.messages import Contours, OutlinePoints, OutlineSelect, OutlineSelection
-from applications.outlining.topics import CONTOUR_IMAGE, CONTOUR_PATH, CONTOUR_POINTS, CONTOURS, OUTLINE_SELECT
+from applications.outlining.contour_choice import NoSuchContour, described, middle_of, parse_choice
+from applications.outlining.topics import (
+    CONTOUR_IMAGE,
+    CONTOUR_PATH,
+    CONTOUR_POINTS,
+    CONTOURS,
+    OUTLINE_SELECT,
+    Contours,
+    OutlinePoints,
+    OutlineSelect,
+    OutlineSelection,
+)
 from common import topics
 from common.errors import ConfigError, NoResponder, RemoteError, RequestFailed, RequestLost, ZencellError
 from common.perception.camera_input import decode_color_image
