@@ -15,7 +15,7 @@ from common.config import CameraConfig, Cell, Container, ObjectConfig, Reach, se
 from common.config.basics import Rgb
 from common.hardware.loading import is_simulated
 from common.perception.pinhole import Pinhole
-from common.planning.free_axes import chooses
+from common.planning.ik import controls_full_pose
 from common.robot.transforms import tool_down
 from common.scene.workspace import ReachCache, bounds_told, reach_reason, yaw_candidates
 from common.sim.layout import layout
@@ -126,9 +126,9 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
     gripper = cell.robot.gripper
     width = gripper.max_width if gripper is not None and gripper.joints else None
     tilt = cell.grasp.tilt(arm.robot.dof)
-    turned = f"with any of {bounds.yaw_count} hand orientations" if chooses(arm.robot) else "at any yaw"
+    turned = f"with any of {bounds.yaw_count} hand orientations" if controls_full_pose(arm.robot) else "at any yaw"
     turns = [yaw + (math.pi / 2 if gripper is not None and gripper.closing_axis == "x" else 0.0)
-             for yaw in (yaw_candidates(bounds.yaw_count) if chooses(arm.robot) else [0.0])]
+             for yaw in (yaw_candidates(bounds.yaw_count) if controls_full_pose(arm.robot) else [0.0])]
     things = []
     if is_simulated(cell.robot):
         layout(cell.world, cell.run.seed,
@@ -142,7 +142,7 @@ def reach(cell: Cell, arm: Arm) -> Iterator[Finding]:
         low = cell.grasp.height(z)
         poses = [tool_down(x, y, low, turn) for turn in turns]
         if reason := cache.reason((x, y, z)):
-            told = reason.startswith(("too ", "singular")) or not chooses(arm.robot)
+            told = reason.startswith(("too ", "singular")) or not controls_full_pose(arm.robot)
             why = "" if told else arm.why_not(poses, width, tilt)
             yield error(f"{what}, {reason}{f' ({why})' if why else ''}", "move it, or robot.base_position")
         elif why := arm.why_not(poses, width, tilt):

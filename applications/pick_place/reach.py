@@ -10,7 +10,7 @@ import numpy as np
 from applications.pick_place.parameters import RELEASED
 from common.config import Grasp
 from common.errors import ConfigError
-from common.planning.free_axes import chooses, solve_down
+from common.planning.ik import controls_full_pose, solve_tool_down_ik
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
 from common.scene.workspace import WorkspaceBounds, reach_reason, yaw_candidates
@@ -98,8 +98,8 @@ def _is_free(robot: RobotModel, geometry: RobotGeometry, place: tuple[float, flo
     """Whether the arm is clear of itself as it takes something there, with one turn of the hand, coming from home."""
     x, y, z = place
     at, home, tilt = (x, y, grasp.height(z)), robot.named("home"), grasp.tilt(robot.dof)
-    found = (solve_down(robot, at, yaw, home, tilt=tilt, iterations=20)
-             for yaw in (yaw_candidates(WorkspaceBounds().yaw_count) if chooses(robot) else (0.0,)))
+    found = (solve_tool_down_ik(robot, at, yaw, home, tilt=tilt, iterations=20)
+             for yaw in (yaw_candidates(WorkspaceBounds().yaw_count) if controls_full_pose(robot) else (0.0,)))
     return any(q is not None and not hits(robot, geometry, q) for q in found)
 
 
@@ -130,5 +130,5 @@ def _box(robot: RobotModel, reached: list[Place], grasp: Grasp) -> tuple[Place, 
 
 def _released(robot: RobotModel, place: Place, grasp: Grasp) -> bool:
     """Whether the tool comes above the box, coming from home."""
-    at, tilt = (*place, grasp.drop_z), grasp.tilt(robot.dof) if chooses(robot) else RELEASED
-    return solve_down(robot, at, 0.0, robot.named("home"), tilt=tilt, restarts=20, iterations=40) is not None
+    at, tilt = (*place, grasp.drop_z), grasp.tilt(robot.dof) if controls_full_pose(robot) else RELEASED
+    return solve_tool_down_ik(robot, at, 0.0, robot.named("home"), tilt=tilt, restarts=20, iterations=40) is not None

@@ -9,7 +9,7 @@ from applications.pick_place.choice import Pick, PickPlaceView
 from applications.pick_place.parameters import RELEASED, Config
 from common import messages as m
 from common.config import GripperConfig
-from common.planning.free_axes import ALL
+from common.planning.ik import ALL
 from common.robot.transforms import matrix_to_pose, rpy_to_matrix, tool_down, transform
 from common.tasks.stages import Grip, Move, Place, Stage
 
