@@ -7,8 +7,8 @@ itself; or so many primitives stand there, which together are as large. Pairs of
 through the whole pipeline as configured, the same for all numbers of points. Set-up is all that comes before planning
 in a request: the robot and the scene are taken out, points are downsampled, the collision world is made with
 shapes that it has had before. Every trajectory is looked at again at 0.005 rad against the boxes themselves; ends
-with 1 where one collides, but for fewer than 100,000 points, which are too far apart to show the boxes. Times are [ms]: wall, and of the
-process on all processors ("cpu").
+with 1 where one collides, but for fewer than 100,000 points, which are too far apart to show the boxes. Times are
+[ms]: wall, and of the process on all processors ("cpu").
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ from pydantic import Field, model_validator
 from common.config import Section
 from common.errors import Refused, ZencellError
 from common.messages import CameraInfo, Image, JointState, PlanningScene, PointCloud2, TFMessage
+from common.perception.camera_input import FrameError
 from common.perception.depth import Depth, check_depth, depth_of
-from common.perception.intake import Unusable
 from common.perception.pinhole import CameraError, Pinhole
 from common.planning.obstacles import InvalidShape
 from common.planning.point_obstacles import CameraView, KnownShapeFilter, PointObstacle, depth_points, occluded_spheres
@@ -168,7 +168,7 @@ class CameraObstacles:
             )
             points = depth_points(depth[::step, ::step], coarse)
             return CameraView(f"points of {name}", points, q, width), (depth, camera)
-        except (Unusable, CameraError) as error:
+        except (FrameError, CameraError) as error:
             raise Refused("bad_points", f"{name}: {error}") from None
         except ZencellError as error:
             if isinstance(error, Refused):
@@ -218,7 +218,7 @@ def frame_pose(frame: str, poses: TFMessage | None, robot: RobotModel, q: Array)
     """Return the (4, 4) world pose of a frame whose chain of parents ends at world or at a link of the robot at q.
 
     Raises:
-        Unusable: its chain of parents does not.
+        FrameError: its chain of parents does not.
     """
     known = {t.child_frame_id: t for t in (poses.transforms if poses is not None else [])}
     links = set(robot.link_names)
@@ -232,7 +232,7 @@ def frame_pose(frame: str, poses: TFMessage | None, robot: RobotModel, q: Array)
             break
         T = pose_to_matrix(known[at].transform) @ T
         at = known[at].header.frame_id
-    raise Unusable("unknown_frame", f"tf_static has no pose of frame {frame!r}; its frames: "
+    raise FrameError("unknown_frame", f"tf_static has no pose of frame {frame!r}; its frames: "
                                     f"{', '.join(known) or 'none'}")
 
 
@@ -240,18 +240,18 @@ def cloud_points(cloud: PointCloud2) -> Array:
     """Return (N, 3) finite points [m] of a cloud in its frame.
 
     Raises:
-        Unusable: it lacks x, y or z, or its size does not match its layout.
+        FrameError: it lacks x, y or z, or its size does not match its layout.
     """
     missing = [name for name in ("x", "y", "z") if name not in cloud.fields]
     if missing:
-        raise Unusable("fields", f"the cloud has no {missing[0]}; its fields are {', '.join(cloud.fields) or 'none'}")
+        raise FrameError("fields", f"the cloud has no {missing[0]}; its fields are {', '.join(cloud.fields) or 'none'}")
     at = [cloud.fields.index(name) for name in ("x", "y", "z")]
     row = cloud.width * cloud.point_step
     if cloud.point_step % 4 or 4 * (max(at) + 1) > cloud.point_step or cloud.row_step < row:
-        raise Unusable("step", f"point_step {cloud.point_step} and row_step {cloud.row_step} do not fit "
+        raise FrameError("step", f"point_step {cloud.point_step} and row_step {cloud.row_step} do not fit "
                                f"{len(cloud.fields)} fields of {cloud.width} points")
     if len(cloud.data) < cloud.row_step * (cloud.height - 1) + row:
-        raise Unusable("truncated", f"{len(cloud.data)} bytes are too few for {cloud.width}x{cloud.height} points")
+        raise FrameError("truncated", f"{len(cloud.data)} bytes are too few for {cloud.width}x{cloud.height} points")
     data = np.frombuffer(cloud.data, np.uint8)
     rows = np.lib.stride_tricks.as_strided(data, (cloud.height, row), (cloud.row_step, 1), writeable=False)
     values = np.ascontiguousarray(rows).view("<f4").reshape(-1, cloud.point_step // 4)[:, at]
