@@ -7,7 +7,6 @@ from contextlib import AsyncExitStack
 
 import numpy as np
 import pytest
-from common.supervision.wiring import wiring
 from pydantic import ValidationError
 
 from common import topics
@@ -42,6 +41,7 @@ from common.planning.collision import CollisionWorld, interpolate
 from common.planning.ik import solve_ik
 from common.process.in_process import running_service
 from common.process.persist import persist
+from common.process.wiring import wiring
 from common.robot.transforms import rpy_to_matrix, transform
 from common.sim.objects import world_object
 from common.transport.local import LocalNetwork
@@ -233,7 +233,7 @@ def test_camera_on_the_robot_is_where_its_link_was() -> None:
     with pytest.raises(FrameError, match="'nowhere'; its frames: lens, mount"):
         frame_pose("nowhere", poses, ROBOT, START)
     around = TFMessage(transforms=[stamped("a", "b", on_tool, 0), stamped("b", "a", on_tool, 0)])
-    with pytest.raises(FrameError, match="'a' is"):
+    with pytest.raises(FrameError, match="frame 'a'; its"):
         frame_pose("a", around, ROBOT, START)
 
 
