@@ -149,7 +149,7 @@ class Views:
         before = self._before.setdefault(number, RobotOcclusion(silhouettes))
         state = self._joints.latest
         q = robot.order(state.name, state.position) if state is not None else None
-        return before.in_picture(camera, frame.header.stamp, q, state.header.stamp if state is not None else 0)
+        return before.in_image(camera, frame.header.stamp, q, state.header.stamp if state is not None else 0)
 
     def _without_cut_off(self, number: int, frame: MarkerArray) -> MarkerArray:
         """The frame without what is cut off by the border of its picture and whole in another one."""

@@ -210,7 +210,7 @@ def _is_undone(camera: CameraFile, ideal: Array) -> bool:
     return bool(np.abs(back.reshape(-1, 2) - np.column_stack([u.ravel(), v.ravel()])).max() < UNDONE)
 
 
-# Where everything was within an exposure, from what is known of how it moves now."""
+# Where everything was within an exposure, from what is known of how it moves now.
 
 OLDEST = 0.1  # [s] after which what was told of a thing says nothing about how it moves
 LONGEST = 0.25  # [s] between two pictures that tell how fast a thing moves

@@ -128,7 +128,7 @@ def placed(corners: Array, T: Array) -> Array:
     return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
 
 
-# The links of a robot as triangles, from its collision geometry."""
+# The links of a robot as triangles, from its collision geometry.
 
 def robot_shapes(robot: RobotModel) -> dict[str, Array]:
     """Triangles (n, 3, 3) [m] of every link that has a shape, in the frame of the link.

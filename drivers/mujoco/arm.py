@@ -122,7 +122,7 @@ def limit_force(model: mujoco.MjModel, actuator: int, force: float) -> None:
     model.actuator_forcerange[actuator] = (-force, force) if math.isfinite(force) else (0.0, 0.0)
 
 
-# Fingers in the world with physics: driven along a jerk-limited width, with no more force than they were told."""
+# Fingers in the world with physics: driven along a jerk-limited width, with no more force than they were told.
 
 ENCODER = 5  # decimals of what is measured [m], [m/s]
 STILL = 2e-3  # [m/s] fingers that are slower stand
