@@ -80,7 +80,7 @@ class Views:
         self._names, self._home = robot.joints, HomeWatch(robot.named_poses["home"])
         self._only_at_home = only_at_home
         self._newest: list[Seen | None] = [None for _ in keys]
-        self._left_out = SkippedFrames(log, "a frame of detections")
+        self._left_out = SkippedFrames(log, "frame of detections")
 
     async def watch(self, look: Callable[[int, Seen], Awaitable[None]]) -> None:
         """Have every frame looked at as it comes, one after the other, with the number of its view; never returns."""

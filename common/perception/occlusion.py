@@ -145,7 +145,8 @@ class RobotOcclusion:
         since = list(self._readings)[visible[-1] if visible else 0 :]
         selected = [since[0][1], *(q for (_, q), (_, p) in zip(since[1:], since, strict=False) if not _same(q, p))]
         last = self._last
-        if last is not None and last[0] is camera and len(last[1]) == len(selected) and all(map(_same, last[1], selected)):
+        if last is not None and last[0] is camera and len(last[1]) == len(selected) and all(
+                map(_same, last[1], selected)):
             return last[2]
         occlusion = self._silhouettes.occlusion(camera, selected)
         self._last = camera, selected, occlusion
