@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from common.transport.bus import Bus
     from lab.chaos.agent import Chaos
     from page.serving import Page
-    from recording.report.collector import Collector
+    from recording.report.aggregator import Collector
 
 T = TypeVar("T")
 
@@ -83,7 +83,7 @@ class Operation:
         )
         from common.transport.endpoint import endpoint_of
         from page.access import VIEWER
-        from recording.report.fold import Fold
+        from recording.report.aggregator import RunAggregator
         from security.requiring import require_secured, with_near
         from tools.check.cell import require_safe
 
@@ -104,8 +104,9 @@ class Operation:
             kept = {name: entry for name, entry in loaded.services.items() if entry.kind != VIEWER}
             loaded = loaded.model_copy(update={"services": kept})
         self.cell: Cell = loaded
-        self.fold = Fold(loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
-                         speed=self.launch.clock.speed, containers=list(loaded.world.containers))
+        self.fold = RunAggregator(
+            loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
+            speed=self.launch.clock.speed, containers=list(loaded.world.containers))
         self.summary = self.fold.summary
         require_modules(loaded)
         require_safe(loaded)
@@ -130,9 +131,9 @@ class Operation:
         Raises:
             ConfigError: there is no page, the port is taken, or host or port cannot be used.
         """
-        from page.serving import page_of
+        from page.serving import build_report
 
-        self._page = page = page_of(self.cell, host, port)
+        self._page = page = build_report(self.cell, host, port)
         if page is not None:
             overrides = (*self.launch.overrides, *page.overrides)
             self.launch = replace(self.launch, overrides=overrides, extra=page.environment)
@@ -147,8 +148,8 @@ class Operation:
             return
         from common.supervision.launch import python_module
         from common.transport.credentials import RECORDER
-        from recording.own import Own
-        from recording.telling import require_new
+        from recording.capture import CustomTopics
+        from recording.summary import require_new
         from security.requiring import require_recorder
 
         path = Path(file).absolute()
@@ -157,7 +158,7 @@ class Operation:
         place = ["--connect", self.launch.connect] if self.launch.connect else ["--domain", str(self.launch.domain)]
         self._watchers[RECORDER] = [
             *python_module("cli.main"), "record", "--cell", self.cell.name, "-o", str(path), *place, "--gate",
-            "--own", str(Own.of(self.cell)),
+            "--own", str(CustomTopics.of(self.cell)),
         ]
 
     def disturb(self, seed: int, per_minute: float, *, until_ended: bool) -> None:
@@ -297,7 +298,7 @@ class Operation:
         return Content(statuses, {name: rate for name, rate in rates.items() if rate}, self.fold.progress)
 
     def _prepare(self, bus: Bus) -> None:
-        from recording.report.collector import Collector
+        from recording.report.aggregator import Collector
 
         assert self._screen is not None
         self._collector = Collector(bus, self.fold, self.began, self._screen.progress)
@@ -354,12 +355,12 @@ class Operation:
         self._screen.note(line)
 
     async def _tell_doubts(self) -> None:
-        from tools.check.beside import NotLooked, doubts_beside
+        from tools.check.cell import QuickCheckFailed, warnings_in_subprocess
 
         try:
-            for found in await doubts_beside(self.cell, self.launch.environment()):
+            for found in await warnings_in_subprocess(self.cell, self.launch.environment()):
                 self._note(f"{found.severity}: {printable(found.line)}")
-        except NotLooked as told:
+        except QuickCheckFailed as told:
             self._note(f"warning: {told}")
 
     async def _disturbing(self) -> None:
@@ -373,12 +374,13 @@ class Operation:
             self._screen.note(f"Open {self._page.address}")
         self._doubts = asyncio.create_task(self._tell_doubts(), name="doubts")
         if self._disturbance is not None:
-            from lab.chaos.setting import chaos_in, keys_of
+            from lab.chaos.agent import create_chaos, keys_of
 
             assert self._supervisor is not None
             seed, per_minute, until_ended = self._disturbance
             known = keys_of(await bus.owners(), [entry.name for entry in self.cell.services.values()])
-            self._chaos = chaos_in(bus, self.cell, self._supervisor, known, seed, per_minute, until_ended=until_ended)
+            self._chaos = create_chaos(
+                bus, self.cell, self._supervisor, known, seed, per_minute, until_ended=until_ended)
         return self._collector
 
 

@@ -18,7 +18,7 @@ from common.perception.pinhole import Pinhole
 from common.sim.footprints import overlap, within
 from common.sim.objects import Solid, initial_pose, solid_of
 from common.sim.table import Table, tables
-from tools.check.finding import Finding, error, warning
+from tools.check import Finding, error, warning
 
 Array = NDArray[np.float64]
 
