@@ -446,7 +446,7 @@ def test_world_takes_no_more_objects_than_can_be_told_of(monkeypatch) -> None:
     small = {"op": "add", "shape": "sphere", "size": Vector3(x=0.01)}
     for i in range(2):
         world.edit(WorldEdit(**small, position=Vector3(x=0.3 + 0.1 * i)), 0.0)
-    with pytest.raises(Refused, match="room for 3"):
+    with pytest.raises(Refused, match="at most 3"):
         world.edit(WorldEdit(**small, position=Vector3(x=0.7)), 0.0)
     world.edit(WorldEdit(op="remove", id="sphere_1"), 0.0)
     world.edit(WorldEdit(**small, position=Vector3(x=0.7)), 0.0)
